@@ -111,6 +111,8 @@ class Settings(BaseModel):
     """Memory for the scenes whose references are chosen, MiB."""
     reference_cache_mib: int = Field(default=512, ge=0)
     """Memory for references' features, MiB."""
+    background_matching: bool = True
+    """Whether references are matched with one another when the server is idle, so that queries need not."""
     coverage: float = Field(default=0.99, gt=0, lt=1)
     """Share of right answers to accept where a request sets none; a larger one also accepts more wrong answers."""
     allow_watching: bool = False

@@ -31,6 +31,11 @@ from mapless_server.store.cache import LruCache
 LOCALIZE = "/mapless.v1.LocalizationService/Localize"
 
 COUNTERS = {
+    "mapless_background_pairs_total": set(),
+    "mapless_background_cpu_seconds_total": set(),
+    "mapless_background_failures_total": set(),
+    "mapless_stored_pairs_total": {"result"},
+    "mapless_stored_pairs_failures_total": set(),
     "mapless_captured_total": set(),
     "mapless_capture_dropped_total": {"reason"},
     "grpc_server_started_total": {"grpc_service", "grpc_method"},
@@ -53,6 +58,7 @@ COUNTERS = {
     "mapless_store_errors_total": set(),
 }
 GAUGES = {
+    "mapless_background_waiting": set(),
     "mapless_capture_bytes": set(),
     "mapless_capture_enabled": set(),
     "mapless_python_allocated_blocks": set(),

@@ -52,7 +52,7 @@ def complete(store: Store, stored: PairStore) -> dict[tuple[str, str], np.ndarra
     """Every pair of the scene; what was stored."""
     everything: dict[tuple[str, str], np.ndarray] = {}
     for claim in claim_all(stored):
-        others = stored.list_missing(MATCHING, claim, [key_of(store, name) for name in "abc"])
+        others = stored.list_missing(MATCHING, claim, [key_of(store, name) for name in "abc"], 20)
         made = {(other, claim.key): matches(5, seed) for seed, other in enumerate(others)}
         stored.add(MATCHING, claim, made, is_complete=True)
         everything |= made
@@ -156,7 +156,7 @@ class TestClaims:
         store, stored = two
         keys = {name: key_of(store, name) for name in "abc"}
         others = {
-            it.reference_id: stored.list_missing(MATCHING, it, [keys["c"], keys["b"], keys["a"]])
+            it.reference_id: stored.list_missing(MATCHING, it, [keys["c"], keys["b"], keys["a"]], 20)
             for it in claim_all(stored)
         }
         assert others == {"a": [], "b": [keys["a"]], "c": [keys["b"], keys["a"]]}
@@ -178,7 +178,8 @@ class TestClaims:
         keys = [key_of(store, name) for name in "ab"]
         stored.add(MATCHING, claim, {(keys[0], claim.key): matches(2)}, is_complete=False)
         assert claim_all(stored) == [claim]
-        assert stored.list_missing(MATCHING, claim, keys) == [keys[1]]
+        assert stored.list_missing(MATCHING, claim, keys, 20) == [keys[1]]
+        assert stored.list_missing(MATCHING, claim, keys, 1) == []
 
     def test_completed_ones_are_not_claimed_again(
         self, two: tuple[Store, PairStore], monkeypatch: pytest.MonkeyPatch
@@ -216,7 +217,7 @@ class TestClaims:
         (claim,) = claim_all(stored, progress)
         assert (claim.scene_key, claim.reference_id) == (OTHER, "a")
         # A pair lies within one scene.
-        assert stored.list_missing(MATCHING, claim, [key_of(store, name) for name in "abc"]) == []
+        assert stored.list_missing(MATCHING, claim, [key_of(store, name) for name in "abc"], 20) == []
         store.delete_scene(OTHER)
         store.create_scene(OTHER)
         store.add_references(OTHER, [make_reference("a", 5)])

@@ -242,9 +242,10 @@ def serving(
 
     It has a tier of stand-ins for each of the `features`, or the given `tier`, and computes by a StandInMethod, or the
     given `method`. It closes its store, which lies in the folder unless one is given. Its queue is so long that a slow
-    machine rejects no call, which other tests are about.
+    machine rejects no call, which other tests are about; so is matching in the background.
     """
     defaults = {"port": 0, "workers": 2, "metrics": False, "warm_up": False, "max_queued_s": 60.0}
+    defaults["background_matching"] = False
     settings = Settings(host="127.0.0.1", data_dir=data_dir, **(defaults | options))
     store = store or Store.open(data_dir)
     stand_in, extractors, known = StandInMethod(), [StandInExtractor(name) for name in features], list[Metrics]()

@@ -15,6 +15,7 @@ from mapless_server.method.groups.rig import RigEstimate
 from mapless_server.method.groups.sequence import SequenceEstimate
 from mapless_server.method.rejection import Rejection
 from mapless_server.scenes import Choice, Coverage, Narrowing, ReferenceAudit, Selection, Viewpoint
+from mapless_server.scenes.background import BackgroundMatching
 from mapless_server.scheduling import (
     ComputeItem,
     Expired,
@@ -62,6 +63,7 @@ class QueueEngine:
         options: limits.
         references: of all scenes.
         queue: of the work.
+        background: matches references when the queue is empty, once it is started; None where nothing does.
     """
 
     def __init__(
@@ -90,6 +92,7 @@ class QueueEngine:
         self.tiers = tuple(tiers)
         self.options = options
         self.references = references
+        self.background: BackgroundMatching | None = None
         stages = QueryStages(self.tiers, options.escalation, method)
         is_batched = any(tier.pipeline.reconstructor.is_batched for tier in tiers)
         coarse = Stage(COARSE, DEVICE, REFINE, options.max_batch) if is_batched else Stage(COARSE, HOST, REFINE)

@@ -1,9 +1,9 @@
 """Correspondences: matches of keypoints between photographs.
 
 Matches between references, whose poses are known, must also satisfy the epipolar constraint; they depend only on the
-two stored references, so they are made once: ahead of the queries and stored (`scenes.background`), or by the first
-query that needs them, and cached. Matches of the query with each reference come from descriptors alone, or from a
-network that compares all keypoints of both photographs: implementations of `QueryMatching`.
+two stored references, so they are made once, ahead of the queries (`scenes.background`) or by the first one that needs
+them, and cached. Matches of the query with each reference come from descriptors alone, or from a network that compares
+all keypoints of both photographs: implementations of `QueryMatching`.
 
 Between distant references few matches pass the ratio test over all keypoints. Wide correspondences add matches that
 pass it among the keypoints along the epipolar line: many more, of which more are wrong, so they are used only for

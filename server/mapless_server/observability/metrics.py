@@ -20,6 +20,7 @@ from prometheus_client.metrics_core import Metric
 
 from mapless.v1 import localization_service_pb2, reference_service_pb2
 from mapless_server.method.rejection import RejectionReason
+from mapless_server.scenes.pair_observer import PairObserver
 from mapless_server.scheduling import Ending, Observer, Refusal
 from mapless_server.security import ENDLESS_METHODS
 
@@ -27,6 +28,9 @@ from .scraped import Scraped
 
 STAGES = ("prepare", "coarse", "refine", "join", "describe", "retrieve", "audit", "coverage")
 """Stages of the queue."""
+
+LOOKED_UP = ("stored", "absent", "damaged")
+"""What a query finds of a pair of references in the store."""
 
 CAPTURE_DROPS = ("queue", "size", "disk", "deleted", "store", "fault")
 """Reasons for which a call was not captured."""
@@ -99,7 +103,7 @@ class _Children(Generic[M]):
         return child
 
 
-class Metrics(Observer):
+class Metrics(Observer, PairObserver):
     """The metrics of one server. Implements `rpc.CallObserver`, too; never raises.
 
     Attributes:
@@ -232,6 +236,28 @@ class Metrics(Observer):
         """An operation of the store failed by a fault that is not the caller's."""
         self._store_errors.inc()
 
+    def pairs_looked_up(self, stored: int, absent: int, damaged: int) -> None:
+        """A query looked for pairs of references; it matches those itself that are absent or damaged."""
+        for result, count in zip(LOOKED_UP, (stored, absent, damaged), strict=True):
+            self._looked_up(result).inc(count)
+
+    def pair_lookup_failed(self) -> None:
+        """A query could not look for pairs of references."""
+        self._lookup_failures.inc()
+
+    def pairs_made(self, count: int, cpu_seconds: float) -> None:
+        """Pairs of a reference were matched in the background and stored."""
+        self._background_pairs.inc(count)
+        self._background_seconds.inc(max(0.0, cpu_seconds))
+
+    def matching_failed(self) -> None:
+        """Matching a reference in the background failed."""
+        self._background_failures.inc()
+
+    def references_wait(self, count: int) -> None:
+        """So many references wait to be matched in the background."""
+        self._background_waiting.set(count)
+
     def ran_out_of_memory(self) -> None:
         """The device had no memory left for a batch."""
         self._oom.inc()
@@ -341,6 +367,23 @@ class Metrics(Observer):
         stored = histogram("mapless_store_op_seconds", "Time of the store's operations.", STAGE_BUCKETS, ["op"])
         self._store_seconds = _Children(stored)
         self._store_errors = counter("mapless_store_errors", "Operations of the store that failed by a fault of ours.")
+        looked_up = counter(
+            "mapless_stored_pairs", "Pairs of references that queries looked for, by result.", ["result"]
+        )
+        self._looked_up = _Children(looked_up, [(result,) for result in LOOKED_UP])
+        self._lookup_failures = counter(
+            "mapless_stored_pairs_failures", "Queries that could not look for stored pairs."
+        )
+        self._background_pairs = counter("mapless_background_pairs", "Pairs of references matched in the background.")
+        self._background_seconds = counter(
+            "mapless_background_cpu_seconds", "Processor time of matching references in the background."
+        )
+        self._background_failures = counter(
+            "mapless_background_failures", "Failures of matching references in the background; each is tried again."
+        )
+        self._background_waiting = gauge(
+            "mapless_background_waiting", "References that wait to be matched in the background, as last counted."
+        )
         self._oom = counter("mapless_gpu_oom", "Batches that the device had no memory for.")
         self._fatal = counter("mapless_fatal", "Faults that end the process.")
         self._capture_enabled = gauge("mapless_capture_enabled", "1 if calls are captured, with photographs, else 0.")

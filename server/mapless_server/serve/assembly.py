@@ -26,13 +26,16 @@ from mapless_server.observability.metrics import Metrics
 from mapless_server.scenes import GlobalDescriptor
 from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.audit.scene_auditor import AuditTools
+from mapless_server.scenes.background import BackgroundMatching
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
+from mapless_server.scenes.pair_observer import PairObserver
 from mapless_server.scenes.retrieval.vlad import VladDescriptor
+from mapless_server.scenes.stored_pairs import Matching, PairFinder
 from mapless_server.scheduling import Observer, Quota, WorkQueueOptions
 from mapless_server.security import RateLimiter
 from mapless_server.settings import Settings, available_cores
-from mapless_server.store import Store, StoreError
+from mapless_server.store import PairStore, Store, StoreError
 
 log = logging.getLogger(__name__)
 
@@ -96,7 +99,7 @@ def make_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateL
     try:
         tiers = make_tiers(settings)
         descriptor = make_descriptor(settings, tiers[0].extractor)
-        return engine_over(store, tiers, engine_options(settings), metrics, quota, descriptor=descriptor)
+        return engine_over(store, tiers, engine_options(settings), metrics, quota, None, descriptor, metrics)
     except (ImportError, WeightsMissing) as error:
         raise StartupError(what_is_missing(error)) from error
     except (ValueError, WeightsError) as error:
@@ -111,6 +114,7 @@ def engine_over(
     quota: Quota | None = None,
     method: Method | None = None,
     descriptor: GlobalDescriptor | None = None,
+    pair_observer: PairObserver | None = None,
 ) -> QueueEngine:
     """An engine and the references in memory that it reads.
 
@@ -122,6 +126,7 @@ def engine_over(
         quota: likewise.
         method: likewise.
         descriptor: for choosing references; None makes one of the first tier's features.
+        pair_observer: of matches of references.
 
     Raises:
         ValueError: no tier, two with the same extractor or matcher, or a descriptor of other features.
@@ -135,7 +140,21 @@ def engine_over(
     pairs = PairMatches(tiers[0].pipeline.matcher.options.reference_ratio, CACHED_AUDIT_PAIRS)
     audit_tools = AuditTools(library, indexes, descriptor, first, pairs)
     references = References(library, indexes, descriptor, extractors, audit_tools, options.image_limits)
-    return QueueEngine(tiers, references, options, observer, quota, method)
+    engine = QueueEngine(tiers, references, options, observer, quota, method)
+    engine.background = _background_matching(store, indexes, engine, pair_observer or PairObserver())
+    return engine
+
+
+def _background_matching(
+    store: Store, indexes: SceneIndexes, engine: QueueEngine, observer: PairObserver
+) -> BackgroundMatching:
+    """Matching for the queries of each tier, the first one first; from now on, queries look for its results."""
+    pairs, matchings = PairStore(store.database), dict[Matching, PairFinder]()
+    for tier in engine.tiers:
+        matcher = tier.pipeline.matcher
+        matcher.stored = finder = PairFinder(pairs, tier.extractor.name, observer)
+        matchings |= {Matching(tier.extractor, matcher, wide): finder for wide in (False, True)}
+    return BackgroundMatching(store, indexes, matchings, lambda: engine.queue.job_count == 0, observer)
 
 
 def feature_names(features: str, device: str) -> tuple[str, ...]:

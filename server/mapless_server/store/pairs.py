@@ -29,7 +29,7 @@ from .faults import unless_damaged
 from .tables import reference, reference_matching, reference_pair, scene, scene_generation
 
 CLAIM_S = 60.0
-"""Far longer than the pairs of one reference take on an idle server; see `scenes.background` for a busy one."""
+"""Far longer than the pairs of one reference take on an idle server; on a busy one, it is released before the end."""
 
 FIRST_RETRY_S, LONGEST_RETRY_S = 30.0, 3600.0
 """After the first failure with a reference, twice as long after each further one."""
@@ -110,8 +110,8 @@ class PairStore:
             )
             return connection.execute(is_free).rowcount == 1 or queries.insert_new(connection, reference_matching, row)
 
-    def list_missing(self, matching: str, claim: Claim, others: Sequence[str]) -> list[str]:
-        """Those of these keys that precede the claimed reference in its scene and whose pairs are not stored."""
+    def list_missing(self, matching: str, claim: Claim, others: Sequence[str], at_most: int) -> list[str]:
+        """The first `at_most` of these keys that precede the claimed reference in its scene, without stored pairs."""
         column, pair = reference.c, reference_pair.c
         generation = select(column.generation).where(column.key == claim.key).scalar_subquery()
         precedes = or_(column.generation < generation, (column.generation == generation) & (column.key < claim.key))
@@ -124,9 +124,9 @@ class PairStore:
             ),
         )
         with self._database.read() as connection:
-            missing = set(connection.scalars(earlier))
-            missing -= {key for pair in connection.execute(stored) for key in pair}
-        return [key for key in others if key in missing]
+            preceding = set(connection.scalars(earlier))
+            found = {key for pair in connection.execute(stored) for key in pair}
+        return [key for key in [key for key in others if key in preceding][:at_most] if key not in found]
 
     def add(self, matching: str, claim: Claim, matches: Mapping[Pair, Matches], is_complete: bool) -> None:
         """Stores pairs of a claimed reference, and ends the claim: it is complete, or others may claim it at once.

@@ -91,12 +91,16 @@ class Store(StoreReader):
         store._pending_deletions.resume()
         return store
 
-    def uncached(self) -> Store:
+    def uncached(self, cache_bytes: int = 0) -> Store:
         """The same database without caches, for reading what queries do not: the caches and their counts are kept.
 
-        It lives as long as this store, is not closed, and is only read.
+        It lives as long as this store and is not closed. Only features are written through it, which invalidate
+        nothing that is cached here.
+
+        Args:
+            cache_bytes: bound of a cache of features of its own.
         """
-        return Store(self._database, LruCache(0), name_cache_bytes=0)
+        return Store(self._database, LruCache(cache_bytes), name_cache_bytes=0)
 
     def close(self) -> None:
         """Releases the data folder; no call may be in progress or follow."""

@@ -113,6 +113,11 @@ class Entries:
             np.dot(part, vector, out=products[start:stop])
         return (products[rows] if is_dense else products) * self._inverse_norms[rows]
 
+    def vector(self, row: int) -> Vector | None:
+        """The descriptor (D,) of a row, rounded, of unit length; None if it has none."""
+        inverse_norm = self._inverse_norms[row]
+        return None if np.isnan(inverse_norm) else self._table.vectors[row] * inverse_norm
+
     def centres(self, rows: Rows) -> Array:
         """Camera centres (N, 3), world, metres."""
         return self._table.poses[rows, :, 3]

@@ -1,0 +1,266 @@
+"""Matches references with one another when there is time, so that a query pays only for its own matches.
+
+A thread takes one reference after another, of all scenes, and matches it with the references that a query from its
+place would choose, one pair at a time. The matches are stored where the queries of all servers find them. Between pairs
+it waits while the server computes for a caller, except for a small share of one core, so that it ends on a busy server,
+too.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+
+from mapless_server.errors import DataLoss, NotFound
+from mapless_server.method.context import StageContext
+from mapless_server.method.correspond import in_order
+from mapless_server.method.options import check_bounds
+from mapless_server.method.views import Matches, PosedView
+from mapless_server.store import Claim, Pair, PairStore, Progress, Store
+from mapless_server.store.pairs import CLAIM_S
+
+from .indexes import SceneIndexes
+from .library import ReferenceLibrary, load_usable
+from .pair_observer import PairObserver
+from .retrieval.ranking import RankOptions, Selection, rank_references
+from .stored_pairs import Matching, PairFinder
+
+log = logging.getLogger(__name__)
+
+_AS_QUERIES_CHOOSE = RankOptions(nearby_weight=1.0)
+"""That of `engine.stages`: references near one another are not thinned out before they are matched."""
+
+_CACHE_BYTES = 64 * 2**20
+"""Features that are kept from one reference to the next, of about 60; in addition to what queries have in memory."""
+
+_WAITING_IS_COUNTED_S = 30.0
+
+
+class _Closed(Exception):
+    """The server is being closed."""
+
+
+@dataclass(frozen=True)
+class BackgroundOptions:
+    """Options of matching in the background.
+
+    Attributes:
+        pairs: references that each is matched with, at most, of those before it. In the kitchen of 7-Scenes (86
+            references, 15 queries, 10 references a query) a query finds 93 % of its pairs with 20, 97 % with 30, 99 %
+            with 40, which take 17, 24 and 30 pairs a reference.
+        busy_share: of one core while the server computes for callers.
+        quiet_s: only after this time without work for a caller the server counts as idle: a caller that sends one
+            photograph after another leaves gaps of some milliseconds.
+        poll_s: time between two looks into the store for new references, also those that other servers have added.
+        longest_poll_s: the same after repeated failures of the store.
+    """
+
+    pairs: int = 30
+    busy_share: float = 0.05
+    quiet_s: float = 0.05
+    poll_s: float = 2.0
+    longest_poll_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "pairs", at_least=1)
+        check_bounds(self, "busy_share", above=0, at_most=1)
+        check_bounds(self, "quiet_s", at_least=0)
+        check_bounds(self, "poll_s longest_poll_s", above=0)
+
+
+class BackgroundMatching:
+    """Matches the references of a store in a thread of its own."""
+
+    def __init__(
+        self,
+        store: Store,
+        indexes: SceneIndexes,
+        matchings: Mapping[Matching, PairFinder],
+        is_idle: Callable[[], bool],
+        observer: PairObserver,
+        options: BackgroundOptions | None = None,
+    ) -> None:
+        """Nothing is matched before `start`, or `match_waiting`.
+
+        Args:
+            store: of the references.
+            indexes: by which references are chosen for queries.
+            matchings: what is made, the most important first; and what queries find of it.
+            is_idle: whether the server computes nothing for a caller.
+            observer: receives the events.
+            options: see there.
+        """
+        self._store = store
+        self._pairs = PairStore(store.database)
+        self._indexes = indexes
+        self._matchings = matchings
+        self._is_idle = is_idle
+        self._observer = observer
+        self.options = options or BackgroundOptions()
+        self._progress: dict[str, Progress] = {matching.name: {} for matching in matchings}
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._pair_s = 0.0
+        self._counted_s = 0.0
+
+    def start(self) -> None:
+        """Starts the thread, unless the store can only be read."""
+        if self._store.database.only_reads:
+            log.warning("references are not matched in the background: the store can only be read")
+            return
+        self._thread = threading.Thread(target=self._run, name="background matching", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Ends the thread after its current pair; what it has made is stored."""
+        self._closing.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def match_waiting(self) -> None:
+        """Matches the references that may be claimed now, until there are none; raises if the store fails."""
+        for matching, finder in self._matchings.items():
+            damaged = finder.take_damaged(matching.name)
+            if damaged:
+                self._pairs.discard(matching.name, damaged)
+        found = self._claim()
+        if found is None:
+            return
+        self._count_waiting()
+        # Of its own, so that references that queries use stay in memory.
+        with closing(ReferenceLibrary(self._store.uncached(_CACHE_BYTES))) as library:
+            while found is not None and not self._closing.is_set():
+                self._match_claimed(library, *found)
+                if time.monotonic() - self._counted_s >= _WAITING_IS_COUNTED_S:
+                    self._count_waiting()
+                found = self._claim()
+        self._count_waiting()
+
+    def _run(self) -> None:
+        poll_s = self.options.poll_s
+        while not self._closing.wait(poll_s):
+            has_failed = self._fails()
+            poll_s = min(2 * poll_s, self.options.longest_poll_s) if has_failed else self.options.poll_s
+
+    def _fails(self) -> bool:
+        """Matches what waits; whether the store failed."""
+        try:
+            self.match_waiting()
+        except Exception as error:
+            self._observer.matching_failed()
+            log.warning("matching references in the background failed, and is tried again: %s", error)
+            return True
+        return False
+
+    def _claim(self) -> tuple[Matching, Claim] | None:
+        for matching in self._matchings:
+            claim = self._pairs.claim(matching.name, self._progress[matching.name])
+            if claim is not None:
+                return matching, claim
+        return None
+
+    def _count_waiting(self) -> None:
+        self._observer.references_wait(max(self._pairs.count_waiting(it.name) for it in self._matchings))
+        self._counted_s = time.monotonic()
+
+    def _match_claimed(self, library: ReferenceLibrary, matching: Matching, claim: Claim) -> None:
+        """Matches one reference, or postpones it if that fails."""
+        until_s = time.monotonic() + CLAIM_S / 2
+        begin_s = time.thread_time()
+        try:
+            made, is_complete = self._match(library, matching, claim, until_s)
+        except _Closed:
+            made, is_complete = {}, False
+        except NotFound:  # the reference was deleted
+            self._pairs.postpone(matching.name, claim)
+            return
+        except Exception as error:
+            wait_s = self._pairs.postpone(matching.name, claim)
+            self._observer.matching_failed()
+            message = "reference %s of scene %s could not be matched, next time in %.0f s: %s"
+            is_expected = isinstance(error, DataLoss)
+            log.warning(
+                message, claim.reference_id, claim.scene_key, wait_s, error, exc_info=None if is_expected else error
+            )
+            return
+        self._pairs.add(matching.name, claim, made, is_complete)
+        self._observer.pairs_made(len(made), time.thread_time() - begin_s)
+
+    def _match(
+        self, library: ReferenceLibrary, matching: Matching, claim: Claim, until_s: float
+    ) -> tuple[dict[Pair, Matches], bool]:
+        """Pairs of a reference, and whether they are all; those that were made until a time, or until it is closed."""
+        made: dict[Pair, Matches] = {}
+        wanted = self._nearest(matching, claim)
+        if not wanted:
+            return made, True
+        (subject,) = self._load(library, matching, claim, [claim.reference_id])
+        if subject.key != claim.key:
+            raise NotFound("the reference was replaced")
+        for reference_id in wanted:
+            self._let_callers_first()
+            if self._closing.is_set() or time.monotonic() > until_s:
+                return made, False
+            begin_s = time.monotonic()
+            for other in self._load_usable(library, matching, claim, reference_id):
+                first, second = in_order(subject, other)
+                made[first.key, second.key] = matching.matcher.match_pair(first, second, matching.wide)
+            self._pair_s = time.monotonic() - begin_s
+        return made, True
+
+    def _nearest(self, matching: Matching, claim: Claim) -> list[str]:
+        """Ids of the references that a query from the claimed one's place would choose first, without stored pairs.
+
+        A scene that is added at once has half of its references before and half after the claimed one.
+        """
+        entries = self._indexes.entries(claim.scene_key, StageContext(self._check))
+        (row,) = entries.rows([claim.reference_id]) if claim.reference_id in entries else (None,)
+        if row is None:
+            raise DataLoss(f"reference {claim.reference_id!r} is damaged in the store; delete it and add it again")
+        selection = Selection(2 * self.options.pairs + 1, options=_AS_QUERIES_CHOOSE)
+        id_of = {it.key: it.reference_id for it in rank_references(entries, entries.vector(row), selection)}
+        id_of.pop(claim.key, None)
+        missing = self._pairs.list_missing(matching.name, claim, list(id_of), self.options.pairs)
+        return [id_of[key] for key in missing]
+
+    def _load(
+        self, library: ReferenceLibrary, matching: Matching, claim: Claim, reference_ids: Sequence[str]
+    ) -> tuple[PosedView, ...]:
+        return library.load(claim.scene_key, reference_ids, matching.extractor, StageContext(self._check))[1]
+
+    def _load_usable(
+        self, library: ReferenceLibrary, matching: Matching, claim: Claim, reference_id: str
+    ) -> tuple[PosedView, ...]:
+        """A reference, or nothing if it is damaged or deleted, which is no fault of the claimed one."""
+        context = StageContext(self._check)
+
+        def report(damaged_id: str, error: Exception) -> None:
+            if isinstance(error, DataLoss):
+                self._indexes.report_damaged(claim.scene_key, damaged_id, error)
+
+        return load_usable(
+            lambda ids: library.load(claim.scene_key, ids, matching.extractor, context),
+            [reference_id],
+            (DataLoss, NotFound),
+            report,
+        )[1]
+
+    def _check(self) -> None:
+        if self._closing.is_set():
+            raise _Closed
+
+    def _let_callers_first(self) -> None:
+        """Waits while the server computes for callers, but not for more than the share of a busy server allows."""
+        if self._is_idle():
+            return
+        options, now_s = self.options, time.monotonic()
+        until_s = now_s + self._pair_s / options.busy_share
+        busy_s = now_s
+        while now_s < until_s and now_s - busy_s < options.quiet_s and not self._closing.wait(options.quiet_s / 5):
+            now_s = time.monotonic()
+            if not self._is_idle():
+                busy_s = now_s

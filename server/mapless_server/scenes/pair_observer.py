@@ -1,0 +1,25 @@
+"""Events of matching references ahead of queries, for metrics."""
+
+from __future__ import annotations
+
+
+class PairObserver:
+    """Receives the events in any thread; ignores them unless a method is overridden.
+
+    Methods must return at once and never raise.
+    """
+
+    def pairs_looked_up(self, stored: int, absent: int, damaged: int) -> None:
+        """A query looked for pairs of references; it matches those itself that are absent or damaged."""
+
+    def pair_lookup_failed(self) -> None:
+        """A query could not look for pairs of references, and matches all of them itself."""
+
+    def pairs_made(self, count: int, cpu_seconds: float) -> None:
+        """Pairs of a reference were matched in the background and stored."""
+
+    def matching_failed(self) -> None:
+        """Matching a reference in the background failed; it is tried again."""
+
+    def references_wait(self, count: int) -> None:
+        """So many references wait to be matched in the background."""

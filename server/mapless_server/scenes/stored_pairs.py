@@ -1,0 +1,88 @@
+"""What queries find of the pairs of references that were matched before."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+from mapless_server.method.correspond import Matcher
+from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.views import Matches, PosedView
+from mapless_server.store import Pair, PairStore
+
+from .pair_observer import PairObserver
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Matching:
+    """One of the ways in which references are matched.
+
+    Attributes:
+        extractor: of the features.
+        matcher: of the queries.
+        wide: whether the matches are wide ones.
+    """
+
+    extractor: FeatureExtractor
+    matcher: Matcher
+    wide: bool = False
+
+    @property
+    def name(self) -> str:
+        """As `PairStore` expects it."""
+        return matching_name(self.extractor.name, self.matcher.matching(self.wide))
+
+
+def matching_name(extractor: str, rule: str) -> str:
+    """Names the features and the rule by which they are matched, see `Matcher.matching`."""
+    return f"{extractor}/{rule}"
+
+
+class PairFinder:
+    """Implements `method.correspond.StoredPairs` for the matcher of one extractor's features."""
+
+    def __init__(self, pairs: PairStore, extractor: str, observer: PairObserver) -> None:
+        """`extractor` is the name of the features that are matched."""
+        self._pairs = pairs
+        self._extractor = extractor
+        self._observer = observer
+        self._damaged: dict[str, set[Pair]] = {}
+        self._guard = threading.Lock()
+
+    def find(self, matching: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> list[Matches | None]:
+        """See StoredPairs.find."""
+        name = matching_name(self._extractor, matching)
+        keys = [(first.key, second.key) for first, second in pairs]
+        try:
+            stored = self._pairs.load(name, keys)
+        except Exception as error:  # the query can do without
+            log.warning("stored matches cannot be read, and are made by the query: %s", error)
+            self._observer.pair_lookup_failed()
+            return [None] * len(pairs)
+        found = {
+            key: matches
+            for key, pair in zip(keys, pairs, strict=True)
+            if (matches := stored.get(key)) is not None and _is_within(matches, *pair)
+        }
+        damaged = stored.keys() - found.keys()
+        if damaged:
+            log.error("%d damaged pairs of references are matched again", len(damaged))
+            with self._guard:
+                self._damaged.setdefault(name, set()).update(damaged)
+        self._observer.pairs_looked_up(len(found), len(keys) - len(stored), len(damaged))
+        return [found.get(key) for key in keys]
+
+    def take_damaged(self, name: str) -> Collection[Pair]:
+        """The pairs of a matching that were found damaged since the last call."""
+        with self._guard:
+            return self._damaged.pop(name, set())
+
+
+def _is_within(matches: Matches, first: PosedView, second: PosedView) -> bool:
+    """Whether both photographs have the matched keypoints."""
+    counts = len(first.view.features), len(second.view.features)
+    return bool(((matches >= 0) & (matches < counts)).all())

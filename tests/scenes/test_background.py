@@ -1,0 +1,379 @@
+"""Matching in the background: its results equal those of a query, each pair is made once, failures are tried again."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.planted_damage import damage
+from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
+from support.servers import StandInDescriptor, StandInExtractor
+from support.stores import DATABASES, Folder, Place, place_on
+from support.waiting import wait_until
+
+from mapless_server.errors import Unavailable
+from mapless_server.method import correspond
+from mapless_server.method.context import StageContext
+from mapless_server.method.correspond import Matcher, in_order
+from mapless_server.method.views import Features, Matches, PosedView
+from mapless_server.scenes.background import BackgroundMatching, BackgroundOptions
+from mapless_server.scenes.indexes import SceneIndexes
+from mapless_server.scenes.library import ReferenceLibrary
+from mapless_server.scenes.pair_observer import PairObserver
+from mapless_server.scenes.stored_pairs import Matching, PairFinder
+from mapless_server.security import SceneKey
+from mapless_server.store import NewReference, PairStore, Store, pairs
+
+SCENE = SceneKey("s")
+EXTRACTOR, DESCRIPTOR = StandInExtractor(), StandInDescriptor()
+PLANTED = make_scene(random_for("background"), SceneOptions(reference_count=5, point_count=60, outlier_share=0.3))
+
+
+@dataclass
+class Counts(PairObserver):
+    """What an observer was notified of."""
+
+    found: Counter[str] = field(default_factory=Counter)
+    made: int = 0
+    failures: int = 0
+    lookup_failures: int = 0
+    waiting: int | None = None
+
+    def pairs_looked_up(self, stored: int, absent: int, damaged: int) -> None:
+        self.found.update(stored=stored, absent=absent, damaged=damaged)
+
+    def pair_lookup_failed(self) -> None:
+        self.lookup_failures += 1
+
+    def pairs_made(self, count: int, cpu_seconds: float) -> None:
+        assert cpu_seconds >= 0
+        self.made += count
+
+    def matching_failed(self) -> None:
+        self.failures += 1
+
+    def references_wait(self, count: int) -> None:
+        self.waiting = count
+
+
+def new(i: int, planted: SyntheticScene = PLANTED) -> NewReference:
+    """A reference of the planted scene, whose photograph is never read."""
+    view, pose = planted.references[i].view, planted.references[i].world_from_camera
+    vector = np.zeros(16, np.float32)
+    vector[:2] = np.cos(i / 5), np.sin(i / 5)  # the nearer, the more similar
+    return NewReference(f"r{i}", b"photograph", view.camera, pose, {EXTRACTOR.name: view}, {DESCRIPTOR.name: vector})
+
+
+class Server:
+    """What one server has of matching, without its queue."""
+
+    def __init__(
+        self,
+        store: Store,
+        options: BackgroundOptions | None = None,
+        is_idle: Callable[[], bool] = lambda: True,
+        widths: Sequence[bool] = (False, True),
+    ) -> None:
+        self.store, self.counts, self.matcher = store, Counts(), Matcher()
+        self.pairs = PairStore(store.database)
+        self.finder = self.matcher.stored = PairFinder(self.pairs, EXTRACTOR.name, self.counts)
+        self.library = ReferenceLibrary(store)
+        indexes = SceneIndexes(store, self.library, DESCRIPTOR, EXTRACTOR, 2**30)
+        matchings = {Matching(EXTRACTOR, self.matcher, wide): self.finder for wide in widths}
+        self.background = BackgroundMatching(store, indexes, matchings, is_idle, self.counts, options)
+
+    def references(self) -> tuple[PosedView, ...]:
+        ids = self.store.list_reference_ids(SCENE, 100)
+        return self.library.load(SCENE, ids, EXTRACTOR, StageContext())[1]
+
+    def name(self, wide: bool = False) -> str:
+        return Matching(EXTRACTOR, self.matcher, wide).name
+
+    def stored(self, wide: bool = False) -> dict[tuple[str, str], Matches | None]:
+        """By the references' names, of all pairs that are stored."""
+        name_of = {it.key: it.name.rpartition("/")[2] for it in self.references()}
+        found = self.pairs.load(self.name(wide), [(a, b) for a in name_of for b in name_of])
+        return {(name_of[a], name_of[b]): matches for (a, b), matches in found.items()}
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Folder:
+    return Folder(tmp_path / "data")
+
+
+@pytest.fixture
+def store(place: Folder) -> Iterator[Store]:
+    with place.open() as store:
+        store.create_scene(SCENE)
+        store.add_references(SCENE, [new(i) for i in range(3)])
+        store.add_references(SCENE, [new(i) for i in range(3, 5)])
+        yield store
+
+
+@pytest.fixture
+def compared(monkeypatch: pytest.MonkeyPatch) -> Counter[int]:
+    """How often two sets of features were compared, by the sum of their first coordinates."""
+    counts: Counter[int] = Counter()
+    usual = correspond.mutual_matches
+
+    def counting(first: Features, second: Features, ratio: float, either: bool = False) -> Matches:
+        counts[round(1e3 * float(first.keypoints[0, 0] + second.keypoints[0, 0]))] += 1
+        return usual(first, second, ratio, either)
+
+    monkeypatch.setattr(correspond, "mutual_matches", counting)
+    return counts
+
+
+def let_pass(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
+    now_us = pairs._now_us
+    monkeypatch.setattr(pairs, "_now_us", lambda: now_us() + round(seconds * 1e6))
+
+
+class TestResults:
+    @pytest.mark.parametrize("wide", [False, True])
+    def test_a_query_finds_all_pairs_and_gets_the_same(self, store: Store, wide: bool, compared: Counter[int]) -> None:
+        server, query = Server(store), PLANTED.query
+        expected = Matcher().correspond(query, server.references(), wide)
+        server.background.match_waiting()
+        compared.clear()
+        found = server.matcher.correspond(query, server.references(), wide)
+        assert compared.total() == 5  # with the query
+        assert server.counts.found == {"stored": 10, "absent": 0, "damaged": 0}
+        for pair, matches in expected.reference_pairs.items():
+            np.testing.assert_array_equal(found.reference_pairs[pair], matches)
+            assert found.reference_pairs[pair].dtype == matches.dtype
+        assert (server.counts.made, server.counts.waiting, server.counts.failures) == (20, 0, 0)
+
+    def test_nothing_is_made_twice(self, store: Store, compared: Counter[int]) -> None:
+        for _ in range(2):
+            Server(store, widths=[False]).background.match_waiting()
+        assert len(compared) == compared.total() == 10
+
+    def test_each_reference_is_matched_with_the_nearest_before_it(self, place: Folder) -> None:
+        with place.open() as store:
+            store.create_scene(SCENE)
+            for i in (0, 4, 1, 3):
+                store.add_references(SCENE, [new(i)])
+            server = Server(store, BackgroundOptions(pairs=1), widths=[False])
+            server.background.match_waiting()
+            assert set(server.stored()) == {("r0", "r1"), ("r3", "r4")}
+
+    def test_one_that_is_added_later_is_matched_with_those_before(self, store: Store, compared: Counter[int]) -> None:
+        server = Server(store, widths=[False])
+        server.background.match_waiting()
+        compared.clear()
+        store.delete_reference(SCENE, "r1")
+        store.add_references(SCENE, [new(1)])
+        server.background.match_waiting()
+        assert compared.total() == 4
+        assert len(server.stored()) == 10
+        for (a, b), matches in server.stored().items():
+            first, second = (next(it for it in server.references() if it.name.endswith(name)) for name in (a, b))
+            np.testing.assert_array_equal(matches, Matcher().match_pair(*in_order(first, second)))
+
+
+class TestDamage:
+    def test_a_damaged_pair_is_made_again(self, store: Store, place: Folder) -> None:
+        server = Server(store, widths=[False])
+        server.background.match_waiting()
+        usual = server.stored()
+        place.execute(
+            "UPDATE reference_pair SET data = zeroblob(8) WHERE first_key = (SELECT min(first_key) FROM reference_pair)"
+        )
+        found = Server(store, widths=[False])
+        correspondences = found.matcher.correspond(PLANTED.query, found.references())
+        assert found.counts.found["damaged"] > 0
+        for pair, matches in Matcher().correspond(PLANTED.query, found.references()).reference_pairs.items():
+            np.testing.assert_array_equal(correspondences.reference_pairs[pair], matches)
+        found.background.match_waiting()
+        assert found.counts.made == found.counts.found["damaged"]
+        again = found.stored()
+        assert again.keys() == usual.keys()
+        for names, stored in usual.items():
+            np.testing.assert_array_equal(again[names], stored)
+
+    def test_matches_of_keypoints_that_are_not_there_are_damage(self, store: Store) -> None:
+        server = Server(store, widths=[False])
+        first, second = server.references()[:2]
+        claim = server.pairs.claim(server.name(), {})
+        assert claim is not None
+        for wrong in ([len(first.view.features), 0], [0, len(second.view.features)], [-1, 0]):
+            server.pairs.add(server.name(), claim, {(first.key, second.key): np.array([wrong], np.int32)}, False)
+            assert server.finder.find(server.matcher.matching(), [(first, second)]) == [None]
+            server.pairs.discard(server.name(), server.finder.take_damaged(server.name()))
+        assert server.counts.found == {"damaged": 3, "stored": 0, "absent": 0}
+
+    def test_a_damaged_reference_keeps_no_other_from_being_matched(
+        self, store: Store, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        damage(store, SCENE, "r2", "features")
+        server = Server(store, widths=[False])
+        with caplog.at_level(logging.WARNING):
+            server.background.match_waiting()
+        assert server.counts.failures == 1
+        assert server.counts.made == 6
+        assert server.counts.waiting == 1
+        assert "reference r2 of scene s could not be matched, next time in 30 s" in caplog.text
+        server.background.match_waiting()
+        assert server.counts.failures == 1
+        let_pass(monkeypatch, 31)
+        server.background.match_waiting()
+        assert server.counts.failures == 2
+        store.delete_reference(SCENE, "r2")
+        store.add_references(SCENE, [new(2)])
+        server.background.match_waiting()
+        assert (server.counts.made, server.counts.waiting) == (10, 0)
+
+    def test_a_query_does_without_a_store_that_fails(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+        server = Server(store)
+
+        def away(*_: object) -> None:
+            raise Unavailable("the store is not there")
+
+        references = server.references()
+        monkeypatch.setattr(server.pairs, "load", away)
+        found = server.matcher.correspond(PLANTED.query, references)
+        assert server.counts.lookup_failures == 1
+        for pair, matches in Matcher().correspond(PLANTED.query, references).reference_pairs.items():
+            np.testing.assert_array_equal(found.reference_pairs[pair], matches)
+
+
+class TestFailures:
+    def test_a_failure_is_counted_and_tried_again_with_back_off(
+        self, store: Store, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        server = Server(store, widths=[False])
+
+        def fail(*_: object) -> Matches:
+            raise ArithmeticError("planted")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(server.matcher, "match_pair", fail)
+            server.background.match_waiting()
+            # The first reference has none before it.
+            assert (server.counts.failures, server.counts.made, server.counts.waiting) == (4, 0, 4)
+        server.background.match_waiting()
+        assert server.counts.made == 0
+        let_pass(monkeypatch, pairs.FIRST_RETRY_S + 1)
+        server.background.match_waiting()
+        assert (server.counts.failures, server.counts.made, server.counts.waiting) == (4, 10, 0)
+
+    def test_the_thread_outlives_a_store_that_is_away(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+        server = Server(store, BackgroundOptions(poll_s=0.01, longest_poll_s=0.02))
+        away, claim = threading.Event(), server.background._pairs.claim
+        away.set()
+
+        def flaky(matching: str, progress: pairs.Progress) -> pairs.Claim | None:
+            if away.is_set():
+                raise Unavailable("the store is not there")
+            return claim(matching, progress)
+
+        monkeypatch.setattr(server.background._pairs, "claim", flaky)
+        server.background.start()
+        try:
+            wait_until(lambda: server.counts.failures >= 3)
+            away.clear()
+            wait_until(lambda: server.counts.made == 20)
+        finally:
+            server.background.close()
+
+
+class TestSharing:
+    @pytest.mark.parametrize("database", DATABASES)
+    def test_servers_share_the_work_and_do_no_pair_twice(
+        self, database: str, tmp_path: Path, compared: Counter[int]
+    ) -> None:
+        place: Place = place_on(database, lambda: tmp_path)
+        with place.open() as first, place.open() if database == "postgresql" else first.uncached() as second:
+            first.create_scene(SCENE)
+            first.add_references(SCENE, [new(i) for i in range(5)])
+            servers = [Server(it, widths=[False]) for it in (first, second, first)]
+            with ThreadPoolExecutor(3) as threads:
+                list(threads.map(lambda it: it.background.match_waiting(), servers))
+            assert len(compared) == compared.total() == sum(it.counts.made for it in servers) == 10
+            assert len(servers[0].stored()) == 10
+
+    def test_what_a_killed_server_began_is_finished(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+        killed, server = Server(store, widths=[False]), Server(store, widths=[False])
+
+        class Killed(BaseException):
+            pass
+
+        def die(*_: object) -> None:
+            raise Killed
+
+        monkeypatch.setattr(killed.background._pairs, "add", die)
+        with pytest.raises(Killed):
+            killed.background.match_waiting()
+        server.background.match_waiting()
+        assert server.counts.waiting == 1
+        let_pass(monkeypatch, pairs.CLAIM_S + 1)
+        server.background.match_waiting()
+        assert server.counts.waiting == 0
+        assert len(server.stored()) == 10
+
+
+class TestPriority:
+    def test_a_busy_server_matches_little(self, store: Store) -> None:
+        is_busy = threading.Event()
+        options = BackgroundOptions(poll_s=0.01, busy_share=1e-6, quiet_s=0.01)
+        server = Server(store, options, lambda: not is_busy.is_set())
+        usual = server.matcher.match_pair
+
+        def once(first: PosedView, second: PosedView, wide: bool = False) -> Matches:
+            is_busy.set()
+            return usual(first, second, wide)
+
+        server.matcher.match_pair = once  # type: ignore[method-assign]
+        server.background.start()
+        try:
+            wait_until(is_busy.is_set)
+            made = server.counts.made
+            assert not threading.Event().wait(0.3)
+            assert server.counts.made <= made + 1
+        finally:
+            server.background.close()  # at once, though it waits
+        assert len(server.stored()) <= 2
+
+    def test_a_busy_server_gets_its_share(self, store: Store) -> None:
+        server = Server(store, BackgroundOptions(busy_share=1.0, quiet_s=0.01), lambda: False)
+        server.background.match_waiting()
+        assert server.counts.made == 20
+
+    def test_what_is_made_before_the_claim_ends_is_stored(
+        self, store: Store, monkeypatch: pytest.MonkeyPatch, compared: Counter[int]
+    ) -> None:
+        monkeypatch.setattr("mapless_server.scenes.background.CLAIM_S", 0.0)
+        server = Server(store, widths=[False])
+        usual = server.background._let_callers_first
+        steps = iter(range(1000))
+
+        def sometimes() -> None:
+            usual()
+            in_time = next(steps) % 3
+            monkeypatch.setattr("mapless_server.scenes.background.CLAIM_S", 60.0 if in_time else 0.0)
+
+        monkeypatch.setattr(server.background, "_let_callers_first", sometimes)
+        server.background.match_waiting()
+        assert len(compared) == compared.total() == 10
+
+    def test_a_store_that_can_only_be_read_is_left_alone(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+        server = Server(store, BackgroundOptions(poll_s=0.01))
+        monkeypatch.setattr(store.database, "only_reads", True)
+        server.background.start()
+        server.background.close()
+        assert not server.stored()
+
+
+def test_order_of_names_is_that_of_the_rows(store: Store) -> None:
+    server = Server(store, widths=[False])
+    server.background.match_waiting()
+    assert set(server.stored()) == set(combinations(["r0", "r1", "r2", "r3", "r4"], 2))

@@ -1,0 +1,172 @@
+"""Servers that match references ahead of queries: the same answers for less work, also after one was killed."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import grpc
+import pytest
+from support.planted_damage import damage
+from support.servers import listening
+from support.stores import Folder
+from support.waiting import wait_until
+
+from mapless import Client, NewReference, wire
+from mapless.v1 import localization_service_pb2 as pb
+from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
+from mapless_server.engine.queue_engine import QueueEngine
+from mapless_server.observability.metrics import Metrics
+from mapless_server.scenes.background import BackgroundMatching
+from mapless_server.security import RateLimiter, SceneKey
+from mapless_server.serve.assembly import make_engine
+from mapless_server.settings import Settings
+from mapless_server.store import Store, pairs
+from mapless_tools.child import child_server
+from mapless_tools.demo import room
+
+REFERENCES, QUERIES = 7, 2
+PAIRS = REFERENCES * (REFERENCES - 1) // 2
+OFF = {"background_matching": False}
+
+
+class Served:
+    """A server with the real method."""
+
+    def __init__(self, address: str, metrics: Metrics) -> None:
+        self._address = address
+        self._metrics = metrics
+
+    def value(self, name: str, **labels: str) -> float:
+        samples = (sample for family in self._metrics.registry.collect() for sample in family.samples)
+        return sum(it.value for it in samples if it.name == name and labels.items() <= it.labels.items())
+
+    def answers(self) -> list[bytes]:
+        """To every query, without what differs from call to call."""
+        with grpc.insecure_channel(self._address) as channel:
+            return [_answer(LocalizationServiceStub(channel), i) for i in range(QUERIES)]
+
+
+def _answer(stub: LocalizationServiceStub, index: int) -> bytes:
+    photograph = room().queries[index]
+    intrinsics = wire.camera_to_message(photograph.camera)
+    request = pb.LocalizeRequest(scene="scenes/room", image=photograph.data, intrinsics=intrinsics)
+    request.options.include_debug = True
+    answer = stub.Localize(request, timeout=60)
+    for field in ("request_id", "stages", "queue_duration", "total_duration"):
+        answer.diagnostics.ClearField(field)
+    return bytes(answer.SerializeToString(deterministic=True))
+
+
+@contextmanager
+def serving(data_dir: Path, **options: object) -> Iterator[Served]:
+    known = list[Metrics]()
+
+    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
+        known.append(metrics)
+        return make_engine(settings, store, metrics, quota)
+
+    defaults = {"port": 0, "workers": 2, "metrics": False, "warm_up": False, "data_dir": data_dir}
+    settings = Settings(**(defaults | options))  # type: ignore[arg-type]
+    with listening(settings, Store.open(data_dir), make) as (running, _):
+        yield Served(running.address, known[0])
+
+
+@pytest.fixture(scope="module")
+def unmatched(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[bytes]]:
+    """A folder with a scene that nobody has matched, and the answers of a server without stored pairs."""
+    data_dir = tmp_path_factory.mktemp("unmatched") / "data"
+    with serving(data_dir, **OFF) as served:
+        with Client(served._address) as client:
+            client.create_scene("room")
+            added = [NewReference(it.name, it.data, it.camera, it.world_from_camera) for it in room().references]
+            client.add_references("room", added[:REFERENCES])
+        return data_dir, served.answers()
+
+
+@pytest.fixture
+def data_dir(unmatched: tuple[Path, list[bytes]], tmp_path: Path) -> Path:
+    """A copy of the folder."""
+    return Path(shutil.copytree(unmatched[0], tmp_path / "data"))
+
+
+@pytest.fixture(scope="module")
+def matched_once(unmatched: tuple[Path, list[bytes]], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    data_dir = Path(shutil.copytree(unmatched[0], tmp_path_factory.mktemp("matched") / "data"))
+    with serving(data_dir) as served:
+        wait_until(lambda: served.value("mapless_background_pairs_total") == 2 * PAIRS)
+        wait_until(lambda: served.value("mapless_background_waiting") == 0)
+        assert served.value("mapless_background_failures_total") == 0
+    return data_dir
+
+
+@pytest.fixture
+def matched(matched_once: Path, tmp_path: Path) -> Path:
+    """A copy of the folder in which all pairs, strict and wide, are stored."""
+    return Path(shutil.copytree(matched_once, tmp_path / "data"))
+
+
+@pytest.fixture
+def expected(unmatched: tuple[Path, list[bytes]]) -> list[bytes]:
+    return unmatched[1]
+
+
+def count_pairs(data_dir: Path) -> int:
+    with closing(Folder(data_dir).open_as_is()) as database, database.read() as connection:
+        return int(connection.exec_driver_sql("SELECT count(*) FROM reference_pair").scalar_one())
+
+
+def test_answers_are_the_same_with_stored_pairs(matched: Path, expected: list[bytes]) -> None:
+    with serving(matched, **OFF) as served:
+        assert served.answers() == expected
+        assert served.value("mapless_stored_pairs_total", result="stored") > 0
+        assert served.value("mapless_stored_pairs_total", result="absent") == 0
+
+
+def test_switched_off_nothing_is_made(data_dir: Path, expected: list[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(BackgroundMatching, "start", lambda _: pytest.fail("it was started"))
+    with serving(data_dir, **OFF) as served:
+        assert served.answers() == expected
+        assert served.value("mapless_stored_pairs_total", result="stored") == 0
+        assert served.value("mapless_stored_pairs_total", result="absent") > 0
+
+
+def test_damaged_pairs_change_no_answer_and_are_made_again(matched: Path, expected: list[bytes]) -> None:
+    Folder(matched).execute("UPDATE reference_pair SET data = zeroblob(16)")
+    with serving(matched) as served:
+        assert served.answers() == expected
+        damaged = served.value("mapless_stored_pairs_total", result="damaged")
+        assert damaged > 0
+        wait_until(lambda: served.value("mapless_background_pairs_total") == damaged)
+
+
+def test_background_work_that_fails_fails_no_query(data_dir: Path, expected: list[bytes]) -> None:
+    with Store.open(data_dir) as store:
+        ids = store.list_reference_ids(SceneKey("room"), 1)
+        damage(store, SceneKey("room"), ids[0], "features")
+    with serving(data_dir) as served:
+        wait_until(lambda: served.value("mapless_background_failures_total") == 2)  # strict and wide
+        wait_until(lambda: served.value("mapless_background_pairs_total") == (REFERENCES - 1) * (REFERENCES - 2))
+        assert len(served.answers()) == len(expected)
+        assert served.value("mapless_background_waiting") == 1
+
+
+def test_what_a_killed_server_began_is_finished(
+    data_dir: Path, expected: list[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with child_server(data_dir) as child:
+        wait_until(lambda: count_pairs(data_dir) > 0)
+        os.kill(child.process_id, signal.SIGKILL)
+    begun = count_pairs(data_dir)
+    assert 0 < begun < 2 * PAIRS
+    now_us = pairs._now_us
+    monkeypatch.setattr(pairs, "_now_us", lambda: now_us() + round(1e6 * pairs.CLAIM_S))
+    with serving(data_dir) as served:
+        wait_until(lambda: served.value("mapless_background_pairs_total") == 2 * PAIRS - begun)
+    assert count_pairs(data_dir) == 2 * PAIRS
+    with serving(data_dir, **OFF) as served:
+        assert served.answers() == expected
