@@ -9,11 +9,9 @@ what is there is shown by the same server with `capture_dir`, and by planted pie
 from __future__ import annotations
 
 import inspect
-import os
 import re
 import shutil
 import subprocess
-import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -28,8 +26,8 @@ import pytest
 from support import corner
 from support.images import encode, textured
 from support.postgres import shared_cluster
-from support.programs import Program
-from support.waiting import LIMIT_S, wait_until
+from support.programs import Program, program
+from support.waiting import wait_until
 
 from mapless import (
     AlreadyExists,
@@ -153,29 +151,15 @@ def served(
     """The real server, whose every folder is within this one."""
     for name in ("home", "tmp", "work", "cache"):
         (folder / name).mkdir(parents=True)
-    given = {"port": 0, "metrics_port": 0, "data_dir": folder / "data", "workers": 2, "warm_up": None} | settings
+    given = {"port": 0, "metrics_port": 0, "data_dir": folder / "data", "workers": 2} | settings
     flags = [f"--{name.replace('_', '-')}={value}" for name, value in given.items() if value is not None]
-    private = {
-        "HOME": folder / "home",
-        "TMPDIR": folder / "tmp",
-        "XDG_CACHE_HOME": folder / "cache",
-        "PYTHONDONTWRITEBYTECODE": "1",
-        "MAPLESS_WARM_UP": "false",
-    }
-    with (folder / "log").open("w") as log:
-        process = subprocess.Popen(
-            [*prefix, sys.executable, "-m", "mapless_tools", "serve", *flags],
-            stdout=subprocess.PIPE,
-            stderr=log,
-            text=True,
-            cwd=folder / "work",
-            env={**os.environ, **{name: str(value) for name, value in private.items()}, **(environment or {})},
-        )
-    try:
-        yield Program(process, folder)
-    finally:
-        process.terminate()
-        process.communicate(timeout=LIMIT_S)
+    private = {"HOME": "home", "TMPDIR": "tmp", "XDG_CACHE_HOME": "cache"}
+    variables = {name: str(folder / place) for name, place in private.items()} | dict(environment or {})
+    arguments = ["-m", "mapless_tools", "serve", *flags]
+    with program(folder, arguments, prefix, folder / "work", PYTHONDONTWRITEBYTECODE="1", **variables) as running:
+        yield running
+        running.process.terminate()
+        running.wait()
 
 
 def ask_everything(address: str) -> None:

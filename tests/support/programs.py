@@ -93,16 +93,19 @@ class Program:
 
 
 @contextmanager
-def program(folder: Path, arguments: Sequence[str], **environment: str) -> Iterator[Program]:
-    """A Python program with its log in the folder; it is gone when the block is left."""
+def program(
+    folder: Path, arguments: Sequence[str], prefix: Sequence[str] = (), cwd: Path | None = None, **environment: str
+) -> Iterator[Program]:
+    """A Python program, or what runs one, with its log in the folder; it is gone when the block is left."""
     folder.mkdir(exist_ok=True)
     paths = (str(TESTS), os.environ.get("PYTHONPATH"))
     with (folder / "log").open("a") as log:
         process = subprocess.Popen(
-            [sys.executable, *arguments],
+            [*prefix, sys.executable, *arguments],
             stdout=subprocess.PIPE,
             stderr=log,
             text=True,
+            cwd=cwd,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths)), **environment},
         )
     deadline = threading.Timer(LIMIT_S, process.kill)  # reading its output has no deadline
@@ -120,7 +123,7 @@ def real(folder: Path, **settings: Any) -> Iterator[Program]:
     """`python -m mapless_server`, at once."""
     given = {"port": 0, "metrics_port": 0, "data_dir": folder / "data", "workers": 2} | settings
     flags = [part for name, value in given.items() for part in (f"--{name.replace('_', '-')}", str(value))]
-    with program(folder, ["-m", "mapless_server", "serve", *flags], MAPLESS_WARM_UP="false") as running:
+    with program(folder, ["-m", "mapless_server", "serve", *flags]) as running:
         yield running
 
 
