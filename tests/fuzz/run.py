@@ -36,7 +36,6 @@ class Watched:
         self._check = check
         self._counts = counts
         self._inputs = self._accepted = 0
-        self._largest_bytes = 0
 
     def __call__(self, data: bytes) -> None:
         """What libFuzzer calls."""
