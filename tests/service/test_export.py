@@ -10,7 +10,6 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 import pytest
-import typer
 from support.images import encode, textured
 from support.layouts import CAMERA, assert_same_camera, assert_same_pose, by_name, truth
 from support.planted_damage import damage
@@ -22,13 +21,9 @@ from mapless.geodesy import enu_from_y_up
 from mapless.geometry import Fisheye, RadialTangential
 from mapless_server.security import SceneKey
 from mapless_server.store import Store
-from mapless_tools.ingest.command import export_command, import_command
+from mapless_tools.cli.app import app
 from mapless_tools.ingest.formats import read_dataset
 from mapless_tools.ingest.formats.writing import PosedImage, cameras_files
-
-app = typer.Typer()
-app.command("import")(import_command)
-app.command("export")(export_command)
 
 LENSES = (None, RadialTangential(0.1, -0.2, 0.01, 0.02, 0.3), Fisheye(0.1, 0.2, 0.3, 0.4))
 ENDINGS = (".png", ".jpg", ".webp")

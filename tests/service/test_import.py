@@ -14,7 +14,6 @@ from typing import Any, NoReturn
 
 import numpy as np
 import pytest
-import typer
 from support.images import encode
 from support.layouts import CAMERA, assert_same_camera, assert_same_pose, truth, write_cameras, write_image
 from support.servers import RunningServer
@@ -24,16 +23,8 @@ from typer.testing import CliRunner, Result
 from mapless import Client
 from mapless.geometry import Camera
 from mapless_tools.child import ServerFailed
-from mapless_tools.ingest.command import export_command, import_command
+from mapless_tools.cli.app import app
 from mapless_tools.ingest.formats.writing import LAYOUTS, PosedImage
-
-PROGRAM = (
-    "import typer; from mapless_tools.ingest.command import import_command, export_command; app = typer.Typer();"
-    "app.command('import')(import_command); app.command('export')(export_command); app()"
-)
-app = typer.Typer()
-app.command("import")(import_command)
-app.command("export")(export_command)
 
 COUNT = 12
 
@@ -227,7 +218,8 @@ def test_after_a_termination_the_next_run_continues(tmp_path: Path) -> None:
     (folder / "cameras.json").write_text(LAYOUTS["cameras"](images, "a test")["cameras.json"])
     environment = os.environ | {"MAPLESS_DATA_DIR": str(tmp_path / "store")}
     report = tmp_path / "report.json"
-    arguments = [sys.executable, "-c", PROGRAM, "import", str(folder), "place", "--skip-check", "--report", str(report)]
+    arguments = [sys.executable, "-m", "mapless_tools", "import", str(folder), "place", "--skip-check"]
+    arguments += ["--report", str(report)]
     process = subprocess.Popen(arguments, env=environment, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stderr is not None
