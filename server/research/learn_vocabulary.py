@@ -30,7 +30,7 @@ ROOMS = range(100, 110)
 PHOTOGRAPHS = 14
 """Of each room."""
 
-EVERY = {"sift": 1, "aliked": 3, "xfeat": 1}
+EVERY = {"sift": 1, "aliked": 3, "xfeat": 1, "edgepoint2-l64": 1}
 """Of the photographs, the first of so many is looked at: ALIKED takes two seconds each on a CPU."""
 
 DESCRIPTORS = 60_000

@@ -36,7 +36,10 @@ def tiers(tmp_path_factory: pytest.TempPathFactory) -> tuple[Tier, ...]:
         pytest.skip(
             f"needs `mapless-server weights fetch aliked`; {weights} has none (TEST_WEIGHTS names another place)"
         )
-    settings = Settings(features="auto", device="cpu", weights_dir=weights, data_dir=tmp_path_factory.mktemp("data"))
+    # Without those of EdgePoint2, which would be the cheap ones.
+    folder = tmp_path_factory.mktemp("data")
+    (folder / "aliked-n16.safetensors").symlink_to(weights / "aliked-n16.safetensors")
+    settings = Settings(features="auto", device="cpu", weights_dir=folder, data_dir=folder)
     return make_tiers(settings)
 
 

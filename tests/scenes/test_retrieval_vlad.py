@@ -15,10 +15,10 @@ from mapless_server.method.views import Features, View
 from mapless_server.scenes.retrieval.vlad import DIMENSION, VladDescriptor
 from mapless_server.scenes.retrieval.vocabulary import FILE, LEARNED, Vocabulary, dataless, shipped
 
-DIGESTS = {"sift": "53ac1a6f", "aliked": "d26d2f4e", "xfeat": "8c987f94"}
+DIGESTS = {"sift": "53ac1a6f", "aliked": "d26d2f4e", "xfeat": "8c987f94", "edgepoint2-l64": "94322c2c"}
 """Of the shipped vocabularies. Another digest makes another name, and all stored descriptors are computed again."""
 
-LENGTHS = {"sift": 128, "aliked": 128, "xfeat": 64}
+LENGTHS = {"sift": 128, "aliked": 128, "xfeat": 64, "edgepoint2-l64": 64}
 
 
 def view_of(descriptors: Array) -> View:

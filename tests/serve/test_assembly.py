@@ -32,18 +32,22 @@ def settings(tmp_path: Path, **values: str) -> Settings:
 def test_one_kind_of_features_is_one_tier(tmp_path: Path) -> None:
     (tier,) = make_tiers(settings(tmp_path, features="sift"))
     assert tier.extractor.name == make_first_features(settings(tmp_path, features="sift"))[1].name
-    assert feature_names("sift", "cpu") == ("sift",)
+    assert feature_names(settings(tmp_path, features="sift"), "cpu") == ("sift",)
 
 
-def test_auto_begins_with_features_that_need_nothing(tmp_path: Path) -> None:
-    assert feature_names("auto", "cpu")[0] == "sift"
+def test_auto_is_the_default_and_sift_without_weights(tmp_path: Path) -> None:
+    assert settings(tmp_path) == settings(tmp_path, features="auto")
+    assert feature_names(settings(tmp_path), "cpu") == feature_names(settings(tmp_path), "cuda") == ("sift",)
     _, extractor = make_first_features(settings(tmp_path, features="auto"))
     assert extractor.name == make_first_features(settings(tmp_path, features="sift"))[1].name
 
 
 @pytest.mark.parametrize(
     ("missing", "told"),
-    [("weights", "weights fetch aliked"), ("package", "mapless-absent is not installed: pip install")],
+    [
+        ("weights", "run `mapless-server weights fetch edgepoint2-l64 aliked`"),
+        ("package", "mapless-absent is not installed: pip install"),
+    ],
 )
 def test_auto_leaves_out_what_is_missing_and_logs_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, missing: str, told: str
@@ -56,13 +60,31 @@ def test_auto_leaves_out_what_is_missing_and_logs_it(
     if missing == "package":
         monkeypatch.setattr(assembly, "find_weights", lambda name, weights_dir: weights_dir / name)
         monkeypatch.setattr(assembly, "make_extractor", without_package)
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(logging.INFO):
         (tier,) = make_tiers(settings(tmp_path, features="auto"))
     assert tier.extractor.name.startswith("sift")
     (record,) = caplog.records
     assert told in record.getMessage()
     assert "\n" not in record.getMessage()
-    assert record.getMessage().startswith("features auto: sift serves without aliked: ")
+    assert record.getMessage().startswith("features auto: sift without edgepoint2-l64 and aliked, which ")
+
+
+def test_auto_uses_the_best_features_whose_weights_are_there(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    pytest.importorskip("torch")
+    from safetensors.torch import save_file
+
+    from mapless_server.networks.edgepoint2 import VARIANTS, EdgePoint2
+
+    (tmp_path / "weights").mkdir()
+    save_file(EdgePoint2(VARIANTS["l64"]).state_dict(), tmp_path / "weights" / "edgepoint2-l64.safetensors")
+    with caplog.at_level(logging.INFO):
+        for device in ("cpu", "cuda"):
+            assert feature_names(settings(tmp_path), device) == ("edgepoint2-l64",)
+        (tier,) = make_tiers(settings(tmp_path, device="cpu"))
+    assert tier.extractor.name.startswith("edgepoint2-l64-")
+    (record,) = caplog.records
+    assert record.getMessage().startswith("features auto: edgepoint2-l64 without aliked, which ")
+    assert record.getMessage().endswith("run `mapless-server weights fetch aliked`")
 
 
 def test_features_named_in_the_settings_are_never_replaced(tmp_path: Path) -> None:
@@ -87,8 +109,12 @@ def test_features_without_a_network_need_no_torch(tmp_path: Path, monkeypatch: p
     assert len(make_tiers(settings(tmp_path, features="auto"))) == 1
 
 
-def test_on_a_gpu_the_strong_features_answer_alone() -> None:
-    assert feature_names("auto", "cuda") == ("aliked",)
+def test_on_a_gpu_the_strong_features_answer_alone(tmp_path: Path) -> None:
+    (tmp_path / "weights").mkdir()
+    for name in ("aliked-n16", "edgepoint2-l64"):
+        (tmp_path / "weights" / f"{name}.safetensors").touch()
+    assert feature_names(settings(tmp_path), "cuda") == ("aliked",)
+    assert feature_names(settings(tmp_path), "cpu") == ("edgepoint2-l64", "aliked")
 
 
 def test_a_missing_device_ends_the_start(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import Tier
@@ -16,12 +16,13 @@ from mapless_server.engine.references import References
 from mapless_server.engine.stages import Method
 from mapless_server.extras import install_hint
 from mapless_server.images import ImageLimits
-from mapless_server.method.choices import BEST_VARIANTS
+from mapless_server.method.choices import AUTO, BEST_VARIANTS
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.correspond import Matcher, make_matcher
 from mapless_server.method.features import FeatureExtractor, make_extractor
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.networks.weights import CATALOGUE, WeightsError, WeightsMissing, find_weights
+from mapless_server.networks.weights import CATALOGUE, WeightsError, WeightsMissing, find_weights, named
+from mapless_server.networks.weights.folder import Status, look_up
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scenes import GlobalDescriptor
 from mapless_server.scenes.audit.neighbourhood import PairMatches
@@ -39,12 +40,17 @@ from mapless_server.store import PairStore, Store, StoreError
 
 log = logging.getLogger(__name__)
 
-CHEAP_FEATURES, STRONG_FEATURES = "sift", "aliked"
-"""The features of `auto`; the licences of both allow any use.
+WITHOUT_WEIGHTS = "sift"
+"""The features that need nothing."""
 
-On a CPU the first is used, and the second where the first is in doubt: of 159 photographs, 120 of them with 3 to 5
-references far apart, SIFT loses 16 at 0.1 s a photograph, ALIKED 3 at 1 to 3 s, and ALIKED after SIFT the same 3 though
-only 53 need it. On a GPU the second is as fast as the first, and is used alone.
+CPU_TIERS = ((BEST_VARIANTS["edgepoint2"], WITHOUT_WEIGHTS), ("aliked",))
+GPU_TIERS = (("aliked", BEST_VARIANTS["edgepoint2"], WITHOUT_WEIGHTS),)
+"""The features of `auto`, of each tier the best first, of which the first that can be used is; all licences are free.
+
+On a CPU EdgePoint2 costs half of SIFT and localizes from fewer references, farther apart. ALIKED answers where the
+first tier is in doubt: of 159 photographs, 120 of them with 3 to 5 references far apart, SIFT loses 16 at 0.1 s a
+photograph, ALIKED 3 at 1 to 3 s, and ALIKED after SIFT the same 3 though only 53 need it. On a GPU ALIKED is as fast,
+and is used alone.
 """
 
 CACHED_AUDIT_PAIRS = 2000
@@ -157,17 +163,22 @@ def _background_matching(
     return BackgroundMatching(store, indexes, matchings, lambda: engine.queue.job_count == 0, observer)
 
 
-def feature_names(features: str, device: str) -> tuple[str, ...]:
-    """The features of the setting on "cpu" or "cuda...", the cheapest first."""
-    if features != "auto":
-        return (BEST_VARIANTS.get(features, features),)
-    return (CHEAP_FEATURES, STRONG_FEATURES) if device == "cpu" else (STRONG_FEATURES,)
+def feature_names(settings: Settings, device: str) -> tuple[str, ...]:
+    """The features of the settings on "cpu" or "cuda...", the cheapest first; with `auto`, those with weights."""
+    return tuple(_present(_tiers(settings.features, device), settings))
+
+
+def _tiers(features: str, device: str) -> tuple[tuple[str, ...], ...]:
+    """For each tier, the cheapest first, the features that it may use, the best first."""
+    if features != AUTO:
+        return ((BEST_VARIANTS.get(features, features),),)
+    return CPU_TIERS if device == "cpu" else GPU_TIERS
 
 
 def make_tiers(settings: Settings) -> tuple[Tier, ...]:
     """The tiers of the settings, the cheapest first.
 
-    `auto` leaves out features without weights or packages, and logs it; at the worst the cheap ones are used alone.
+    `auto` leaves out features without weights or packages, and logs it; at the worst SIFT is used alone.
 
     Raises:
         ValueError: there is no such device.
@@ -217,9 +228,25 @@ def device_for(settings: Settings) -> str:
 
     Without networks it is the CPU: looking for others would import torch, a third of the server's memory.
     """
-    if settings.device == "auto" and settings.backend == "geometric" and settings.features == CHEAP_FEATURES:
+    if settings.device == "auto" and settings.backend == "geometric" and not _wants_networks(settings):
         return "cpu"
     return choose_device(settings.device)
+
+
+def _wants_networks(settings: Settings) -> bool:
+    """Whether the features are a network's; with `auto`, whether there are weights of one."""
+    if settings.features != AUTO:
+        return settings.features != WITHOUT_WEIGHTS
+    return any(name != WITHOUT_WEIGHTS for tiers in (CPU_TIERS, GPU_TIERS) for name in _present(tiers, settings))
+
+
+def _present(tiers: Iterable[Sequence[str]], settings: Settings) -> Iterator[str]:
+    """The first features of each tier whose weights are in the folder, if they need any."""
+    for alternatives in tiers:
+        for name in alternatives:
+            if name not in WITH_WEIGHTS or look_up(named(name), settings.weights_dir).status is not Status.ABSENT:
+                yield name
+                break
 
 
 def choose_device(device: str) -> str:
@@ -267,15 +294,33 @@ def _find_device(device: str) -> str:
 
 
 def _make_extractors(settings: Settings, device: str) -> dict[str, FeatureExtractor]:
-    *cheaper, last = feature_names(settings.features, device)
-    extractors = {name: _make_extractor(name, settings, device) for name in cheaper}
-    try:
-        return extractors | {last: _make_extractor(last, settings, device)}
-    except (ImportError, WeightsMissing) as error:
-        if settings.features != "auto":
-            raise
-        log.warning("features auto: %s serves without %s: %s", CHEAP_FEATURES, last, what_is_missing(error))
-    return extractors or {CHEAP_FEATURES: make_extractor(CHEAP_FEATURES)}
+    extractors: dict[str, FeatureExtractor] = {}
+    missing: dict[str, ImportError | WeightsMissing] = {}
+    for alternatives in _tiers(settings.features, device):
+        for name in alternatives:
+            try:
+                extractors[name] = _make_extractor(name, settings, device)
+                break
+            except (ImportError, WeightsMissing) as error:
+                if settings.features != AUTO:
+                    raise
+                missing[name] = error
+    if missing:
+        log.info(
+            "features auto: %s without %s, which localizes from fewer references, farther apart: %s",
+            " and ".join(extractors),
+            " and ".join(missing),
+            _remedy(missing),
+        )
+    return extractors
+
+
+def _remedy(missing: Mapping[str, ImportError | WeightsMissing]) -> str:
+    """What brings the missing features: a package first, then all weights at once."""
+    for error in missing.values():
+        if isinstance(error, ImportError):
+            return install_hint(error)
+    return f"run `mapless-server weights fetch {' '.join(missing)}`"
 
 
 def _make_extractor(name: str, settings: Settings, device: str) -> FeatureExtractor:

@@ -37,7 +37,7 @@ class Provenance:
 def provenance_of(settings: Settings) -> Provenance:
     """Of a server with these settings, here and now; errors as `device_for` and `feature_names`."""
     device = device_for(settings)
-    features = feature_names(settings.features, device)
+    features = feature_names(settings, device)
     used = {settings.backend, *features, *(f"{name}-lightglue" for name in features if device != "cpu")}
     if settings.retrieval == "megaloc" or (settings.retrieval == "auto" and device != "cpu"):
         used.add("megaloc")

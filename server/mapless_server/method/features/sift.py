@@ -1,4 +1,4 @@
-"""SIFT: no weights, no torch; the default on a CPU."""
+"""SIFT: no weights, no torch; the default where there are no weights."""
 
 from __future__ import annotations
 

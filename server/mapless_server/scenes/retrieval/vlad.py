@@ -16,7 +16,7 @@ from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.views import View
 
 from .descriptor import Vector
-from .vocabulary import REDUCED, WORDS, Vocabulary, dataless, nearest_words, shipped
+from .vocabulary import LEARNED, REDUCED, WORDS, Vocabulary, dataless, nearest_words, shipped
 
 RULE = 1
 """Version of the computation; part of the name."""
@@ -27,8 +27,8 @@ DIMENSION = WORDS * REDUCED
 class VladDescriptor:
     """VLAD of one extractor's features, with the vocabulary of their kind, or with one that needs no data.
 
-    Without a shipped vocabulary (SuperPoint, whose weights were not available) three times as many of the first ten
-    references see something else; see `vocabulary`.
+    Without a shipped vocabulary (SuperPoint, whose weights were not available; variants of EdgePoint2 that `auto` does
+    not use) three times as many of the first ten references see something else; see `vocabulary`.
 
     Attributes:
         name: for example "vlad-1-0123abcd-sift-2048-1024px-0.02": version, vocabulary, extractor.
@@ -46,7 +46,8 @@ class VladDescriptor:
     @staticmethod
     def of(extractor: FeatureExtractor) -> VladDescriptor:
         """With the vocabulary that is shipped for the kind of features, which the extractor's name begins with."""
-        return VladDescriptor(extractor.name, shipped(extractor.name.split("-")[0]))
+        kind = next((it for it in LEARNED if extractor.name.startswith(f"{it}-")), "")
+        return VladDescriptor(extractor.name, shipped(kind))
 
     def describe(self, view: View) -> Vector:
         """See GlobalDescriptor.describe.

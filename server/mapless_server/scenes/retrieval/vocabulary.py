@@ -3,7 +3,8 @@
 The shipped vocabularies were learned from rendered photographs (`research.learn_vocabulary`). Measured with SIFT in the
 kitchen of 7-Scenes (100 references, 120 queries), by the share of the first ten that are within 0.5 m and 30 degrees of
 the query: 0.95 with the rendered vocabulary, 0.94 with one learned from other real places, 0.82 with one that needs no
-data. All three have such a reference among the first ten for every query.
+data. All three have such a reference among the first ten for every query. With EdgePoint2 (76 references, 76 queries
+of the same): 0.99 with the rendered vocabulary, 0.95 without data, where SIFT has 0.91.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ WORDS = 32
 REDUCED = 32
 """Components of a descriptor after its projection; with 16 the share falls to 0.93."""
 
-LEARNED = ("sift", "aliked", "xfeat")
+LEARNED = ("sift", "aliked", "xfeat", "edgepoint2-l64")
 """Kinds of features that a vocabulary is shipped for; each has three arrays in the file, see `Vocabulary`."""
 
 FILE = "vocabularies.npz"
