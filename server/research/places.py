@@ -23,13 +23,15 @@ from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline, StageOptions
 from mapless_server.method.priors.known import NO_PRIORS, Priors
+from mapless_server.method.results import Support
 from mapless_server.method.retrieve import choose_references
 from mapless_server.method.views import PosedView, View
 from mapless_tools.dataset import Frame, read_folder
 from mapless_tools.evaluate.metrics import pose_error
 
-RIGHT_M, RIGHT_DEG = 0.10, 5.0
-"""An answer with a larger error is wrong."""
+RIGHT_SHARE, RIGHT_M, RIGHT_DEG = 0.05, 0.25, 5.0
+"""An answer is wrong that is off by a larger share of the distance to what the photograph shows, by more degrees or,
+in a scene in metres, by more metres."""
 KITCHEN = "7scenes-redkitchen-seq01-first600"
 METRIC: tuple[tuple[str, int | None], ...] = (
     ("fountain-P11", None),
@@ -43,6 +45,15 @@ METRIC: tuple[tuple[str, int | None], ...] = (
 """Folders and how many frames, evenly spread, are references; None leaves one out."""
 OTHERS = ("fox-portrait", "reichstag-internet")
 """Their unit is no metre; they serve as other places."""
+ALL = (
+    *dict.fromkeys(name for name, _ in METRIC),
+    *OTHERS,
+    "euroc-v101-drone",
+    "office-lockers",
+    "meeting-room",
+    "studio-flat",
+    "statue-of-liberty-internet",
+)
 KS = (10, 5, 3)
 QUERIES, FRAMES = 40, 150
 CROSS_REFERENCES = 30
@@ -55,11 +66,13 @@ class Place:
     Attributes:
         name: of its folder.
         views, poses: by the frame's index.
+        metric: whether the unit of the poses is the metre.
     """
 
     name: str
     views: dict[int, View]
     poses: dict[int, RigidTransform]
+    metric: bool = True
 
     def posed(self, indices: Iterable[int]) -> tuple[PosedView, ...]:
         """References at some indices, as the method wants them."""
@@ -84,6 +97,7 @@ class Pair:
         query, references: photographs.
         true_pose: of the query; None in another place.
         priors: of the pose, for the method.
+        metric: whether the unit of the poses is the metre.
     """
 
     title: str
@@ -92,11 +106,12 @@ class Pair:
     references: tuple[PosedView, ...]
     true_pose: RigidTransform | None
     priors: Priors = NO_PRIORS
+    metric: bool = True
 
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """A pair's answer and its error, in metres and degrees; None if no pose was found, accepted or not.
+    """A pair's answer and its error, in units of the scene and degrees; None if no pose was found, accepted or not.
 
     The error is infinite where the references are of another place: any pose is wrong.
     """
@@ -108,22 +123,29 @@ class Measured:
     @property
     def right(self) -> bool:
         """Whether there is a pose that is near enough to the truth."""
-        return self.off is not None and self.off[0] <= RIGHT_M and self.off[1] <= RIGHT_DEG
+        if self.off is None or self.pair.true_pose is None or self.answer.support is None:
+            return False
+        largest = RIGHT_SHARE * _distance_seen(self.answer.support, self.pair.true_pose)
+        return self.off[0] <= (min(RIGHT_M, largest) if self.pair.metric else largest) and self.off[1] <= RIGHT_DEG
 
 
-def read_places(data: Path, names: Iterable[str]) -> dict[str, Place]:
-    """The scenes of some folders, with SIFT features; of long sequences evenly spread frames."""
-    return {name: read_place(data / name) for name in names}
+def read_places(data: Path, names: Iterable[str], extractor: FeatureExtractor | None = None) -> dict[str, Place]:
+    """The scenes of some folders, with SIFT features by default; of long sequences evenly spread frames."""
+    return {name: read_place(data / name, extractor) for name in names}
 
 
 def read_place(folder: Path, extractor: FeatureExtractor | None = None, wanted: Sequence[int] | None = None) -> Place:
     """The scene of a folder; `wanted` are indices of frames, by default every so many-th."""
-    extractor, frames = extractor or make_extractor("sift"), read_folder(folder).frames
+    extractor, dataset = extractor or make_extractor("sift"), read_folder(folder)
+    frames = dataset.frames
     indices = range(0, len(frames), max(1, len(frames) // FRAMES)) if wanted is None else wanted
     with ThreadPoolExecutor(2) as pool:
         views = pool.map(lambda i: view_of(extractor, frames[i]), indices)
         place = Place(
-            folder.name, dict(zip(indices, views, strict=True)), {i: frames[i].world_from_camera for i in indices}
+            folder.name,
+            dict(zip(indices, views, strict=True)),
+            {i: frames[i].world_from_camera for i in indices},
+            dataset.metric,
         )
     print(f"{place.name}: {len(place.views)} photographs", file=sys.stderr, flush=True)
     return place
@@ -135,7 +157,11 @@ def view_of(extractor: FeatureExtractor, frame: Frame) -> View:
 
 
 def right_pairs(
-    place: Place, reference_count: int | None, ks: Sequence[int] = KS, frames_apart: int = 0
+    place: Place,
+    reference_count: int | None,
+    ks: Sequence[int] = KS,
+    frames_apart: int = 0,
+    features: str = "sift",
 ) -> Iterator[Pair]:
     """Queries of a scene with k of its references each, or all where it has fewer.
 
@@ -144,6 +170,7 @@ def right_pairs(
         reference_count: references, evenly spread, and queries between them; None leaves one out.
         ks: numbers of references.
         frames_apart: references within so many frames of the query are not used.
+        features: kind of the views' features.
     """
     indices = sorted(place.views)
     references, queries = indices, indices
@@ -157,12 +184,12 @@ def right_pairs(
         others = [i for i in references if i != query and abs(i - query) > frames_apart]
         if len(others) < 2:
             continue
-        chosen = place.posed(place.most_matching(place.views[query], others, max(wanted)))
+        chosen = place.posed(place.most_matching(place.views[query], others, max(wanted), features))
         for k in wanted:
-            yield Pair(title, k, place.views[query], chosen[:k], place.poses[query])
+            yield Pair(title, k, place.views[query], chosen[:k], place.poses[query], metric=place.metric)
 
 
-def cross_pairs(places: Sequence[Place], queries_each: int, k: int = 10) -> Iterator[Pair]:
+def cross_pairs(places: Sequence[Place], queries_each: int, k: int = 10, features: str = "sift") -> Iterator[Pair]:
     """Queries of each scene, evenly spread, with references of every other."""
     for place in places:
         queries = spread(sorted(place.views), queries_each)
@@ -171,7 +198,7 @@ def cross_pairs(places: Sequence[Place], queries_each: int, k: int = 10) -> Iter
                 references = spread(sorted(other.views), CROSS_REFERENCES)
                 for query in queries:
                     view = place.views[query]
-                    chosen = other.posed(other.most_matching(view, references, k))
+                    chosen = other.posed(other.most_matching(view, references, k, features))
                     yield Pair(f"{place.name} in {other.name}", k, view, chosen, None)
 
 
@@ -215,3 +242,12 @@ def _error(pair: Pair, answer: Answer) -> tuple[float, float] | None:
     else:
         return None
     return pose_error(pair.true_pose, pose) if pair.true_pose is not None else (np.inf, np.inf)
+
+
+def _distance_seen(support: Support, true_pose: RigidTransform) -> float:
+    """Median depth of the points that are inside the photograph at its true pose; 0 without any."""
+    camera, x_in_world = support.query.camera, support.structure.x_in_world
+    x_in_camera = true_pose.shifted(-support.origin).inverse().apply(x_in_world)
+    projected = camera.project(x_in_camera)
+    inside = ((projected >= 0) & (projected < [camera.width_px, camera.height_px])).all(axis=1)
+    return float(np.median(x_in_camera[inside, 2])) if inside.any() else 0.0

@@ -1,15 +1,14 @@
-"""The weights and quantiles of trust, from answers that are known to be right or wrong.
+"""The quantiles of trust, from answers that are known to be right, and what they accept in a place left out.
 
-    PYTHONPATH=client:server python -m research.trust FOLDER_OF_SCENES [--samples FILE]
+    PYTHONPATH=client:server python -m research.trust FOLDER_OF_SCENES [--weights FOLDER] [--samples FILE]
 
-Natural answers are those to the queries of a scene from its own references, many and few, near and far apart. Wrong
+Natural answers are those to the queries of a place from its own references, many and few, near and far apart. Wrong
 poses come from other places; from mirrored photographs; from references two of which have wrong poses; and from
 references that look elsewhere. Photographs with most of their features left out give right answers that are hard to
 tell. A wrong focal length is not here: of a flat wall a photograph with another focal length is the same.
 
-Weights by logistic regression, none below 0, so that more evidence never lowers the trust; every scene counts alike,
-and so do right and wrong. Quantiles of the natural right answers alone. To test it each scene is left out once, and
-judged by what the others teach.
+Quantiles of the natural right answers alone, in which every place counts alike. To test them each place is left out
+once, and judged by what the others teach.
 """
 
 from __future__ import annotations
@@ -22,93 +21,98 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.answer import Localization
-from mapless_server.method.features import make_extractor
+from mapless_server.method.correspond import make_matcher
+from mapless_server.method.features import FeatureExtractor, make_extractor
 from mapless_server.method.options import LocalizeOptions
-from mapless_server.method.pipeline import StageOptions
 from mapless_server.method.rejection import RejectionReason
-from mapless_server.method.trust.judge import FEATURES, LEVELS, Evidence, JudgeOptions, evidence_of, trust_of
+from mapless_server.method.trust.agreement import AgreementOptions
+from mapless_server.method.trust.evidence import Evidence, evidence_of
+from mapless_server.method.trust.judge import LEVELS
+from mapless_server.method.trust.votes import votes_of
 from mapless_server.method.views import Features
 from mapless_tools.dataset import read_folder
 
-from .places import (
-    KITCHEN,
-    METRIC,
-    OTHERS,
-    Pair,
-    Place,
-    answered,
-    cross_pairs,
-    read_places,
-    right_pairs,
-    weights_alike,
-)
+from .places import ALL, KITCHEN, Pair, Place, answered, cross_pairs, read_places, right_pairs, weights_alike
 
-KS = (10, 5, 3, 2)
-SPARSE: tuple[tuple[str, int], ...] = (
-    ("tum-fr3-office", 6),
-    ("kitti-drive-a", 8),
-    ("fountain-P11", 5),
-    ("herz-jesus-P8", 4),
-    (KITCHEN, 8),
-)
-"""Few references, far apart, of which the queries in between are given all or some."""
+LEAVE_ONE_OUT = (10, 5, 3)
+"""References that each photograph of a place is given, the others of the place at choice."""
+SPARSE: dict[str, tuple[int, ...]] = {
+    KITCHEN: (30, 10, 5, 3),
+    "tum-fr3-office": (6,),
+    "kitti-drive-a": (8,),
+    "fountain-P11": (5,),
+    "herz-jesus-P8": (4,),
+    "euroc-v101-drone": (20, 10, 5),
+    "office-lockers": (20, 10),
+    "statue-of-liberty-internet": (20, 10),
+    "meeting-room": (10, 5),
+    "studio-flat": (10, 5),
+    "fox-portrait": (10, 5),
+}
+"""Few references, far apart, of which the queries in between are given ten or all."""
 FEATURES_LEFT = (150, 300)
-CROSS_QUERIES, CROSS_K = 6, 5
+CROSS_QUERIES, CROSS_K = 8, 5
 HARD_PAIRS, HARD_KS = 12, (3, 6)
-COVERAGES = (0.90, 0.95, 0.99)
-RIDGE = 0.005
-"""On the squared weights of standardized features; four times as much changes no figure by more than a per cent."""
+COVERAGES = (0.90, 0.95, 0.97, 0.98, 0.99)
 
 
 @dataclass(frozen=True)
 class Sample:
-    """An answer that passed the gate.
+    """A pose that passed the gate.
 
     Attributes:
         kind: "natural", "cross", "mirrored", "moved" (wrong reference poses), "elsewhere" (references that look away)
             or "thinned".
-        scene: of the references.
-        right: whether it is off by no more than 10 cm and 5 degrees.
-        evidence: what speaks for it.
+        place: of the references.
+        features: kind of features.
+        right: whether it is near enough to the truth (`Measured.right`).
+        evidence: for it.
     """
 
     kind: str
-    scene: str
+    place: str
+    features: str
     right: bool
     evidence: Evidence
 
 
-def collect(data: Path) -> Iterator[Sample]:
-    """Localizes everything in a folder of the scenes' folders; minutes."""
-    metric = list(dict.fromkeys(name for name, _ in METRIC))
-    places = read_places(data, [*metric, *OTHERS])
-    for name, count in dict.fromkeys((*METRIC, *SPARSE)):
-        yield from _samples("natural", right_pairs(places[name], count, KS))
-    yield from _samples("cross", cross_pairs(list(places.values()), CROSS_QUERIES, CROSS_K))
-    for name in metric:
-        place, random = places[name], np.random.default_rng(11)
-        pairs = [pair for pair in right_pairs(place, dict(SPARSE)[name], HARD_KS) if len(pair.references) >= 3]
+def collect(data: Path, features: str, extractor: FeatureExtractor) -> Iterator[Sample]:
+    """Localizes everything in a folder of the scenes' folders; half an hour."""
+    places = read_places(data, ALL, extractor)
+    for name, place in places.items():
+        if name != KITCHEN:  # a film, where a photograph's neighbours are all but the same
+            yield from _samples("natural", right_pairs(place, None, LEAVE_ONE_OUT, features=features), features)
+        for count in SPARSE.get(name, ()):
+            yield from _samples("natural", right_pairs(place, count, (min(10, count),), features=features), features)
+    yield from _samples("cross", cross_pairs(list(places.values()), CROSS_QUERIES, CROSS_K, features), features)
+    for name, place in places.items():
+        random = np.random.default_rng(11)
+        few = min(SPARSE.get(name, (5,)))
+        pairs = [p for p in right_pairs(place, max(few, 4), HARD_KS, features=features) if len(p.references) >= 3]
         chosen = [pairs[i] for i in np.unique(np.linspace(0, len(pairs) - 1, HARD_PAIRS).round().astype(int))]
-        yield from _samples("thinned", (_thinned(pair, left, random) for pair in chosen for left in FEATURES_LEFT))
-        yield from _samples("moved", (_moved(pair, random) for pair in chosen))
-        yield from _samples("elsewhere", _elsewhere(place))
-        yield from _samples("mirrored", _mirrored(place, data / name))
+        thinned = (_thinned(pair, left, random) for pair in chosen for left in FEATURES_LEFT)
+        yield from _samples("thinned", thinned, features)
+        yield from _samples("moved", (_moved(pair, random) for pair in chosen), features)
+        yield from _samples("elsewhere", _elsewhere(place), features)
+        yield from _samples("mirrored", _mirrored(place, data / name, extractor), features)
 
 
-def _samples(kind: str, pairs: Iterable[Pair]) -> Iterator[Sample]:
+def _samples(kind: str, pairs: Iterable[Pair], features: str) -> Iterator[Sample]:
     """Of what passes the gate, accepted or not."""
-    options = LocalizeOptions(coverage=1.0)
-    for it in answered(pairs, options):
+    matcher = make_matcher(features)
+    for it in answered(pairs, LocalizeOptions(coverage=1.0), features):
         support, outcome = it.answer.support, it.answer.outcome
-        passed = isinstance(outcome, Localization) or outcome.reason is RejectionReason.AMBIGUOUS
-        if support is not None and support.estimate is not None and passed:
-            scene = it.pair.references[0].name.split("/")[1]
-            yield Sample(kind, scene, it.right, evidence_of(support, StageOptions().pnp.inlier_px))
+        # What judge rejects has a hint, or names two poses; what the gate rejects has neither.
+        judged = isinstance(outcome, Localization) or outcome.hint or outcome.reason is RejectionReason.AMBIGUOUS
+        if support is not None and support.estimate is not None and judged:
+            votes = votes_of(support, matcher.match_query(it.pair.query, it.pair.references))
+            place = it.pair.references[0].name.split("/")[1]
+            yield Sample(kind, place, features, it.right, evidence_of(support, votes, AgreementOptions()))
+    matcher.close()
 
 
 def _thinned(pair: Pair, left: int, random: np.random.Generator) -> Pair:
@@ -138,13 +142,12 @@ def _elsewhere(place: Place, count: int = 5) -> Iterator[Pair]:
         ahead = place.poses[query].rotation[:, 2]
         away = sorted(indices, key=lambda i: float(ahead @ place.poses[i].rotation[:, 2]))[:count]
         references = place.posed(i for i in away if i != query)
-        yield Pair(place.name, count, place.views[query], references, place.poses[query])
+        yield Pair(place.name, count, place.views[query], references, place.poses[query], metric=place.metric)
 
 
-def _mirrored(place: Place, folder: Path) -> Iterator[Pair]:
+def _mirrored(place: Place, folder: Path, extractor: FeatureExtractor) -> Iterator[Pair]:
     """The mirrored photographs, which show no place at all, with the references that the right ones are given."""
-    extractor, frames = make_extractor("sift"), read_folder(folder).frames
-    indices = sorted(place.views)
+    frames, indices = read_folder(folder).frames, sorted(place.views)
 
     def apart(first: int, second: int) -> float:
         """Metres between two photographs, and as many for each radian between their directions."""
@@ -161,64 +164,40 @@ def _mirrored(place: Place, folder: Path) -> Iterator[Pair]:
         yield Pair(place.name, 6, query, place.posed(nearest), None)
 
 
-def fit(samples: Sequence[Sample]) -> JudgeOptions:
-    """The options of the judge."""
-    weights = fit_weights(samples)
+def fit(samples: Sequence[Sample]) -> Array:
+    """Quantiles of the scores of natural right answers at `LEVELS`, every place and kind of features counting alike."""
     natural = [it for it in samples if it.kind == "natural" and it.right]
-    quantiles = np.quantile([it.evidence.features() @ weights for it in natural], LEVELS)
-    return JudgeOptions(tuple(np.round(weights, 3).tolist()), tuple(np.round(quantiles, 3).tolist()))
-
-
-def fit_weights(samples: Sequence[Sample]) -> Array:
-    """Weights (7,) of the features, none below 0, that tell right samples from wrong ones best.
-
-    Minimizes the mean of log(1 + exp(-y (w . z + b))) + ridge |w|^2 over standardized features z, y = 1 or -1.
-    """
-    features = np.stack([it.evidence.features() for it in samples])
-    sign = np.where([it.right for it in samples], 1.0, -1.0)
-    share = np.zeros(len(samples))
-    for side in (1.0, -1.0):
-        rows = np.flatnonzero(sign == side).tolist()
-        share[rows] = 0.5 * weights_alike([samples[i].scene for i in rows])
-    spread = features.std(axis=0) + 1e-9
-    z = (features - features.mean(axis=0)) / spread
-
-    def loss(unknowns: Array) -> tuple[float, Array]:
-        margin = sign * (z @ unknowns[:-1] + unknowns[-1])
-        pull = -share * sign / (1 + np.exp(np.clip(margin, -500, 500)))
-        value = share @ np.logaddexp(0, -margin) + RIDGE * unknowns[:-1] @ unknowns[:-1]
-        return float(value), np.append(z.T @ pull + 2 * RIDGE * unknowns[:-1], pull.sum())
-
-    bounds = [(0.0, None)] * len(FEATURES) + [(None, None)]
-    found = minimize(loss, np.zeros(len(FEATURES) + 1), jac=True, bounds=bounds, method="L-BFGS-B")
-    return np.asarray(found.x[:-1] / spread)
+    scores = np.array([it.evidence.score for it in natural])
+    weights = weights_alike([f"{it.place} {it.features}" for it in natural])
+    return np.asarray(np.quantile(scores, LEVELS, weights=weights, method="inverted_cdf"))
 
 
 def left_out(samples: Sequence[Sample]) -> Iterator[str]:
-    """Lines of a table: each scene judged by what the others teach, at several coverages."""
-    scenes = sorted({it.scene for it in samples if it.kind == "natural"})
+    """Lines of a table: each place judged by what the others teach, at several coverages."""
+    places = sorted({it.place for it in samples if it.kind == "natural"})
     trusts = np.full(len(samples), np.nan)
-    for scene in scenes:
-        options = fit([it for it in samples if it.scene != scene])
+    for place in places:
+        scores = fit([it for it in samples if it.place != place])
         for i, it in enumerate(samples):
-            if it.scene == scene:
-                trusts[i] = trust_of(it.evidence, options)
-    kinds = np.array([it.kind for it in samples])
-    right = np.array([it.right for it in samples])
+            if it.place == place:
+                trusts[i] = np.interp(it.evidence.score, scores, LEVELS)
+    kinds, right = (np.array([getattr(it, name) for it in samples]) for name in ("kind", "right"))
     others = [kind for kind in dict.fromkeys(kinds.tolist()) if kind != "natural" and not right[kinds == kind].all()]
-    yield f"| left out | coverage | right accepted | accepted, wrong | {' | '.join(f'{k}, wrong' for k in others)} |"
-    yield "|---|---|---|---|" + "---|" * len(others)
-    for title, chosen in [(scene, [scene]) for scene in scenes] + [("each of all", scenes)]:
-        own = np.array([it.scene in chosen for it in samples])
-        for coverage in COVERAGES:
-            accepted = own & (trusts >= 1 - coverage)
-            natural = kinds == "natural"
-            cells = [
-                _share(accepted & natural & right, own & natural & right),
-                _share(accepted & natural & ~right, accepted & natural),
-                *(_share(accepted & (kinds == k) & ~right, own & (kinds == k) & ~right) for k in others),
-            ]
-            yield f"| {title} | {coverage:g} | {' | '.join(cells)} |"
+    heads = ["left out", "features", "coverage", "right accepted", "accepted, wrong", *(f"{k}, wrong" for k in others)]
+    yield f"| {' | '.join(heads)} |"
+    yield "|---|---|---|---|---|" + "---|" * len(others)
+    natural = kinds == "natural"
+    for features in dict.fromkeys(it.features for it in samples):
+        for title, chosen in [(place, [place]) for place in places] + [("each of all", places)]:
+            own = np.array([it.place in chosen and it.features == features for it in samples])
+            for coverage in COVERAGES:
+                accepted = own & (trusts >= 1 - coverage)
+                cells = [
+                    _share(accepted & natural & right, own & natural & right),
+                    _share(accepted & natural & ~right, accepted & natural),
+                    *(_share(accepted & (kinds == k) & ~right, own & (kinds == k) & ~right) for k in others),
+                ]
+                yield f"| {title} | {features} | {coverage:g} | {' | '.join(cells)} |"
 
 
 def _share(part: NDArray[np.bool_], whole: NDArray[np.bool_]) -> str:
@@ -229,17 +208,21 @@ def main() -> None:
     """Fits and prints."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("data", type=Path, help="folder of the scenes' folders")
+    parser.add_argument("--weights", type=Path, help="folder with edgepoint2-l64.safetensors, for these features too")
     parser.add_argument("--samples", type=Path, help="read from this file if it is there, else written to it")
     arguments = parser.parse_args()
     if arguments.samples and arguments.samples.is_file():
         read = json.loads(arguments.samples.read_text())
         samples = [Sample(**{**it, "evidence": Evidence(**it["evidence"])}) for it in read]
     else:
-        samples = list(collect(arguments.data))
+        samples = list(collect(arguments.data, "sift", make_extractor("sift")))
+        if arguments.weights:
+            name = "edgepoint2-l64"
+            extractor = make_extractor(name, arguments.weights / f"{name}.safetensors")
+            samples += collect(arguments.data, name, extractor)
         if arguments.samples:
             arguments.samples.write_text(json.dumps([asdict(it) for it in samples]))
-    options = fit(samples)
-    print(f"weights = {options.weights}\nscores = {options.scores}\n")
+    print(f"scores = {tuple(np.round(fit(samples), 3).tolist())}\n")
     print("\n".join(left_out(samples)))
 
 

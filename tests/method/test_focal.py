@@ -72,7 +72,7 @@ def test_few_matches_do_not_determine_it() -> None:
 def test_the_judge_rejects_with_both_numbers_and_a_hint() -> None:
     support = solved(planted("judge"), 1.15)
     matches = [np.empty((0, 2), np.int32)] * len(support.references)
-    rejection = judge(support, matches, PnpOptions().inlier_px, 1.0, JudgeOptions()).rejection
+    rejection = judge(support, matches, 1.0, JudgeOptions()).rejection
     assert rejection is not None
     assert rejection.reason is RejectionReason.GATE
     found = re.search(r"says ([0-9.]+) times the focal length", rejection.message)
@@ -84,11 +84,12 @@ def test_the_judge_rejects_with_both_numbers_and_a_hint() -> None:
 
 
 def test_it_is_wrong_only_beyond_tolerance_and_error() -> None:
-    wrong = Focal(log_ratio=0.2, sigma=0.01, agreeing=100, agreeing_before=40, given_px=500.0)
+    wrong = Focal(0.2, 0.01, agreeing=100, agreeing_before=40, given_px=500.0, reference_count=5.0)
     assert wrong.is_wrong(OPTIONS)
     assert not replace(wrong, log_ratio=OPTIONS.max_log_ratio * 0.9).is_wrong(OPTIONS)
     assert not replace(wrong, sigma=0.06).is_wrong(OPTIONS)
     assert not replace(wrong, agreeing=30).is_wrong(OPTIONS)
+    assert not replace(wrong, reference_count=2.0).is_wrong(OPTIONS)  # two references may err together
 
 
 def test_a_support_without_a_pose_is_refused() -> None:

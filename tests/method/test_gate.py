@@ -1,4 +1,4 @@
-"""The gate: rejects poses that chance or repeated texture could support; the numbers it compares."""
+"""The gate: rejects poses that chance could support; the expected number of such poses."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.pnp_problems import POSE, Problem, planted, problem_of
+from support.pnp_problems import POSE, Problem, planted
 from support.scenes import CAMERA, random_for
 
 from mapless.geometry import RigidTransform
@@ -17,10 +17,8 @@ from mapless_server.method.results import PointMatches, PoseEstimate
 from mapless_server.method.trust.gate import (
     GateOptions,
     false_alarms,
-    findable_count,
     format_false_alarms,
     gate_failure,
-    hull_share,
     log10_false_alarms,
 )
 
@@ -37,22 +35,14 @@ def failure_of(problem: Problem, initial: RigidTransform = POSE, options: GateOp
 
 
 def said(problem: Problem, estimate: PoseEstimate, options: GateOptions) -> str:
-    return gate_failure(*problem, estimate.world_from_camera, estimate.inliers, INLIER_PX, options) or ""
+    query, _, matches = problem
+    return gate_failure(query.camera, matches, estimate.inliers, INLIER_PX, options) or ""
 
 
 @pytest.mark.parametrize("outlier_share", [0.0, 0.5])
 def test_a_planted_pose_passes_the_gate(outlier_share: float) -> None:
     for seed in range(5):
         assert not failure_of(planted(random_for("good", outlier_share, seed), 100, 0.5, outlier_share))
-
-
-@pytest.mark.parametrize("count", [6, 40, 400])
-def test_poses_from_degenerate_points_fail_the_gate(count: int) -> None:
-    on_a_line = np.linspace(-1, 1, count)[:, None] * np.array([1.0, 0.3, 0.2])
-    for x_in_world in (on_a_line, np.zeros((count, 3))):
-        problem = problem_of(x_in_world, CAMERA.project(POSE.inverse().apply(x_in_world)))
-        for initial in (POSE, POSE.shifted(np.array([3.0, 1.0, 0.0]))):
-            assert failure_of(problem, initial)
 
 
 def test_random_matches_fail_the_gate() -> None:
@@ -72,53 +62,6 @@ def test_guided_matches_around_a_wrong_pose_fail_the_gate() -> None:
         searched = PointMatches(matches.point, matches.keypoint, np.ones(80, bool), radius_px=20.0)
         query = replace(view, features=replace(view.features, keypoints=keypoints))
         assert failure_of((query, structure, searched)), seed
-
-
-def test_inliers_in_one_corner_fail_the_gate() -> None:
-    random = random_for("corner")
-    pixels = random.uniform([100, 100], [180, 160], (60, 2))
-    x_in_world = POSE.apply(CAMERA.rays(pixels) * random.uniform(3, 6, (60, 1)))
-    problem = problem_of(x_in_world, pixels)
-    assert "cover only" in failure_of(problem)
-    assert not failure_of(problem, options=GateOptions(min_hull_share=0.0))
-
-
-def test_few_inliers_of_many_visible_points_fail_the_gate() -> None:
-    random = random_for("share")
-    view, structure, matches = planted(random, 1000)
-    few = PointMatches(matches.point[:30], matches.keypoint[:30], matches.guided[:30], 0.0)
-    assert "1000 points should be found" in failure_of((view, structure, few))
-    behind = replace(structure, x_in_world=structure.x_in_world.copy())
-    behind.x_in_world[30:] = POSE.apply([0.0, 0.0, -5.0])  # what is not in front need not be found
-    assert not failure_of((view, behind, few))
-
-
-def test_agreeing_gravity_lowers_the_required_shares() -> None:
-    view, structure, matches = planted(random_for("share"), 1000)
-
-    def failure(count: int, log10_chance: float) -> str | None:
-        few = PointMatches(matches.point[:count], matches.keypoint[:count], matches.guided[:count], 0.0)
-        return gate_failure(view, structure, few, POSE, np.ones(count, bool), 4.0, GateOptions(), log10_chance)
-
-    assert "should be found" in (failure(30, 0.0) or "")
-    assert failure(30, -2.8) is None
-    assert "should be found" in (failure(15, -2.8) or "")
-
-
-def test_hull_share_of_a_rectangle_is_its_area() -> None:
-    corners = np.array([[0.0, 0.0], [480.0, 0.0], [480.0, 360.0], [0.0, 360.0], [100.0, 100.0]])
-    query, _, matches = problem_of(np.zeros((5, 3)), corners)
-    assert hull_share(query, matches, np.ones(5, bool)) == pytest.approx(0.25, rel=1e-4)
-
-
-def test_findable_points_are_in_front_and_inside_the_image() -> None:
-    inside = POSE.apply(CAMERA.rays(np.array([[0.0, 0.0], [959.0, 719.0]])) * 3.0)
-    outside = POSE.apply(CAMERA.rays(np.array([[-2.0, 0.0], [959.0, 722.0]])) * 3.0)
-    behind = POSE.apply([0.0, 0.0, -2.0])[None]
-    query, structure, _ = problem_of(np.concatenate([inside, outside, behind]), np.zeros((5, 2)))
-    assert findable_count(query, structure, POSE) == 2
-    bare = problem_of(inside[:1], np.zeros((1, 2)))[0]
-    assert findable_count(bare, structure, POSE) == 1
 
 
 # False alarms
@@ -163,6 +106,5 @@ def test_guided_and_other_matches_have_their_own_chance() -> None:
 
 
 def test_options_outside_their_bounds_are_refused() -> None:
-    for options in ({"min_hull_share": 1.5}, {"min_found_share": -0.1}, {"max_log10_false_alarms": math.nan}):
-        with pytest.raises(ValueError, match="must be"):
-            GateOptions(**options)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="must be"):
+        GateOptions(max_log10_false_alarms=math.nan)

@@ -9,36 +9,33 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.planted import true_structure
-from support.scenes import SceneOptions, make_scene, random_for
+from support.pnp_problems import POSE, problem_of
+from support.scenes import CAMERA, SceneOptions, make_scene, random_for
 
+from mapless.geometry import RigidTransform
+from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import PoseEstimate, Support
-from mapless_server.method.trust.judge import (
-    FEATURES,
-    LEVELS,
-    Evidence,
-    JudgeOptions,
-    evidence_of,
-    judge,
-    score_of,
-    trust_of,
-)
+from mapless_server.method.trust.agreement import AgreementOptions
+from mapless_server.method.trust.evidence import Evidence, evidence_of, findable_count, hull_share
+from mapless_server.method.trust.judge import LEVELS, JudgeOptions, judge, trust_of
+from mapless_server.method.trust.votes import votes_of
+from mapless_server.method.views import Matches, PosedView
 
 OPTIONS = JudgeOptions()
-INLIER_PX = PnpOptions().inlier_px
+COVERAGE = LocalizeOptions().coverage
 GOOD = Evidence(
-    log10_false_alarms=-900.0,
     inlier_count=300,
     match_count=330,
-    findable_count=600,
+    found_share=0.5,
+    expected_share=0.6,
     hull_share=0.6,
-    reference_count=4.0,
-    error_sigma=1.0,
-    position_95_m=0.02,
+    matches_apart=0.002,
+    references_apart=0.003,
 )
-POOR = Evidence(-11.0, 11, 31, 70, 0.05, 1.6, 1.5, 0.4)
-"""Such a pose was 89 cm off."""
+POOR = Evidence(22, 102, 0.1, 0.6, 0.04, 0.3, 0.2)
+"""Such a pose was off by a tenth of the distance to the photograph's contents."""
 
 
 def support_of(outlier_share: float = 0.0, seen_share: float = 0.9) -> Support:
@@ -52,38 +49,61 @@ def support_of(outlier_share: float = 0.0, seen_share: float = 0.9) -> Support:
 
 
 def verdict(support: Support, coverage: float, options: JudgeOptions = OPTIONS) -> tuple[float, Rejection | None]:
-    judged = judge(support, [np.empty((0, 2), np.int32)] * len(support.references), INLIER_PX, coverage, options)
+    judged = judge(support, query_matches_of(support), coverage, options)
     return judged.trust, judged.rejection
+
+
+def query_matches_of(support: Support) -> list[Matches]:
+    """The matches with each reference that the support's matches come from."""
+    tracks, matches = support.structure.tracks, support.matches
+    keypoint_of = np.full(len(support.structure.x_in_world), -1)
+    keypoint_of[matches.point] = matches.keypoint
+    of_references = []
+    for view in range(len(support.references)):
+        rows = (tracks.view == view) & (keypoint_of[tracks.point] >= 0)
+        pairs = np.stack([keypoint_of[tracks.point[rows]], tracks.keypoint[rows]], axis=1)
+        of_references.append(pairs.astype(np.int32))
+    return of_references
 
 
 def test_trust_is_high_with_good_support_and_low_without() -> None:
     assert trust_of(GOOD, OPTIONS) > 0.3
-    assert trust_of(POOR, OPTIONS) < 0.01
+    assert trust_of(POOR, OPTIONS) < 1 - COVERAGE
 
 
 @pytest.mark.parametrize(
     "better",
     [
-        replace(GOOD, log10_false_alarms=-2000.0),
-        replace(GOOD, match_count=305),
-        replace(GOOD, findable_count=320),
+        replace(GOOD, found_share=0.6),
+        replace(GOOD, expected_share=0.5),
         replace(GOOD, hull_share=0.9),
-        replace(GOOD, reference_count=8.0),
-        replace(GOOD, position_95_m=0.01),
+        replace(GOOD, matches_apart=0.001),
+        replace(GOOD, references_apart=0.001),
     ],
 )
-def test_more_evidence_never_lowers_the_trust(better: Evidence) -> None:
-    assert score_of(better, OPTIONS) >= score_of(GOOD, OPTIONS)
-    assert score_of(replace(better, error_sigma=2.0), OPTIONS) <= score_of(better, OPTIONS)
+def test_more_evidence_raises_the_score(better: Evidence) -> None:
+    assert better.score > GOOD.score
 
 
-@given(features=st.lists(st.floats(-10, 10), min_size=7, max_size=7), which=st.integers(0, 6), more=st.floats(0, 5))
-def test_the_score_is_monotone_in_every_number(features: list[float], which: int, more: float) -> None:
-    weights = np.array(OPTIONS.weights)
-    raised = np.array(features)
-    raised[which] += more
-    assert raised @ weights >= np.array(features) @ weights - 1e-9
-    assert len(FEATURES) == len(weights)
+def test_the_score_is_the_formula() -> None:
+    apart = np.hypot(GOOD.matches_apart, GOOD.references_apart)
+    assert pytest.approx(np.log(0.5 / 0.6 * 0.6 / apart)) == GOOD.score
+
+
+@pytest.mark.parametrize("shape", ["line", "one point"])
+@pytest.mark.parametrize("count", [6, 40, 400])
+def test_poses_from_degenerate_points_are_rejected(shape: str, count: int) -> None:
+    on_a_line = np.linspace(-1, 1, count)[:, None] * np.array([1.0, 0.3, 0.2])
+    x_in_world = on_a_line if shape == "line" else np.zeros((count, 3))
+    query, structure, matches = problem_of(x_in_world, CAMERA.project(POSE.inverse().apply(x_in_world)))
+    for initial in (POSE, POSE.shifted(np.array([3.0, 1.0, 0.0]))):
+        estimate = solve_pose(query, structure, matches, initial, PnpOptions())
+        if isinstance(estimate, Rejection):
+            continue
+        reference = PosedView("key", "scenes/s/references/r", query, POSE)
+        support = Support(query, (reference,), structure, matches, estimate, np.zeros(3))
+        rejection = judge(support, [np.empty((0, 2), np.int32)], COVERAGE, OPTIONS).rejection
+        assert rejection is not None
 
 
 @given(share=st.floats(0, 1))
@@ -116,38 +136,56 @@ def test_worse_matches_and_fewer_points_lower_the_trust() -> None:
     assert clean > sparse
 
 
-def test_agreement_with_priors_lowers_the_false_alarms() -> None:
-    """A prior that a pose found by chance would meet once in ten thousand."""
-    support = support_of(0.0, 0.3)
-    before, after = evidence_of(support, INLIER_PX), evidence_of(support, INLIER_PX, -4.0)
-    assert after.log10_false_alarms == pytest.approx(before.log10_false_alarms - 4)
-    assert trust_of(after, OPTIONS) >= trust_of(before, OPTIONS)
+def evidence(support: Support) -> Evidence:
+    return evidence_of(support, votes_of(support, query_matches_of(support)), AgreementOptions())
 
 
 def test_evidence_has_the_planted_counts() -> None:
     support = support_of(0.25)
-    evidence = evidence_of(support, INLIER_PX)
+    found = evidence(support)
     assert support.estimate is not None
-    assert evidence.inlier_count == support.estimate.inliers.sum()
-    assert evidence.match_count == len(support.matches)
-    assert evidence.inlier_share == pytest.approx(evidence.inlier_count / evidence.match_count)
-    assert 0 < evidence.found_share <= 1
-    assert 4.0 < evidence.reference_count <= 6.0  # all six see about as much of it
-    assert np.isfinite(evidence.features()).all()
+    assert found.inlier_count == support.estimate.inliers.sum()
+    assert found.match_count == len(support.matches)
+    expected = found.inlier_count / findable_count(
+        support.query, support.structure.x_in_world, support.estimate.world_from_camera
+    )
+    assert found.found_share == pytest.approx(expected)
+    assert 0.5 < found.expected_share <= 1.0  # of what is inside a reference it sees nine tenths
+    assert found.disagreement < 0.01
 
 
-def test_degenerate_evidence_has_finite_features() -> None:
+def test_the_unit_of_the_world_is_no_evidence() -> None:
+    support = support_of()
+    assert support.estimate is not None
+
+    def scaled(pose: RigidTransform) -> RigidTransform:
+        return RigidTransform(pose.rotation, 1000 * pose.translation)
+
+    references = tuple(replace(r, world_from_camera=scaled(r.world_from_camera)) for r in support.references)
+    larger = replace(
+        support,
+        references=references,
+        structure=replace(support.structure, x_in_world=1000 * support.structure.x_in_world),
+        estimate=replace(support.estimate, world_from_camera=scaled(support.estimate.world_from_camera)),
+    )
+    assert evidence(larger).score == pytest.approx(evidence(support).score, abs=0.05)
+
+
+def test_degenerate_evidence_has_a_finite_score() -> None:
     """No result of a solver may give a score of NaN, which no comparison rejects."""
-    worst = Evidence(np.inf, 4, 5000, 0, 0.0, 1.0, 1e6, 10.0)
-    assert np.isfinite(worst.features()).all()
-    assert trust_of(worst, OPTIONS) == 0.0
+    worst = Evidence(4, 5000, 0.0, 0.0, 0.0, 1.0, 1.0)
+    assert np.isfinite(worst.score)
+    assert trust_of(worst, OPTIONS) < 1 - COVERAGE
+
+
+def test_a_support_without_a_pose_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least 4 inliers"):
+        evidence(replace(support_of(), estimate=None))
 
 
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"weights": (1.0,)},
-        {"weights": (-1.0,) * len(FEATURES)},
         {"scores": (1.0, 0.0) * (len(LEVELS) // 2)},
         {"scores": (0.0,)},
     ],
@@ -159,7 +197,7 @@ def test_options_outside_their_bounds_are_refused(wrong: dict[str, tuple[float, 
 
 def test_agreement_with_gravity_only_adds_to_the_trust() -> None:
     """As much as its chance is small, and less than if nothing but chance made poses wrong."""
-    doubtful = Evidence(-60.0, 40, 60, 200, 0.2, 2.0, 1.0, 0.1)
+    doubtful = Evidence(40, 60, 0.2, 0.5, 0.2, 0.02, 0.03)
     trusts = [trust_of(doubtful, OPTIONS, log10_chance) for log10_chance in (0.0, -1.0, -3.0)]
     assert trusts[0] == trust_of(doubtful, OPTIONS)
     assert trusts[0] < trusts[1] < trusts[2]
@@ -167,3 +205,19 @@ def test_agreement_with_gravity_only_adds_to_the_trust() -> None:
     assert trust_of(doubtful, all_of_it, -3.0) > trusts[2]
     with pytest.raises(ValueError, match="must be"):
         replace(OPTIONS, agreement_weight=-0.1)
+
+
+def test_hull_share_of_a_rectangle_is_its_area() -> None:
+    corners = np.array([[0.0, 0.0], [480.0, 0.0], [480.0, 360.0], [0.0, 360.0], [100.0, 100.0]])
+    query, _, matches = problem_of(np.zeros((5, 3)), corners)
+    assert hull_share(query, matches, np.ones(5, bool)) == pytest.approx(0.25, rel=1e-4)
+
+
+def test_findable_points_are_in_front_and_inside_the_image() -> None:
+    inside = POSE.apply(CAMERA.rays(np.array([[0.0, 0.0], [959.0, 719.0]])) * 3.0)
+    outside = POSE.apply(CAMERA.rays(np.array([[-2.0, 0.0], [959.0, 722.0]])) * 3.0)
+    behind = POSE.apply([0.0, 0.0, -2.0])[None]
+    query, structure, _ = problem_of(np.concatenate([inside, outside, behind]), np.zeros((5, 2)))
+    assert findable_count(query, structure.x_in_world, POSE) == 2
+    bare = problem_of(inside[:1], np.zeros((1, 2)))[0]
+    assert findable_count(bare, structure.x_in_world, POSE) == 1

@@ -124,7 +124,7 @@ def _solve(coarse: Coarse, counts_agreement: bool) -> Answer:
         return coarse.answer(estimate, support)
     pose, inliers = estimate.world_from_camera, estimate.inliers
     chance = priors.log10_chance(pose) if counts_agreement else 0.0
-    failure = gate_failure(query, structure, matches, pose, inliers, options.pnp.inlier_px, options.gate, chance)
+    failure = gate_failure(query.camera, matches, inliers, options.pnp.inlier_px, options.gate, chance)
     if failure:
         return coarse.answer(Rejection(RejectionReason.GATE, failure), replace(support, estimate=estimate))
     if prepared.options.variant is Variant.BEST:
@@ -138,7 +138,7 @@ def _solve(coarse: Coarse, counts_agreement: bool) -> Answer:
     support = replace(support, estimate=estimate)
     with stage("judge"):
         query_matches = prepared.correspondences.query_matches
-        judged = judge(support, query_matches, options.pnp.inlier_px, prepared.options.coverage, options.judge, chance)
+        judged = judge(support, query_matches, prepared.options.coverage, options.judge, chance)
     if judged.rejection:
         return coarse.answer(judged.rejection, support)
     return coarse.answer(Localization.of(estimate, len(matches), judged.trust), support)

@@ -64,7 +64,7 @@ class LocalizeOptions:
 
     variant: Variant = Variant.BEST
     scale_strategy: ScaleStrategy = ScaleStrategy.TWO_STAGE
-    coverage: float = 0.99
+    coverage: float = 0.97
 
     def __post_init__(self) -> None:
         check_bounds(self, "coverage", above=0, at_most=1)

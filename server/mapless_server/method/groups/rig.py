@@ -17,9 +17,9 @@ from ..options import check_bounds
 from ..perturbation import perturbed
 from ..pnp import PnpOptions
 from ..rejection import Rejection, RejectionReason
-from ..trust.gate import GateOptions
 from .generalized import inlier_count, rig_ransac
 from .images import (
+    GroupGateOptions,
     GroupImage,
     MatchedImage,
     PosedImage,
@@ -42,7 +42,7 @@ class RigOptions:
     """
 
     pnp: PnpOptions = field(default_factory=PnpOptions)
-    gate: GateOptions = field(default_factory=GateOptions)
+    gate: GroupGateOptions = field(default_factory=GroupGateOptions)
     joint: JointOptions = field(default_factory=JointOptions)
     rounds: int = 2
 

@@ -22,10 +22,10 @@ from mapless.geometry import Array, RigidTransform, Similarity, rotation_angle_d
 from ..options import check_bounds
 from ..pnp import PnpOptions
 from ..rejection import Rejection, RejectionReason
-from ..trust.gate import GateOptions
 from .drift import DriftOptions, SequenceState, world_from_session_at
 from .generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
 from .images import (
+    GroupGateOptions,
     GroupImage,
     MatchedImage,
     PosedImage,
@@ -58,7 +58,7 @@ class SequenceOptions:
     """
 
     pnp: PnpOptions = field(default_factory=PnpOptions)
-    gate: GateOptions = field(default_factory=GateOptions)
+    gate: GroupGateOptions = field(default_factory=GroupGateOptions)
     joint: JointOptions = field(default_factory=JointOptions)
     drift: DriftOptions = field(default_factory=DriftOptions)
     rounds: int = 2

@@ -21,16 +21,16 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, Camera, RigidTransform, rotation_angle_deg
+from mapless.geometry import Camera, RigidTransform, rotation_angle_deg
 
 from ..options import check_bounds
-from ..perturbation import pose_hessian, reprojection_errors_px, world_covariance
+from ..perturbation import pose_hessian, world_covariance
 from ..pnp import PnpOptions, ransac
 from ..rejection import Hypothesis
 from ..results import Support
 from ..uncertainty.covariance import Accuracy, accuracy_from_covariance
-from ..views import Matches
 from .gate import false_alarms
+from .votes import Votes
 
 
 @dataclass(frozen=True)
@@ -66,50 +66,19 @@ class AmbiguityOptions:
         check_bounds(self, "agreeing_px", at_least=self.pnp.inlier_px)
 
 
-@dataclass(frozen=True, eq=False)
-class _Votes:
-    """Matches with each reference, carried to points; row v is one match.
-
-    Attributes:
-        reference: (V,) index of the reference.
-        keypoint: (V,) of the query.
-        x_in_world: (V, 3) the point.
-        pixels: (V, 2) the keypoint.
-    """
-
-    reference: NDArray[np.intp]
-    keypoint: NDArray[np.intp]
-    x_in_world: Array
-    pixels: Array
-
-    def __getitem__(self, rows: NDArray[np.bool_]) -> _Votes:
-        return _Votes(self.reference[rows], self.keypoint[rows], self.x_in_world[rows], self.pixels[rows])
-
-    def errors_px(self, camera: Camera, world_from_camera: RigidTransform) -> Array:
-        """Distances (V,) of the points' projections from the keypoints; NaN behind the camera."""
-        return reprojection_errors_px(camera, world_from_camera, self.x_in_world, self.pixels)
-
-    def keypoint_count(self, rows: NDArray[np.bool_]) -> int:
-        """Number of different keypoints among the selected rows (V,)."""
-        return len(np.unique(self.keypoint[rows]))
-
-
-def find_rival(
-    support: Support, query_matches: Sequence[Matches], options: AmbiguityOptions
-) -> tuple[Hypothesis, Hypothesis] | None:
+def find_rival(support: Support, votes: Votes, options: AmbiguityOptions) -> tuple[Hypothesis, Hypothesis] | None:
     """The first pose and its rival, as hypotheses in the support's world; None without a rival.
 
     Projects all matches, and searches only if enough of them are outliers.
 
     Args:
         support: of the first pose, with its estimate.
-        query_matches: with each reference, (query keypoint, reference keypoint).
+        votes: of the query's matches.
         options: see there.
     """
     estimate, camera = support.estimate, support.query.camera
     if estimate is None:
         return None
-    votes = _votes(support, query_matches)
     errors_px = votes.errors_px(camera, estimate.world_from_camera)
     own = errors_px < options.pnp.inlier_px
     wanted = max(options.min_keypoints, int(np.ceil(options.min_share * votes.keypoint_count(own))))
@@ -135,7 +104,7 @@ def find_rival(
 
 
 def _second_pose(
-    camera: Camera, votes: _Votes, wanted: int, options: AmbiguityOptions
+    camera: Camera, votes: Votes, wanted: int, options: AmbiguityOptions
 ) -> tuple[RigidTransform, Accuracy] | None:
     """A pose with enough inliers that are not chance, and its radii."""
     pose = ransac(camera, votes.x_in_world, votes.pixels, None, options.pnp)
@@ -158,23 +127,8 @@ def _supporters(names: Sequence[str], own: NDArray[np.intp], other: NDArray[np.i
     return tuple(names[i] for i in np.argsort(-own, kind="stable") if own[i] > other[i])
 
 
-def _votes(support: Support, query_matches: Sequence[Matches]) -> _Votes:
-    """The matches with keypoints of triangulated points."""
-    tracks = support.structure.tracks
-    offsets = np.concatenate([[0], np.cumsum([len(r.view.features) for r in support.references])])
-    point_of = np.full(offsets[-1], -1)
-    point_of[offsets[tracks.view] + tracks.keypoint] = tracks.point
-    reference = np.repeat(np.arange(len(query_matches)), [len(m) for m in query_matches])
-    pairs = np.concatenate([np.asarray(m, np.intp).reshape(-1, 2) for m in query_matches])
-    point = point_of[offsets[reference] + pairs[:, 1]]
-    known = point >= 0
-    keypoint = pairs[known, 0]
-    pixels = support.query.features.keypoints[keypoint].astype(np.float64)
-    return _Votes(reference[known], keypoint, support.structure.x_in_world[point[known]], pixels)
-
-
 def _outliers(
-    votes: _Votes, own: NDArray[np.bool_], apart: NDArray[np.bool_], reference_count: int
+    votes: Votes, own: NDArray[np.bool_], apart: NDArray[np.bool_], reference_count: int
 ) -> NDArray[np.bool_]:
     """The matches (V,) far from the first pose, of references with more such matches than inliers."""
     against, favour = (np.bincount(votes.reference[rows], minlength=reference_count) for rows in (apart, own))

@@ -1,0 +1,110 @@
+"""Halves of the data: a right pose is found again from each of them, a wrong one is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.planted import moved_references, true_correspondences, true_structure
+from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
+
+from mapless.geometry import RigidTransform
+from mapless_server.method.pnp import PnpOptions, solve_pose
+from mapless_server.method.results import PoseEstimate, Support
+from mapless_server.method.trust.agreement import (
+    NO_AGREEMENT,
+    AgreementOptions,
+    disagreement_of_matches,
+    disagreement_of_references,
+)
+from mapless_server.method.trust.votes import votes_of
+
+OPTIONS = AgreementOptions()
+DISTANCE_M = 4.0
+
+
+def planted(case: object, **options: object) -> SyntheticScene:
+    return make_scene(random_for("agreement", case), replace(SceneOptions(point_count=300), **options))  # type: ignore[arg-type]
+
+
+def solved(scene: SyntheticScene) -> Support:
+    structure, matches = true_structure(scene)
+    estimate = solve_pose(scene.query, structure, matches, scene.world_from_query, PnpOptions())
+    assert isinstance(estimate, PoseEstimate)
+    return Support(scene.query, scene.references, structure, matches, estimate, np.zeros(3))
+
+
+def both(scene: SyntheticScene, support: Support) -> tuple[float, float]:
+    votes = votes_of(support, true_correspondences(scene).query_matches)
+    return (
+        disagreement_of_matches(support, DISTANCE_M, OPTIONS),
+        disagreement_of_references(support, votes, DISTANCE_M, OPTIONS),
+    )
+
+
+@pytest.mark.parametrize("outlier_share", [0.0, 0.3])
+def test_halves_of_a_right_pose_agree(outlier_share: float) -> None:
+    for case in range(5):
+        scene = planted(case, outlier_share=outlier_share)
+        assert max(both(scene, solved(scene))) < 0.01
+
+
+def test_halves_of_random_matches_disagree() -> None:
+    scene = planted("random")
+    support = solved(scene)
+    shuffled = random_for("shuffled").permutation(support.matches.point)
+    wrong = replace(support, matches=replace(support.matches, point=shuffled))
+    assert disagreement_of_matches(wrong, DISTANCE_M, OPTIONS) > 0.1
+
+
+def test_halves_of_references_with_wrong_poses_disagree() -> None:
+    """Points seen by references of one half are where those references were moved to."""
+    scene = planted("moved")
+    support = solved(scene)
+    votes = votes_of(support, true_correspondences(scene).query_matches)
+    shift = np.array([1.0, 0.0, 0.0])
+    moved = replace(votes, x_in_world=votes.x_in_world + np.where((votes.reference % 2 == 0)[:, None], shift, 0.0))
+    assert disagreement_of_references(support, votes, DISTANCE_M, OPTIONS) < 0.01
+    assert disagreement_of_references(support, moved, DISTANCE_M, OPTIONS) > 0.05
+
+
+def test_fewer_matches_than_two_poses_need_give_none() -> None:
+    scene = planted("few", point_count=60)
+    support, few = solved(scene), slice(0, 6)
+    matches = support.matches
+    kept = replace(matches, point=matches.point[few], keypoint=matches.keypoint[few], guided=matches.guided[few])
+    assert disagreement_of_matches(replace(support, matches=kept), DISTANCE_M, OPTIONS) == NO_AGREEMENT
+
+
+def test_guided_matches_take_no_part_beside_others() -> None:
+    scene = planted("guided")
+    support = solved(scene)
+    wrong = random_for("guided").permutation(support.matches.point)
+    guided = np.arange(len(wrong)) % 3 > 0
+    point = np.where(guided, wrong, support.matches.point)
+    mixed = replace(support, matches=replace(support.matches, point=point, guided=guided))
+    assert disagreement_of_matches(mixed, DISTANCE_M, OPTIONS) < 0.01
+    only = replace(support, matches=replace(support.matches, guided=np.ones(len(wrong), bool)))
+    assert disagreement_of_matches(only, DISTANCE_M, OPTIONS) < 0.01
+
+
+def test_the_unit_and_the_world_frame_do_not_matter() -> None:
+    scene = planted("frame")
+    support = solved(scene)
+    world = RigidTransform(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([3.0, -2.0, 1.0]))
+    structure = replace(support.structure, x_in_world=world.apply(support.structure.x_in_world))
+    turned = replace(support, structure=structure, references=moved_references(support.references, world))
+    assert disagreement_of_matches(turned, DISTANCE_M, OPTIONS) == pytest.approx(
+        disagreement_of_matches(support, DISTANCE_M, OPTIONS), rel=1e-3
+    )
+    larger = replace(support, structure=replace(structure, x_in_world=1000 * structure.x_in_world))
+    assert disagreement_of_matches(larger, 1000 * DISTANCE_M, OPTIONS) == pytest.approx(
+        disagreement_of_matches(support, DISTANCE_M, OPTIONS), rel=1e-3
+    )
+
+
+@pytest.mark.parametrize("wrong", [{"splits": 0}, {"shuffling": -0.1}])
+def test_options_outside_their_bounds_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="must be"):
+        AgreementOptions(**wrong)  # type: ignore[arg-type]
