@@ -49,9 +49,9 @@ class BackgroundOptions:
     """Options of matching in the background.
 
     Attributes:
-        pairs: references that each is matched with, at most, of those before it. In the kitchen of 7-Scenes (86
-            references, 15 queries, 10 references a query) a query finds 93 % of its pairs with 20, 97 % with 30, 99 %
-            with 40, which take 17, 24 and 30 pairs a reference.
+        pairs: references that each is matched with, at most, of those before it. In the kitchen of 7-Scenes (75
+            references, 25 queries, 10 references a query) a query finds 90 % of its pairs with 20, 96 % with 30, 99 %
+            with 40, for which 17, 24 and 29 pairs are made for each reference.
         busy_share: of one core while the server computes for callers.
         quiet_s: only after this time without work for a caller the server counts as idle: a caller that sends one
             photograph after another leaves gaps of some milliseconds.
