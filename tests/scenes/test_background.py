@@ -214,21 +214,21 @@ class TestDamage:
     def test_a_damaged_reference_keeps_no_other_from_being_matched(
         self, store: Store, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        damage(store, SCENE, "r2", "features")
+        damage(store, SCENE, "r3", "features")
         server = Server(store, widths=[False])
         with caplog.at_level(logging.WARNING):
             server.background.match_waiting()
         assert server.counts.failures == 1
         assert server.counts.made == 6
         assert server.counts.waiting == 1
-        assert "reference r2 of scene s could not be matched, next time in 30 s" in caplog.text
+        assert "reference r3 of scene s could not be matched, next time in 30 s" in caplog.text
         server.background.match_waiting()
         assert server.counts.failures == 1
         let_pass(monkeypatch, 31)
         server.background.match_waiting()
         assert server.counts.failures == 2
-        store.delete_reference(SCENE, "r2")
-        store.add_references(SCENE, [new(2)])
+        store.delete_reference(SCENE, "r3")
+        store.add_references(SCENE, [new(3)])
         server.background.match_waiting()
         assert (server.counts.made, server.counts.waiting) == (10, 0)
 
