@@ -203,7 +203,7 @@ class TestDamage:
     def test_matches_of_keypoints_that_are_not_there_are_damage(self, store: Store) -> None:
         server = Server(store, widths=[False])
         first, second = server.references()[:2]
-        claim = server.pairs.claim(server.name(), {})
+        claim = server.pairs.claim(server.name(), pairs.Progress())
         assert claim is not None
         for wrong in ([len(first.view.features), 0], [0, len(second.view.features)], [-1, 0]):
             server.pairs.add(server.name(), claim, {(first.key, second.key): np.array([wrong], np.int32)}, False)

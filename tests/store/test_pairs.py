@@ -37,7 +37,7 @@ def key_of(store: Store, name: str) -> str:
 
 
 def claim_all(stored: PairStore, progress: Progress | None = None) -> list[Claim]:
-    progress, found = {} if progress is None else progress, []
+    progress, found = progress or Progress(), []
     while claim := stored.claim(MATCHING, progress):
         found.append(claim)
     return found
@@ -150,7 +150,7 @@ class TestClaims:
         assert sorted(it.reference_id for it in claims) == ["a", "b", "c"]
         assert claim_all(stored) == []
         assert stored.count_waiting(MATCHING) == 3
-        assert stored.claim("another", {}) is not None
+        assert stored.claim("another", Progress()) is not None
 
     def test_each_pair_belongs_to_the_later_reference(self, two: tuple[Store, PairStore]) -> None:
         store, stored = two
@@ -165,7 +165,7 @@ class TestClaims:
         self, two: tuple[Store, PairStore], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         _, stored = two
-        progress: Progress = {}
+        progress = Progress()
         assert len(claim_all(stored, progress)) == 3
         let_pass(monkeypatch, pairs.CLAIM_S - 5)
         assert claim_all(stored, progress) == []
@@ -185,7 +185,7 @@ class TestClaims:
         self, two: tuple[Store, PairStore], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         store, stored = two
-        progress: Progress = {}
+        progress = Progress()
         complete(store, stored)
         let_pass(monkeypatch, 1e6)
         assert claim_all(stored, progress) == []
@@ -210,7 +210,7 @@ class TestClaims:
 
     def test_scenes_of_all_tenants_are_served(self, two: tuple[Store, PairStore]) -> None:
         store, stored = two
-        progress: Progress = {}
+        progress = Progress()
         claim_all(stored, progress)
         store.create_scene(OTHER)
         store.add_references(OTHER, [make_reference("a", 4)])

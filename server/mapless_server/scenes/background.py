@@ -101,7 +101,7 @@ class BackgroundMatching:
         self._is_idle = is_idle
         self._observer = observer
         self.options = options or BackgroundOptions()
-        self._progress: dict[str, Progress] = {matching.name: {} for matching in matchings}
+        self._progress = {matching.name: Progress() for matching in matchings}
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self._pair_s = 0.0
@@ -123,10 +123,6 @@ class BackgroundMatching:
 
     def match_waiting(self) -> None:
         """Matches the references that may be claimed now, until there are none; raises if the store fails."""
-        for matching, finder in self._matchings.items():
-            damaged = finder.take_damaged(matching.name)
-            if damaged:
-                self._pairs.discard(matching.name, damaged)
         found = self._claim()
         if found is None:
             return
@@ -157,7 +153,10 @@ class BackgroundMatching:
         return False
 
     def _claim(self) -> tuple[Matching, Claim] | None:
-        for matching in self._matchings:
+        for matching, finder in self._matchings.items():
+            damaged = finder.take_damaged(matching.name)
+            if damaged:
+                self._pairs.discard(matching.name, damaged)
             claim = self._pairs.claim(matching.name, self._progress[matching.name])
             if claim is not None:
                 return matching, claim

@@ -13,7 +13,7 @@ from __future__ import annotations
 import random
 import time
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from sqlalchemy import Connection, Row, Select, delete, func, literal, or_, select, update
@@ -42,8 +42,18 @@ _MICROSECONDS = 1_000_000
 Pair = tuple[str, str]
 """The keys of two references, in the order of the matches' columns."""
 
-Progress = dict[SceneKey, int]
-"""Generations until which every reference of a scene has been claimed, as far as a server knows."""
+
+@dataclass(eq=False)
+class Progress:
+    """What a server knows of the claims of one matching, so that it reads only what has changed.
+
+    Attributes:
+        generations: until which every reference of a scene has been claimed.
+        generation_sum: of all scenes that ever existed, when every reference of all scenes had been claimed.
+    """
+
+    generations: dict[SceneKey, int] = field(default_factory=dict)
+    generation_sum: int = -1
 
 
 @dataclass(frozen=True)
@@ -84,7 +94,7 @@ class PairStore:
 
         Args:
             matching: its name.
-            progress: of this server with this matching, empty at first; updated.
+            progress: of this server with this matching, new at first; updated.
         """
         while True:
             with self._database.read() as connection:
@@ -193,10 +203,14 @@ def _due(connection: Connection, matching: str) -> Sequence[Row[Any]]:
 def _new(connection: Connection, matching: str, progress: Progress) -> Sequence[Row[Any]]:
     """References of one scene that no server has claimed yet, the oldest first."""
     column = scene_generation.c
+    generation_sum = connection.scalar(select(func.sum(column.generation))) or 0
+    if generation_sum == progress.generation_sum:
+        return []
     scenes = select(column.scene_id, column.generation).join(scene, scene.c.scene_id == column.scene_id)
     generations = {SceneKey(row.scene_id): row.generation for row in connection.execute(scenes)}
-    for gone in progress.keys() - generations.keys():
-        del progress[gone]
+    known = progress.generations
+    for gone in known.keys() - generations.keys():
+        del known[gone]
     is_claimed = (
         select(literal(1))
         .where(reference_matching.c.reference_key == reference.c.key, reference_matching.c.matching == matching)
@@ -204,7 +218,7 @@ def _new(connection: Connection, matching: str, progress: Progress) -> Sequence[
     )
     # In any order, so that a scene of many references does not keep the others waiting.
     for scene_key, generation in random.sample(list(generations.items()), len(generations)):
-        since = progress.get(scene_key, -1)
+        since = known.get(scene_key, -1)
         if since == generation:
             continue
         if since > generation:  # the database was replaced by a backup
@@ -217,7 +231,8 @@ def _new(connection: Connection, matching: str, progress: Progress) -> Sequence[
         found = connection.execute(new.limit(_CANDIDATES)).all()
         if found:
             return found
-        progress[scene_key] = generation
+        known[scene_key] = generation
+    progress.generation_sum = generation_sum
     return []
 
 
