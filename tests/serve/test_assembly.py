@@ -66,7 +66,7 @@ def test_auto_leaves_out_what_is_missing_and_logs_it(
     (record,) = caplog.records
     assert told in record.getMessage()
     assert "\n" not in record.getMessage()
-    assert record.getMessage().startswith("features auto: sift without edgepoint2-l64 and aliked, which ")
+    assert record.getMessage().startswith("features auto: sift; with edgepoint2-l64 and aliked more ")
 
 
 def test_auto_uses_the_best_features_whose_weights_are_there(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -83,7 +83,7 @@ def test_auto_uses_the_best_features_whose_weights_are_there(tmp_path: Path, cap
         (tier,) = make_tiers(settings(tmp_path, device="cpu"))
     assert tier.extractor.name.startswith("edgepoint2-l64-")
     (record,) = caplog.records
-    assert record.getMessage().startswith("features auto: edgepoint2-l64 without aliked, which ")
+    assert record.getMessage().startswith("features auto: edgepoint2-l64; with aliked more ")
     assert record.getMessage().endswith("run `mapless-server weights fetch aliked`")
 
 

@@ -307,7 +307,7 @@ def _make_extractors(settings: Settings, device: str) -> dict[str, FeatureExtrac
                 missing[name] = error
     if missing:
         log.info(
-            "features auto: %s without %s, which localizes from fewer references, farther apart: %s",
+            "features auto: %s; with %s more photographs are localized where references are few or far apart: %s",
             " and ".join(extractors),
             " and ".join(missing),
             _remedy(missing),
