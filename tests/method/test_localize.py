@@ -15,6 +15,7 @@ from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, ran
 
 import mapless_server.method.localize as method
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless_server.method import localize as localize_module
 from mapless_server.method import pnp
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.coarse import Bucket, Outcome, Reconstructor, Request
@@ -394,11 +395,12 @@ def test_low_overlap_is_the_reason() -> None:
         elsewhere = make_scene(random_for("elsewhere", seed), SceneOptions(point_count=400))
         answer = answer_of(pipeline_of("geometric"), query=elsewhere.query)
         assert reason_of(answer) is RejectionReason.LOW_OVERLAP
-        assert list(answer.stage_seconds) == ["correspond", "coarse"]
+        assert list(answer.stage_seconds)[:3] == ["correspond", "coarse", "two_view"]
 
 
 def test_scale_unreliable_is_the_reason() -> None:
-    answer = answer_of(Pipeline(ChangedNetwork(FakeNetwork(SCENE), blinded), MATCHER))
+    pipeline = Pipeline(ChangedNetwork(FakeNetwork(SCENE), blinded), MATCHER)
+    answer = answer_of(pipeline, LocalizeOptions(Variant.FULL))
     assert reason_of(answer) is RejectionReason.SCALE_UNRELIABLE
     assert list(answer.stage_seconds) == ["correspond", "coarse", "scale"]
 
@@ -480,10 +482,14 @@ def looking_back(reconstruction: Reconstruction) -> Reconstruction:
 
 
 def test_pnp_failed_is_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    pipeline = Pipeline(ChangedNetwork(FakeNetwork(SCENE), looking_back), MATCHER)
     monkeypatch.setattr(pnp, "ransac", lambda *_: None)
-    answer = answer_of(Pipeline(ChangedNetwork(FakeNetwork(SCENE), looking_back), MATCHER))
+    found = pose_of(answer_of(pipeline)).world_from_camera
+    assert_pose_close(found, SCENE.world_from_query, metres=0.02, degrees=0.2)  # by two_view
+    monkeypatch.setattr(localize_module, "solve_two_view", lambda *_: None)
+    answer = answer_of(pipeline)
     assert reason_of(answer) is RejectionReason.PNP_FAILED
-    assert list(answer.stage_seconds)[-1] == "pnp"
+    assert list(answer.stage_seconds)[-2:] == ["pnp", "two_view"]
 
 
 # Many queries, in three parts
@@ -559,12 +565,14 @@ def test_a_coarse_answer_has_the_initial_pose_and_its_stage() -> None:
 
 
 def test_without_an_initial_pose_there_is_no_coarse_answer() -> None:
+    """But a refined one, from the matches with the references themselves, where the variant has it."""
     pipeline = Pipeline(ChangedNetwork(FakeNetwork(SCENE), blinded), MATCHER)
     hopeful, settled = reconstruct(
         [prepared_of(pipeline, LocalizeOptions(variant)) for variant in (Variant.BEST, Variant.FULL)]
     )
     assert coarse_answer(coarse_of(hopeful)) is None
-    assert reason_of(refine(coarse_of(hopeful))) is RejectionReason.SCALE_UNRELIABLE
+    found = pose_of(refine(coarse_of(hopeful))).world_from_camera
+    assert_pose_close(found, SCENE.world_from_query, metres=0.02, degrees=0.2)
     assert isinstance(settled, Answer)
     assert reason_of(settled) is RejectionReason.SCALE_UNRELIABLE
 

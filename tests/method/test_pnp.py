@@ -177,7 +177,7 @@ def test_poselib_has_the_options_that_are_passed(monkeypatch: pytest.MonkeyPatch
 
 def test_poselibs_pose_is_camera_from_world_with_w_first() -> None:
     camera_from_world = POSE.inverse()
-    pose = pnp._poselib_pose(POSE)
+    pose = pnp.poselib_pose(camera_from_world)
     np.testing.assert_allclose(pose.R, camera_from_world.rotation, atol=1e-12)
     np.testing.assert_allclose(pose.t, camera_from_world.translation, atol=1e-12)
 

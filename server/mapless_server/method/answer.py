@@ -11,7 +11,7 @@ from mapless.geometry import Array, RigidTransform
 
 from .priors.known import PriorCheck
 from .rejection import Rejection
-from .results import MetricScale, PoseEstimate, PoseStage, Support
+from .results import MetricScale, PoseEstimate, PoseStage, Support, TwoViewSupport
 from .uncertainty.covariance import accuracy_from_covariance
 
 
@@ -24,8 +24,8 @@ class Localization:
         covariance: (6, 6), order x y z rx ry rz, fixed world axes, metres and radians; None for a pose without
             refinement, by request (`Variant.COARSE`) or for lack of time (`PoseStage.COARSE`).
         pose_stage: the stage that gave the pose.
-        inlier_count: number of 2D-3D matches that are inliers.
-        match_count: number of 2D-3D matches.
+        inlier_count: number of 2D-3D matches that are inliers; of two-view matches too, if the pose rests on them.
+        match_count: number of all these matches.
         reprojection_error_px: median of the inliers, pixels of the processed image.
         prior_checks: comparison of the pose with each prior.
         trust: 0 to 1, share of right answers whose score is at most as high (see `judge`); None for a pose without
@@ -42,15 +42,19 @@ class Localization:
     trust: float | None = None
 
     @classmethod
-    def of(cls, estimate: PoseEstimate, match_count: int, trust: float) -> Localization:
-        """The localization of an accepted estimate."""
+    def of(cls, estimate: PoseEstimate, trust: float, two_view: TwoViewSupport | None = None) -> Localization:
+        """The localization of an accepted estimate, and the two-view matches that it rests on, if any."""
+        errors_px, inliers = estimate.errors_px, estimate.inliers
+        if two_view is not None:
+            errors_px = np.concatenate([errors_px, two_view.errors_px])
+            inliers = np.concatenate([inliers, two_view.inliers])
         return cls(
             estimate.world_from_camera,
             estimate.covariance,
             estimate.stage,
-            int(estimate.inliers.sum()),
-            match_count,
-            float(np.median(estimate.errors_px[estimate.inliers])),
+            int(inliers.sum()),
+            len(inliers),
+            float(np.median(errors_px[inliers])),
             estimate.prior_checks,
             trust,
         )

@@ -1,5 +1,7 @@
 """The method on one screen: correspond > coarse > scale > structure > match > pnp > gate > adjust > covariance > judge.
 
+Where the references share too little with one another for that, `two_view` follows.
+
 `localize` calls the three parts in order for one query. The queue calls each part separately: `prepare` (correspond),
 `reconstruct` (coarse and scale of a batch of queries; in `pipeline`), `refine` (the rest).
 """
@@ -22,7 +24,16 @@ from .rejection import Rejection, RejectionReason
 from .results import MetricScale, PointMatches, Structure, Support
 from .structure import build_structure
 from .trust.gate import gate_failure
-from .trust.judge import judge
+from .trust.judge import contradiction, judge
+from .trust.two_view import (
+    lacks_distance,
+    one_reference_rejection,
+    two_view_evidence,
+    two_view_failure,
+    two_view_trust,
+)
+from .trust.votes import votes_of
+from .two_view.solve import solve_two_view
 from .uncertainty.covariance import pose_covariance
 from .views import Matches, PosedView, View
 
@@ -92,13 +103,14 @@ def prepare(
 def refine(coarse: Coarse) -> Answer:
     """Structure, matches and pose; if the result is weak, all again from wide correspondences.
 
-    If the gate still rejects the pose, its agreement with gravity or heading is counted as evidence for it.
+    If the gate still rejects the pose, its agreement with gravity or heading is counted as evidence for it. If that
+    does not help either, the pose is estimated from matches with the references themselves (see `two_view`).
     """
     answer = _strict_then_wide(coarse, counts_agreement=False)
     is_gated = isinstance(answer.outcome, Rejection) and answer.outcome.reason is RejectionReason.GATE
     if is_gated and coarse.prepared.priors.has_directions:
-        return _strict_then_wide(coarse, counts_agreement=True)
-    return answer
+        answer = _strict_then_wide(coarse, counts_agreement=True)
+    return _solve_two_view(coarse, answer) if coarse.prepared.can_use_two_views(answer) else answer
 
 
 def _strict_then_wide(coarse: Coarse, counts_agreement: bool) -> Answer:
@@ -141,7 +153,49 @@ def _solve(coarse: Coarse, counts_agreement: bool) -> Answer:
         judged = judge(support, query_matches, prepared.options.coverage, options.judge, chance)
     if judged.rejection:
         return coarse.answer(judged.rejection, support)
-    return coarse.answer(Localization.of(estimate, len(matches), judged.trust), support)
+    return coarse.answer(Localization.of(estimate, judged.trust), support)
+
+
+def _solve_two_view(coarse: Coarse, answer: Answer) -> Answer:
+    """The answer from two-view matches and 2D-3D matches together; the given rejection if that gives none."""
+    support = _two_view_support(coarse, answer.support)
+    answer = replace(answer, stage_seconds=dict(coarse.prepared.context.stage_seconds))
+    if support is None or support.estimate is None:
+        return answer
+    prepared, options = coarse.prepared, coarse.prepared.pipeline.options
+    query_matches, estimate = prepared.correspondences.query_matches, support.estimate
+    with prepared.context.stage("judge"):
+        evidence = two_view_evidence(support, query_matches, options.two_view_gate)
+        doubt, trust = (
+            two_view_failure(evidence, options.two_view_gate),
+            two_view_trust(evidence, options.two_view_gate),
+        )
+        rejection = None if doubt else contradiction(support, votes_of(support, query_matches), options.judge)
+    if rejection:
+        return coarse.answer(rejection, support)
+    if doubt and lacks_distance(evidence, options.two_view_gate):
+        assert isinstance(answer.outcome, Rejection)
+        return replace(answer, outcome=one_reference_rejection(answer.outcome.reason, doubt, support))
+    if doubt or trust < 1 - prepared.options.coverage:
+        return answer
+    return coarse.answer(Localization.of(estimate, trust, support.two_view), support)
+
+
+def _two_view_support(coarse: Coarse, found: Support | None) -> Support | None:
+    """The pose from two-view matches and wide correspondences; a pose found before is a candidate."""
+    prepared, options = coarse.prepared, coarse.prepared.pipeline.options
+    query, references, context = prepared.query, prepared.references, prepared.context
+    query_matches, matcher = prepared.correspondences.query_matches, prepared.pipeline.matcher
+    known = [found.estimate.world_from_camera] if found and found.estimate else []
+    with context.stage("two_view"):
+        wide = matcher.correspond(query, references, True, context.check, query_matches)
+        stages = prepared.structure_options, prepared.match_options, options.adjust
+        result = solve_two_view(query, references, wide, known, prepared.origin, *stages, options.two_view)
+    if result is None or result.estimate is None:
+        return None
+    checks = prepared.priors.check(result.estimate.world_from_camera, result.estimate.covariance)
+    unused = tuple(replace(it, used=False) for it in checks)
+    return replace(result, estimate=replace(result.estimate, prior_checks=unused))
 
 
 def _structure_and_matches(coarse: Coarse, scale: MetricScale) -> tuple[Structure, PointMatches]:

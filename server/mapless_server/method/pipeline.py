@@ -32,6 +32,8 @@ from .scale_equations import ScaleOptions
 from .structure import PAPER_STRUCTURE, StructureOptions
 from .trust.gate import GateOptions
 from .trust.judge import JudgeOptions
+from .trust.two_view import TwoViewGateOptions
+from .two_view.solve import TwoViewOptions
 from .views import PosedView, View
 
 T = TypeVar("T")
@@ -51,6 +53,8 @@ class StageOptions:
         gate: of the gate.
         adjust: of the final adjustment.
         judge: of the judge.
+        two_view: of the pose from matches with the references themselves, for queries that fail otherwise.
+        two_view_gate: of its acceptance.
     """
 
     weak_inliers: int = 100
@@ -59,6 +63,8 @@ class StageOptions:
     gate: GateOptions = field(default_factory=GateOptions)
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
     judge: JudgeOptions = field(default_factory=JudgeOptions)
+    two_view: TwoViewOptions = field(default_factory=TwoViewOptions)
+    two_view_gate: TwoViewGateOptions = field(default_factory=TwoViewGateOptions)
 
     @staticmethod
     def structure(variant: Variant) -> StructureOptions:
@@ -136,6 +142,17 @@ class Prepared:
         if isinstance(answer.outcome, Rejection):
             return answer.outcome.reason not in (RejectionReason.DEGENERATE_REFERENCES, RejectionReason.AMBIGUOUS)
         return answer.outcome.inlier_count < self.pipeline.options.weak_inliers
+
+    def can_use_two_views(self, answer: Answer) -> bool:
+        """Whether a pose may be found from matches with the references themselves, after this answer.
+
+        Not where a stage has found what is wrong: a second place, the focal length, or references at one place.
+        """
+        outcome = answer.outcome
+        if self.options.variant is not Variant.BEST or len(self.references) < 2 or isinstance(outcome, Localization):
+            return False
+        starved = outcome.reason not in (RejectionReason.DEGENERATE_REFERENCES, RejectionReason.AMBIGUOUS)
+        return starved and outcome.hint is None
 
 
 @dataclass(frozen=True, eq=False)

@@ -126,12 +126,7 @@ def ransac(
     pose, _ = poselib.estimate_absolute_pose(
         pixels[::step],
         x_in_world[::step],
-        {
-            "model": "PINHOLE",
-            "width": camera.width_px,
-            "height": camera.height_px,
-            "params": [camera.focal_x_px, camera.focal_y_px, camera.principal_x_px, camera.principal_y_px],
-        },
+        poselib_camera(camera),
         {
             "max_reproj_error": options.inlier_px,
             "min_iterations": options.min_iterations,
@@ -139,7 +134,7 @@ def ransac(
             "seed": 0,
         },
         {"loss_type": "CAUCHY", "loss_scale": options.loss_scale_px},
-        None if world_from_camera is None else _poselib_pose(world_from_camera),
+        None if world_from_camera is None else poselib_pose(world_from_camera.inverse()),
     )
     rotation, translation = np.asarray(pose.R), np.asarray(pose.t)
     if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
@@ -147,9 +142,19 @@ def ransac(
     return RigidTransform(rotation, translation).inverse()
 
 
-def _poselib_pose(world_from_camera: RigidTransform) -> poselib.CameraPose:
-    camera_from_world = world_from_camera.inverse()
-    q = camera_from_world.quaternion()
+def poselib_camera(camera: Camera) -> dict[str, object]:
+    """A pinhole camera as PoseLib takes it."""
+    return {
+        "model": "PINHOLE",
+        "width": camera.width_px,
+        "height": camera.height_px,
+        "params": [camera.focal_x_px, camera.focal_y_px, camera.principal_x_px, camera.principal_y_px],
+    }
+
+
+def poselib_pose(target_from_source: RigidTransform) -> poselib.CameraPose:
+    """A pose as PoseLib takes it; those of cameras are camera_from_world."""
+    q = target_from_source.quaternion()
     pose = poselib.CameraPose()
-    pose.q, pose.t = np.array([q.w, q.x, q.y, q.z]), camera_from_world.translation
+    pose.q, pose.t = np.array([q.w, q.x, q.y, q.z]), target_from_source.translation
     return pose

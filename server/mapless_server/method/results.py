@@ -151,6 +151,27 @@ class PoseEstimate:
 
 
 @dataclass(frozen=True, eq=False)
+class TwoViewSupport:
+    """Matches of the query with single references, of keypoints that are no inliers through a point.
+
+    Attributes:
+        reference: (T,) index of the reference.
+        keypoint: (T,) index into the query's keypoints; once for each reference at most.
+        reference_keypoint: (T,) index into the reference's keypoints.
+        x_in_world: (T, 3) metres, triangulated from both with the query's pose; NaN behind a camera.
+        errors_px: (T,) Sampson distances from the epipolar constraint.
+        inliers: (T,) which of them agree with the pose.
+    """
+
+    reference: NDArray[np.intp]
+    keypoint: NDArray[np.intp]
+    reference_keypoint: NDArray[np.intp]
+    x_in_world: Array
+    errors_px: Array
+    inliers: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
 class Support:
     """The data that a pose is estimated from, and the estimate.
 
@@ -163,6 +184,7 @@ class Support:
         matches: of the query with the points.
         estimate: pose and inliers; None without a pose.
         origin: (3,) that origin in the caller's world, metres.
+        two_view: matches with single references, where the pose rests on them too.
     """
 
     query: View
@@ -171,13 +193,16 @@ class Support:
     matches: PointMatches
     estimate: PoseEstimate | None
     origin: Array
+    two_view: TwoViewSupport | None = None
 
     def inliers_by_reference(self) -> tuple[int, ...]:
-        """Per reference, inliers on points that it observes."""
+        """Per reference, inliers on points that it observes, and inliers of two views."""
         count = len(self.references)
         if self.estimate is None:
             return (0,) * count
         agreeing = np.zeros(len(self.structure.x_in_world), bool)
         agreeing[self.matches.point[self.estimate.inliers]] = True
         seen = self.structure.tracks.view[agreeing[self.structure.tracks.point]]
+        if self.two_view is not None:
+            seen = np.concatenate([seen, self.two_view.reference[self.two_view.inliers]])
         return tuple(np.bincount(seen, minlength=count).tolist())

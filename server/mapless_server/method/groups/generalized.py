@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, Camera, RigidTransform, Similarity
 
 from ..perturbation import reprojection_errors_px
-from ..pnp import PnpOptions
+from ..pnp import PnpOptions, poselib_camera, poselib_pose
 
 _libc = ctypes.CDLL(None)
 _rand_lock = threading.Lock()
@@ -82,8 +82,8 @@ def rig_ransac(cameras: Sequence[CameraMatches], options: PnpOptions) -> RigidTr
         pose, _ = poselib.estimate_generalized_absolute_pose(
             [camera.pixels for camera in cameras],
             [camera.x_in_world for camera in cameras],
-            [_poselib_pose(camera.rig_from_camera.inverse()) for camera in cameras],
-            [_poselib_camera(camera.camera) for camera in cameras],
+            [poselib_pose(camera.rig_from_camera.inverse()) for camera in cameras],
+            [poselib_camera(camera.camera) for camera in cameras],
             {
                 "max_reproj_error": options.inlier_px,
                 "min_iterations": options.min_iterations,
@@ -177,19 +177,3 @@ def _world_from_rig(pose: poselib.CameraPose) -> RigidTransform | None:
     if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
         return None
     return RigidTransform(rotation, translation).inverse()
-
-
-def _poselib_pose(target_from_source: RigidTransform) -> poselib.CameraPose:
-    q = target_from_source.quaternion()
-    pose = poselib.CameraPose()
-    pose.q, pose.t = np.array([q.w, q.x, q.y, q.z]), target_from_source.translation
-    return pose
-
-
-def _poselib_camera(camera: Camera) -> dict[str, object]:
-    return {
-        "model": "PINHOLE",
-        "width": camera.width_px,
-        "height": camera.height_px,
-        "params": [camera.focal_x_px, camera.focal_y_px, camera.principal_x_px, camera.principal_y_px],
-    }

@@ -74,18 +74,25 @@ def log10_false_alarms(camera: Camera, matches: PointMatches, inliers: NDArray[n
     )
 
 
-def false_alarms(match_count: int, inlier_count: int, chance: float) -> float:
-    """log10 of (n - 3) C(n, k) C(k, 3) p^(k - 3), at least k of n matches agreeing with a pose through three of them.
+def false_alarms(match_count: int, inlier_count: int, chance: float, sample: int = 3) -> float:
+    """log10 of (n - m) C(n, k) C(k, m) p^(k - m), at least k of n matches agreeing with a pose through m of them.
 
     Args:
         match_count: n.
         inlier_count: k.
         chance: p, the probability that a wrong match agrees.
+        sample: m, the number of matches that determine a pose.
     """
-    n, k = match_count, inlier_count
-    if k <= 3 or chance >= 1:
+    n, k, m = match_count, inlier_count, sample
+    if k <= m or chance >= 1:
         return np.inf
-    return float((np.log(n - 3) + _log_choose(n, k) + _log_choose(k, 3) + (k - 3) * np.log(chance)) / np.log(10))
+    return float((np.log(n - m) + _log_choose(n, k) + _log_choose(k, m) + (k - m) * np.log(chance)) / np.log(10))
+
+
+def log10_tail(match_count: int, inlier_count: int, chance: float) -> float:
+    """log10 of an upper bound of the probability of k or more inliers of n wrong matches, (n + 1) C(n, k) p^k."""
+    n, k = match_count, inlier_count
+    return float(min(0.0, (np.log(n + 1) + _log_choose(n, k) + k * np.log(chance)) / np.log(10)))
 
 
 def format_false_alarms(log10_expected: float) -> str:

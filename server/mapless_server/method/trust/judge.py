@@ -31,7 +31,7 @@ from .agreement import AgreementOptions
 from .ambiguity import AmbiguityOptions, find_rival
 from .evidence import Evidence, evidence_of
 from .focal import Focal, FocalOptions, wrong_focal
-from .votes import votes_of
+from .votes import Votes, votes_of
 
 _RARE = (0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075)
 LEVELS = (*_RARE, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
@@ -108,15 +108,19 @@ def judge(
     votes = votes_of(support, query_matches)
     evidence = evidence_of(support, votes, options.agreement)
     trust = trust_of(evidence, options, log10_chance)
+    rejection = contradiction(support, votes, options)
+    if rejection is None and trust < 1 - coverage:
+        rejection = _low_trust(evidence, trust, coverage)
+    return Judgement(trust, evidence, rejection)
+
+
+def contradiction(support: Support, votes: Votes, options: JudgeOptions) -> Rejection | None:
+    """A rejection if the matches with points contradict the focal length, or support a second pose about as well."""
     focal = wrong_focal(support, options.focal)
     if focal:
-        return Judgement(trust, evidence, _miscalibrated(support, focal))
+        return _miscalibrated(support, focal)
     hypotheses = find_rival(support, votes, options.ambiguity)
-    if hypotheses:
-        return Judgement(trust, evidence, _ambiguous(hypotheses))
-    if trust < 1 - coverage:
-        return Judgement(trust, evidence, _low_trust(evidence, trust, coverage))
-    return Judgement(trust, evidence, None)
+    return _ambiguous(hypotheses) if hypotheses else None
 
 
 def trust_of(evidence: Evidence, options: JudgeOptions, log10_chance: float = 0.0) -> float:

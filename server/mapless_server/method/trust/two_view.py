@@ -1,0 +1,180 @@
+"""Whether a pose from two-view matches and 2D-3D matches is right, or chance and repetition could have produced it.
+
+Two a-contrario tests (see `gate`):
+
+    pose        as many inliers among wrong matches, at a pose through three 2D-3D matches or six two-view matches. Each
+                kind has its own chance of an inlier, a disc or a band in the image, and the numbers of inliers of the
+                two are independent, so the chances multiply.
+    distance    as many inliers among the matches that do not involve the reference with the most inliers, at the right
+                direction from it and a distance through one of them. One reference alone determines the direction:
+                hundreds of its matches agree with any distance. The chance is that of a band for both kinds, because
+                a point that this reference observes lies on the epipolar line whatever the distance.
+
+Wrong matches of repeated texture agree with one another, so a second reference must support the pose with a share of
+its own matches. This share gives the trust: the share of right answers with one as low (see `judge`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from mapless.geometry import Array
+
+from ..options import check_bounds
+from ..rejection import Advice, Hint, Rejection, RejectionReason
+from ..results import Support
+from ..two_view.matches import TwoViewMatches
+from ..two_view.pose import band_chance, disc_chance
+from ..views import Matches
+from .gate import false_alarms, format_false_alarms, log10_tail
+
+LEVELS = (0.0, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 1.0)
+"""Shares of the right answers at which `TwoViewGateOptions.shares` are the quantiles."""
+
+
+@dataclass(frozen=True)
+class TwoViewGateOptions:
+    """Options of the test.
+
+    Attributes:
+        max_log10_pose: largest log10 of the expected number of such poses among wrong matches. Of 220 photographs with
+            references of other places none was below -3.
+        max_log10_distance: the same of such distances.
+        min_second_share: least share of inliers among the matches of the reference with the second most inliers. On
+            a statue that looks alike from several sides, wrong poses had up to 0.26, and one with a wrong focal length,
+            off by 6 degrees, 0.32; of 31 right answers to photographs that failed otherwise 22 have more.
+        min_hull_share: least share of the image covered by the convex hull of the inliers; see `GateOptions`.
+        shares: quantiles of the second reference's share of those right answers at `LEVELS`.
+        inlier_px: largest reprojection error of an inlier.
+        epipolar_px: largest Sampson distance of an inlier.
+    """
+
+    max_log10_pose: float = -15.0
+    max_log10_distance: float = -5.0
+    min_second_share: float = 0.35
+    min_hull_share: float = 0.04
+    shares: tuple[float, ...] = (0.253, 0.256, 0.274, 0.288, 0.331, 0.432, 0.476, 0.636)
+    inlier_px: float = 4.0
+    epipolar_px: float = 2.0
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "max_log10_pose max_log10_distance", at_most=0)
+        check_bounds(self, "min_second_share min_hull_share shares", at_least=0, at_most=1)
+        check_bounds(self, "inlier_px epipolar_px", above=0)
+        if len(self.shares) != len(LEVELS) or list(self.shares) != sorted(self.shares):
+            raise ValueError(f"TwoViewGateOptions.shares must be {len(LEVELS)} rising numbers, is {self.shares}")
+
+
+@dataclass(frozen=True)
+class TwoViewEvidence:
+    """The evidence for a pose.
+
+    Attributes:
+        log10_pose: log10 of the expected number of such poses; see the module.
+        log10_distance: log10 of the expected number of such distances.
+        inlier_count: number of inliers of both kinds.
+        match_count: number of matches of both kinds.
+        other_inliers: inliers on points, and of references other than the one with the most.
+        second_share: share of inliers among the matches of the reference with the second most.
+        hull_share: share of the image covered by the convex hull of the inliers.
+    """
+
+    log10_pose: float
+    log10_distance: float
+    inlier_count: int
+    match_count: int
+    other_inliers: int
+    second_share: float
+    hull_share: float
+
+
+def two_view_evidence(
+    support: Support, query_matches: Sequence[Matches], options: TwoViewGateOptions
+) -> TwoViewEvidence:
+    """The evidence for the estimate of a support with two-view matches.
+
+    Args:
+        support: with an estimate and two-view matches.
+        query_matches: of the query with each reference.
+        options: see there.
+
+    Raises:
+        ValueError: there is no estimate, or there are no two-view matches.
+    """
+    estimate, lines, matches, camera = support.estimate, support.two_view, support.matches, support.query.camera
+    if estimate is None or lines is None:
+        raise ValueError("support.estimate and support.two_view must not be None")
+    disc, band = disc_chance(camera, options.inlier_px), band_chance(camera, options.epipolar_px)
+    # Matches searched near a pose agree with it by construction.
+    points = int((~matches.guided).sum()), int((estimate.inliers & ~matches.guided).sum())
+    all_lines = len(lines.inliers), int(lines.inliers.sum())
+    pose = min(
+        false_alarms(*points, disc) + log10_tail(*all_lines, band),
+        false_alarms(*all_lines, band, sample=6) + log10_tail(*points, disc),
+    )
+    every = TwoViewMatches.of(support.query, support.references, query_matches)
+    agreeing = every.sampson_px(estimate.world_from_camera) < options.epipolar_px
+    counts = np.bincount(every.reference[agreeing], minlength=len(support.references))
+    strongest, second = np.argsort(-counts, kind="stable")[:2]
+    others = lines.reference != strongest
+    other_inliers = int(lines.inliers[others].sum()) + points[1]
+    distance = false_alarms(int(others.sum()) + points[0], other_inliers, band, sample=1)
+    keypoint = np.concatenate([matches.keypoint[estimate.inliers], lines.keypoint[lines.inliers]])
+    return TwoViewEvidence(
+        pose,
+        distance,
+        points[1] + all_lines[1],
+        points[0] + all_lines[0],
+        other_inliers,
+        float(counts[second] / max(1, len(query_matches[second]))),
+        _hull_px2(support.query.features.keypoints[keypoint]) / (camera.width_px * camera.height_px),
+    )
+
+
+def lacks_distance(evidence: TwoViewEvidence, options: TwoViewGateOptions) -> bool:
+    """Whether one reference supports the pose, and too few other matches do."""
+    return evidence.log10_pose <= options.max_log10_pose and evidence.log10_distance > options.max_log10_distance
+
+
+def two_view_failure(evidence: TwoViewEvidence, options: TwoViewGateOptions) -> str | None:
+    """Why a pose fails, in one sentence; None if it passes."""
+    count = f"{evidence.inlier_count} of {evidence.match_count} matches with references and points agree on a pose"
+    if evidence.log10_pose > options.max_log10_pose:
+        return f"{count}, which chance could do ({format_false_alarms(evidence.log10_pose)})"
+    if lacks_distance(evidence, options):
+        return (
+            f"{count}, but all except {evidence.other_inliers} of them are with one reference, and one reference tells "
+            "the direction but no distance"
+        )
+    if evidence.second_share < options.min_second_share:
+        return (
+            f"{count}, but of the matches with the second reference only {100 * evidence.second_share:.0f} %: repeated "
+            "structure somewhere else, most likely"
+        )
+    if evidence.hull_share < options.min_hull_share:
+        return f"{count}, but they cover only {100 * evidence.hull_share:.1f} % of the image"
+    return None
+
+
+def one_reference_rejection(reason: RejectionReason, message: str, support: Support) -> Rejection:
+    """The rejection of a pose without a distance, with what helps."""
+    best = support.references[int(np.argmax(support.inliers_by_reference()))].name
+    advice = (
+        f"Add references that show the same as {best} from a step aside, or use others: one reference tells the "
+        "direction, but no distance."
+    )
+    return Rejection(reason, message, Hint("two_view", Advice.ADD_REFERENCES, advice, best))
+
+
+def two_view_trust(evidence: TwoViewEvidence, options: TwoViewGateOptions) -> float:
+    """Trust, 0 to 1: share of right answers whose second reference has at most this share of inliers."""
+    return float(np.interp(evidence.second_share, options.shares, LEVELS))
+
+
+def _hull_px2(pixels: Array) -> float:
+    """Area of the convex hull of pixels (N, 2); 0 of fewer than three."""
+    return float(ConvexHull(pixels, qhull_options="QJ").volume) if len(pixels) >= 3 else 0.0

@@ -1,0 +1,1 @@
+"""Pose from matches with the references themselves, where they share too little to triangulate: begin with `solve`."""

@@ -1,0 +1,313 @@
+"""Poses from matches with the references themselves: planted truth without a single point that two references share.
+
+Each reference observes points of its own, so nothing can be triangulated; the query observes the points of all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.scenes import CAMERA, random_for
+
+from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless_server.method.adjust import AdjustOptions
+from mapless_server.method.answer import Localization
+from mapless_server.method.coarse.make import make_reconstructor
+from mapless_server.method.correspond import Correspondences, Matcher
+from mapless_server.method.epipolar import sampson_px
+from mapless_server.method.localize import localize
+from mapless_server.method.match import MatchOptions
+from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.perturbation import moved, rotation_vector
+from mapless_server.method.pipeline import Pipeline
+from mapless_server.method.rejection import Advice, Rejection, RejectionReason
+from mapless_server.method.results import Support
+from mapless_server.method.structure import StructureOptions
+from mapless_server.method.trust.two_view import (
+    TwoViewEvidence,
+    TwoViewGateOptions,
+    lacks_distance,
+    two_view_evidence,
+    two_view_failure,
+    two_view_trust,
+)
+from mapless_server.method.two_view.matches import TwoViewMatches
+from mapless_server.method.two_view.pose import RelativePoseOptions, band_chance, disc_chance
+from mapless_server.method.two_view.solve import TwoViewOptions, few_references_factor, solve_two_view
+from mapless_server.method.views import Features, Matches, PosedView, View
+
+TRUE = RigidTransform(rotation_from_vector([0.1, -0.15, 0.05]), np.array([0.3, -0.1, -4.2]))
+CENTRES = ((-1.2, 0.1, -4.0), (1.0, -0.2, -4.4), (0.2, 0.5, -3.6))
+ORIGIN = np.zeros(3)
+GATE = TwoViewGateOptions()
+
+
+@dataclass(frozen=True, eq=False)
+class Planted:
+    """A query and its references, and the matches among them."""
+
+    query: View
+    references: tuple[PosedView, ...]
+    correspondences: Correspondences
+
+    def solved(self, options: TwoViewOptions | None = None) -> Support | None:
+        stages = StructureOptions(), MatchOptions(), AdjustOptions()
+        return solve_two_view(
+            self.query, self.references, self.correspondences, (), ORIGIN, *stages, options or TwoViewOptions()
+        )
+
+    def evidence(self, support: Support) -> TwoViewEvidence:
+        return two_view_evidence(support, self.correspondences.query_matches, GATE)
+
+
+class Given(Matcher):
+    """Matches as planted."""
+
+    def __init__(self, correspondences: Correspondences) -> None:
+        super().__init__()
+        self._given = correspondences
+
+    def correspond(
+        self,
+        query: View,
+        references: Sequence[PosedView],
+        wide: bool = False,
+        check: Callable[[], None] = lambda: None,
+        query_matches: Sequence[Matches] | None = None,
+    ) -> Correspondences:
+        return self._given
+
+
+def view_of(pixels: Array, random: np.random.Generator) -> View:
+    """Keypoints with descriptors that have nothing in common."""
+    descriptors = random.normal(size=(len(pixels), 64))
+    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+    sizes_px = np.full(len(pixels), 2.0, np.float32)
+    return View(CAMERA, Features(pixels.astype(np.float32), descriptors.astype(np.float32), sizes_px))
+
+
+def planted(
+    counts: Sequence[int] = (60, 60, 60),
+    noise_px: float = 0.0,
+    wrong_share: float = 0.0,
+    seed: int = 0,
+    pose_noise_px: float = 0.0,
+) -> Planted:
+    """References that observe so many points each, all of which the query observes too; keypoint i of point i.
+
+    The stored poses of the references are turned by so many pixels, and shifted by as much at four metres.
+    """
+    random = random_for("two views", counts, noise_px, wrong_share, seed)
+    references: list[PosedView] = []
+    seen: list[Array] = []
+    matches: list[Matches] = []
+    for index, (count, centre) in enumerate(zip(counts, CENTRES, strict=False)):
+        pose = RigidTransform(rotation_from_vector(random.normal(0, 0.05, 3)), np.array(centre))
+        points = random.uniform([-1.6, -1.1, -1.0], [1.6, 1.1, 1.5], (count, 3))
+        own, queried = (CAMERA.project(it.inverse().apply(points)) for it in (pose, TRUE))
+        wrong = np.arange(count) < wrong_share * count
+        queried = np.where(wrong[:, None], random.uniform([0, 0], [959, 719], (count, 2)), queried)
+        own, queried = (it + random.normal(0, noise_px, it.shape) for it in (own, queried))
+        angle = pose_noise_px / CAMERA.focal_x_px
+        stored = moved(pose, random.normal(0, np.repeat([4 * angle, angle], 3))) if pose_noise_px else pose
+        references.append(PosedView(f"{index}", f"reference {index}", view_of(own, random), stored))
+        first = len(np.concatenate(seen)) if seen else 0
+        matches.append(np.stack([first + np.arange(count), np.arange(count)], axis=1).astype(np.int32))
+        seen.append(queried)
+    nothing = np.empty((0, 2), np.int32)
+    pairs = {(i, j): nothing for i in range(len(counts)) for j in range(i + 1, len(counts))}
+    query = view_of(np.concatenate(seen), random)
+    return Planted(query, tuple(references), Correspondences(pairs, tuple(matches)))
+
+
+def error_of(pose: RigidTransform) -> Array:
+    """The error (6,): x y z rx ry rz."""
+    return np.concatenate([pose.translation - TRUE.translation, rotation_vector(pose.rotation @ TRUE.rotation.T)])
+
+
+def pose_of(support: Support | None) -> RigidTransform:
+    assert support is not None
+    assert support.estimate is not None
+    return support.estimate.world_from_camera
+
+
+@pytest.mark.parametrize("counts", [(40, 40), (60, 12), (60, 60, 60)])
+def test_exact_matches_give_the_true_pose_without_any_point(counts: tuple[int, ...]) -> None:
+    support = planted(counts).solved()
+    assert support is not None
+    assert not len(support.matches)
+    np.testing.assert_allclose(error_of(pose_of(support)), 0, atol=1e-4)  # keypoints are float32
+
+
+@pytest.mark.parametrize("wrong_share", [0.3, 0.6])
+def test_wrong_matches_among_right_ones_are_no_inliers(wrong_share: float) -> None:
+    for seed in range(3):
+        problem = planted((80, 60, 50), 0.5, wrong_share, seed)
+        support = problem.solved()
+        assert np.linalg.norm(error_of(pose_of(support))[:3]) < 0.05
+        assert support is not None
+        assert two_view_failure(problem.evidence(support), GATE) is None
+
+
+def test_the_same_matches_give_the_same_pose() -> None:
+    first, second = (pose_of(planted((50, 30), 0.5, 0.4).solved()) for _ in range(2))
+    np.testing.assert_array_equal(first.rotation, second.rotation)
+    np.testing.assert_array_equal(first.translation, second.translation)
+
+
+def test_poses_do_not_depend_on_the_unit_of_length() -> None:
+    problem = planted((50, 40), 0.5)
+    feet = [
+        replace(r, world_from_camera=replace(r.world_from_camera, translation=r.world_from_camera.translation * 3.28))
+        for r in problem.references
+    ]
+    scaled = replace(problem, references=tuple(feet))
+    expected = pose_of(problem.solved()).translation
+    np.testing.assert_allclose(pose_of(scaled.solved()).translation / 3.28, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("pose_noise_px", [0.0, 1.0])
+def test_covariance_is_right_against_planted_noise(pose_noise_px: float) -> None:
+    """The mean squared errors of 30 poses, over the mean of what is stated."""
+    errors, stated = [], []
+    plain = replace(
+        AdjustOptions(), uncertainty=replace(AdjustOptions().uncertainty, shared_matches=1e9, rotation_factor=1.0)
+    )
+    for seed in range(30):
+        problem = planted((60, 60, 60), 0.5, 0.0, seed, pose_noise_px)
+        support = solve_two_view(
+            problem.query, problem.references, problem.correspondences, (), ORIGIN,
+            StructureOptions(), MatchOptions(), plain, TwoViewOptions(),
+        )  # fmt: skip
+        assert support is not None
+        assert support.estimate is not None
+        errors.append(error_of(support.estimate.world_from_camera))
+        stated.append(np.diag(support.estimate.covariance))
+    for axes in (slice(0, 3), slice(3, 6)):
+        ratio = np.sqrt(np.mean(np.square(errors), axis=0)[axes].sum() / np.mean(stated, axis=0)[axes].sum())
+        assert 0.4 < ratio < 1.2, ratio
+
+
+def test_one_reference_tells_the_direction_but_no_distance() -> None:
+    problem = planted((120, 2), 0.3)
+    answer = localize(
+        problem.query,
+        problem.references,
+        Pipeline(make_reconstructor("geometric", Path()), Given(problem.correspondences)),
+        LocalizeOptions(),
+    )
+    assert isinstance(answer.outcome, Rejection)
+    assert "one reference tells the direction but no distance" in answer.outcome.message
+    hint = answer.outcome.hint
+    assert hint is not None
+    assert (hint.advice, hint.best_reference) == (Advice.ADD_REFERENCES, "reference 0")
+
+
+def test_localize_answers_where_nothing_can_be_triangulated() -> None:
+    problem = planted((70, 60, 50), 0.5, 0.3)
+    pipeline = Pipeline(make_reconstructor("geometric", Path()), Given(problem.correspondences))
+    answer = localize(problem.query, problem.references, pipeline, LocalizeOptions())
+    assert isinstance(answer.outcome, Localization), answer.outcome
+    assert np.linalg.norm(error_of(answer.outcome.world_from_camera)[:3]) < 0.05
+    assert "two_view" in answer.stage_seconds
+    assert 100 < answer.outcome.inlier_count < answer.outcome.match_count == 180
+    assert sum(answer.reference_inlier_counts) == answer.outcome.inlier_count
+    failed = localize(problem.query, problem.references[:1], pipeline, LocalizeOptions()).outcome
+    assert isinstance(failed, Rejection)
+    assert failed.reason is RejectionReason.NO_USABLE_REFERENCES
+
+
+def test_random_matches_have_no_accepted_pose() -> None:
+    for seed in range(4):
+        problem = planted((150, 120, 100), 0.0, 1.0, seed)
+        support = problem.solved()
+        assert support is None or two_view_failure(problem.evidence(support), GATE) is not None
+
+
+def test_a_second_reference_of_another_place_is_no_support() -> None:
+    """One relative pose is right, the matches with the other references are random."""
+    right, random = planted((150, 100), 0.3), planted((150, 100), 0.0, 1.0)
+    counts = [len(it) for it in right.correspondences.query_matches]
+    features = right.query.features
+    mixed = np.concatenate([features.keypoints[: counts[0]], random.query.features.keypoints[counts[0] :]])
+    problem = replace(right, query=replace(right.query, features=replace(features, keypoints=mixed)))
+    support = problem.solved()
+    assert support is not None
+    assert lacks_distance(problem.evidence(support), GATE)
+
+
+def test_sampson_distances_are_those_of_the_fundamental_matrix() -> None:
+    problem = planted((30, 20), 1.0, 0.5)
+    two_view = TwoViewMatches.of(problem.query, problem.references, problem.correspondences.query_matches)
+    pose = moved(TRUE, np.array([0.1, -0.2, 0.3, 0.02, 0.01, -0.03]))
+    expected = [
+        sampson_px(PosedView("", "", problem.query, pose), reference, matches)
+        for reference, matches in zip(problem.references, problem.correspondences.query_matches, strict=True)
+    ]
+    np.testing.assert_allclose(two_view.sampson_px(pose), np.concatenate(expected), rtol=1e-6)
+
+
+def test_sampson_distances_along_a_line_are_those_at_its_points() -> None:
+    problem = planted((30, 20), 1.0)
+    two_view = TwoViewMatches.of(problem.query, problem.references, problem.correspondences.query_matches)
+    direction, distances = np.array([0.3, 0.1, -0.2]), np.array([-1.0, 0.0, 2.5])
+    along = two_view.sampson_along_px(TRUE.rotation, TRUE.translation, direction, distances)
+    for distance, row in zip(distances, along, strict=True):
+        np.testing.assert_allclose(row, two_view.sampson_px(TRUE.shifted(distance * direction)), rtol=1e-6)
+
+
+def test_triangulated_points_are_the_planted_ones() -> None:
+    problem = planted((40, 30))
+    two_view = TwoViewMatches.of(problem.query, problem.references, problem.correspondences.query_matches)
+    points, parallax_deg = two_view.triangulated(
+        problem.query, problem.references, TRUE, StructureOptions().first_noise
+    )
+    projected = CAMERA.project(TRUE.inverse().apply(points))
+    np.testing.assert_allclose(projected, problem.query.features.keypoints, atol=1e-3)
+    assert (parallax_deg > 1).all()
+
+
+def test_chances_are_shares_of_the_image() -> None:
+    assert disc_chance(CAMERA, 4.0) == pytest.approx(np.pi * 16 / (960 * 720))
+    assert band_chance(CAMERA, 2.0) == pytest.approx(4 * np.sqrt(2) * 1200 / (960 * 720))
+    assert disc_chance(CAMERA, 1e4) == band_chance(CAMERA, 1e4) == 1.0
+
+
+def test_trust_rises_with_the_second_references_share() -> None:
+    shares = np.linspace(0, 1, 21)
+    trusts = [two_view_trust(TwoViewEvidence(-50, -20, 100, 200, 40, it, 0.5), GATE) for it in shares]
+    assert trusts == sorted(trusts)
+    assert (trusts[0], trusts[-1]) == (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("evidence", "part"),
+    [
+        (TwoViewEvidence(-10.0, -20.0, 100, 200, 40, 0.5, 0.5), "chance could do"),
+        (TwoViewEvidence(-50.0, -1.0, 100, 200, 40, 0.5, 0.5), "one reference"),
+        (TwoViewEvidence(-50.0, -20.0, 100, 200, 40, 0.1, 0.5), "repeated structure"),
+        (TwoViewEvidence(-50.0, -20.0, 100, 200, 40, 0.5, 0.01), "of the image"),
+    ],
+)
+def test_each_lack_of_evidence_is_named(evidence: TwoViewEvidence, part: str) -> None:
+    assert part in (two_view_failure(evidence, GATE) or "")
+    assert two_view_failure(TwoViewEvidence(-50.0, -20.0, 100, 200, 40, 0.5, 0.5), GATE) is None
+
+
+def test_few_references_widen_the_radii() -> None:
+    assert few_references_factor((30, 30, 30)) == pytest.approx(2.0)
+    assert few_references_factor((50, 50, 0, 0)) == pytest.approx(3.0)
+    assert few_references_factor((100, 0, 0)) == pytest.approx(11.0)
+
+
+def test_wrong_options_are_named() -> None:
+    with pytest.raises(ValueError, match=r"RelativePoseOptions.epipolar_px must be above 0, is 0"):
+        RelativePoseOptions(epipolar_px=0)
+    with pytest.raises(ValueError, match=r"TwoViewOptions.min_inliers must be at least 7, is 3"):
+        TwoViewOptions(min_inliers=3)
+    with pytest.raises(ValueError, match=r"TwoViewGateOptions.shares must be 8 rising numbers"):
+        TwoViewGateOptions(shares=(0.1, 0.2))
