@@ -7,6 +7,8 @@ are adjusted together,
     min  sum_obs rho(|r_o|^2 / sigma_o^2) + sum_i |xi_i|^2 / sigma_prior^2,
 
 over the query's pose, its points and a small motion xi_i of every reference, which a prior holds to its given pose.
+Errors of given poses are alike for neighbours and drift apart with distance, so the nearest references hold the query,
+and the prior of a farther one is wider in proportion to its distance.
 Priors on the query's pose add their terms, unless the photograph alone contradicts them. The points are eliminated (see
 `bundle`).
 """
@@ -40,7 +42,12 @@ class AdjustOptions:
     Attributes:
         loss_scale_sigma: of the Cauchy loss, under which the influence of outliers vanishes.
         prior_share: standard deviation of the prior on reference poses, in image pixels, as a share of the noise level
-            of the structure. The residuals are an upper bound of the effect of pose errors.
+            of the structure, for the reference nearest to the query; in proportion to the distance for the others. The
+            residuals are an upper bound of the effect of pose errors. With the same prior for all references the
+            medians were 0.69 instead of 0.48 cm on a drive, 0.33 instead of 0.18 cm for a drone with ten references.
+        max_wider: the prior of a far reference is at most so many times as wide. A film's next frame does not hold the
+            query alone. With 5 real scenes gain more, but where the errors of poses have nothing to do with distance,
+            the adjustment then makes the pose worse; with 2.5 it still improves it.
         error_inflation: factor by which standard deviations from the sum over residuals are typically too small; it
             sets the weight of priors. The answer's covariance does not use it (see `uncertainty`).
         inlier_px: as in the pose solver; the inliers of the answer are those of its own pose.
@@ -53,6 +60,7 @@ class AdjustOptions:
 
     loss_scale_sigma: float = 1.4
     prior_share: float = 0.2
+    max_wider: float = 2.5
     error_inflation: float = 2.0
     inlier_px: float = 4.0
     min_kept_share: float = 0.8
@@ -63,6 +71,7 @@ class AdjustOptions:
 
     def __post_init__(self) -> None:
         check_bounds(self, "inlier_px min_kept_share loss_scale_sigma prior_share max_error_px", above=0)
+        check_bounds(self, "max_wider", at_least=1)
         check_bounds(self, "iterations min_decrease", above=0)
 
 
@@ -172,7 +181,13 @@ def pose_problem(
     tracks, chosen = tracks_with_query(structure, matches.point[used], matches.keypoint[used], len(references))
     observations, start, depth_m = bundle_of(tracks, views, structure, chosen)
     noise_px = options.prior_share * structure.noise.level_px
-    information = [reference_information(noise_px, it.view.camera.focal_x_px, depth_m) for it in references]
+    centres = np.array([it.world_from_camera.translation for it in references])
+    distances_m = np.linalg.norm(centres - world_from_query.translation, axis=1)
+    wider = np.minimum(distances_m / max(distances_m.min(), 1e-9), options.max_wider)
+    information = [
+        reference_information(noise_px * factor, it.view.camera.focal_x_px, depth_m)
+        for it, factor in zip(references, np.maximum(wider, 1.0), strict=True)
+    ]
     problem = BundleProblem(
         observations, tracks.view, start.poses[:-1], np.array(information), options.loss_scale_sigma
     )
