@@ -31,8 +31,8 @@ GOOD = Evidence(
     found_share=0.5,
     expected_share=0.6,
     hull_share=0.6,
-    matches_apart=0.002,
-    references_apart=0.003,
+    matches_apart=0.0015,
+    references_apart=0.002,
 )
 POOR = Evidence(22, 102, 0.1, 0.6, 0.04, 0.3, 0.2)
 """Such a pose was off by a tenth of the distance to the photograph's contents."""
