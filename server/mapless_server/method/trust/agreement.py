@@ -38,14 +38,13 @@ class AgreementOptions:
         splits: into halves, of which the median counts; one split may put all good matches into one half.
         shuffling: references are assigned to halves in the order of their numbers of matches, each raised by up to this
             share at random, so that the splits differ and the halves remain balanced.
-        pnp: of the halves' poses. The few iterations find a pose with a third of the matches as inliers.
+        pnp: of the halves' poses. Of good matches 30 iterations give the same poses as 100; 1000 find a pose with
+            a third of the matches as inliers.
     """
 
     splits: int = 3
     shuffling: float = 0.3
-    pnp: PnpOptions = field(
-        default_factory=lambda: PnpOptions(min_iterations=100, max_iterations=1000, max_matches=600)
-    )
+    pnp: PnpOptions = field(default_factory=lambda: PnpOptions(min_iterations=30, max_iterations=1000, max_matches=600))
 
     def __post_init__(self) -> None:
         check_bounds(self, "splits", at_least=1)
