@@ -228,7 +228,7 @@ def guarded(cluster: Cluster, tmp_path_factory: pytest.TempPathFactory) -> Guard
     tokens = {caller: create_token(tokens_file, caller, *held, None) for caller, held in CALLERS.items()}
     running = Guarded(cluster, tokens, tokens_file)
     cluster.deploy(running.application())
-    with running.client() as client:
+    with running.client(timeout_s=120.0) as client:  # the replicas' processes start meanwhile
         for scene in SCENES:
             fill(client, scene)
         fill(client, "slow", 1.5)
