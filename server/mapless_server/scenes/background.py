@@ -106,6 +106,7 @@ class BackgroundMatching:
         self._thread: threading.Thread | None = None
         self._pair_s = 0.0
         self._counted_s = 0.0
+        self._waiting_count = 0
 
     def start(self) -> None:
         """Starts the thread, unless the store can only be read."""
@@ -125,6 +126,8 @@ class BackgroundMatching:
         """Matches the references that may be claimed now, until there are none; raises if the store fails."""
         found = self._claim()
         if found is None:
+            if self._waiting_count:  # another server may have matched them
+                self._count_waiting()
             return
         self._count_waiting()
         # Of its own, so that references that queries use stay in memory.
@@ -163,7 +166,8 @@ class BackgroundMatching:
         return None
 
     def _count_waiting(self) -> None:
-        self._observer.references_wait(max(self._pairs.count_waiting(it.name) for it in self._matchings))
+        self._waiting_count = max(self._pairs.count_waiting(it.name) for it in self._matchings)
+        self._observer.references_wait(self._waiting_count)
         self._counted_s = time.monotonic()
 
     def _match_claimed(self, library: ReferenceLibrary, matching: Matching, claim: Claim) -> None:
@@ -202,13 +206,18 @@ class BackgroundMatching:
             raise NotFound("the reference was replaced")
         for reference_id in wanted:
             self._let_callers_first()
-            if self._closing.is_set() or time.monotonic() > until_s:
+            # One pair at least, so that a busy server ends, too.
+            if self._closing.is_set() or (made and time.monotonic() > until_s):
                 return made, False
-            begin_s = time.monotonic()
-            for other in self._load_usable(library, matching, claim, reference_id):
+            try:
+                others = self._load_usable(library, matching, claim, reference_id)
+            except _Closed:
+                return made, False
+            for other in others:
+                begin_s = time.monotonic()
                 first, second = in_order(subject, other)
                 made[first.key, second.key] = matching.matcher.match_pair(first, second, matching.wide)
-            self._pair_s = time.monotonic() - begin_s
+                self._pair_s = time.monotonic() - begin_s
         return made, True
 
     def _nearest(self, matching: Matching, claim: Claim) -> list[str]:
@@ -219,6 +228,8 @@ class BackgroundMatching:
         entries = self._indexes.entries(claim.scene_key, StageContext(self._check))
         (row,) = entries.rows([claim.reference_id]) if claim.reference_id in entries else (None,)
         if row is None:
+            if not self._indexes.is_damaged(claim.scene_key, claim.reference_id):
+                raise NotFound("the reference was deleted")
             raise DataLoss(f"reference {claim.reference_id!r} is damaged in the store; delete it and add it again")
         selection = Selection(2 * self.options.pairs + 1, options=_AS_QUERIES_CHOOSE)
         id_of = {it.key: it.reference_id for it in rank_references(entries, entries.vector(row), selection)}
@@ -257,7 +268,7 @@ class BackgroundMatching:
         if self._is_idle():
             return
         options, now_s = self.options, time.monotonic()
-        until_s = now_s + self._pair_s / options.busy_share
+        until_s = now_s + min(self._pair_s / options.busy_share, CLAIM_S / 4)  # the claim must not end meanwhile
         busy_s = now_s
         while now_s < until_s and now_s - busy_s < options.quiet_s and not self._closing.wait(options.quiet_s / 5):
             now_s = time.monotonic()

@@ -84,7 +84,7 @@ def evidence_of(support: Support, votes: Votes, options: AgreementOptions) -> Ev
         raise ValueError("support.estimate must have at least 4 inliers")
     inliers, pose = estimate.inliers, estimate.world_from_camera
     x_in_camera = pose.inverse().apply(structure.x_in_world[matches.point[inliers]])
-    distance_m = float(np.median(x_in_camera[:, 2]))
+    distance_m = max(float(np.median(x_in_camera[:, 2])), np.finfo(float).tiny)
     return Evidence(
         int(inliers.sum()),
         len(matches),
