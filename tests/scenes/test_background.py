@@ -7,6 +7,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
@@ -347,6 +348,34 @@ class TestPriority:
         server = Server(store, BackgroundOptions(busy_share=1.0, quiet_s=0.01), lambda: False)
         server.background.match_waiting()
         assert server.counts.made == 20
+
+    def test_a_busy_server_with_slow_pairs_ends_too(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+        """The wait for its share would be longer than a claim holds."""
+        monkeypatch.setattr("mapless_server.scenes.background.CLAIM_S", 0.02)
+        server = Server(store, BackgroundOptions(busy_share=1e-3, quiet_s=0.01), lambda: False)
+        server.background.match_waiting()
+        assert server.counts.made == 20
+
+    def test_a_reference_deleted_after_its_claim_is_no_failure(self, store: Store) -> None:
+        server = Server(store)
+        found = server.background._claim()
+        assert found is not None
+        store.delete_reference(SCENE, found[1].reference_id)
+        with closing(ReferenceLibrary(store)) as library:
+            server.background._match_claimed(library, *found)
+        assert server.counts.failures == 0
+
+    def test_what_another_server_matched_waits_no_longer(self, store: Store) -> None:
+        first, second = Server(store), Server(store)
+        claimed = second.background._claim()
+        assert claimed is not None
+        first.background._count_waiting()
+        assert first.counts.waiting > 0
+        with closing(ReferenceLibrary(store)) as library:
+            second.background._match_claimed(library, *claimed)
+        second.background.match_waiting()
+        first.background.match_waiting()
+        assert first.counts.waiting == 0
 
     def test_what_is_made_before_the_claim_ends_is_stored(
         self, store: Store, monkeypatch: pytest.MonkeyPatch, compared: Counter[int]
