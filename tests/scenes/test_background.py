@@ -370,7 +370,7 @@ class TestPriority:
         claimed = second.background._claim()
         assert claimed is not None
         first.background._count_waiting()
-        assert first.counts.waiting > 0
+        assert first.counts.waiting == 5
         with closing(ReferenceLibrary(store)) as library:
             second.background._match_claimed(library, *claimed)
         second.background.match_waiting()
