@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Camera
 from mapless_server.method.features import make_extractor
 from mapless_server.networks.weights import find_weights
-from mapless_server.scenes.retrieval.vocabulary import LEARNED, REDUCED, SEED, WORDS, Floats, Vocabulary, nearest_words
+from mapless_server.scenes.retrieval.vlad import LEARNED, REDUCED, SEED, WORDS, Floats, Vocabulary, nearest_words
 
 from .rendered_room.photographs import lit_room, photograph, scatter
 

@@ -14,9 +14,8 @@ from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_ve
 from mapless_server.method.coarse import Request, reconstruct_one
 from mapless_server.method.coarse.geometric import GeometricOptions, GeometricReconstructor
 from mapless_server.method.correspond import Correspondences, Matcher
-from mapless_server.method.reconstruction import ReconstructedView, Reconstruction
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.views import PosedView, View
+from mapless_server.method.views import PosedView, ReconstructedView, Reconstruction, View
 
 EXACT = SceneOptions(noise_px=0.0, point_count=300, reference_count=4)
 

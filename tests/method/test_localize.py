@@ -26,10 +26,9 @@ from mapless_server.method.correspond import Correspondences, Matcher
 from mapless_server.method.localize import MIN_FEATURES, localize, prepare, refine
 from mapless_server.method.options import LocalizeOptions, ScaleStrategy, Variant
 from mapless_server.method.pipeline import Coarse, Pipeline, Prepared, StageOptions, coarse_answer, reconstruct
-from mapless_server.method.reconstruction import Reconstruction
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import PoseStage, ScaleStage
-from mapless_server.method.views import Features, Matches, PosedView, View
+from mapless_server.method.views import Features, Matches, PosedView, Reconstruction, View
 
 SCENE = make_scene(random_for("localize"), SceneOptions(point_count=400, reference_count=5))
 MATCHER = Matcher()

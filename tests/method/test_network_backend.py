@@ -44,9 +44,8 @@ from mapless_server.method.coarse.geometric import GeometricReconstructor
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor, condition_poses
 from mapless_server.method.coarse.token_cache import TokenCacheOptions
-from mapless_server.method.reconstruction import Reconstruction
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.views import PosedView, View
+from mapless_server.method.views import PosedView, Reconstruction, View
 from mapless_server.networks import pi3
 from mapless_server.networks import runner as runner_module
 from mapless_server.networks.conditions import normalize_poses

@@ -17,7 +17,7 @@ from support.small_networks import photograph, references_of, view_of
 from support.images import textured
 from mapless_server.method.coarse.network import NetworkReconstructor
 from mapless_server.method.coarse import reconstruct_one
-from mapless_server.method.reconstruction import Reconstruction
+from mapless_server.method.views import Reconstruction
 from mapless_server.networks.runner import NetworkRunner
 
 backend = NetworkReconstructor(NetworkRunner(ruled_network("pi3", small=False), "pi3", "rule"))

@@ -15,11 +15,11 @@ from mapless.geometry import RigidTransform
 from mapless_server.method.correspond import Correspondences
 from mapless_server.method.match import one_to_one as one_to_one_on_host
 from mapless_server.method.options import ScaleStrategy
-from mapless_server.method.reconstruction import Reconstruction
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import ScaleStage
 from mapless_server.method.scale_equations import ScaleOptions
 from mapless_server.method.structure import StructureOptions, tracks_of
+from mapless_server.method.views import Reconstruction
 
 pytest.importorskip("torch", reason="the networks' extra is not installed")
 

@@ -15,12 +15,15 @@ from support.scenes import random_for
 from mapless.geometry import Array
 from mapless_server.method.optimize import (
     MinimizeOptions,
+    cauchy_cost,
+    cauchy_weight,
     damped_step,
     minimize,
     minimize_each,
+    soft_l1,
+    soft_l1_weight,
     solve_step,
 )
-from mapless_server.method.robust import cauchy_cost, cauchy_weight, soft_l1, soft_l1_weight
 
 least_squares: Any = optimize.least_squares  # mypy takes it for the module of that name
 CLOSELY = MinimizeOptions(iterations=200, min_decrease=1e-15)

@@ -15,7 +15,6 @@ from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 from mapless.geometry import RigidTransform, Similarity, rotation_angle_deg, rotation_from_vector
 from mapless_server.method.correspond import Correspondences
 from mapless_server.method.options import ScaleStrategy
-from mapless_server.method.reconstruction import ReconstructedView, Reconstruction
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import MetricScale, ScaleStage
 from mapless_server.method.scale import estimate_scale
@@ -26,6 +25,7 @@ from mapless_server.method.scale_equations import (
     trajectory_scale,
     triangulate_depths,
 )
+from mapless_server.method.views import ReconstructedView, Reconstruction
 
 EXACT = SceneOptions(noise_px=0.0)
 TRIANGULATION = ScaleOptions(strategy=ScaleStrategy.TRIANGULATION)

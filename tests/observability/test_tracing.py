@@ -21,8 +21,8 @@ from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanE
 from opentelemetry.trace import SpanKind, StatusCode
 
 from mapless_server.extras import install_hint
-from mapless_server.observability.call_record import TracedStep
 from mapless_server.observability.otlp import OtlpTracer, make_otlp_tracer
+from mapless_server.observability.tracing import TracedStep
 from mapless_server.serve import running
 from mapless_server.serve.assembly import StartupError
 from mapless_server.settings import Settings

@@ -20,7 +20,7 @@ from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server.errors import NotFound, Overloaded, PermissionDenied, Unauthenticated
-from mapless_server.observability.call_record import MAX_STEPS, TracedStep
+from mapless_server.observability.tracing import MAX_STEPS, TracedStep
 from mapless_server.rpc import CallGuard, receiving
 from mapless_server.rpc.call import ANSWER_MARGIN_SHARE, Call
 from mapless_server.rpc.receiving import OpenMethods, Receiver

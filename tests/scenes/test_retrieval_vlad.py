@@ -12,8 +12,7 @@ from support.scenes import CAMERA, SceneOptions, make_scene, random_for, unit_ro
 from mapless.geometry import Array
 from mapless_server.method.features import SiftExtractor
 from mapless_server.method.views import Features, View
-from mapless_server.scenes.retrieval.vlad import DIMENSION, VladDescriptor
-from mapless_server.scenes.retrieval.vocabulary import FILE, LEARNED, Vocabulary, dataless, shipped
+from mapless_server.scenes.retrieval.vlad import DIMENSION, FILE, LEARNED, VladDescriptor, Vocabulary, dataless, shipped
 
 DIGESTS = {"sift": "53ac1a6f", "aliked": "d26d2f4e", "xfeat": "8c987f94", "edgepoint2-l64": "94322c2c"}
 """Of the shipped vocabularies. Another digest makes another name, and all stored descriptors are computed again."""

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_server.services.progressive import FutureCoarseAnswer, coarse_then_final
+from mapless_server.services.localization import FutureCoarseAnswer, coarse_then_final
 
 FINAL = pb.LocalizeResponse(localization=pb.Localization(inlier_count=100))
 

@@ -19,13 +19,12 @@ from mapless_server.method.correspond import Correspondences
 from mapless_server.method.match import PAPER_MATCH, MatchOptions, match_points
 from mapless_server.method.on_device import Refined, launch_on_device
 from mapless_server.method.on_device.compute import Options
-from mapless_server.method.reconstruction import Reconstruction
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.results import MetricScale, PointMatches, Structure
 from mapless_server.method.scale import estimate_scale
 from mapless_server.method.scale_equations import ScaleOptions
 from mapless_server.method.structure import PAPER_STRUCTURE, StructureOptions, build_structure
-from mapless_server.method.views import Matches
+from mapless_server.method.views import Matches, Reconstruction
 from support.fake_network import FakeNetwork, FakeNetworkOptions
 from support.planted import true_correspondences
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for, unit_rows

@@ -18,8 +18,7 @@ from mapless.geometry import Camera
 from mapless_server.method.coarse import reconstruct_one
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
-from mapless_server.method.reconstruction import Reconstruction
-from mapless_server.method.views import Features, View
+from mapless_server.method.views import Features, Reconstruction, View
 from mapless_server.networks.network import Sizes
 from mapless_tools.bench_network import host
 from mapless_tools.bench_network.command import bench_network

@@ -20,10 +20,9 @@ from mapless.geometry import Array, RigidTransform, rotation_from_vector
 
 from .arrays import invert_symmetric
 from .observations import Linearization, Observations, linearize
-from .optimize import solve_step
+from .optimize import cauchy_cost, solve_step
 from .priors.known import NO_PRIORS, Priors
 from .results import Structure
-from .robust import cauchy_cost
 from .structure import observe
 from .tracks import Tracks
 from .views import PosedView

@@ -19,7 +19,6 @@ from .options import LocalizeOptions, Variant
 from .pipeline import Coarse, Pipeline, Prepared, reconstruct, with_wide_correspondences
 from .pnp import solve_pose
 from .priors.known import NO_PRIORS, Priors
-from .reconstruction import Reconstruction
 from .rejection import Rejection, RejectionReason
 from .results import MetricScale, PointMatches, Structure, Support
 from .structure import build_structure
@@ -35,7 +34,7 @@ from .trust.two_view import (
 from .trust.votes import votes_of
 from .two_view.solve import solve_two_view
 from .uncertainty.covariance import pose_covariance
-from .views import Matches, PosedView, View
+from .views import Matches, PosedView, Reconstruction, View
 
 MIN_FEATURES = 12
 """A photograph with fewer local features is blank, black or blurred."""

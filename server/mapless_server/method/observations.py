@@ -23,10 +23,9 @@ from .arrays import (
     normalize_jacobian,
     solve_symmetric,
 )
-from .optimize import minimize_each
+from .optimize import cauchy_weight, minimize_each, soft_l1, soft_l1_weight
 from .perturbation import motion_jacobian
 from .results import KeypointNoise
-from .robust import cauchy_weight, soft_l1, soft_l1_weight
 from .tracks import Grouping
 
 ONE_PIXEL = KeypointNoise(1.0, 0.0)

@@ -24,7 +24,6 @@ from .match import PAPER_MATCH, MatchOptions
 from .options import LocalizeOptions, Variant
 from .pnp import PnpOptions
 from .priors.known import NO_PRIORS, Priors
-from .reconstruction import Reconstruction
 from .rejection import Rejection, RejectionReason
 from .results import MetricScale, PointMatches, PoseStage, Structure, Support
 from .scale import estimate_scale
@@ -34,7 +33,7 @@ from .trust.gate import GateOptions
 from .trust.judge import JudgeOptions
 from .trust.two_view import TwoViewGateOptions
 from .two_view.solve import TwoViewOptions
-from .views import PosedView, View
+from .views import PosedView, Reconstruction, View
 
 T = TypeVar("T")
 

@@ -14,9 +14,8 @@ import numpy as np
 
 from mapless.geometry import Array, Camera, RigidTransform, normalize, normalize_jacobian
 
-from .optimize import damped_step
+from .optimize import cauchy_cost, cauchy_weight, damped_step
 from .perturbation import motion_jacobian, perturbed
-from .robust import cauchy_cost, cauchy_weight
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,11 +18,10 @@ import numpy as np
 from mapless.geometry import RigidTransform, Similarity
 
 from .correspond import Correspondences
-from .reconstruction import Reconstruction
 from .rejection import Rejection, RejectionReason
 from .results import MetricScale, ScaleStage
 from .scale_equations import ScaleCandidates, ScaleOptions, gather, predict, scale_candidates, trajectory_radius
-from .views import PosedView
+from .views import PosedView, Reconstruction
 
 
 def estimate_scale(

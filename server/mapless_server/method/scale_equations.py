@@ -29,9 +29,8 @@ from mapless.geometry import Array
 from .arrays import AnyArray, length, median, namespace
 from .correspond import Correspondences
 from .options import ScaleStrategy, check_bounds
-from .reconstruction import Reconstruction
 from .tracks import keypoint_depths, keypoint_offsets, keypoint_rays
-from .views import PosedView
+from .views import PosedView, Reconstruction
 
 
 @dataclass(frozen=True)

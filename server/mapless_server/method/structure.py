@@ -33,10 +33,9 @@ from .observations import (
     triangulate,
 )
 from .options import check_bounds
-from .reconstruction import Reconstruction
 from .results import KeypointNoise, MetricScale, Structure
 from .tracks import Tracks, build_tracks, keypoint_depths, keypoint_offsets, keypoint_rays
-from .views import PosedView
+from .views import PosedView, Reconstruction
 
 
 @dataclass(frozen=True)

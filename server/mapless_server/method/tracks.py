@@ -15,8 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from mapless.geometry import Array
 
 from .arrays import AnyArray, namespace
-from .reconstruction import Reconstruction
-from .views import Matches, PosedView
+from .views import Matches, PosedView, Reconstruction
 
 
 class Grouping(Protocol):

@@ -18,9 +18,8 @@ from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapProp
 
 from mapless_server import __version__
 
-from .call_record import TracedStep
 from .logs import plain
-from .tracing import Metadata
+from .tracing import Metadata, TracedStep
 
 EXPORT_LIMIT_S = 5.0
 """Time that a collector may take for a batch, retries included."""

@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 from urllib.parse import unquote
 
 from mapless_server.engine.query import Caller
-from mapless_server.observability.call_record import CallRecord
-from mapless_server.observability.tracing import Metadata
+from mapless_server.observability.tracing import CallRecord, Metadata
 from mapless_server.scheduling import Flow, StageRecord
 from mapless_server.security import Principal
 

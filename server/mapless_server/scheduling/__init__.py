@@ -7,7 +7,7 @@ job         A call's work (`jobs`). It goes through stages, such as "prepare", "
             step.
 admission   A job is admitted if its predicted computing time and its memory fit within the bounds and it can end before
             its deadline (`admission`); otherwise it is refused at once. Predictions are averages of earlier jobs of the
-            same kind (`costs`).
+            same kind.
 lane        A group of threads, such as "host" or "device". Each stage is computed by one lane.
 fairness    Of the jobs that wait for a stage, the next one is chosen by deficit round robin over tenants and their
             clients (`fair_queue`).
@@ -19,7 +19,7 @@ deadline    A job ends at its deadline wherever it is, and with its fallback, if
 threads that compute what the scheduler selects, and callers that wait on an event loop.
 """
 
-from .costs import CostModel
+from .admission import CostModel
 from .jobs import (
     Abandoned,
     Done,

@@ -14,8 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from .admission import Admission
-from .costs import CostModel, Ledger
+from .admission import Admission, CostModel, Ledger
 from .fair_queue import FairQueue
 from .jobs import (
     Abandoned,

@@ -18,9 +18,8 @@ from mapless_server.method.coarse import Bucket, Outcome, Request
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.grids import GridOptions, common_grid, lay_out
 from mapless_server.method.coarse.network import NetworkReconstructor
-from mapless_server.method.reconstruction import ReconstructedView, Reconstruction
 from mapless_server.method.rejection import Rejection
-from mapless_server.method.views import PosedView, View
+from mapless_server.method.views import PosedView, ReconstructedView, Reconstruction, View
 
 UNITS_PER_METRE = 0.3
 """Of the planted reconstruction, so that there is a scale to find."""

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 from ..correspond import Correspondences
 from ..priors.known import NO_PRIORS, Priors
-from ..reconstruction import Reconstruction
 from ..rejection import Rejection
-from ..views import PosedView, View
+from ..views import PosedView, Reconstruction, View
 
 if TYPE_CHECKING:  # it needs torch
     from .device import DeviceReconstruction

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mapless.geometry import Camera, RigidTransform
 
-from ..reconstruction import ReconstructedView, Reconstruction
+from ..views import ReconstructedView, Reconstruction
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,13 +23,12 @@ from ..perturbation import reprojection_errors_px
 from ..pnp import PnpOptions, ransac
 from ..priors.informed import informed_pose
 from ..priors.known import NO_PRIORS, Priors
-from ..reconstruction import ReconstructedView, Reconstruction
 from ..rejection import Rejection, RejectionReason
 from ..results import PointMatches, Structure
 from ..structure import StructureOptions, observe, trustworthy
 from ..tracks import build_tracks
 from ..trust.gate import GateOptions, format_false_alarms, log10_false_alarms
-from ..views import PosedView, View
+from ..views import PosedView, ReconstructedView, Reconstruction, View
 from . import Bucket, Outcome, Request
 
 

@@ -18,9 +18,9 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform, Similarity, cross_matrix
 
+from ..optimize import cauchy_cost, cauchy_weight
 from ..options import check_bounds
 from ..perturbation import perturbed, rotation_vector
-from ..robust import cauchy_cost, cauchy_weight
 
 _MEDIAN_SQUARE = 5.35
 """Median of a chi-square of six degrees of freedom."""

@@ -18,14 +18,13 @@ from mapless.geometry import Camera
 
 from ..coarse.device import DeviceReconstruction
 from ..correspond import Correspondences
-from ..reconstruction import map_cells
 from ..rejection import Rejection, RejectionReason
 from ..results import KeypointNoise, MetricScale, PointMatches, Structure
 from ..scale import check_references, judge, not_finite
 from ..scale_equations import gather
 from ..structure import StructureOptions, tracks_of
 from ..tracks import Tracks
-from ..views import PosedView, View
+from ..views import PosedView, View, map_cells
 from .compute import Inputs, Options, Outputs, Points, compute
 from .match import prepare_match
 from .structure import prepare_structure

@@ -13,10 +13,9 @@ import numpy as np
 
 from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian
 
-from ..optimize import MinimizeOptions, damped_step, minimize
+from ..optimize import MinimizeOptions, cauchy_cost, cauchy_weight, damped_step, minimize
 from ..options import check_bounds
 from ..perturbation import moved
-from ..robust import cauchy_cost, cauchy_weight
 from .known import NO_PRIORS, Priors
 
 

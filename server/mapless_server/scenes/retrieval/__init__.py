@@ -1,7 +1,7 @@
 """Retrieval: which references resemble a photograph.
 
 descriptor   the interface of global descriptors: one vector per photograph, whose dot products are similarities
-vlad         the descriptor that is made of local features, with the vocabularies in `vocabulary`
+vlad         the descriptor that is made of local features, and its vocabularies
 megaloc      the paper's descriptor, a network on the pixels; needs torch
 index        a scene's descriptors and poses in memory
 narrowing    limits and likely values of the camera's pose
