@@ -13,6 +13,7 @@ from support.jacobians import assert_jacobian
 from support.scenes import random_for
 
 from mapless.geometry import Array
+from mapless_server.method.arrays import SYMMETRIC
 from mapless_server.method.optimize import (
     MinimizeOptions,
     cauchy_cost,
@@ -105,11 +106,12 @@ def test_minimum_equals_scipys_with_soft_l1_loss() -> None:
         jacobian /= np.linalg.norm(jacobian, axis=2, keepdims=True)
         weight = soft_l1_weight(residuals(points) ** 2, 0.1)
         weighted = np.swapaxes(jacobian * weight[:, :, None], 1, 2)
-        return weighted @ jacobian, (weighted @ residuals(points)[:, :, None])[..., 0]
+        hessian = np.stack([(weighted @ jacobian)[:, i, j] for i, j in SYMMETRIC])
+        return hessian, (weighted @ residuals(points)[:, :, None])[..., 0].T
 
     start = truth + random.normal(0, 0.3, truth.shape)
     start[5] = np.nan
-    found = minimize_each(cost, linearize, start, 60)
+    found = minimize_each(lambda it: cost(it.T), lambda it: linearize(it.T), start.T, 60).T
     assert np.isnan(found[5]).all()
     for p in np.delete(np.arange(count), 5):
 

@@ -14,11 +14,12 @@ from support.planted import metric_scale, true_correspondences, true_tracks
 from support.scenes import CAMERA, SceneOptions, SyntheticScene, arc_poses, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform
-from mapless_server.method.arrays import invert_symmetric, solve_symmetric
+from mapless_server.method.arrays import SYMMETRIC, columns, invert_symmetric, rows, solve_columns, solve_symmetric
 from mapless_server.method.correspond import Correspondences
 from mapless_server.method.observations import (
     MIN_NOISE_LEVEL_PX,
     ONE_PIXEL,
+    Columns,
     Observations,
     adjust_points,
     better_start,
@@ -107,6 +108,19 @@ def test_jacobians_equal_finite_differences() -> None:
         assert_jacobian(jacobians[o], residual, truth[point], tolerance=1e-6)
 
 
+def test_columns_equal_the_plain_rows() -> None:
+    _, observations, truth = planted("columns", SceneOptions(point_count=40), KeypointNoise(0.4, 0.05))
+    residuals, jacobians = observations.linearized(truth)
+    in_columns, slopes = Columns.of(observations).linearized(columns(truth))
+    np.testing.assert_allclose(rows(in_columns), residuals, atol=1e-10)
+    np.testing.assert_allclose(rows(slopes), jacobians, rtol=1e-10, atol=1e-10)
+    starts = observations.tracks.starts
+    sums = np.add.reduceat(jacobians, starts, axis=0)
+    np.testing.assert_allclose(observations.sum_by_point(jacobians), sums, rtol=1e-12, atol=1e-9)
+    in_columns = observations.tracks.sum_columns(columns(residuals))
+    np.testing.assert_allclose(rows(in_columns), np.add.reduceat(residuals, starts, axis=0), rtol=1e-12, atol=1e-9)
+
+
 # Small systems
 
 
@@ -120,14 +134,18 @@ def test_solutions_equal_lapacks() -> None:
     np.testing.assert_allclose(matrices[well] @ inverses, np.tile(np.eye(3), (well.sum(), 1, 1)), atol=1e-6)
     expected = np.linalg.solve(matrices[well], vectors[well, :, None])[..., 0]
     np.testing.assert_allclose(solve_symmetric(matrices, vectors)[well], expected, rtol=1e-5, atol=1e-12)
+    elements = np.stack([matrices[:, i, j] for i, j in SYMMETRIC])
+    np.testing.assert_allclose(solve_columns(elements, vectors.T).T[well], expected, rtol=1e-5, atol=1e-12)
 
 
 @pytest.mark.parametrize("matrix", [np.zeros((3, 3)), np.diag([1.0, 1.0, 0.0]), np.ones((3, 3)) * 1e8])
 def test_singular_systems_have_no_solution(matrix: Array) -> None:
     regular = np.diag([1.0, 2.0, 4.0])
     solved = solve_symmetric(np.stack([matrix, regular]), np.ones((2, 3)))
-    assert np.isnan(solved[0]).all()
-    np.testing.assert_allclose(solved[1], [1, 0.5, 0.25])
+    elements = np.array([(matrix[i, j], regular[i, j]) for i, j in SYMMETRIC])
+    for found in (solved, solve_columns(elements, np.ones((3, 2))).T):
+        assert np.isnan(found[0]).all()
+        np.testing.assert_allclose(found[1], [1, 0.5, 0.25])
 
 
 # Triangulation

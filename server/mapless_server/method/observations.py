@@ -14,6 +14,8 @@ from mapless.geometry import Array
 from .arrays import (
     AnyArray,
     apply,
+    apply_columns,
+    columns,
     identity,
     length,
     median,
@@ -21,7 +23,10 @@ from .arrays import (
     namespace,
     normalize,
     normalize_jacobian,
+    rows,
     solve_symmetric,
+    symmetric_products,
+    take,
 )
 from .optimize import cauchy_weight, minimize_each, soft_l1, soft_l1_weight
 from .perturbation import motion_jacobian
@@ -115,6 +120,58 @@ class Observations:
         return Observations(tracks, *(getattr(self, name)[rows] for name in columns)), x_in_world[points]
 
 
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """The same observations with one row for each component: column o is one observation (see `arrays.columns`).
+
+    Attributes:
+        point: (O,) index of each column's point.
+        rotation: (3, 3, O) camera_from_world of the observing reference.
+        translation: (3, O) of the same, metres.
+        focal: (2, O) of its camera, in standard deviations.
+        offset: (2, O) principal point minus observed pixel, in standard deviations.
+    """
+
+    point: AnyArray
+    rotation: AnyArray
+    translation: AnyArray
+    focal: AnyArray
+    offset: AnyArray
+
+    @staticmethod
+    def of(observations: Observations) -> Columns:
+        """From rows."""
+        sigma_px = observations.sigma_px[:, None]
+        return Columns(
+            observations.point,
+            columns(observations.rotation),
+            columns(observations.translation),
+            columns(observations.focal_px / sigma_px),
+            columns((observations.principal_px - observations.pixel) / sigma_px),
+        )
+
+    def in_camera(self, x_in_world: AnyArray) -> AnyArray:
+        """(3, O), from points (3, P) in the world."""
+        return apply_columns(self.rotation, take(x_in_world, self.point)) + self.translation
+
+    def residuals(self, x_in_camera: AnyArray) -> AnyArray:
+        """(2, O), in standard deviations, of points in the camera's frame (3, O); NaN behind the camera."""
+        return x_in_camera[:2] * _inverse_depth(x_in_camera) * self.focal + self.offset
+
+    def linearized(self, x_in_world: AnyArray) -> tuple[AnyArray, AnyArray]:
+        """The residuals (2, O) at points (3, P), and the derivative (2, 3, O) of each by its point, per metre."""
+        x_in_camera = self.in_camera(x_in_world)
+        inverse_depth = _inverse_depth(x_in_camera)
+        ideal, slope = x_in_camera[:2] * inverse_depth, self.focal * inverse_depth
+        by_point = slope[:, None] * (self.rotation[:2] - ideal[:, None] * self.rotation[2])
+        return ideal * self.focal + self.offset, by_point
+
+
+def _inverse_depth(x_in_camera: AnyArray) -> AnyArray:
+    """(O,) of points (3, O); NaN behind the camera."""
+    return 1 / namespace(x_in_camera).where(x_in_camera[2] > 0, x_in_camera[2], np.nan)
+
+
 def back_project(centre: AnyArray, ray: AnyArray, depth_m: AnyArray) -> AnyArray:
     """Points (P, 3) at depths (P,) along rays (P, 3) of depth 1 from camera centres (P, 3), all in one frame."""
     return centre + ray * depth_m[:, None]
@@ -154,18 +211,20 @@ def adjust_points(
     Returns:
         (P, 3). No point has a higher cost than at the start.
     """
+    problem = Columns.of(observations)
 
     def cost(points: AnyArray) -> AnyArray:
-        return _cost(observations, observations.residuals(points), loss_scale_sigma)
+        squared = (problem.residuals(problem.in_camera(points)) ** 2).sum(0)
+        return observations.tracks.sum_columns(soft_l1(squared, loss_scale_sigma))
 
     def linearize(points: AnyArray) -> tuple[AnyArray, AnyArray]:
-        residuals, jacobians = observations.linearized(points)
-        weight = soft_l1_weight((residuals**2).sum(-1), loss_scale_sigma)
-        weighted = namespace(points).swapaxes(jacobians * weight[:, None, None], 1, 2)
-        hessian = observations.sum_by_point(multiply(weighted, jacobians))
-        return hessian, observations.sum_by_point(apply(weighted, residuals))
+        residuals, by_point = problem.linearized(points)
+        weighted = by_point * soft_l1_weight((residuals**2).sum(0), loss_scale_sigma)
+        terms = symmetric_products(weighted, by_point), (weighted * residuals[:, None]).sum(0)
+        sums = observations.tracks.sum_columns(namespace(points).concatenate(terms))
+        return sums[:6], sums[6:]
 
-    return minimize_each(cost, linearize, x_in_world, iterations)
+    return rows(minimize_each(cost, linearize, columns(x_in_world), iterations))
 
 
 def estimate_noise(observations: Observations, x_in_world: AnyArray, noise: KeypointNoise) -> KeypointNoise:

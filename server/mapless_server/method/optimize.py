@@ -28,7 +28,7 @@ import numpy as np
 
 from mapless.geometry import Array
 
-from .arrays import AnyArray, identity, namespace, solve_symmetric
+from .arrays import AnyArray, namespace, solve_columns
 from .options import check_bounds
 
 X = TypeVar("X")
@@ -116,20 +116,21 @@ def minimize_each(
     Reads no value, so that nothing synchronizes with a device: all problems take the same number of steps.
 
     Args:
-        cost: of points (P, 3), the cost of each (P,).
-        linearize: at points (P, 3), hessians (P, 3, 3) and gradients (P, 3) of half the cost.
-        start: (P, 3).
+        cost: of points (3, P), the cost of each (P,).
+        linearize: at points (3, P), hessians (6, P) as in `arrays.SYMMETRIC` and gradients (3, P) of half the cost.
+        start: (3, P).
         iterations: number of steps.
         damping: initial value.
     """
-    xp, x, eye = namespace(start), start, identity(start)
-    damped, least = xp.full_like(start[:, 0], damping), cost(start)
+    xp, x = namespace(start), start
+    damped, least = xp.full_like(start[0], damping), cost(start)
     for _ in range(iterations):
         hessian, gradient = linearize(x)
-        candidate = x - solve_symmetric(hessian * (1 + damped[:, None, None] * eye), gradient)
+        hessian[:3] *= 1 + damped  # the diagonals
+        candidate = x - solve_columns(hessian, gradient)
         candidate_cost = cost(candidate)
         better = candidate_cost <= least  # False for NaN: behind a camera, or a singular system
-        x = xp.where(better[:, None], candidate, x)
+        x = xp.where(better, candidate, x)
         least = xp.where(better, candidate_cost, least)
         damped = xp.where(better, damped * LOWERED, damped * 10)
     return x

@@ -107,6 +107,11 @@ class DeviceTracks:
         """See Tracks."""
         return self._by_point(values, 0.0).sum(1)
 
+    def sum_columns(self, values: Tensor) -> Tensor:
+        """See Tracks."""
+        rows = values.reshape(*values.shape[:-1], *self.seen.shape)
+        return rows.masked_fill(self._blank, 0.0).sum(-1)
+
     def max_by_point(self, values: Tensor) -> Tensor:
         """See Tracks; minus infinity for a point without rows."""
         return self._by_point(values, -torch.inf).amax(1)
