@@ -55,7 +55,7 @@ def test_gradient_equals_finite_differences_of_the_cost(moved: float, tolerance:
     """Half of it, as in least squares. Away from the start the prior's error is differentiated as if it were small."""
     problem, state = problem_of("gradient", moved)
     equations = problem.linearize(state)
-    gradient = np.concatenate([equations.pose_gradient, equations.point_gradient.ravel()])
+    gradient = np.concatenate([equations.pose_gradient, equations.point_gradient.T.ravel()])
     assert_jacobian(
         2 * gradient, lambda v: problem.cost(from_vector(state, v)), np.zeros(len(gradient)), tolerance=tolerance
     )
@@ -99,6 +99,37 @@ def test_reduced_system_inverts_to_the_full_covariance() -> None:
     reduced, _, _ = problem.linearize(state).reduced(0.0)
     expected = np.linalg.inv(matrix)[:cameras, :cameras]
     np.testing.assert_allclose(np.linalg.inv(reduced), expected, rtol=0, atol=1e-3 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("moved", [0.0, 1e-3])
+def test_normal_equations_equal_sums_over_plain_rows(moved: float) -> None:
+    problem, state = problem_of("plain", moved)
+    rows, points, views = problem.rows(state), problem.observations.point, problem.view
+    size, count = 6 * len(state.poses.rotation), len(state.points)
+    matrix, gradient = np.zeros((size + 3 * count,) * 2), np.zeros(size + 3 * count)
+    for o, (point, view) in enumerate(zip(points, views, strict=True)):
+        jacobian = np.zeros((2, len(gradient)))
+        jacobian[:, 6 * view : 6 * view + 6] = rows.by_pose[o]
+        jacobian[:, size + 3 * point : size + 3 * point + 3] = rows.by_point[o]
+        matrix += rows.weight[o] * jacobian.T @ jacobian
+        gradient += rows.weight[o] * jacobian.T @ rows.residual[o]
+    inverse = np.linalg.inv(matrix[size:, size:])
+    reduced, right, eliminated = problem.by_view.equations(state, problem.loss_scale_sigma).reduced(0.0)
+    crossed = matrix[:size, size:] @ inverse
+    expected = matrix[:size, :size] - crossed @ matrix[size:, :size]
+    np.testing.assert_allclose(reduced, expected, atol=1e-9 * np.abs(matrix[:size, :size]).max())
+    slopes = gradient[:size] - crossed @ gradient[size:]
+    np.testing.assert_allclose(right, slopes, atol=1e-9 * np.abs(gradient[:size]).max())
+    motion = random_for("plain motion").normal(0, 1e-3, size)
+    steps = -inverse @ (gradient[size:] + matrix[size:, :size] @ motion)
+    np.testing.assert_allclose(eliminated.steps(motion).ravel(), steps, atol=1e-9 * np.abs(steps).max())
+
+
+def test_a_point_that_is_not_determined_gives_no_step() -> None:
+    problem, state = problem_of("singular")
+    equations = problem.linearize(state)
+    equations.point_block[:, 3] = 0.0
+    assert problem.step(state, equations, 1e-4) is None
 
 
 def test_reference_motion_is_the_motion_from_the_given_pose() -> None:

@@ -9,18 +9,21 @@ system of 6 unknowns per camera.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 
-from .arrays import invert_symmetric
+from .arrays import apply_columns, columns, symmetric_products, take
 from .observations import Linearization, Observations, linearize
-from .optimize import cauchy_cost, solve_step
+from .optimize import cauchy_cost, cauchy_weight, solve_step
 from .priors.known import NO_PRIORS, Priors
 from .results import Structure
 from .structure import observe
@@ -106,9 +109,9 @@ class BundleProblem:
     prior_weight: float = 1.0
 
     @cached_property
-    def pick(self) -> Array:
-        """(V, O): row v picks camera v's observations, so that sums over cameras become one matrix product."""
-        return np.asarray((self.view == np.arange(len(self.information) + 1)[:, None]).astype(float))
+    def by_view(self) -> ViewColumns:
+        """The observations sorted by view, in columns."""
+        return ViewColumns.of(self.observations, self.view, len(self.information) + 1)
 
     def at(self, bundle: Bundle) -> Observations:
         """The observations by cameras at these poses."""
@@ -120,7 +123,8 @@ class BundleProblem:
 
     def cost(self, bundle: Bundle) -> float:
         """NaN for a point behind a camera."""
-        squared = (self.at(bundle).residuals(bundle.points) ** 2).sum(axis=1)
+        x_in_camera = self.by_view.in_camera(bundle.poses, np.ascontiguousarray(bundle.points.T))
+        squared = (self.by_view.residuals(x_in_camera) ** 2).sum(axis=0)
         prior = float((self.reference_motion(bundle) ** 2 * self.information).sum())
         if self.priors:
             prior += self.prior_weight * self.priors.cost(bundle.world_from_query)
@@ -132,37 +136,23 @@ class BundleProblem:
 
     def linearize(self, bundle: Bundle) -> NormalEquations:
         """See optimize.Problem."""
-        rows = self.rows(bundle)
-        weight, by_point, by_pose = rows.weight, rows.by_point, rows.by_pose
-        weighted_point = np.swapaxes(by_point * weight[:, None, None], 1, 2)
-        weighted_pose = np.swapaxes(by_pose * weight[:, None, None], 1, 2)
-        error = rows.residual[:, :, None]
-
-        pose_block = (self.pick @ (weighted_pose @ by_pose).reshape(-1, 36)).reshape(-1, 6, 6)
-        pose_gradient = self.pick @ (weighted_pose @ error)[..., 0]
+        equations = self.by_view.equations(bundle, self.loss_scale_sigma)
+        pose_block, pose_gradient = equations.pose_block, equations.pose_gradient.reshape(-1, 6)
         pose_block[:-1] += self.information[:, :, None] * np.eye(6)
         pose_gradient[:-1] += self.information * self.reference_motion(bundle)
         if self.priors:
             known_gradient, known = self._query_terms(bundle.world_from_query)
             pose_gradient[-1] += known_gradient
             pose_block[-1] += known
-        cross = np.zeros((len(bundle.points), len(pose_block), 6, 3))
-        cross[self.observations.point, self.view] = weighted_pose @ by_point  # one observation per point and view
-        return NormalEquations(
-            pose_block,
-            pose_gradient.ravel(),
-            self.observations.sum_by_point(weighted_point @ by_point),
-            self.observations.sum_by_point((weighted_point @ error)[..., 0]),
-            cross.reshape(len(bundle.points), -1, 3),
-        )
+        return equations
 
     def step(self, bundle: Bundle, equations: NormalEquations, damping: float) -> Bundle | None:
         """See optimize.Problem."""
-        matrix, gradient, inverse = equations.reduced(damping)
+        matrix, gradient, points = equations.reduced(damping)
         motion = solve_step(matrix, gradient)
         if motion is None:
             return None
-        return bundle.moved(motion.reshape(-1, 6), equations.point_steps(motion, inverse))
+        return bundle.moved(motion.reshape(-1, 6), points.steps(motion))
 
     def _query_terms(self, world_from_query: RigidTransform) -> tuple[Array, Array]:
         """Gradient (6,) and information (6, 6) of the query's priors, by a left perturbation of camera_from_world.
@@ -175,39 +165,174 @@ class BundleProblem:
 
 
 @dataclass(frozen=True, eq=False)
+class ViewColumns:
+    """Observations sorted by view, one row for each component; column o is one observation (see `arrays.columns`).
+
+    Attributes:
+        point, view: (O,) of each.
+        parts: the columns of each view.
+        focal, offset: (2, O) as in `observations.Columns`.
+        sums: (P, O): a product with it sums over the observations of each point.
+    """
+
+    point: NDArray[np.intp]
+    view: NDArray[np.intp]
+    parts: tuple[slice, ...]
+    focal: Array
+    offset: Array
+    sums: Any
+
+    @staticmethod
+    def of(observations: Observations, view: NDArray[np.intp], view_count: int) -> ViewColumns:
+        """From rows and the view (O,) of each."""
+        order = np.argsort(view, kind="stable")
+        point, view = observations.point[order], view[order]
+        ends = np.searchsorted(view, np.arange(view_count + 1))
+        sigma_px = observations.sigma_px[order, None]
+        count = len(point)
+        return ViewColumns(
+            point,
+            view,
+            tuple(slice(*part) for part in itertools.pairwise(ends.tolist())),
+            columns(observations.focal_px[order] / sigma_px),
+            columns((observations.principal_px - observations.pixel)[order] / sigma_px),
+            csr_array((np.ones(count), (point, np.arange(count))), shape=(int(point.max(initial=-1)) + 1, count)),
+        )
+
+    def in_camera(self, poses: Poses, x_in_world: Array) -> Array:
+        """(3, O) in the cameras' frames, from points (3, P)."""
+        rotation = take(columns(poses.rotation), self.view)
+        return np.asarray(apply_columns(rotation, take(x_in_world, self.point)) + take(poses.translation.T, self.view))
+
+    def residuals(self, x_in_camera: Array) -> Array:
+        """(2, O), in standard deviations; NaN behind the camera."""
+        depth = np.where(x_in_camera[2] > 0, x_in_camera[2], np.nan)
+        return np.asarray(x_in_camera[:2] / depth * self.focal + self.offset)
+
+    def linearized(self, bundle: Bundle) -> tuple[Array, Array, Array]:
+        """Residuals (2, O) and their derivatives by the point (2, 3, O) and the pose (2, 6, O)."""
+        rotation = take(columns(bundle.poses.rotation), self.view)
+        x_in_world = take(np.ascontiguousarray(bundle.points.T), self.point)
+        x, y, z = apply_columns(rotation, x_in_world) + take(bundle.poses.translation.T, self.view)
+        inverse_depth = 1 / np.where(z > 0, z, np.nan)
+        ideal, slope = np.stack([x, y]) * inverse_depth, self.focal * inverse_depth
+        by_point = slope[:, None] * (rotation[:2] - ideal[:, None] * rotation[2])
+        # The derivative by the camera's point, times [I | -[x]x] (see `perturbation.motion_jacobian`).
+        (u, v), (fx, fy), zero = ideal, self.focal, np.zeros_like(z)
+        by_pose = np.stack(
+            [
+                np.stack([slope[0], zero, -slope[0] * u, -fx * u * v, fx * (1 + u * u), -fx * v]),
+                np.stack([zero, slope[1], -slope[1] * v, -fy * (1 + v * v), fy * u * v, fy * u]),
+            ]
+        )
+        return ideal * self.focal + self.offset, by_point, by_pose
+
+    def equations(self, bundle: Bundle, loss_scale_sigma: float) -> NormalEquations:
+        """The normal equations of the observations alone, weighted by a Cauchy loss of this scale."""
+        residual, by_point, by_pose = self.linearized(bundle)
+        weight = cauchy_weight((residual**2).sum(axis=0), loss_scale_sigma)
+        weighted_point, weighted_pose = by_point * weight, by_pose * weight
+        blocks, gradients = [], []
+        for part in self.parts:
+            (x, y), (weighted_x, weighted_y) = by_pose[:, :, part], weighted_pose[:, :, part]
+            blocks.append(weighted_x @ x.T + weighted_y @ y.T)
+            gradients.append(weighted_x @ residual[0, part] + weighted_y @ residual[1, part])
+        point_block = symmetric_products(weighted_point, by_point)
+        point_gradient = (weighted_point * residual[:, None]).sum(axis=0)
+        return NormalEquations(
+            self,
+            np.stack(blocks),
+            np.concatenate(gradients),
+            np.stack([self.sums @ row for row in point_block]),
+            np.stack([self.sums @ row for row in point_gradient]),
+            np.einsum("kao,kbo->abo", weighted_pose, by_point),
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class NormalEquations:
     """[B E; E^T C] [d_pose; d_point] = -[g; h], where B and C are block-diagonal.
 
     Attributes:
+        columns: the observations.
         pose_block: B, (V, 6, 6).
         pose_gradient: g, (6 V,).
-        point_block: C, (P, 3, 3).
-        point_gradient: h, (P, 3).
-        cross: E, (P, 6 V, 3).
+        point_block: C, (6, P) as in `arrays.SYMMETRIC`.
+        point_gradient: h, (3, P).
+        cross: E, (6, 3, O), the block of each observation's view and point.
     """
 
+    columns: ViewColumns
     pose_block: Array
     pose_gradient: Array
     point_block: Array
     point_gradient: Array
     cross: Array
 
-    def reduced(self, damping: float) -> tuple[Array, Array, Array]:
-        """B - E C^-1 E^T (6 V, 6 V), g - E C^-1 h (6 V,) and C^-1 (P, 3, 3), diagonals enlarged by `damping`."""
-        damped_points = self.point_block * (1 + damping * np.eye(3))
-        inverse = invert_symmetric(damped_points)
-        size = self.cross.shape[1]
-        wide = np.swapaxes(self.cross, 0, 1).reshape(size, -1)  # (6 V, 3 P)
-        gained = np.swapaxes(self.cross @ inverse, 0, 1).reshape(size, -1)
-        matrix = -gained @ wide.T
-        for v, block in enumerate(self.pose_block * (1 + damping * np.eye(6))):
-            matrix[6 * v : 6 * v + 6, 6 * v : 6 * v + 6] += block
-        return matrix, self.pose_gradient - gained @ self.point_gradient.ravel(), inverse
+    def reduced(self, damping: float) -> tuple[Array, Array, EliminatedPoints]:
+        """B - E C^-1 E^T (6 V, 6 V), g - E C^-1 h (6 V,) and the points, diagonals enlarged by `damping`.
 
-    def point_steps(self, motion: Array, inverse: Array) -> Array:
-        """Steps (P, 3) of the points after a motion (6 V,) of the cameras; `inverse` as from `reduced`."""
-        back = self.point_gradient + np.swapaxes(self.cross, 1, 2) @ motion
-        return np.asarray(-(inverse @ back[:, :, None])[..., 0])
+        With Cholesky's C = L L^T the products are those of F = E L^-T with itself and with L^-1 h.
+        """
+        damped = self.point_block.copy()
+        damped[:3] *= 1 + damping
+        factor = _cholesky(damped)
+        gradient = np.stack(_forward(factor, self.point_gradient))
+        factors = take(factor, self.columns.point)
+        by_observation = np.stack(_forward(factors, np.swapaxes(self.cross, 0, 1)), axis=1).reshape(18, -1)
+        by_view = np.zeros((len(self.pose_block), 18, self.point_gradient.shape[1]))
+        for cross, part in zip(by_view, self.columns.parts, strict=True):
+            cross[:, self.columns.point[part]] = by_observation[:, part]  # one observation per point and view
+        wide = by_view.reshape(len(self.pose_gradient), -1)
+        matrix = -(wide @ wide.T)
+        for view, block in enumerate(self.pose_block * (1 + damping * np.eye(6))):
+            matrix[6 * view : 6 * view + 6, 6 * view : 6 * view + 6] += block
+        return matrix, self.pose_gradient - wide @ gradient.ravel(), EliminatedPoints(factor, gradient, wide)
+
+
+@dataclass(frozen=True, eq=False)
+class EliminatedPoints:
+    """What determines the points once the cameras are known.
+
+    Attributes:
+        factor: L (6, P), as in `arrays.SYMMETRIC`.
+        gradient: L^-1 h, (3, P).
+        cross: E L^-T, (6 V, 3 P).
+    """
+
+    factor: Array
+    gradient: Array
+    cross: Array
+
+    def steps(self, motion: Array) -> Array:
+        """Steps (P, 3) of the points after a motion (6 V,) of the cameras."""
+        xx, yy, zz, xy, xz, yz = self.factor
+        x, y, z = -(self.gradient + (motion @ self.cross).reshape(3, -1))
+        z = z / zz
+        y = (y - yz * z) / yy
+        return np.stack([(x - xy * y - xz * z) / xx, y, z], axis=1)
+
+
+def _cholesky(matrices: Array) -> Array:
+    """L (6, P) of symmetric positive matrices (6, P); both as in `arrays.SYMMETRIC`, NaN where singular."""
+    xx, yy, zz, xy, xz, yz = matrices
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first = np.sqrt(xx)
+        xy, xz = xy / first, xz / first
+        second = yy - xy * xy
+        yz = (yz - xz * xy) / np.sqrt(second)
+        third = zz - xz * xz - yz * yz
+    solvable = xx * second * third > 1e-14 * np.maximum(np.maximum(xx, yy), zz) ** 3
+    diagonal = np.sqrt(np.where(solvable, np.stack([xx, second, third]), np.nan))
+    return np.concatenate([diagonal, [xy, xz, yz]])
+
+
+def _forward(factor: Array, vectors: Array) -> list[Array]:
+    """L^-1 b of vectors b (3, ..., P), their components."""
+    xx, yy, zz, xy, xz, yz = factor
+    x = vectors[0] / xx
+    y = (vectors[1] - xy * x) / yy
+    return [x, y, (vectors[2] - xz * x - yz * y) / zz]
 
 
 def bundle_of(

@@ -265,9 +265,9 @@ class GroupProblem(Generic[S]):
         if step is None:
             return None
         points = []
-        for i, (it, (_, _, inverse), its_columns) in enumerate(zip(equations, reduced, columns, strict=True)):
+        for i, ((_, _, eliminated), its_columns) in enumerate(zip(reduced, columns, strict=True)):
             centre = point.state.camera_from_world(self.blocks[i].image).inverse().translation
-            points.append(_stepped(point.points[i], it.point_steps(its_columns @ step, inverse), centre))
+            points.append(_stepped(point.points[i], eliminated.steps(its_columns @ step), centre))
         references = point.references.moved(step[: 6 * self.reference_count].reshape(-1, 6))
         return Point(references, tuple(points), point.state.moved(step[6 * self.reference_count :]))
 
