@@ -42,7 +42,7 @@ GOOD = {"width_px": 640, "height_px": 480, "focal_x_px": 5, "focal_y_px": 5, "pr
 
 
 @pytest.mark.parametrize(
-    ("changes", "complaint"),
+    ("changes", "error_text"),
     [
         ({"focal_x_px": -5}, "focal_x_px: must be above 0 and at most 64000, is -5"),
         ({"focal_x_px": None}, "focal_x_px is missing"),
@@ -61,10 +61,10 @@ GOOD = {"width_px": 640, "height_px": 480, "focal_x_px": 5, "focal_y_px": 5, "pr
         ({"width_px": 10**400}, "width_px must be a whole number, is 1000"),
     ],
 )
-def test_a_wrong_camera_names_file_field_and_value(tmp_path: Path, changes: dict[str, Any], complaint: str) -> None:
+def test_a_wrong_camera_names_file_field_and_value(tmp_path: Path, changes: dict[str, Any], error_text: str) -> None:
     file = tmp_path / "camera.json"
     file.write_text(json.dumps(GOOD | changes))
-    with pytest.raises(ValueError, match=f"^{re.escape(f'{file}: {complaint}').replace(re.escape('.*'), '.*')}"):
+    with pytest.raises(ValueError, match=f"^{re.escape(f'{file}: {error_text}').replace(re.escape('.*'), '.*')}"):
         read_camera(file)
 
 
@@ -77,7 +77,7 @@ def test_a_field_is_named_as_it_was_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "complaint"),
+    ("content", "error_text"),
     [
         (b"", "is empty"),
         (b"hello", "is not JSON: Expecting value in line 1, column 1"),
@@ -87,15 +87,15 @@ def test_a_field_is_named_as_it_was_written(tmp_path: Path) -> None:
         (b"\xff\xfe\x00", "is not a text file"),
     ],
 )
-def test_a_file_without_a_camera_says_what_it_is(tmp_path: Path, content: bytes, complaint: str) -> None:
+def test_a_file_without_a_camera_says_what_it_is(tmp_path: Path, content: bytes, error_text: str) -> None:
     for read in (read_camera, read_pose):
         (tmp_path / "it.json").write_bytes(content)
-        with pytest.raises(ValueError, match=rf"it\.json: {complaint}"):
+        with pytest.raises(ValueError, match=rf"it\.json: {error_text}"):
             read(tmp_path / "it.json")
 
 
 @pytest.mark.parametrize(
-    ("pose", "complaint"),
+    ("pose", "error_text"),
     [
         ({"rotation": {"w": 2}, "translation_m": {}}, "pose: rotation: quaternion must have norm 1, has 2"),
         ({"rotation": {"w": 1}}, "pose: translation_m is missing"),
@@ -104,8 +104,8 @@ def test_a_file_without_a_camera_says_what_it_is(tmp_path: Path, content: bytes,
         ({"rotation": {"w": 1}, "translation_m": {"y": "Infinity"}}, "pose: translation_m.y: must be finite, is inf"),
     ],
 )
-def test_a_wrong_pose_names_the_field(pose: dict[str, Any], complaint: str) -> None:
-    with pytest.raises(ValueError, match=f"^{re.escape(complaint)}"):
+def test_a_wrong_pose_names_the_field(pose: dict[str, Any], error_text: str) -> None:
+    with pytest.raises(ValueError, match=f"^{re.escape(error_text)}"):
         read_pose(json.dumps(pose))
 
 
@@ -121,7 +121,7 @@ def test_the_cameras_of_a_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "complaint"),
+    ("wrong", "error_text"),
     [
         ({"K": [[1]]}, "K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], is [[1]]"),
         ({"K": [[-5, 0, 3], [0, 5, 2], [0, 0, 1]]}, "K[0][0]: must be above 0 and at most 64000, is -5"),
@@ -134,10 +134,10 @@ def test_the_cameras_of_a_folder(tmp_path: Path) -> None:
         ({"image": None}, "image must be a path, is null"),
     ],
 )
-def test_a_frame_that_is_none_is_named(tmp_path: Path, wrong: dict[str, Any], complaint: str) -> None:
+def test_a_frame_that_is_none_is_named(tmp_path: Path, wrong: dict[str, Any], error_text: str) -> None:
     file = tmp_path / "cameras.json"
     file.write_text(json.dumps({"frames": [frame(), frame(**wrong)]}))
-    with pytest.raises(ValueError, match=re.escape(f"cameras.json: frames[1]: {complaint}")):
+    with pytest.raises(ValueError, match=re.escape(f"cameras.json: frames[1]: {error_text}")):
         read_cameras(file)
 
 

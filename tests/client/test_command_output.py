@@ -49,10 +49,10 @@ def test_a_coarse_pose_is_not_called_localized(is_final: bool, first: str) -> No
     coarse = localized(
         pose_stage="COARSE", covariance=None, accuracy=None, trust=None, prior_checks=(), is_final=is_final
     )
-    told = lines(coarse)
-    assert told[0] == first
-    assert told[-1] == "  support   not verified, 0.30 s"
-    assert not [line for line in told if "within" in line]
+    printed = lines(coarse)
+    assert printed[0] == first
+    assert printed[-1] == "  support   not verified, 0.30 s"
+    assert not [line for line in printed if "within" in line]
 
 
 def test_a_rejection_names_the_reference_that_shares_most() -> None:

@@ -39,7 +39,7 @@ def addresses() -> Iterator[dict[str, str]]:
 
 
 @pytest.mark.parametrize(
-    ("kind", "certificates", "told"),
+    ("kind", "certificates", "expected"),
     [
         ("tls", None, "if it uses TLS"),
         ("tls", ANOTHER.certificate_pem, "is not signed by a known authority"),
@@ -49,26 +49,26 @@ def addresses() -> Iterator[dict[str, str]]:
     ],
 )
 def test_a_failed_connection_is_explained(
-    addresses: dict[str, str], kind: str, certificates: bytes | None, told: str
+    addresses: dict[str, str], kind: str, certificates: bytes | None, expected: str
 ) -> None:
     options = ConnectOptions(tls=certificates is not None, root_certificates=certificates, max_attempts=1)
     with Client(addresses[kind], options) as client, pytest.raises(MaplessError) as caught:
         client.is_serving()
     assert caught.value.code == "UNAVAILABLE"
     assert caught.value.message.startswith(f"cannot connect to {addresses[kind]}: ")
-    assert told in caught.value.message
+    assert expected in caught.value.message
 
 
 @pytest.mark.parametrize(
-    ("address", "told"),
+    ("address", "expected"),
     [
         ("ipv4:127.0.0.1:443", "cannot connect to 127.0.0.1:443: no server .*; an address without a port has port 443"),
         ("ipv6:%5B::1%5D:50051", r"cannot connect to \[::1\]:50051: no server .*; there may be another reason at"),
     ],
 )
-def test_an_address_that_was_not_meant_is_explained(address: str, told: str) -> None:
+def test_an_address_that_was_not_meant_is_explained(address: str, expected: str) -> None:
     details = f"failed: connections to all backends failing; last error: UNKNOWN: {address}: Connection refused (111)"
-    assert re.match(told, _message(details.removeprefix("failed: ")))
+    assert re.match(expected, _message(details.removeprefix("failed: ")))
 
 
 def test_the_servers_own_message_is_kept(addresses: dict[str, str]) -> None:
@@ -88,7 +88,7 @@ def test_without_token_and_client_id_nothing_is_sent() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "complaint"),
+    ("wrong", "error_text"),
     [
         ({"client_certificate": b"x"}, "go together"),
         ({"client_key": b"x", "tls": True}, "go together"),
@@ -100,7 +100,7 @@ def test_without_token_and_client_id_nothing_is_sent() -> None:
         ({"client_id": "a\n"}, "client_id must be"),
     ],
 )
-def test_a_malformed_secret_is_rejected_without_showing_it(wrong: dict[str, Any], complaint: str) -> None:
-    with pytest.raises(ValueError, match=complaint) as caught:
+def test_a_malformed_secret_is_rejected_without_showing_it(wrong: dict[str, Any], error_text: str) -> None:
+    with pytest.raises(ValueError, match=error_text) as caught:
         ConnectOptions(**wrong)
     assert "SECRET" not in str(caught.value)

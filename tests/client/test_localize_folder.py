@@ -122,8 +122,8 @@ def test_refused_photographs_do_not_wait_behind_new_ones(
                 server.changed.wait_for(lambda: server.refused >= 6, 20)
 
     server.fault = until_all_came_again
-    code, answers, told = run(server, folder, capsys, "--parallel", "4")
-    assert (code, told) == (0, f"{COUNT} of {COUNT} localized\n")
+    code, answers, report = run(server, folder, capsys, "--parallel", "4")
+    assert (code, report) == (0, f"{COUNT} of {COUNT} localized\n")
     assert [answer["photo"] for answer in answers] == [f"{i}.jpg" for i in range(COUNT)]
     assert set(server.answered[:3]) < {"0", "1", "2", "3"}
 
@@ -138,9 +138,9 @@ def test_the_summary_counts_the_reasons(server: FewAtATime, folder: Path, capsys
 
     server.fault = fault
     (folder / "5.jpg").unlink()
-    code, answers, told = run(server, folder, capsys)
+    code, answers, report = run(server, folder, capsys)
     summary = f"4 of {COUNT} localized, 1 not localized (1 LOW_OVERLAP), 3 failed (2 INTERNAL, 1 UNREADABLE_FILE)\n"
-    assert (code, told) == (1, summary)
+    assert (code, report) == (1, summary)
     assert "5.jpg cannot be read: No such file" in answers[5]["error"]["message"]
 
 
@@ -153,9 +153,9 @@ def test_an_interrupted_run_reports_its_progress(
 
     server.fault = fault
     written = tmp_path / "poses.jsonl"
-    code, _, told = run(server, folder, capsys, "--output", str(written), "--parallel", "1")
+    code, _, report = run(server, folder, capsys, "--output", str(written), "--parallel", "1")
     where = f"answers are in {written}\n"
-    assert (code, told) == (
+    assert (code, report) == (
         1,
         f"ended after 3 of {COUNT}: 3 of 3 localized\n{where}mapless: NOT_FOUND: no such scene\n",
     )
@@ -194,8 +194,8 @@ def test_what_is_captured_is_counted() -> None:
         InvalidArgument("INVALID_ARGUMENT", "no image", reason="INVALID_IMAGE"),
     ):
         tally.count(outcome)
-    told = "2 of 4 localized, 1 not localized (1 LOW_OVERLAP), 1 failed (1 INVALID_IMAGE); 2 captured by the server"
-    assert (tally.summary(), tally.exit_code) == (told, 1)
+    report = "2 of 4 localized, 1 not localized (1 LOW_OVERLAP), 1 failed (1 INVALID_IMAGE); 2 captured by the server"
+    assert (tally.summary(), tally.exit_code) == (report, 1)
 
 
 def test_refusals_lower_concurrency_and_answers_raise_it() -> None:

@@ -38,7 +38,7 @@ def test_cameras_come_back_as_they_were(distortion: RadialTangential | Fisheye |
 
 
 @pytest.mark.parametrize(
-    ("convert", "value", "complaint"),
+    ("convert", "value", "error_text"),
     [
         (wire.camera_to_message, "camera.json", "camera must be a Camera, is str; read_camera"),
         (wire.camera_to_message, changed(width_px=640.0), "camera.width_px must be a whole number, is 640.0"),
@@ -61,8 +61,8 @@ def test_cameras_come_back_as_they_were(distortion: RadialTangential | Fisheye |
         ),
     ],
 )
-def test_a_value_of_another_type_is_named(convert: Callable[[Any], Any], value: Any, complaint: str) -> None:
-    with pytest.raises(TypeError, match=complaint):
+def test_a_value_of_another_type_is_named(convert: Callable[[Any], Any], value: Any, error_text: str) -> None:
+    with pytest.raises(TypeError, match=error_text):
         convert(value)
 
 

@@ -73,10 +73,10 @@ def test_serve_takes_the_configuration() -> None:
     assert set(schema.model_dump(exclude_unset=True)) == set(SERVE)
     (application,) = schema.applications
     (deployment,) = application.deployments
-    (told,) = SERVE["applications"][0]["deployments"]
-    assert set(deployment.model_dump(exclude_unset=True)) == set(told)
-    scaling = AutoscalingConfig(**told["autoscaling_config"])
-    assert set(told["autoscaling_config"]) <= set(type(scaling).model_fields)
+    (given,) = SERVE["applications"][0]["deployments"]
+    assert set(deployment.model_dump(exclude_unset=True)) == set(given)
+    scaling = AutoscalingConfig(**given["autoscaling_config"])
+    assert set(given["autoscaling_config"]) <= set(type(scaling).model_fields)
     assert (scaling.min_replicas, scaling.max_replicas) == (WORKERS["minReplicas"], WORKERS["maxReplicas"])
     assert schema.grpc_options.port == CALLS
     assert schema.grpc_options.enable_reflection is False
@@ -114,14 +114,14 @@ def test_settings_are_mapless_own(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_every_pod_has_the_same_ray_settings_that_ray_knows() -> None:
-    told = environment("head", "RAY_")
-    assert told == environment("worker", "RAY_")
-    assert told["RAY_SERVE_ENABLE_HA_PROXY"] == "1"
+    given = environment("head", "RAY_")
+    assert given == environment("worker", "RAY_")
+    assert given["RAY_SERVE_ENABLE_HA_PROXY"] == "1"
     source = Path(constants.__file__).read_text()
-    for name in told:
+    for name in given:
         assert f'"{name}"' in source, name
-    assert variables().items() <= told.items()
-    assert f"hdr({SCENE_KEY})" in told["RAY_SERVE_HAPROXY_BALANCE_ALGORITHM"]
+    assert variables().items() <= given.items()
+    assert f"hdr({SCENE_KEY})" in given["RAY_SERVE_HAPROXY_BALANCE_ALGORITHM"]
 
 
 # What KubeRay is told

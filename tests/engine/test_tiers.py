@@ -99,8 +99,8 @@ class TestBetter:
             assert isinstance(outcome, Rejection)
             assert outcome.reason is RejectionReason.GATE
             apart = "3.00 m and 0.0 degrees" if "x_m" in far else "0.00 m and 20.0 degrees"
-            told = f"the pose of cheap (30 inliers) and that of strong ({inliers}) are {apart} apart"
-            assert outcome.message == f"the features disagree: {told}"
+            expected = f"the pose of cheap (30 inliers) and that of strong ({inliers}) are {apart} apart"
+            assert outcome.message == f"the features disagree: {expected}"
         else:
             assert isinstance(outcome, Localization)
 

@@ -111,9 +111,9 @@ def test_what_is_wrong_is_one_line(loop: Any, tmp_path: Path, camera_json: str, 
     (tmp_path / "cameras.json").write_text('{"frames": []}')
     with pytest.raises(SystemExit) as caught:
         loop.main([str(tmp_path / video), "--camera", str(tmp_path / camera), "--scene", "hall"])
-    told = str(caught.value.code)
-    assert told.startswith("robot_loop: ")
-    assert "\n" not in told
+    message = str(caught.value.code)
+    assert message.startswith("robot_loop: ")
+    assert "\n" not in message
 
 
 def test_what_is_no_video_is_said(loop: Any, tmp_path: Path) -> None:

@@ -213,25 +213,25 @@ def test_the_report_can_be_printed_for_any_frame_file(text: str) -> None:
     dataset = Dataset("a", (), True, "", refused=(Refusal(text, text),))
     print_report(ImportReport("scene", dataset, ()), Console(file=stream, width=10_000))
     stream.flush()
-    told = buffer.getvalue().decode()
-    assert all(line.isprintable() for line in told.split("\n"))
+    printed = buffer.getvalue().decode()
+    assert all(line.isprintable() for line in printed.split("\n"))
     json.dumps(vars(dataset.refused[0])).encode()
 
 
 @given(st.lists(identifiers, max_size=12, unique=True).map(sorted), st.integers(1, 5))
-def test_pages_tell_each_of_a_list_once_and_in_order(ids: list[str], size: int) -> None:
-    told: list[str] = []
+def test_pages_have_each_of_a_list_once_and_in_order(ids: list[str], size: int) -> None:
+    listed: list[str] = []
     token = ""
     for _ in range(len(ids) + 1):
         page = Page(reference_pb.ListScenesRequest(page_size=size, page_token=token), "acme", "scenes")
         found = [it for it in ids if it > page.after][: page.limit]
         records, token = page.cut(found, str)
-        told += records
+        listed += records
         if not token:
             break
         with pytest.raises(FieldError, match="page_token"):
             Page(reference_pb.ListScenesRequest(page_token=token), "others", "scenes")
-    assert told == ids
+    assert listed == ids
 
 
 @given(st.text(max_size=60) | st.binary(max_size=60).map(lambda data: base64.urlsafe_b64encode(data).decode()))

@@ -121,17 +121,17 @@ def test_a_replicas_handlers_are_those_of_the_plain_server(settings: Settings) -
 
 
 async def test_a_server_that_serve_stops_is_drained_first(settings: Settings) -> None:
-    told: list[Any] = []
+    events: list[Any] = []
 
     class Stopped:
         async def drain(self, delay_s: float, grace_s: float) -> None:
-            told.append(("drained", delay_s, grace_s))
+            events.append(("drained", delay_s, grace_s))
 
     async def stop(grace_s: float | None) -> None:
-        told.append("stopped")
+        events.append("stopped")
 
     await Ingress(settings, Stopped(), None).drained(stop)(7.0)  # type: ignore[arg-type]
-    assert told == [("drained", 0.0, 7.0), "stopped"]
+    assert events == [("drained", 0.0, 7.0), "stopped"]
 
 
 async def test_tls_is_rejected_behind_serve(settings: Settings) -> None:

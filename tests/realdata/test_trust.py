@@ -56,9 +56,9 @@ def test_a_wrong_focal_length_is_reported_with_the_right_one(photographs: Photog
         camera = replace(given, focal_x_px=factor * given.focal_x_px, focal_y_px=factor * given.focal_y_px)
         (it,) = answered([replace(pair, query=replace(pair.query, camera=camera))], ALL)
         assert it.answer.support is not None
-        told = wrong_focal(it.answer.support, FocalOptions())
-        assert told is not None
-        assert told.estimated_px == pytest.approx(given.focal_x_px, rel=0.01)
+        estimate = wrong_focal(it.answer.support, FocalOptions())
+        assert estimate is not None
+        assert estimate.estimated_px == pytest.approx(given.focal_x_px, rel=0.01)
         assert isinstance(it.answer.outcome, Rejection)
         assert it.answer.outcome.hint is not None
         assert it.answer.outcome.hint.advice is Advice.CHECK_CALIBRATION

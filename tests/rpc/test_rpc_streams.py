@@ -324,7 +324,7 @@ class TestFiniteStreams:
             time.sleep(0.15)  # with the headers, and with the message
             return Principal()
 
-        with warnings.catch_warnings(record=True) as told:
+        with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always")
             late = serving(Numbers(1), Counted(), default_deadline_s=0.2, authenticate=authenticate)
             async with late as (channel, _):
@@ -332,7 +332,7 @@ class TestFiniteStreams:
                     await read(watching(channel, None, FINITE))
             assert from_rpc_error(caught.value).reason == "DEADLINE_EXCEEDED"
             gc.collect()
-        assert not told
+        assert not warned
 
     async def test_the_caller_is_authenticated_twice_only(self) -> None:
         asked = []

@@ -172,8 +172,8 @@ async def outcomes(calls: Sequence[asyncio.Task[Any]]) -> list[Any]:
 def _nothing_unhandled(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
     """An exception that reaches only the loop is a failure."""
     yield
-    told = [*caplog.get_records("call"), *caplog.get_records("teardown")]
-    assert not [it for it in told if it.name == "asyncio" and it.levelname == "ERROR"]
+    logged = [*caplog.get_records("call"), *caplog.get_records("teardown")]
+    assert not [it for it in logged if it.name == "asyncio" and it.levelname == "ERROR"]
 
 
 class TestResults:

@@ -294,7 +294,7 @@ class TestFilesAtTheStart:
             read_material(files)
 
     @pytest.mark.parametrize(
-        ("which", "content", "complaint"),
+        ("which", "content", "error_text"),
         [
             ("certificate", None, "No such file"),
             ("key", None, "No such file"),
@@ -313,14 +313,14 @@ class TestFilesAtTheStart:
         ],
     )
     def test_an_error_is_one_sentence_that_names_the_file(
-        self, mutual: TlsFiles, which: str, content: bytes | None, complaint: str
+        self, mutual: TlsFiles, which: str, content: bytes | None, error_text: str
     ) -> None:
         path: Path = getattr(mutual, which)
         if content is None:
             path.unlink()
         else:
             path.write_bytes(content)
-        with pytest.raises(SecurityError, match=complaint) as caught:
+        with pytest.raises(SecurityError, match=error_text) as caught:
             Tls(mutual)
         assert str(path) in str(caught.value)
         assert "\n" not in str(caught.value)
@@ -373,7 +373,7 @@ class TestCommand:
         assert server.health_metadata["authorization"] == "Bearer mapless_x"
 
     @pytest.mark.parametrize(
-        ("changes", "code", "complaint"),
+        ("changes", "code", "error_text"),
         [
             ({"--key": None}, 2, "go together"),
             ({"--cert": None}, 2, "go together"),
@@ -389,10 +389,10 @@ class TestCommand:
         capsys: pytest.CaptureFixture[str],
         changes: dict[str, str | None],
         code: int,
-        complaint: str,
+        error_text: str,
     ) -> None:
         given = {flag: value for flag, value in (flags | changes).items() if value is not None}
         assert self.health(server, given) == code
         said = capsys.readouterr().err
-        assert complaint in said
+        assert error_text in said
         assert "mapless_x" not in said

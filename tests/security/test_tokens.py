@@ -137,7 +137,7 @@ class TestFile:
             create_token(tmp_path / "absent" / "tokens.json", "a", "t", "read", None)
 
     @pytest.mark.parametrize(
-        ("content", "complaint"),
+        ("content", "error_text"),
         [
             ("", "Invalid JSON"),
             ("[]", "valid dictionary|object"),
@@ -152,9 +152,9 @@ class TestFile:
             ('{"tenants": {"a/b": {}}}', "tenants.a/b"),
         ],
     )
-    def test_a_wrong_file_is_one_sentence_that_shows_no_secret(self, path: Path, content: str, complaint: str) -> None:
+    def test_a_wrong_file_is_one_sentence_that_shows_no_secret(self, path: Path, content: str, error_text: str) -> None:
         path.write_text(content)
-        with pytest.raises(SecurityError, match=complaint) as caught:
+        with pytest.raises(SecurityError, match=error_text) as caught:
             read_tokens(path)
         assert str(caught.value).startswith(str(path))
         assert "\n" not in str(caught.value)
@@ -393,7 +393,7 @@ class TestCommand:
         assert self.run("list", path=path) == (0, "", "")
 
     @pytest.mark.parametrize(
-        ("arguments", "code", "complaint"),
+        ("arguments", "code", "error_text"),
         [
             (("create", "--name", "a", "--role", "king"), 1, "role"),
             (("create", "--name", "a", "--role", "read", "--expires", "soon"), 2, "--expires"),
@@ -403,11 +403,11 @@ class TestCommand:
             (("revoke", "a"), 1, "no token"),
         ],
     )
-    def test_complaints_are_one_line(self, path: Path, arguments: tuple[str, ...], code: int, complaint: str) -> None:
+    def test_complaints_are_one_line(self, path: Path, arguments: tuple[str, ...], code: int, error_text: str) -> None:
         create_token(path, "old", "t", "read", None)
         found_code, printed, said = self.run(*arguments, path=path)
         assert (found_code, printed, said.count("\n")) == (code, "", 1)
-        assert complaint in said
+        assert error_text in said
 
     def test_the_setting_names_the_file(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """The client's variable MAPLESS_TOKEN is no setting, and no error."""

@@ -43,14 +43,14 @@ def test_auto_is_the_default_and_sift_without_weights(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("missing", "told"),
+    ("missing", "expected"),
     [
         ("weights", "run `mapless-server weights fetch edgepoint2-l64 aliked`"),
         ("package", "mapless-absent is not installed: pip install"),
     ],
 )
 def test_auto_leaves_out_what_is_missing_and_logs_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, missing: str, told: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, missing: str, expected: str
 ) -> None:
     def without_package(name: str, *arguments: object) -> object:
         if name != "sift":
@@ -64,7 +64,7 @@ def test_auto_leaves_out_what_is_missing_and_logs_it(
         (tier,) = make_tiers(settings(tmp_path, features="auto"))
     assert tier.extractor.name.startswith("sift")
     (record,) = caplog.records
-    assert told in record.getMessage()
+    assert expected in record.getMessage()
     assert "\n" not in record.getMessage()
     assert record.getMessage().startswith("features auto: sift; with edgepoint2-l64 and aliked more ")
 

@@ -69,7 +69,7 @@ def test_the_file_may_be_named_by_the_environment(config: Path, monkeypatch: pyt
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "expected"),
     [
         ("prot = 1", "prot (file)"),
         ("port = 65536", "port (file): must be at most 65535, is 65536"),
@@ -83,12 +83,12 @@ def test_the_file_may_be_named_by_the_environment(config: Path, monkeypatch: pyt
         ('log_level = "loud"', "log_level (file)"),
     ],
 )
-def test_an_error_in_the_file_names_setting_and_origin(tmp_path: Path, text: str, told: str) -> None:
+def test_an_error_in_the_file_names_setting_and_origin(tmp_path: Path, text: str, expected: str) -> None:
     path = tmp_path / "mapless.toml"
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:
         load_settings({}, path)
-    assert told in str(caught.value)
+    assert expected in str(caught.value)
 
 
 def test_features_that_can_be_made_are_those_of_the_setting(tmp_path: Path) -> None:

@@ -222,8 +222,8 @@ class TestDisk:
                 wait_until(lambda: health_of(client) == (True, True, False))
                 with pytest.raises(SystemExit) as caught:
                     main(["--address", client.address, "health"])
-            told = "SERVING\nLocalizationService SERVING\nReferenceService NOT_SERVING\n"
-            assert (caught.value.code, capsys.readouterr().out) == (0, told)
+            expected = "SERVING\nLocalizationService SERVING\nReferenceService NOT_SERVING\n"
+            assert (caught.value.code, capsys.readouterr().out) == (0, expected)
 
     def serves_queries_alone(self, client: HealthClient) -> None:
         assert is_answered(client)
@@ -374,12 +374,12 @@ class TestTwoServers:
             (soft / DATABASE_FILE).symlink_to(data / DATABASE_FILE)
             os.link(data / DATABASE_FILE, hard / DATABASE_FILE)
             *by_folder, by_soft, by_hard = self.opened_by_another(data, link, relative, soft, hard)
-            assert all(f"in use by another server (process {os.getpid()})" in told for told in by_folder)
-            assert all("in use by another server, under another name" in told for told in (by_soft, by_hard))
-            # Somebody tidies up: the file's own lock is still there.
+            assert all(f"in use by another server (process {os.getpid()})" in error for error in by_folder)
+            assert all("in use by another server, under another name" in error for error in (by_soft, by_hard))
+            # The lock of the folder is deleted: that of the file is still there.
             (data / LOCK_FILE).unlink()
-            (told,) = self.opened_by_another(data)
-            assert "in use by another server" in told
+            (error,) = self.opened_by_another(data)
+            assert "in use by another server" in error
         assert self.opened_by_another(data) == [""]
 
     def test_a_lock_file_of_a_killed_server_blocks_no_start(self, tmp_path: Path) -> None:

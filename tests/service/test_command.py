@@ -78,22 +78,22 @@ def test_from_an_empty_server_to_a_pose(run: Run, tmp_path: Path, camera_json: s
 
 
 def test_complaints(run: Run, tmp_path: Path, camera_json: str) -> None:
-    code, _, complaint = run("scene", "get", "absent")
+    code, _, error_text = run("scene", "get", "absent")
     assert code == 1
-    assert complaint.startswith("mapless: NOT_FOUND: ")
+    assert error_text.startswith("mapless: NOT_FOUND: ")
     photo = str(tmp_path / "absent.jpg")
-    code, _, complaint = run("localize", "s", photo, "--camera", camera_json)
-    assert (code, "absent.jpg" in complaint) == (2, True)
-    assert complaint == f"mapless: {photo}: No such file or directory\n"
-    code, _, complaint = run("localize", "s", photo, "--camera", '{"width": 3}')
-    assert (code, "width is no field" in complaint) == (2, True)
+    code, _, error_text = run("localize", "s", photo, "--camera", camera_json)
+    assert (code, "absent.jpg" in error_text) == (2, True)
+    assert error_text == f"mapless: {photo}: No such file or directory\n"
+    code, _, error_text = run("localize", "s", photo, "--camera", '{"width": 3}')
+    assert (code, "width is no field" in error_text) == (2, True)
 
 
 def test_a_file_whose_name_is_no_id_needs_one(run: Run, scene: str, tmp_path: Path, camera_json: str) -> None:
     (tmp_path / "my photo.png").write_bytes(PHOTO)
     where = ("--camera", camera_json, "--pose", json.dumps(plain(pose(0.5))))
-    code, _, complaint = run("reference", "add", scene, tmp_path / "my photo.png", *where)
-    assert (code, "my photo.png: its name gives no id, so give one with --id: " in complaint) == (2, True)
+    code, _, error_text = run("reference", "add", scene, tmp_path / "my photo.png", *where)
+    assert (code, "my photo.png: its name gives no id, so give one with --id: " in error_text) == (2, True)
     code, stored, _ = run("reference", "add", scene, tmp_path / "my photo.png", *where, "--id", "mine")
     assert (code, stored["reference_id"]) == (0, "mine")
 
@@ -107,7 +107,7 @@ def test_a_blank_reference_is_warned_of(run: Run, scene: str, tmp_path: Path, ca
 
 
 @pytest.mark.parametrize(
-    ("content", "camera", "complaint"),
+    ("content", "camera", "error_text"),
     [
         (b"", CAMERA, "photo.png: IMAGE_EMPTY: the image is empty\n"),
         (b"hello", CAMERA, "photo.png: IMAGE_UNKNOWN_FORMAT: "),
@@ -115,13 +115,13 @@ def test_a_blank_reference_is_warned_of(run: Run, scene: str, tmp_path: Path, ca
     ],
 )
 def test_an_error_names_the_file(
-    run: Run, scene: str, tmp_path: Path, content: bytes, camera: Camera, complaint: str
+    run: Run, scene: str, tmp_path: Path, content: bytes, camera: Camera, error_text: str
 ) -> None:
     (tmp_path / "photo.png").write_bytes(content)
     (tmp_path / "camera.json").write_text(json.dumps(plain(camera)))
     code, _, printed = run("localize", scene, tmp_path / "photo.png", "--camera", tmp_path / "camera.json")
     assert code == 1
-    assert printed.startswith(f"mapless: {tmp_path}/{complaint}")
+    assert printed.startswith(f"mapless: {tmp_path}/{error_text}")
 
 
 @pytest.fixture
@@ -148,9 +148,9 @@ def lines_of(printed: str) -> list[Any]:
 def test_a_folder_gives_one_json_line_per_photograph_in_order(
     run: Run, scene: str, folder: Path, parallel: str
 ) -> None:
-    code, printed, told = run("localize", scene, folder, "--parallel", parallel)
+    code, printed, report = run("localize", scene, folder, "--parallel", parallel)
     answers = lines_of(printed)
-    assert (code, told) == (0, "2 of 2 localized\n")
+    assert (code, report) == (0, "2 of 2 localized\n")
     assert [answer["photo"] for answer in answers] == ["images/2.png", "images/0.png"]
     assert all("world_from_camera" in answer for answer in answers)
 
@@ -159,8 +159,8 @@ def test_a_call_that_fails_does_not_end_the_others(run: Run, scene: str, folder:
     """Four numbers take the size of the image from each file; a file that has none fails by its call alone."""
     written = tmp_path / "answers.jsonl"
     camera = json_format.MessageToJson(wire.camera_to_message(CAMERA))
-    code, printed, told = run("localize", scene, folder / "images", "--camera", camera, "--output", written)
-    assert (code, printed, told) == (
+    code, printed, report = run("localize", scene, folder / "images", "--camera", camera, "--output", written)
+    assert (code, printed, report) == (
         1,
         "",
         f"2 of 3 localized, 1 failed (1 IMAGE_UNKNOWN_FORMAT)\nanswers are in {written}\n",
@@ -178,25 +178,25 @@ def test_a_call_that_fails_does_not_end_the_others(run: Run, scene: str, folder:
 
 def test_a_folder_with_unlocalized_photographs_ends_with_3(run: Run, folder: Path) -> None:
     assert run("scene", "create", "bare")[0] == 0
-    code, printed, told = run("localize", "bare", folder)
-    assert (code, told) == (3, "0 of 2 localized, 2 not localized (2 NO_USABLE_REFERENCES)\n")
+    code, printed, report = run("localize", "bare", folder)
+    assert (code, report) == (3, "0 of 2 localized, 2 not localized (2 NO_USABLE_REFERENCES)\n")
     assert {answer["reason"] for answer in lines_of(printed)} == {"NO_USABLE_REFERENCES"}
 
 
 def test_a_photograph_beside_a_cameras_json_needs_no_camera(run: Run, scene: str, folder: Path) -> None:
-    code, answer, told = run("localize", scene, folder / "images" / "0.png")
-    assert (code, answer["inlier_count"], told) == (0, 90, "")
-    code, _, complaint = run("localize", scene, folder / "images" / "1.png")
-    assert (code, "does not list" in complaint) == (2, True)
+    code, answer, report = run("localize", scene, folder / "images" / "0.png")
+    assert (code, answer["inlier_count"], report) == (0, 90, "")
+    code, _, error_text = run("localize", scene, folder / "images" / "1.png")
+    assert (code, "does not list" in error_text) == (2, True)
     (folder / "cameras.json").unlink()
-    code, _, complaint = run("localize", scene, folder / "images" / "0.png")
-    assert (code, "give --camera" in complaint) == (2, True)
+    code, _, error_text = run("localize", scene, folder / "images" / "0.png")
+    assert (code, "give --camera" in error_text) == (2, True)
 
 
 def test_an_error_that_concerns_all_photographs_ends_the_run(run: Run, folder: Path) -> None:
-    code, printed, complaint = run("localize", "nowhere", folder)
+    code, printed, error_text = run("localize", "nowhere", folder)
     assert (code, printed) == (1, "")
-    assert complaint.startswith("mapless: NOT_FOUND: ")
+    assert error_text.startswith("mapless: NOT_FOUND: ")
 
 
 class TestOnATerminal:
@@ -235,13 +235,13 @@ class TestOnATerminal:
         terminal: Callable[[], None],
     ) -> None:
         terminal()
-        code, printed, told = run("localize", scene, folder)
+        code, printed, report = run("localize", scene, folder)
         assert code == 0
         assert [line.split()[0] for line in printed.splitlines()] == ["photograph", "images/2.png", "images/0.png"]
-        assert "[........................] 0/2" in told
-        assert "[############............] 1/2, 0 s to go" in told
-        assert "[########################] 2/2" in told
-        assert told.endswith("\r\x1b[K2 of 2 localized\n")
+        assert "[........................] 0/2" in report
+        assert "[############............] 1/2, 0 s to go" in report
+        assert "[########################] 2/2" in report
+        assert report.endswith("\r\x1b[K2 of 2 localized\n")
 
     def test_a_rejection_is_printed_with_its_reason(self, run: Run, folder: Path, terminal: Callable[[], None]) -> None:
         terminal()
@@ -254,8 +254,8 @@ class TestOnATerminal:
 
 def test_drawings_are_one_page_each_and_debug_goes_by_name(run: Run, scene: str, folder: Path, tmp_path: Path) -> None:
     pages = tmp_path / "pages"
-    code, printed, told = run("localize", scene, folder, "--draw", pages)
-    assert (code, told) == (0, f"2 of 2 localized\npages to look at are in {pages}\n")
+    code, printed, report = run("localize", scene, folder, "--draw", pages)
+    assert (code, report) == (0, f"2 of 2 localized\npages to look at are in {pages}\n")
     assert all(answer["debug"] is None for answer in lines_of(printed))
     assert sorted(page.name for page in pages.iterdir()) == ["images_0.png.html", "images_2.png.html"]
     assert "images/0.png" in (pages / "images_0.png.html").read_text()
@@ -276,7 +276,7 @@ def test_a_scene_has_its_place_on_the_earth(run: Run) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "expected"),
     [
         (["--parallel", "0"], "--parallel must be at least 1, is 0"),
         (["--rerank"], "--rerank needs --reference"),
@@ -289,11 +289,13 @@ def test_a_scene_has_its_place_on_the_earth(run: Run) -> None:
         (["--axes", "sideways", "--camera", '{"width_px": 96}'], "camera: height_px"),
     ],
 )
-def test_wrong_arguments_are_reported_before_any_call(run: Run, folder: Path, arguments: list[str], told: str) -> None:
-    code, printed, complaint = run("localize", "s", folder / "images", *arguments)
+def test_wrong_arguments_are_reported_before_any_call(
+    run: Run, folder: Path, arguments: list[str], expected: str
+) -> None:
+    code, printed, error_text = run("localize", "s", folder / "images", *arguments)
     assert (code, printed) == (2, "")
-    assert told in complaint
-    assert "Traceback" not in complaint
+    assert expected in error_text
+    assert "Traceback" not in error_text
 
 
 @pytest.mark.parametrize("command", ["localize", "retrieve"])

@@ -73,13 +73,13 @@ def test_where_a_scene_is_on_the_earth_goes_along(
     scene, _ = filled
     datum = Datum(47.1 / 3, 8.1 / 3, 400.1 / 3, enu_from_y_up(30))
     client.update_scene(scene, datum=datum, down_in_world=(0.01, -1.0, 0.02))
-    told = client.get_scene(scene)
+    exported = client.get_scene(scene)
     assert run(server, "export", scene, tmp_path / "out").exit_code == 0
     copy = f"{scene}-copy"
     done = run(server, "import", tmp_path / "out", copy, "--skip-check")
     assert done.exit_code == 0, done.output
     found = client.get_scene(copy)
-    assert (found.datum, found.down_in_world) == (datum, told.down_in_world)
+    assert (found.datum, found.down_in_world) == (datum, exported.down_in_world)
     # One that is there keeps what is known of it.
     client.update_scene(copy, datum=None)
     assert run(server, "import", tmp_path / "out", copy, "--skip-check").exit_code == 0

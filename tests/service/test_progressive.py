@@ -380,13 +380,13 @@ def test_the_log_has_the_time_of_the_coarse_answer(server: Serving, caplog: pyte
         assert len(list(call)) == 1
         wait_until(lambda: any(record.getMessage() == "LocalizeProgressively OK" for record in caplog.records))
     (line,) = (it for it in caplog.records if it.getMessage() == "LocalizeProgressively OK")
-    told: Any = vars(line)
-    assert told["request_id"] == "logged"
-    assert 0 < told["coarse_ms"] <= told["duration_ms"]
+    fields: Any = vars(line)
+    assert fields["request_id"] == "logged"
+    assert 0 < fields["coarse_ms"] <= fields["duration_ms"]
     assert server.server.value("mapless_coarse_answer_seconds_count") == counted + 1
-    assert {"prepare", "coarse", "refine"} == set(told["stages_ms"])
-    assert (told["outcome"], told["pose_stage"], told["code"]) == ("localized", "refined", "OK")
-    assert told["bytes_out"] > 0
+    assert {"prepare", "coarse", "refine"} == set(fields["stages_ms"])
+    assert (fields["outcome"], fields["pose_stage"], fields["code"]) == ("localized", "refined", "OK")
+    assert fields["bytes_out"] > 0
 
 
 def test_a_caller_that_leaves_is_logged_without_an_error(server: Serving, caplog: pytest.LogCaptureFixture) -> None:

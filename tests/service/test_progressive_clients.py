@@ -112,7 +112,7 @@ def kind(request: pytest.FixtureRequest) -> Any:
     return request.param
 
 
-def told(kind: Any, address: str, **asked: Any) -> tuple[list[LocalizationResult | Rejected], MaplessError | None]:
+def ending_of(kind: Any, address: str, **asked: Any) -> tuple[list[LocalizationResult | Rejected], MaplessError | None]:
     """All that a call yields, and the error that it ends with."""
     answers: list[LocalizationResult | Rejected] = []
 
@@ -134,7 +134,7 @@ def told(kind: Any, address: str, **asked: Any) -> tuple[list[LocalizationResult
 
 def test_the_coarse_answer_is_printed_before_the_final_one(kind: Any) -> None:
     with playing(([COARSE, FINAL], None)) as (address, played):
-        (first, last), error = told(kind, address, variant="full", axes="unity")
+        (first, last), error = ending_of(kind, address, variant="full", axes="unity")
     assert error is None
     assert isinstance(first, LocalizationResult)
     assert isinstance(last, LocalizationResult)
@@ -148,7 +148,7 @@ def test_the_coarse_answer_is_printed_before_the_final_one(kind: Any) -> None:
 
 def test_a_rejection_is_final(kind: Any) -> None:
     with playing(([COARSE, rejected()], None)) as (address, _):
-        (first, last), error = told(kind, address)
+        (first, last), error = ending_of(kind, address)
     assert error is None
     assert (first.is_final, last.is_final) == (False, True)
     assert isinstance(last, Rejected)
@@ -172,7 +172,7 @@ def test_a_broken_call_is_retried_with_one_coarse_answer(
     kind: Any, attempts: list[Attempt], expected_m: list[float]
 ) -> None:
     with playing(*attempts) as (address, played):
-        answers, error = told(kind, address)
+        answers, error = ending_of(kind, address)
     assert error is None
     assert [it.world_from_camera.translation[0] for it in answers if isinstance(it, LocalizationResult)] == expected_m
     assert [it.is_final for it in answers] == [False] * (len(expected_m) - 1) + [True]
@@ -192,7 +192,7 @@ def test_an_error_comes_last(
     tries: int,
 ) -> None:
     with playing((messages, end)) as (address, played):
-        answers, error = told(kind, address)
+        answers, error = ending_of(kind, address)
     assert type(error) is error_type
     assert len(answers) == len(messages)
     assert len(played.left_s) == tries
@@ -201,7 +201,7 @@ def test_an_error_comes_last(
 def test_the_deadline_is_that_of_all(kind: Any) -> None:
     later = status("RESOURCE_EXHAUSTED", retry_after_s=0.3)
     with playing(([], later), ([COARSE], None)) as (address, played):
-        answers, error = told(kind, address, timeout_s=1.0)
+        answers, error = ending_of(kind, address, timeout_s=1.0)
     assert error is not None
     assert (len(answers), error.code) == (1, "DEADLINE_EXCEEDED")
     first_s, second_s = played.left_s
@@ -217,7 +217,7 @@ def test_what_breaks_the_contract_is_the_servers_fault(
     kind: Any, messages: list[pb.LocalizeProgressivelyResponse]
 ) -> None:
     with playing((messages, None)) as (address, _):
-        answers, error = told(kind, address)
+        answers, error = ending_of(kind, address)
     assert isinstance(error, Internal)
     assert error.reason == "MALFORMED_ANSWER"
     assert len(answers) == (len(messages) == 3)
@@ -288,6 +288,6 @@ def test_what_fails_leaves_no_file_and_a_folder_is_refused(
     with playing(([], status("INVALID_ARGUMENT"))) as (address, _):
         assert command(capsys, address, photo, "--output", str(tmp_path / "answers.json"))[0] == 1
         assert not (tmp_path / "answers.json").exists()
-        exit_code, _, complaint = command(capsys, address, str(tmp_path))
+        exit_code, _, error_text = command(capsys, address, str(tmp_path))
     assert exit_code == 2
-    assert "--progressive takes one photograph, not a folder" in complaint
+    assert "--progressive takes one photograph, not a folder" in error_text

@@ -177,7 +177,7 @@ def test_answers_are_those_of_the_plain_server_bit_for_bit(
 
 @dataclass(frozen=True)
 class Guarded:
-    """Replicas whose method does as it is told, and that ask for tokens.
+    """Replicas whose method does as the test says, and that require tokens.
 
     Attributes:
         cluster: they are in.
@@ -357,8 +357,8 @@ def test_health_and_reflection_are_the_standard_ones(guarded: Guarded) -> None:
             request = health_pb2.HealthCheckRequest(service=name)
             assert health_pb2_grpc.HealthStub(channel).Check(request, timeout=30).status == 1
         ask = reflection_pb2.ServerReflectionRequest(list_services="")
-        (told,) = reflection_pb2_grpc.ServerReflectionStub(channel).ServerReflectionInfo(iter([ask]), timeout=30)
-    listed = [service.name for service in told.list_services_response.service]
+        (response,) = reflection_pb2_grpc.ServerReflectionStub(channel).ServerReflectionInfo(iter([ask]), timeout=30)
+    listed = [service.name for service in response.list_services_response.service]
     assert set(SERVICE_NAMES) < set(listed)
     assert len(listed) == len(set(listed))
 
@@ -479,17 +479,16 @@ def test_without_any_replica_calls_may_be_retried(guarded: Guarded) -> None:
     with guarded.client(max_attempts=1, timeout_s=5.0) as once, guarded.client() as patient:
         for replica in guarded.cluster.replicas():
             os.kill(replica.process_id, signal.SIGKILL)
-        told = []
+        errors = []
 
         def is_refused() -> bool:
             try:
                 once.get_scene(SCENES[0])
             except Unavailable as error:
-                told.append(error)
-            return bool(told) and told[-1].retry_after_s is not None
+                errors.append(error)
+            return bool(errors) and errors[-1].retry_after_s is not None
 
         wait_until(is_refused)
-        assert (told[-1].reason, told[-1].retry_after_s) == ("STARTING", 1.0)
+        assert (errors[-1].reason, errors[-1].retry_after_s) == ("STARTING", 1.0)
         assert not once.is_serving()
-        # Who does as told need not know.
         assert patient.get_scene(SCENES[0]).scene_id == SCENES[0]

@@ -202,9 +202,9 @@ def test_a_blank_reference_is_stored_and_reported(client: Client, scene: str, ca
 def test_the_client_names_the_bad_reference_of_a_batch(server: RunningServer, scene: str) -> None:
     photos = [PHOTO, PHOTO, PHOTO, b"none"]
     references = [NewReference(f"p{i}", photo, CAMERA, pose(i)) for i, photo in enumerate(photos)]
-    complaint = "IMAGE_UNKNOWN_FORMAT: reference 'p3': the image is not"
+    error_text = "IMAGE_UNKNOWN_FORMAT: reference 'p3': the image is not"
     two_by_two = ConnectOptions(batch_count=2)
-    with Client(server.address, two_by_two) as client, pytest.raises(InvalidArgument, match=complaint):
+    with Client(server.address, two_by_two) as client, pytest.raises(InvalidArgument, match=error_text):
         client.add_references(scene, references)
 
 
@@ -239,11 +239,11 @@ def test_a_page_is_made_off_the_event_loop(client: Client, scene: str, monkeypat
     """A thousand messages take tens of milliseconds, in which nobody else would be answered."""
     to_message, threads = references.reference_to_message, set[str]()
 
-    def told(record: ReferenceRecord) -> pb.Reference:
+    def recorded(record: ReferenceRecord) -> pb.Reference:
         threads.add(threading.current_thread().name)
         return to_message(record)
 
-    monkeypatch.setattr(reference_service, "reference_to_message", told)
+    monkeypatch.setattr(reference_service, "reference_to_message", recorded)
     assert [it.reference_id for it in client.list_references(scene)] == ["r0", "r1", "r2"]
     client.add_references(scene, [NewReference(f"new{i}", PHOTO, CAMERA, pose(i)) for i in range(3)])
     assert threads

@@ -184,9 +184,9 @@ def test_what_is_computed_with_is_compared_too(captured: Path, tmp_path: Path) -
     path, call = only(captured, tmp_path / "copy", is_named)
     path.write_bytes(encode_call(replace(call, circumstances={**call.circumstances, "mapless": "0.0.1"})))
     code, report = replay(tmp_path / "copy", MAPLESS_COVERAGE="0.000001")
-    told = {it["field"]: (it["then"], it["now"]) for it in report["circumstances"]}
-    assert told["mapless"][0] == "0.0.1"
-    assert told["coverage"] == ("0.99", "1e-06")
+    changed = {it["field"]: (it["then"], it["now"]) for it in report["circumstances"]}
+    assert changed["mapless"][0] == "0.0.1"
+    assert changed["coverage"] == ("0.99", "1e-06")
     (replayed,) = report["calls"]
     assert (replayed["outcome_then"], replayed["outcome_now"]) == ("localized", "gate")
     assert code == 1
@@ -217,9 +217,9 @@ def test_damage_is_named_and_not_counted_as_identical(captured: Path, tmp_path: 
     code, report = replay(tmp_path / "copy")
     assert code == 1
     assert "identical" not in {it["verdict"] for it in report["calls"]}
-    told = [*report["unreadable"], *(it["error"] for it in report["calls"])]
-    assert len(told) == 1
-    assert "No such file" in told[0] if damage == "blob" else "cut" in told[0]
+    errors = [*report["unreadable"], *(it["error"] for it in report["calls"])]
+    assert len(errors) == 1
+    assert "No such file" in errors[0] if damage == "blob" else "cut" in errors[0]
 
 
 def test_features_of_an_unknown_form_are_extracted_anew(captured: Path, tmp_path: Path) -> None:
@@ -247,12 +247,12 @@ def test_a_call_that_cannot_be_computed_is_one_row(captured: Path, tmp_path: Pat
     }.items():
         path.with_name(f"{name}.call").write_bytes(encode_call(planted))
     code, report = replay(tmp_path / "copy")
-    told = {it["request_id"]: (it["verdict"], it["error"]) for it in report["calls"]}
+    verdicts = {it["request_id"]: (it["verdict"], it["error"]) for it in report["calls"]}
     assert code == 1
-    assert told["unknown"] == ("not computed", "error: this program knows no method LocalizeTwice")
-    assert told["garbage"][0] == "not computed"
-    assert told["garbage"][1].startswith("error: DecodeError: ")
-    assert told[call.request_id] == ("identical", "")
+    assert verdicts["unknown"] == ("not computed", "error: this program knows no method LocalizeTwice")
+    assert verdicts["garbage"][0] == "not computed"
+    assert verdicts["garbage"][1].startswith("error: DecodeError: ")
+    assert verdicts[call.request_id] == ("identical", "")
 
 
 def test_only_what_was_asked_for_is_judged(captured: Path, tmp_path: Path) -> None:

@@ -261,10 +261,10 @@ def test_the_log_names_the_caller_and_shows_no_token(guarded: Guarded, caplog: p
         client.get_scene("secret")
         with pytest.raises(Unauthenticated), guarded.client("mapless_wrong") as unknown:
             unknown.get_scene("secret")
-    told = "\n".join(f"{record.getMessage()} {record.__dict__}" for record in caplog.records)
-    assert "reader" in told
-    assert guarded.tokens["reader"] not in told
-    assert "mapless_wrong" not in told
+    logged = "\n".join(f"{record.getMessage()} {record.__dict__}" for record in caplog.records)
+    assert "reader" in logged
+    assert guarded.tokens["reader"] not in logged
+    assert "mapless_wrong" not in logged
 
 
 def test_a_tenant_over_its_rate_waits_and_others_do_not(tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ def run(*arguments: object, answer: str = "") -> Result:
     return CliRunner().invoke(app, ["weights", *map(str, arguments)], input=answer)
 
 
-def complaint(result: Result, code: int) -> str:
+def error_text(result: Result, code: int) -> str:
     """The last line on standard error of a command that failed."""
     assert result.exit_code == code, result.output
     assert result.exception is None or isinstance(result.exception, SystemExit)
@@ -121,7 +121,7 @@ def test_the_licence_is_shown_before_a_download(folder: Path, fetched: list[str]
 
 @pytest.mark.parametrize("answer", ["n\n", "\n", ""])
 def test_a_restricting_licence_is_asked_for(folder: Path, fetched: list[str], answer: str) -> None:
-    assert "the licence was not accepted" in complaint(run("fetch", "free", "bound", answer=answer), 1)
+    assert "the licence was not accepted" in error_text(run("fetch", "free", "bound", answer=answer), 1)
     assert not fetched
     assert not folder.exists()
 
@@ -143,43 +143,45 @@ def test_a_permissive_licence_is_not_asked_for(folder: Path, fetched: list[str])
 def test_what_is_damaged_is_fetched_again(folder: Path, fetched: list[str]) -> None:
     folder.mkdir()
     (folder / "free.safetensors").write_bytes(b"damaged")
-    assert "not a safetensors file" in complaint(run("check", "free"), 1)
+    assert "not a safetensors file" in error_text(run("check", "free"), 1)
     assert run("fetch", "free").exit_code == 0
     assert run("check", "free").exit_code == 0
 
 
 def test_adding_linking_and_checking(folder: Path, file: Path, fetched: list[str]) -> None:
-    assert "weights fetch bound" in complaint(run("check", "bound"), 1)
+    assert "weights fetch bound" in error_text(run("check", "bound"), 1)
     added = run("add", "bound", file, "--link")
     assert added.exit_code == 0
     assert "licence CC BY-NC 4.0" in added.stderr
     assert (folder / "bound.safetensors").is_symlink()
     assert "the official file" in run("check", "bound").stdout
     file.write_bytes(safetensors({"a": np.zeros(6, np.float32)}))
-    assert "is not the official file" in complaint(run("check", "bound"), 1)
-    assert "is not the official file" in complaint(run("add", "bound", file), 1)
+    assert "is not the official file" in error_text(run("check", "bound"), 1)
+    assert "is not the official file" in error_text(run("add", "bound", file), 1)
     assert run("add", "bound", file, "--unofficial").exit_code == 0
     assert "not the official file" in run("check", "bound").stdout
-    assert "is not the official file; remove it first" in complaint(run("fetch", "bound"), 1)
+    assert "is not the official file; remove it first" in error_text(run("fetch", "bound"), 1)
     assert not fetched
 
 
 def test_complaints_are_one_line(folder: Path, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for arguments in (("fetch", "pi4"), ("fetch", "aliked", "pi4"), ("add", "pi4", file), ("check", "pi4")):
-        assert "no weights called pi4" in complaint(run(*arguments), 2)
-    assert "No such file" in complaint(run("add", "pi3", tmp_path / "absent"), 1)
-    assert "Is a directory" in complaint(run("add", "pi3", tmp_path), 1)
-    assert "Not a directory" in complaint(run("fetch", "pi3", "--accept-licence", "--weights-dir", file / "weights"), 1)
+        assert "no weights called pi4" in error_text(run(*arguments), 2)
+    assert "No such file" in error_text(run("add", "pi3", tmp_path / "absent"), 1)
+    assert "Is a directory" in error_text(run("add", "pi3", tmp_path), 1)
+    assert "Not a directory" in error_text(
+        run("fetch", "pi3", "--accept-licence", "--weights-dir", file / "weights"), 1
+    )
     file.write_bytes(b"PK\x03\x04" + bytes(100))
-    assert "a zip archive, as PyTorch's pickles are" in complaint(run("add", "pi3", file), 1)
+    assert "a zip archive, as PyTorch's pickles are" in error_text(run("add", "pi3", file), 1)
     monkeypatch.setenv("MAPLESS_WEIGHT_DIR", "x")
-    assert "MAPLESS_WEIGHT_DIR is not a setting" in complaint(run("list"), 2)
+    assert "MAPLESS_WEIGHT_DIR is not a setting" in error_text(run("list"), 2)
 
 
 def test_a_file_that_does_not_fit_the_network_is_refused(folder: Path, file: Path) -> None:
     pytest.importorskip("torch")
     pytest.importorskip("mapless_server.networks.pi3")
-    refused = complaint(run("add", "pi3", file, "--unofficial"), 1)
+    refused = error_text(run("add", "pi3", file, "--unofficial"), 1)
     assert "does not fit Pi3: of its tensors 1208 missing: register_token, " in refused
     assert "1 surplus: a" in refused
 

@@ -22,13 +22,13 @@ def message(number: int) -> pb.LocalizeResponse:
 class Planted:
     """An answer that is there when it is let, with what it tells before."""
 
-    def __init__(self, tells: Sequence[int] = (), end: Exception | None = None) -> None:
-        self._tells, self._end = tells, end
+    def __init__(self, coarse: Sequence[int] = (), end: Exception | None = None) -> None:
+        self._coarse, self._end = coarse, end
         self.may_end = asyncio.Event()
         self.is_cancelled = False
 
     async def answer(self, coarse: FutureCoarseAnswer) -> pb.LocalizeResponse:
-        for number in self._tells:
+        for number in self._coarse:
             coarse.set_result(message(number))
         try:
             await self.may_end.wait()
@@ -55,22 +55,22 @@ async def test_the_coarse_answer_does_not_wait_for_the_final_one() -> None:
     assert [seen(it) async for it in messages] == [(100, True)]
 
 
-@pytest.mark.parametrize(("tells", "expected"), [((), []), ((1,), [(1, False)])])
+@pytest.mark.parametrize(("coarse", "expected"), [((), []), ((1,), [(1, False)])])
 async def test_there_are_two_messages_at_most_and_the_order_is_kept(
-    tells: Sequence[int], expected: list[tuple[int, bool]]
+    coarse: Sequence[int], expected: list[tuple[int, bool]]
 ) -> None:
     """Even where the final answer is there before anybody looks."""
-    planted = Planted(tells)
+    planted = Planted(coarse)
     planted.may_end.set()
     assert [seen(it) async for it in planted.messages()] == [*expected, (100, True)]
 
 
-@pytest.mark.parametrize("tells", [(), (1,)])
-async def test_an_error_comes_in_the_place_of_the_final_answer(tells: Sequence[int]) -> None:
-    planted = Planted(tells, KeyError("planted"))
+@pytest.mark.parametrize("coarse", [(), (1,)])
+async def test_an_error_comes_in_the_place_of_the_final_answer(coarse: Sequence[int]) -> None:
+    planted = Planted(coarse, KeyError("planted"))
     planted.may_end.set()
     messages = planted.messages()
-    for number in tells:
+    for number in coarse:
         assert seen(await anext(messages)) == (number, False)
     with pytest.raises(KeyError, match="planted"):
         await anext(messages)

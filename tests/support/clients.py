@@ -107,7 +107,7 @@ class Failing(grpc.GenericRpcHandler):
 
 class _Status(grpc.Status):
     def __init__(self, code: grpc.StatusCode, details: Sequence[Message]) -> None:
-        self.code, self.details = code, "told to"
+        self.code, self.details = code, "planted"
         rich = status_pb2.Status(code=code.value[0], message=self.details)
         for detail in details:
             rich.details.add().Pack(detail)

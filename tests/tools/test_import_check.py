@@ -231,10 +231,10 @@ def test_photographs_that_cannot_be_read_are_left_to_the_upload(tmp_path: Path) 
     frames = frames_of(tmp_path, views, lambda pose: pose)
     (tmp_path / "0.png").write_bytes(b"no image")
     (tmp_path / "1.png").unlink()
-    told: list[tuple[int, int]] = []
-    verdict = check_frames(frames, lambda step, *counts: told.append(counts), NumberedViews(views))
+    progress: list[tuple[int, int]] = []
+    verdict = check_frames(frames, lambda step, *counts: progress.append(counts), NumberedViews(views))
     assert (verdict.is_known, verdict.is_wrong) == (True, False)
     assert not {0, 1} & {i for error in verdict.pairs for i in error.pair}
     assert verdict.unmatched_count == 0
-    assert told[-1] == (8, 8)
+    assert progress[-1] == (8, 8)
     assert not check_frames(frames[:1], lambda *_: None, NumberedViews(views)).is_known

@@ -177,11 +177,11 @@ def test_the_same_photo_with_almost_the_same_pose_is_skipped(
 def test_what_is_refused_is_not_counted_as_stored(tmp_path: Path) -> None:
     frames = frames_in(tmp_path, 4)
     frames[1].image_path.write_bytes(b"")
-    told: list[tuple[int, int]] = []
+    progress: list[tuple[int, int]] = []
     report = ImportReport("s", Dataset("d", tuple(frames), True, ""), frames)
-    uploader = Uploader(Server(), KnownReferences([]), report, QUICK, lambda step, *counts: told.append(counts))  # type: ignore[arg-type]
+    uploader = Uploader(Server(), KnownReferences([]), report, QUICK, lambda step, *counts: progress.append(counts))  # type: ignore[arg-type]
     uploader.run()
-    assert told == [(0, 4), (3, 3)]
+    assert progress == [(0, 4), (3, 3)]
 
 
 def test_the_same_image_under_another_id_is_the_same_reference(tmp_path: Path) -> None:

@@ -154,9 +154,9 @@ def test_calls_with_a_short_deadline_may_fail() -> None:
     assert len(hurried) / len(plan) == pytest.approx(0.3, abs=0.05)
     assert all(call.deadline_s is not None and 0 < call.deadline_s <= 0.4 for call in hurried)
     assert all(call.deadline_s is None for call in plan if call.kind is not Kind.HURRIED)
-    told = CallRecord(Kind.HURRIED, 0, 0.0, 0.0, 0.1, 0.1, "DEADLINE_EXCEEDED", "DEADLINE_EXCEEDED")
-    assert told.fate is Fate.TOO_HURRIED
-    assert replace(told, kind=Kind.QUERY).fate is Fate.OVERDUE
+    record = CallRecord(Kind.HURRIED, 0, 0.0, 0.0, 0.1, 0.1, "DEADLINE_EXCEEDED", "DEADLINE_EXCEEDED")
+    assert record.fate is Fate.TOO_HURRIED
+    assert replace(record, kind=Kind.QUERY).fate is Fate.OVERDUE
 
 
 @pytest.mark.parametrize(

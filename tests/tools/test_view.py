@@ -113,7 +113,7 @@ class TestScenery:
                 (0, -1, 0),
             ),
         ],
-        ids=["guessed", "told", "datum"],
+        ids=["estimated", "given", "datum"],
     )
     def test_which_way_is_down(self, scene: Scene, down: tuple[float, float, float]) -> None:
         scenery = lay_out(scene, [reference(i, upright(i, turn=i)) for i in range(6)], 10)
