@@ -67,14 +67,14 @@ demo: setup  ## Localize photographs end to end; DATA=folder for real ones
 bench: setup  ## Measure accuracy and latency on the real scenes; DATA=folder with the scenes
 	$(BIN)/mapless-server bench $(if $(DATA),'$(DATA)',../shared/data)
 
-bench-gpu: setup  ## Measure the networks and whole queries on a CUDA device; without one, what a CPU can tell
+bench-gpu: setup  ## Measure the networks and whole queries on a CUDA device; without one, what a CPU can measure
 	$(BIN)/mapless-server bench-network $(ARGS)
 
 load: setup  ## Measure the server under load; DATA=folder for real photographs, ARGS="--minutes 2" for all's options
 	$(BIN)/mapless-server load all $(if $(DATA),--data '$(DATA)') $(ARGS)
 
 RUNS ?= 1000000
-fuzz: setup  ## Fuzz what reads the inputs of strangers; TARGET="images names" for some, RUNS=1000 for few, ARGS="--parallel 2"
+fuzz: setup  ## Fuzz what reads untrusted input; TARGET="images names" for some, RUNS=1000 for few, ARGS="--parallel 2"
 	PYTHONPATH=tests $(BIN)/python -m fuzz.campaign --output fuzz-output --runs $(RUNS) --targets $(TARGET) $(ARGS)
 
 load-ray: setup  ## Measure replicas on Ray Serve, on this machine: half an hour; PART=overhead, throughput, failover or redeploys

@@ -21,7 +21,7 @@ VARIABLES = {
 def main() -> None:
     """Replaces this process by uv."""
     listed = subprocess.run([sys.executable, "-m", "pip", "config", "list"], capture_output=True, text=True, check=True)
-    # uv takes the first index that has a package, pip the best version of all; uv does so too where it is told to.
+    # uv takes the first index that has a package, pip the best version of all; uv does so too with this option.
     environment = {"UV_INDEX_STRATEGY": "unsafe-best-match"}
     # Variables override files.
     for line in sorted(listed.stdout.splitlines(), key=lambda it: it.startswith(":env:")):

@@ -1,6 +1,6 @@
 """Conversion of poses between the axes of OpenCV, ARKit, ARCore, Unity and ROS.
 
-mapless itself speaks OpenCV's: a camera's x points right, y down and z forward, in a right-handed world.
+mapless itself uses OpenCV's: a camera's x points right, y down and z forward, in a right-handed world.
 
 =========  ==============================  =============================================================
 axes       a camera's x, y, z              the world

@@ -81,7 +81,7 @@ namespace Mapless
         /// <param name="address">"https://host:50051", or "http://..." for a server without TLS.</param>
         /// <param name="token">Sent to the server, if it requires one. Only over https.</param>
         /// <param name="clientId">Which device this is; the server is fair between them.</param>
-        /// <param name="handler">What speaks HTTP/2; YetAnotherHttpHandler if null.</param>
+        /// <param name="handler">Handler of HTTP/2; YetAnotherHttpHandler if null.</param>
         public MaplessClient(string address, string token = null, string clientId = null, HttpMessageHandler handler = null)
         {
             channel = GrpcChannel.ForAddress(address, new GrpcChannelOptions

@@ -75,7 +75,7 @@ class Place:
     metric: bool = True
 
     def posed(self, indices: Iterable[int]) -> tuple[PosedView, ...]:
-        """References at some indices, as the method wants them."""
+        """References at some indices, as the method takes them."""
         return tuple(
             PosedView(f"{self.name}-{i}", f"scenes/{self.name}/references/{i}", self.views[i], self.poses[i])
             for i in indices

@@ -105,8 +105,8 @@ def fit(answers: Sequence[Answered]) -> Fit:
 
 
 def left_out(answers: Sequence[Answered]) -> Iterator[str]:
-    """Lines of a table: each scene with the constants that the others give, and the range of an honest 68 %."""
-    yield "| scene left out | K | answers | position 68 % | 95 % | rotation 68 % | 95 % | an honest 68 % |"
+    """Lines of a table: each scene with the constants that the others give, and the range of a correct 68 %."""
+    yield "| scene left out | K | answers | position 68 % | 95 % | rotation 68 % | 95 % | a correct 68 % |"
     yield "|---|---|---|---|---|---|---|---|"
     for scene in dict.fromkeys(it.scene for it in answers):
         constants = fit([it for it in answers if it.scene != scene])

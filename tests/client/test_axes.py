@@ -1,4 +1,4 @@
-"""Poses in everybody's axes, against poses derived by hand from where a camera stands and looks."""
+"""Poses in the axes of other systems, against poses derived by hand from where a camera stands and looks."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def test_a_headset_that_moved_on_finds_itself_in_the_world() -> None:
 
 
 def test_a_session_that_is_parallel_to_the_world_is_moved_only() -> None:
-    """In Unity. The device believes to be at (5, 0, 0), looking along x: so does the answer, at (1, 2, -3)."""
+    """In Unity. The device tracks itself at (5, 0, 0), looking along x; so does the answer, at (1, 2, -3)."""
     believed = RigidTransform(Quaternion(0, H, 0, H).matrix(), np.array([5.0, 0.0, 0.0]))
     world_from_session = module.world_from_session_in(Axes.UNITY, LOOKS_ALONG_X, believed)
     np.testing.assert_allclose(world_from_session.rotation, np.eye(3), atol=1e-12)

@@ -1,4 +1,4 @@
-"""Connections that cannot be made, and what a person is told of them."""
+"""Connections that cannot be made, and the message for a person."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When a call is tried again, and when not: decided without a server, by a clock that is told how late it is."""
+"""When a call is tried again, and when not: decided without a server, by a planted clock."""
 
 from __future__ import annotations
 

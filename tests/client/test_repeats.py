@@ -1,4 +1,4 @@
-"""A change whose answer was lost: what is found is ours if it is all that we sent, and else somebody else's.
+"""A change whose answer was lost: what is found counts as ours if it is all that we sent, else as another caller's.
 
 And whatever a server answers, a client raises no errors but its own.
 """

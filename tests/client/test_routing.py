@@ -1,4 +1,4 @@
-"""Every call that concerns a scene says so beside the message, and nothing that could not travel is ever said."""
+"""Every call that concerns a scene names it in the metadata, with characters that metadata can carry."""
 
 from __future__ import annotations
 

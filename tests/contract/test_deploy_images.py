@@ -324,7 +324,7 @@ def test_a_store_of_its_own_has_one_server(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_servers_of_compose_reach_the_database_that_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By name, port, user and password; it has room for all their connections, and nobody else is let in."""
+    """By name, port, user and password; it has room for all their connections, and accepts no other user."""
     server, database = SHARED["services"]["mapless"], SHARED["services"]["postgres"]
     settings = settings_under(ours(server["environment"]), monkeypatch)
     assert settings.database_url is not None
@@ -339,7 +339,7 @@ def test_servers_of_compose_reach_the_database_that_is_there(monkeypatch: pytest
     assert database["ports"] == []
     assert int(database["user"].split(":")[0]) > 0
     options = dict(word.removeprefix("--").split("=") for word in database["command"] if word.startswith("--"))
-    reserved = 3  # for superusers, unless told otherwise
+    reserved = 3  # for superusers, PostgreSQL's default
     assert int(options["max_connections"]) >= server["deploy"]["replicas"] * CONNECTIONS_AT_MOST + reserved
     assert not {"fsync", "full_page_writes", "synchronous_commit"} & set(options)
     memory_mib = {"m": 1, "g": 1024}[database["mem_limit"][-1]] * int(database["mem_limit"][:-1])

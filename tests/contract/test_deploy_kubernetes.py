@@ -103,7 +103,7 @@ def value_of(variable: Json, container: Json) -> str:
         case {"secretKeyRef": source}:
             return IN_SECRETS[source["name"], source["key"]]
         case other:
-            raise AssertionError(f"nobody knows {other}")
+            raise AssertionError(f"unknown address {other}")
 
 
 def limit(container: Json, source: Json) -> int:
@@ -369,7 +369,7 @@ def test_the_database_is_let_through_when_there_is_one() -> None:
 @needs_kubectl
 @pytest.mark.parametrize("folder", ALONE)
 def test_scaling_joins_any_of_them_that_shares_a_database(folder: str, tmp_path: Path) -> None:
-    """As many as there is work for, and nobody else says how many."""
+    """As many as there is work for; no other field sets the number."""
     documents = built(extended(folder, ["postgres", "autoscaling"], tmp_path))
     scaled = the(documents, "Deployment")
     scaler = the(documents, "HorizontalPodAutoscaler")["spec"]

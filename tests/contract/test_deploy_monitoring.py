@@ -1,7 +1,7 @@
 """Dashboard and alerts query what the server reports: every selector finds a series, every label exists.
 
 The series are those of a `Metrics` to which everything happened once. An alert or a panel that asks for what is not
-there stays empty for ever, and nobody notices.
+there stays empty for ever, without any error.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def test_every_selector_finds_a_series() -> None:
 
 
 def test_every_value_that_is_asked_for_is_one_that_there_is() -> None:
-    """A misspelt alternative, INTERNAL|UNKOWN, hides behind the others. grpc itself answers with UNKNOWN, we do not."""
+    """A misspelt alternative, INTERNAL|UNKOWN, is not noticed. grpc itself answers with UNKNOWN, we do not."""
     for where, selector in [(where, selector) for where, it in EXPRESSIONS for selector in selectors(it)]:
         for matcher in selector.matchers.matchers:
             there = {labels.get(matcher.name, "") for labels in SERIES.by_name[selector.name or ""]} | {"UNKNOWN"}

@@ -64,12 +64,12 @@ def environment(node: str, prefix: str) -> dict[str, str]:
     return {it["name"]: it["value"] for it in container(node)["env"] if it["name"].startswith(prefix) and "value" in it}
 
 
-# What Serve is told
+# The configuration of Serve
 
 
 def test_serve_takes_the_configuration() -> None:
     schema = ServeDeploySchema(**SERVE)
-    # Nothing is misspelt: what Serve does not know it would pass over.
+    # Nothing is misspelt: Serve ignores unknown fields.
     assert set(schema.model_dump(exclude_unset=True)) == set(SERVE)
     (application,) = schema.applications
     (deployment,) = application.deployments
@@ -124,7 +124,7 @@ def test_every_pod_has_the_same_ray_settings_that_ray_knows() -> None:
     assert f"hdr({SCENE_KEY})" in given["RAY_SERVE_HAPROXY_BALANCE_ALGORITHM"]
 
 
-# What KubeRay is told
+# The configuration of KubeRay
 
 
 def test_fields_are_those_of_the_resource() -> None:

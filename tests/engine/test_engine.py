@@ -62,7 +62,7 @@ def caller(deadline_s: float = 60.0) -> Caller:
 
 @dataclass
 class Setting:
-    """An engine of two tiers whose method answers what is planted, and who was asked."""
+    """An engine of two tiers whose method answers what is planted, and which tiers ran."""
 
     store: Store
     replies: dict[str, Reply] = field(default_factory=dict)
@@ -333,7 +333,7 @@ class TestPhotograph:
             np.testing.assert_array_equal(reference.view.photograph.read(), textured(seed=i))
 
     def test_one_deleted_during_the_network_is_no_candidate(self, setting: Setting) -> None:
-        """The server chose it, so the caller must not hear of it."""
+        """The server chose it, so the caller must not get an error."""
 
         def look(_: View, references: Sequence[PosedView], __: Any) -> Answer:
             if len(setting.asked) == 1:

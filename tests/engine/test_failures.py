@@ -66,7 +66,7 @@ def test_the_text_alone_does_nothing_in_another_exception_type(message: str) -> 
     "kind", [it for it in vars(errors).values() if isinstance(it, type) and issubclass(it, errors.RequestError)]
 )
 def test_only_errors_the_caller_can_fix_are_of_the_request(kind: type[errors.RequestError]) -> None:
-    """Stored bytes that are damaged, or a scene that is being emptied, are told to the caller, who has done nothing."""
+    """Damaged bytes in the store, or a scene that is being emptied, are reported to the caller, and not its fault."""
     of_server = kind.__name__ in ("RequestError", "Overloaded", "DeadlineExceeded", "Unavailable", "DataLoss")
     assert failure_of(kind("text")) is (Failure.JOB_FAILED if of_server else Failure.BAD_INPUT)
 

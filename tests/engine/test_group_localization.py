@@ -1,4 +1,4 @@
-"""Groups in a busy server: what they hold is counted, what they have computed is not thrown away, and all is told."""
+"""Groups in a busy server: what they hold is counted, what they have computed is kept, and all stages are recorded."""
 
 from __future__ import annotations
 

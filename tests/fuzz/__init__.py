@@ -1,4 +1,4 @@
-"""Fuzzing: inputs that nobody thought of, against what reads the inputs of strangers.
+"""Fuzzing: unexpected inputs, against what reads untrusted input.
 
 A target is a module with a `TARGET`: seeds that are right, a mutator that knows their structure, and a check, which
 says whether an input was accepted and raises where anything else happens than what is documented. `run` fuzzes one

@@ -4,7 +4,7 @@ Laws: every refusal is an InvalidArgument that names the field; what is accepted
 the same pixels whatever the memory held before, so that nothing half read passes for a photograph.
 
 The decoders are native and give no coverage, so that only our own reading of headers guides what is tried. The mutator
-mends the checksums that would hide a PNG's inside from it.
+corrects the checksums of PNG chunks, which would otherwise be rejected first.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def _with_chunk(png: bytes, kind: bytes, body: bytes) -> bytes:
 
 
 def mutate(data: bytes, random: Random, mutate_bytes: MutateBytes) -> bytes:
-    """Changes bytes in up to three places; a PNG's checksums are mostly mended."""
+    """Changes bytes in up to three places; a PNG's checksums are mostly corrected."""
     for _ in range(random.randrange(1, 4)):
         data = mutate_bytes(data)
     return with_mended_checksums(data) if data.startswith(_PNG) and random.random() < 0.8 else data
@@ -128,14 +128,14 @@ def mutate(data: bytes, random: Random, mutate_bytes: MutateBytes) -> bytes:
 
 def with_mended_checksums(png: bytes) -> bytes:
     """The file with the right checksum behind each chunk that lies within it."""
-    mended, position = bytearray(png), len(_PNG)
-    while position + 12 <= len(mended):
-        end = position + 8 + int.from_bytes(mended[position : position + 4], "big")
-        if end + 4 > len(mended):
+    corrected, position = bytearray(png), len(_PNG)
+    while position + 12 <= len(corrected):
+        end = position + 8 + int.from_bytes(corrected[position : position + 4], "big")
+        if end + 4 > len(corrected):
             break
-        mended[end : end + 4] = struct.pack(">I", zlib.crc32(mended[position + 4 : end]))
+        corrected[end : end + 4] = struct.pack(">I", zlib.crc32(corrected[position + 4 : end]))
         position = end + 4
-    return bytes(mended)
+    return bytes(corrected)
 
 
 TARGET = Target(

@@ -33,7 +33,7 @@ def encoded(kinds: Kinds, message: Message) -> bytes:
 
 
 def decoded(kinds: Kinds, data: bytes) -> Message | None:
-    """The message of an input; None if it is none, which is told to callers as such."""
+    """The message of an input; None if it is none, which callers receive as an error."""
     message = kinds[(data[0] if data else 0) % len(kinds)]()
     try:
         message.ParseFromString(data[1:])

@@ -44,7 +44,7 @@ class Aborted(Exception):
 
 
 class Context:
-    """A call as grpc would tell of it."""
+    """A call with the interface of grpc's."""
 
     def __init__(self, sent: bytes, limit_s: float | None, certificate: bytes, message: bytes) -> None:
         pairs = (line.partition(b":") for line in sent.split(b"\n"))

@@ -30,7 +30,7 @@ TARGETS = {
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """Something that reads the inputs of strangers.
+    """Code that reads untrusted input.
 
     Attributes:
         seeds: makes inputs that are right, or nearly so, and together show all that there is.

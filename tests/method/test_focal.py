@@ -75,7 +75,7 @@ def test_the_judge_rejects_with_both_numbers_and_a_hint() -> None:
     rejection = judge(support, matches, 1.0, JudgeOptions()).rejection
     assert rejection is not None
     assert rejection.reason is RejectionReason.GATE
-    found = re.search(r"says ([0-9.]+) times the focal length", rejection.message)
+    found = re.search(r"give ([0-9.]+) times the focal length", rejection.message)
     assert found is not None
     assert float(found[1]) == pytest.approx(1 / 1.15, rel=0.01)
     assert rejection.hint is not None

@@ -220,7 +220,7 @@ def unit_rows(x: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def test_order_and_signs_have_their_known_values() -> None:
-    """Stored vectors are compared with new ones for as long as a scene lives."""
+    """Stored vectors are compared with new ones for as long as a scene exists."""
     order, signs = signed_groups(8448)
     assert sorted(order.tolist()) == list(range(8448))
     assert order[:5].tolist() == [5627, 2868, 7628, 8365, 7175]

@@ -1,4 +1,4 @@
-"""Whatever is logged, a line is one JSON object, says when and who, and holds no bytes; what repeats is counted."""
+"""Whatever is logged, a line is one JSON object with time and origin, and holds no bytes; repetitions are counted."""
 
 from __future__ import annotations
 

@@ -412,7 +412,7 @@ def test_a_stalled_server_is_not_ready_and_later_not_alive(
     metrics.beat()
     assert (ask(server.port, "/ready")[0], ask(server.port, "/live")[0]) == (200, 200)
     metrics.set_serving(False)
-    assert ask(server.port, "/live") == (200, "alive\n")  # draining kills nobody
+    assert ask(server.port, "/live") == (200, "alive\n")  # a server that drains is not restarted
 
 
 @pytest.mark.parametrize("path", ["/", "/favicon.ico", "/ready/", "/metrics/", "/metrics/../etc/passwd", "/live/"])

@@ -1,4 +1,4 @@
-"""A call is one trace, continued from the caller's, with its steps where they were; and no collector can hurt it."""
+"""A call is one trace, continued from the caller's, with its steps in place; no collector can delay or fail it."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ POLICY = _apply_autoscaling_config(by_device_seconds)
 
 @dataclass
 class Fleet:
-    """Replicas, second by second: what they are asked to compute, what waits, and what Serve then wants.
+    """Replicas, second by second: what they are to compute, what waits, and how many replicas Serve then requests.
 
     Attributes:
         config: Serve's.
@@ -202,7 +202,7 @@ def test_a_tenfold_load_adds_replicas_and_removes_them(monkeypatch: pytest.Monke
 
 
 def test_a_load_faster_than_the_delays_causes_no_changes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A minute up, a minute down: replicas that come when they are not needed any more help nobody."""
+    """A minute up, a minute down: replicas that come when they are not needed any more are of no use."""
     minutes = [poisson(load, 60, seed=i) for i, load in enumerate([2.0, 5.0] * 20)]
     targets = Fleet(CONFIG).run(chain.from_iterable(minutes), monkeypatch)
     assert turns(targets[900:]) <= 2

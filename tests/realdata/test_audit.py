@@ -88,7 +88,7 @@ def check_fault(found: ReferenceAudit, fault: str) -> None:
     "scene", [FOUNTAIN, *(pytest.param(scene, marks=pytest.mark.nightly) for scene in COUNTS if scene != FOUNTAIN)]
 )
 def test_nothing_is_found_where_nothing_was_planted(photographs: Photographs, scene: str) -> None:
-    """On the drive the first poses are off by 6 to 11 cm themselves: there it may be in doubt, but accuses nobody."""
+    """On the drive the first poses are off by 6 to 11 cm themselves: there may be doubt, but no fault."""
     audits = audit(load(photographs, scene))
     fine = (
         {AuditVerdict.CONSISTENT, AuditVerdict.UNVERIFIABLE} if scene == "kitti-drive-a" else {AuditVerdict.CONSISTENT}

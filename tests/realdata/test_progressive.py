@@ -34,8 +34,8 @@ def test_the_coarse_pose_is_near_the_refined_and_a_little_worse(
                 assert isinstance(answer, LocalizationResult)
                 error = answer.world_from_camera.translation - frame.world_from_camera.translation
                 errors_m[answer.is_final].append(float(np.linalg.norm(error)))
-        stranger = church.frames[0]
-        (only,) = client.localize_progressively(stranger.image_path, stranger.camera, "fountain")
+        other = church.frames[0]
+        (only,) = client.localize_progressively(other.image_path, other.camera, "fountain")
     assert not isinstance(only, LocalizationResult)
     assert max(errors_m[False]) < 0.02
     assert np.median(errors_m[True]) < 0.005

@@ -103,13 +103,11 @@ def test_no_photograph_of_another_place_is_localized(
     """25 photographs of five other places, each against ten references of this one."""
     dataset = photographs(place)
     plan = Plan(dataset, spread(dataset, 10), ())
-    strangers = [frame for folder in elsewhere for frame in spread(photographs(folder), 5)]
+    others = [frame for folder in elsewhere for frame in spread(photographs(folder), 5)]
     with child_server(tmp_path) as server, Client(server.address, CONNECT) as client:
         store_references(client, SCENE, plan.references, ignore)
         names = [reference.name for reference in plan.references]
-        answers = {
-            frame.image_path: client.localize(frame.image_path, frame.camera, SCENE, names) for frame in strangers
-        }
+        answers = {frame.image_path: client.localize(frame.image_path, frame.camera, SCENE, names) for frame in others}
     assert len(answers) == 25
     found = {
         file.parts[-3:]: answer.inlier_count

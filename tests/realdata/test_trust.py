@@ -41,13 +41,13 @@ def test_right_answers_are_trusted_and_another_place_is_not(photographs: Photogr
     right = list(answered(chain.from_iterable(list(right_pairs(it, None, (2,)))[::2] for it in places.values()), ALL))
     assert all(it.right for it in right)
     assert min(trust_of(it) for it in right) >= 0.05
-    strangers = list(answered(cross_pairs(list(places.values()), 2, 4), ALL))
-    assert len(strangers) == 4
-    assert not [it.answer.outcome for it in strangers if isinstance(it.answer.outcome, Localization)]
+    others = list(answered(cross_pairs(list(places.values()), 2, 4), ALL))
+    assert len(others) == 4
+    assert not [it.answer.outcome for it in others if isinstance(it.answer.outcome, Localization)]
 
 
 def test_a_wrong_focal_length_is_reported_with_the_right_one(photographs: Photographs) -> None:
-    """15 percent off, of which the answer would be as far from what it sees: next to all of it is found again."""
+    """A focal length 15 percent off would move the pose by as much of its distance: nearly all of it is estimated."""
     photographs(FOUNTAIN)
     place = fountain()
     pair = list(right_pairs(place, None, (4,)))[5]
@@ -65,7 +65,7 @@ def test_a_wrong_focal_length_is_reported_with_the_right_one(photographs: Photog
 
 
 def test_a_scene_with_half_its_references_moved_is_ambiguous(photographs: Photographs) -> None:
-    """The known poses of every second reference are moved by five metres: both places are told."""
+    """The known poses of every second reference are moved by five metres: both places are reported."""
     photographs(FOUNTAIN)
     place = fountain()
     shift = np.array([5.0, 0.0, 0.0])
@@ -110,9 +110,9 @@ def test_no_query_is_localized_in_another_place(photographs: Photographs, part: 
     for name in OTHERS:
         photographs(name)
     pairs_of_places = list(combinations(all_places().values(), 2))[part::STRANGER_PARTS]
-    strangers = list(answered(chain.from_iterable(cross_pairs(pair, 14) for pair in pairs_of_places), ALL))
-    assert len(strangers) == sum(min(14, len(place.views)) for pair in pairs_of_places for place in pair) >= 100
-    assert not [it.pair.title for it in strangers if isinstance(it.answer.outcome, Localization)]
+    others = list(answered(chain.from_iterable(cross_pairs(pair, 14) for pair in pairs_of_places), ALL))
+    assert len(others) == sum(min(14, len(place.views)) for pair in pairs_of_places for place in pair) >= 100
+    assert not [it.pair.title for it in others if isinstance(it.answer.outcome, Localization)]
 
 
 def trust_of(measured: Measured) -> float:

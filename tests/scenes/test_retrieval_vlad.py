@@ -1,4 +1,4 @@
-"""VLAD and its vocabularies: what must not matter does not, what is shipped was learned, and names tell it apart."""
+"""VLAD and its vocabularies: invariances, the shipped vocabularies are learned ones, and names distinguish them."""
 
 from __future__ import annotations
 

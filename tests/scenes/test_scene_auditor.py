@@ -39,7 +39,7 @@ class Extractor:
 
 @dataclass
 class Descriptor:
-    """Tells nothing apart: enough for those that are looked for by pose."""
+    """All descriptors are equal: enough where neighbours are found by pose."""
 
     name: str = "flat"
     dimension: int = 4

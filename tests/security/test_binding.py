@@ -1,4 +1,4 @@
-"""Nothing that protects nobody listens beyond this machine by accident."""
+"""No server without protection listens beyond this machine by accident."""
 
 from __future__ import annotations
 

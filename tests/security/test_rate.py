@@ -1,4 +1,4 @@
-"""A tenant uses its rate and what it saved, and at most one job beyond; nobody waits for ever; memory is bounded."""
+"""A tenant uses its rate and what it saved, and at most one job beyond; no tenant waits for ever; memory is bounded."""
 
 from __future__ import annotations
 

@@ -160,7 +160,7 @@ class TestConnections:
     def test_clients_reject_an_expired_server_certificate(
         self, files: TlsFiles, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        # It was good when the server started: that is what the check is made to believe.
+        # It was valid when the server started: the check is replaced by one that accepts it.
         signed(AUTHORITY, "old", ends=-timedelta(hours=1)).write(files.certificate, files.key)
         with pytest.raises(SecurityError, match="expired"):
             Tls(files)
@@ -382,7 +382,7 @@ class TestCommand:
             ({"--cert": None, "--key": None}, 1, "UNAVAILABLE"),
         ],
     )
-    def test_complaints(
+    def test_errors_name_the_file(
         self,
         server: Serving,
         flags: dict[str, str],

@@ -78,7 +78,7 @@ def serving(data_dir: Path, **options: object) -> Iterator[Served]:
 
 @pytest.fixture(scope="module")
 def unmatched(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[bytes]]:
-    """A folder with a scene that nobody has matched, and the answers of a server without stored pairs."""
+    """A folder with a scene without stored pairs, and the answers of a server without stored pairs."""
     data_dir = tmp_path_factory.mktemp("unmatched") / "data"
     with serving(data_dir, **OFF) as served:
         with Client(served._address) as client:

@@ -348,7 +348,7 @@ class TestTwoServers:
     """On one SQLite file, whatever it is called."""
 
     def opened_by_another(self, *folders: Path) -> list[str]:
-        """What a process says that opens the store in each folder; empty where it can."""
+        """The error of a process that opens the store in each folder; empty without one."""
         code = """if True:
             import sys
             from pathlib import Path
@@ -402,7 +402,7 @@ class TestScenesThatGo:
     def test_a_scene_made_anew_during_calls_gives_no_mixed_answer(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        """In its n-th life all its references, which are called the same in all lives, stand at x = n."""
+        """The n-th scene of this name has all its references, whose names are always the same, at x = n."""
         life, lives, stop = [0], 12, threading.Event()
         together: set[frozenset[float]] = set()
         real_call = StandInMethod.__call__

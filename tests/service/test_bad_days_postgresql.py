@@ -123,7 +123,7 @@ def test_without_a_free_connection_calls_may_be_retried(tmp_path: Path, database
 
 
 def test_without_room_for_its_tables_changes_alone_are_refused(tmp_path: Path) -> None:
-    """With room again all goes on, without a restart of anybody."""
+    """With room again everything works, without any restart."""
     with _filled(tmp_path, lambda disk: Cluster(tables_on=disk)) as (client, database, stored, refusal):
         assert (refusal.code, refusal.reason, refusal.retry_after_s) == ("RESOURCE_EXHAUSTED", "STORE_FULL", None)
         assert isinstance(client.localize(PHOTO, CAMERA, "s", ["r0"]), LocalizationResult)

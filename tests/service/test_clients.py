@@ -174,8 +174,8 @@ def test_another_clients_resource_is_not_taken_for_ones_own(
     ):
         client.create_scene(scene)
     here = f"here-{time.monotonic_ns()}"
-    with Client(server.address) as somebody:
-        somebody.create_scene(here, datum=replace(DATUM, latitude_deg=-33.0))
+    with Client(server.address) as maker:
+        maker.create_scene(here, datum=replace(DATUM, latitude_deg=-33.0))
     with (
         losing(server.address, does_it=False) as (address, _),
         connect(address, FAST) as client,
@@ -192,7 +192,7 @@ def test_calls_go_on_when_a_server_restarts(tmp_path: Path, connect: Connect) ->
         client = connect(first.address, ConnectOptions(max_attempts=20, max_backoff_s=0.5))
         client.localize(PHOTO, CAMERA, "s")
     with client:
-        with pytest.raises(Unavailable):  # where nobody comes back it is told in time
+        with pytest.raises(Unavailable):  # without any server the error comes in time
             client.get_scene("s", timeout_s=0.5)
         came_back = threading.Event()
         leave = threading.Event()

@@ -32,7 +32,7 @@ Run = Callable[..., tuple[int, Any, str]]
 
 @pytest.fixture
 def run(server: RunningServer, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Runs the command: exit code, what was printed (as JSON if it is), and what was complained about."""
+    """Runs the command: exit code, output (parsed if it is JSON), and error output."""
 
     def run(*arguments: object) -> tuple[int, Any, str]:
         with pytest.raises(SystemExit) as caught:
@@ -77,7 +77,7 @@ def test_from_an_empty_server_to_a_pose(run: Run, tmp_path: Path, camera_json: s
     assert run("scene", "list")[1] == []
 
 
-def test_complaints(run: Run, tmp_path: Path, camera_json: str) -> None:
+def test_errors_are_one_line_with_an_exit_code(run: Run, tmp_path: Path, camera_json: str) -> None:
     code, _, error_text = run("scene", "get", "absent")
     assert code == 1
     assert error_text.startswith("mapless: NOT_FOUND: ")
@@ -311,7 +311,7 @@ def test_an_interruption_while_the_command_is_loaded_is_quiet(tmp_path: Path) ->
     (tmp_path / "mapless" / "__init__.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n")
     program = (
         "import signal\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # whoever runs the tests may have it ignored
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # the process that runs the tests may ignore it
         "from mapless_command import main\nmain()"
     )
     paths = os.pathsep.join([str(tmp_path), str(CLIENT)])

@@ -299,7 +299,7 @@ def test_the_servers_limit_of_messages_is_the_limit(fleet: Fleet, size_mib: int,
 
 
 class Echo(grpc.GenericRpcHandler):
-    """A server that keeps what it is told beside the messages."""
+    """A server that keeps the metadata of its calls."""
 
     def __init__(self) -> None:
         self.metadata: list[dict[str, str]] = []
@@ -354,7 +354,7 @@ def test_servers_get_the_callers_metadata_and_address(tmp_path: Path) -> None:
 
 @contextmanager
 def asking(client: Client) -> Iterator[list[BaseException]]:
-    """Somebody asks for one scene after the other, until the block is left; what failed."""
+    """A caller that reads one scene after the other, until the block is left; gives the errors."""
     failures: list[BaseException] = []
     done = threading.Event()
 
@@ -407,7 +407,7 @@ def test_a_server_that_is_killed_costs_retries_and_no_call(url: str, fleet: Flee
             killed.process.kill()
             wait_until(lambda: running.healthy("by_scene") == {left.address})
         assert failures == []
-        # And with nobody left callers are told at once, by the code that says: try again.
+        # Without any server calls fail at once, with the code for which clients retry.
         left.process.kill()
         wait_until(lambda: not running.healthy("by_scene"))
         with Client(running.address, replace(running.options, max_attempts=1)) as client, pytest.raises(Unavailable):
@@ -439,7 +439,7 @@ def test_a_draining_gateway_reports_it_and_answers(url: str, fleet: Fleet, tmp_p
             wait_until(lambda: fetched(f"{leaving.status}/ready")[0] == 503)
         assert failures == []
         _, text = fetched(f"{leaving.administration}/stats?filter=http.calls.downstream_cx_drain_close&format=json")
-        assert sum(it["value"] for it in json.loads(text)["stats"]) >= 1  # clients were told to connect elsewhere
+        assert sum(it["value"] for it in json.loads(text)["stats"]) >= 1  # clients were asked to reconnect
 
 
 def test_the_status_port_shows_metrics_and_nothing_else(fleet: Fleet) -> None:

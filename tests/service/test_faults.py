@@ -124,7 +124,7 @@ class TestClients:
     def test_callers_that_never_send_block_no_other(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
     ) -> None:
-        """Open methods take no token, so these are strangers; a tenth of the real numbers."""
+        """Open methods take no token, so these callers are unknown; a tenth of the real numbers."""
         for module, name in (
             (grpc_server, "MAX_CONCURRENT_RPCS"),
             (receiving, "MAX_OPEN_WAITING"),
@@ -145,7 +145,7 @@ class TestClients:
         starts = [b"", raw_http2.PREFACE, raw_http2.hello(), b"GET / HTTP/1.1\r\n\r\n", b"\x16\x03\x01\x02\x00\x01"]
         for i in range(150):
             said = starts[i % len(starts)] + noise.randbytes(noise.randrange(5000))
-            # The server may have heard enough before it is over.
+            # The server may close the connection before all is sent.
             with raw_http2.connect(server.address) as garbage, suppress(ConnectionResetError, BrokenPipeError):
                 garbage.sendall(said)
             if i % 50 == 0:
@@ -165,7 +165,7 @@ class TestClients:
             client.create_scene("s")
             files, memory_mib = open_files(process), resident_mib(process)
             idle = [stack.enter_context(raw_http2.connect(address)) for _ in range(1000)]
-            for connection in idle[:800]:  # the others do not even say hello
+            for connection in idle[:800]:  # the others do not even begin HTTP/2
                 connection.sendall(raw_http2.hello())
             wait_until(lambda: open_files(process) >= files + 1000)
             for _ in range(20):

@@ -1,4 +1,4 @@
-"""More calls than the server can compute: some are refused at once and told when to retry, the others are answered.
+"""More calls than the server can compute: some are refused at once with a time to retry after, the others are answered.
 
 The caller and the server count each of them once.
 """
@@ -167,7 +167,7 @@ class Refining:
         self.began += 1
         end_s = time.monotonic() + self.seconds
         while time.monotonic() < end_s:
-            asked[-1]()  # nobody may wait any more
+            asked[-1]()  # the queue is full
             time.sleep(0.005)
         return self._stand_in(*asked)
 

@@ -54,7 +54,7 @@ class Staged:
     Attributes:
         gate: refining ends when it is open.
         refining: released by each that begins.
-        given_up: released by each that is ended because nobody wants its answer any more.
+        given_up: released by each that is ended because its caller has left.
         coarse: the coarse pose; None if there is none.
         outcome: refined; None for the first reference's pose.
         trust: of that pose.
@@ -337,7 +337,7 @@ def test_misuse_is_reported_as_by_localize(server: Serving) -> None:
 
 
 def test_a_caller_that_does_not_read_delays_no_other(server: Serving) -> None:
-    """There is one worker, and the answer that nobody reads is computed and out of its way."""
+    """There is one worker, and an answer that is not read does not keep it busy."""
     unread = asking(server)
     assert server.method.refining.acquire(timeout=LIMIT_S)
     server.method.gate.set()

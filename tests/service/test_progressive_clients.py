@@ -42,7 +42,7 @@ FAST = ConnectOptions(timeout_s=20.0, initial_backoff_s=0.01, max_backoff_s=0.02
 LIMIT_S = 20.0
 
 Attempt = tuple[Sequence[pb.LocalizeProgressivelyResponse], grpc.Status | None]
-"""What a call is told, and how it then fails."""
+"""The messages of a call, and how it then fails."""
 
 
 def localized(x_m: float, is_final: bool = False) -> pb.LocalizeProgressivelyResponse:
@@ -248,7 +248,7 @@ CAMERA_NUMBERS = "80,81,47.5,31.5"
 
 
 def command(capsys: pytest.CaptureFixture[str], address: str, *arguments: str) -> tuple[int, list[str], str]:
-    """Exit code, lines printed, and what was complained about."""
+    """Exit code, lines printed, and the error output."""
     with pytest.raises(SystemExit) as ended:
         main(["--address", address, "localize", "s", *arguments, "--camera", CAMERA_NUMBERS, "--progressive"])
     printed = capsys.readouterr()

@@ -236,7 +236,7 @@ def test_names_are_checked_everywhere(client: Client, stubs: Stubs) -> None:
 
 
 def test_a_page_is_made_off_the_event_loop(client: Client, scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A thousand messages take tens of milliseconds, in which nobody else would be answered."""
+    """A thousand messages take tens of milliseconds, in which no other call would be answered."""
     to_message, threads = references.reference_to_message, set[str]()
 
     def recorded(record: ReferenceRecord) -> pb.Reference:

@@ -256,7 +256,7 @@ def test_a_call_that_cannot_be_computed_is_one_row(captured: Path, tmp_path: Pat
 
 
 def test_only_what_was_asked_for_is_judged(captured: Path, tmp_path: Path) -> None:
-    """Another tenant's file that cannot be read is nobody else's fault; an id that is not there is said to be so."""
+    """Another tenant's unreadable file is not reported; an id that does not exist is."""
     _, call = only(captured, tmp_path / "copy", is_named)
     theirs = tmp_path / "copy" / "tenants" / "other" / "calls" / "z" / "00000000000001-1-1.call"
     theirs.parent.mkdir(parents=True)

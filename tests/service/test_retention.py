@@ -280,7 +280,7 @@ def copied(connection: psycopg.Connection[Any], table: str) -> bytes:
 
 @pytest.mark.nightly
 def test_the_search_finds_what_is_captured(tmp_path: Path, search: Search) -> None:
-    """The same server, told to keep calls: then the photographs are there, in that folder and nowhere else."""
+    """The same server with capture: then the photographs are there, in that folder and nowhere else."""
     with served(tmp_path, capture_dir=tmp_path / "captured") as server:
         ask_everything(server.address)
         wait_until(lambda: len(search.files(tmp_path)) >= 7)

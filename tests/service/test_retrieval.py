@@ -164,7 +164,7 @@ def test_a_damaged_reference_costs_itself_unless_it_is_named(tmp_path: Path, wha
         assert len(used) == 2
         assert "r0" not in used
         for is_reranked in (True, False):
-            if what == "descriptor" and not is_reranked:  # nobody looks at it
+            if what == "descriptor" and not is_reranked:  # it is not read
                 continue
             with pytest.raises(DataLoss, match="'r0' is damaged"):
                 client.localize(PHOTOS[0], CAMERA, "s", ["r1", "r0"], rerank_references=is_reranked)

@@ -157,7 +157,7 @@ def test_a_quaternion_is_answered_normalized(client: Client, scene: str) -> None
 
 
 def test_what_is_deleted_leaves_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The engine hears of it: of one reference, then of the others with their scene."""
+    """The engine is notified: of one reference, then of the others with their scene."""
     heard: list[object] = []
     monkeypatch.setattr(QueueEngine, "forget_references", lambda _, keys: heard.append(set(keys)))
     monkeypatch.setattr(QueueEngine, "forget_scene", lambda _, scene_key: heard.append(scene_key))

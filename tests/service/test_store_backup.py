@@ -101,7 +101,7 @@ def test_either_database_comes_back_as_either(place: Place, destination: str, ba
 def test_a_backup_is_its_owners_alone(
     place: Place, backup: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """From its first byte on: it holds everybody's photographs."""
+    """From its first byte on: it holds the photographs of all tenants."""
     seen: list[int] = []
 
     def look(*_: object) -> None:

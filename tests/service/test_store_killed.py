@@ -206,7 +206,7 @@ class Ledger:
                 self._apply(change)
 
     def check(self, place: Place, store: Store, unknown: list[str]) -> None:
-        """Nothing is missing, nothing is there that nobody added, and what is new is whole."""
+        """Nothing is missing, nothing is there that was not added, and what is new is complete."""
         changes = store.list_changes(SCENE, self.generation, DESCRIPTOR)
         scene = store.get_scene(SCENE)
         found = {row[0] for row in place.fetch("SELECT reference_id FROM reference")}

@@ -131,6 +131,6 @@ def opened(page: Page, x: float, y: float) -> bool:
 
 
 def save(page: Page, file: Path) -> None:
-    """For who wants to see what the test saw."""
+    """Kept, to be looked at."""
     cv2.imwrite(str(file), page.screenshot()[..., ::-1])
     print(f"screenshot: {file}")

@@ -102,7 +102,7 @@ def test_watchers_above_the_limit_are_refused(stub: LocalizationServiceStub) -> 
     assert failure.retry_after_s is not None
     seen.pop().cancel()
     end_s = time.monotonic() + LIMIT_S
-    while True:  # the server hears of it a moment later
+    while True:  # the server notices it a moment later
         again = stub.WatchQueries(REQUEST, timeout=LIMIT_S)
         try:
             again.initial_metadata()

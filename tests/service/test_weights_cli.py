@@ -164,7 +164,7 @@ def test_adding_linking_and_checking(folder: Path, file: Path, fetched: list[str
     assert not fetched
 
 
-def test_complaints_are_one_line(folder: Path, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_errors_are_one_line(folder: Path, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for arguments in (("fetch", "pi4"), ("fetch", "aliked", "pi4"), ("add", "pi4", file), ("check", "pi4")):
         assert "no weights called pi4" in error_text(run(*arguments), 2)
     assert "No such file" in error_text(run("add", "pi3", tmp_path / "absent"), 1)

@@ -1,4 +1,4 @@
-"""A coarse answer comes before the final one, once, whatever is told; and whoever stops reading ends what computes."""
+"""A coarse answer comes once, before the final one; a caller that stops reading cancels the computation."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def message(number: int) -> pb.LocalizeResponse:
 
 
 class Planted:
-    """An answer that is there when it is let, with what it tells before."""
+    """A final answer that waits for `may_end`, after these coarse ones."""
 
     def __init__(self, coarse: Sequence[int] = (), end: Exception | None = None) -> None:
         self._coarse, self._end = coarse, end
@@ -59,7 +59,7 @@ async def test_the_coarse_answer_does_not_wait_for_the_final_one() -> None:
 async def test_there_are_two_messages_at_most_and_the_order_is_kept(
     coarse: Sequence[int], expected: list[tuple[int, bool]]
 ) -> None:
-    """Even where the final answer is there before anybody looks."""
+    """Even where the final answer is there before the first message is read."""
     planted = Planted(coarse)
     planted.may_end.set()
     assert [seen(it) async for it in planted.messages()] == [*expected, (100, True)]

@@ -29,7 +29,7 @@ BEFORE = datetime.now(timezone.utc)
 
 
 def known_of(store: Store, key: SceneKey) -> SceneAttributes:
-    """As every call tells it."""
+    """As every method returns it."""
     scene = store.get_scene(key)
     assert scene in store.list_scenes(DEFAULT_TENANT, 10)
     assert store.get_attributes(key) == scene.attributes

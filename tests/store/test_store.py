@@ -166,7 +166,7 @@ class TestReferences:
             (pose,) = store.list_changes(OFFICE, None, "vlad").added
         assert image == new.image
         assert read.camera == new.camera
-        assert repr(read.camera) == repr(new.camera)  # tells -0.0 from 0.0
+        assert repr(read.camera) == repr(new.camera)  # distinguishes -0.0 from 0.0
         for record in (created, read, loaded.record):
             assert record.key == pose.key
             assert record.feature_count == 20

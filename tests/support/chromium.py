@@ -134,7 +134,7 @@ def _end_group(process: subprocess.Popen[str]) -> None:
     with suppress(ProcessLookupError):
         while True:
             os.killpg(process.pid, signal.SIGKILL)
-            process.poll()  # one that nobody has asked about stays in its group
+            process.poll()  # a process stays in its group until its status is read
             assert time.monotonic() < end_s
             time.sleep(0.05)
 

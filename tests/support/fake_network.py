@@ -1,4 +1,4 @@
-"""A coarse backend that knows the truth: a synthetic scene under a random similarity, with planted faults."""
+"""A coarse backend made from the truth: a synthetic scene under a random similarity, with planted faults."""
 
 from __future__ import annotations
 

@@ -129,7 +129,7 @@ def real(folder: Path, **settings: Any) -> Iterator[Program]:
 
 @contextmanager
 def gated(folder: Path, kind: str = "asks", **settings: Any) -> Iterator[Program]:
-    """The program that is this file; its method "asks" whether anybody still waits for it, or "hangs" for good."""
+    """The program that is this file; its method "asks" whether its job is cancelled, or "hangs" for ever."""
     given = [f"{name}={value}" for name, value in settings.items()]
     with program(folder, [*GATED, str(folder), kind, *given]) as running:
         yield running

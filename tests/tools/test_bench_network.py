@@ -1,4 +1,4 @@
-"""The networks' benchmark: its counts are the published ones, what it measures is what it says, failures are told."""
+"""The networks' benchmark: its counts are the published ones, its measurements true, and failures reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A server as a child process: it is told apart from one that does not start, and always ends."""
+"""A server as a child process: one that does not start is an error, and every one ends."""
 
 import re
 import subprocess
@@ -34,7 +34,7 @@ def test_a_server_that_does_not_start_is_reported(monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_child_s_store_is_the_one_it_is_given(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Not the one of the environment: who measures in a folder of their own must not write to everybody's database."""
+    """Not the one of the environment: a measurement in a folder of its own must not write to a shared database."""
     asked: list[tuple[list[str], dict[str, str]]] = []
 
     def popen(command: list[str], env: dict[str, str], **_: Any) -> subprocess.Popen[str]:

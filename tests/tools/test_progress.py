@@ -1,4 +1,4 @@
-"""Progress where nobody watches: a line when a step begins, and some more on its way."""
+"""Progress without a terminal: a line when a step begins, and some more on its way."""
 
 import pytest
 

@@ -121,9 +121,9 @@ class TestScenery:
 
     def test_few_of_thousands_are_spread_over_the_scene(self) -> None:
         random = np.random.default_rng(3)
-        crowd = random.normal(0, 0.1, (3000, 2))
+        cluster = random.normal(0, 0.1, (3000, 2))
         corners = np.array([(50.0, 0.0), (0.0, 40.0), (-30.0, -30.0)])
-        spots = np.concatenate([crowd, corners])
+        spots = np.concatenate([cluster, corners])
         chosen = spread_out(spots, 4)
         assert set(chosen[1:].tolist()) == {3000, 3001, 3002}
         everything = spread_out(spots[-20:], 100)

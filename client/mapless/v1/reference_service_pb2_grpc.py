@@ -219,7 +219,7 @@ class ReferenceServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def RetrieveReferences(self, request, context):
-        """Finds the references that resemble a photograph most. Localize, when it is given none, takes twice as many as it wants
+        """Finds the references that resemble a photograph most. Localize, when it is given none, takes twice as many as it uses
         in this way, and of these the ones with the most feature matches. Takes the role localize. A scene without references
         is answered with an empty list.
         """

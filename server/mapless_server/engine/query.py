@@ -33,7 +33,7 @@ class Tier:
 
     Attributes:
         extractor: finds them.
-        pipeline: its matcher remembers matches of these features, so no other tier may have the same one. Tiers may
+        pipeline: its matcher caches matches of these features, so no other tier may have the same one. Tiers may
             share a reconstructor.
     """
 

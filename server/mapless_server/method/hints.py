@@ -118,11 +118,11 @@ def _stage(case: _Case) -> str:
 def _advice(case: _Case, options: HintOptions) -> tuple[Advice, str]:
     reason = case.rejection.reason
     if reason is RejectionReason.PRIOR_CONFLICT:
-        return Advice.CHECK_PRIOR, "Check the prior: the photograph itself says that the camera is elsewhere."
+        return Advice.CHECK_PRIOR, "Check the prior: the matches place the camera elsewhere."
     if reason is RejectionReason.AMBIGUOUS:
         return (
             Advice.TELL_PLACES_APART,
-            "Say where the camera is, or take a photograph that shows what tells the two places apart; if there is one "
+            "Give a prior on the pose, or take a photograph that shows where the two places differ; if there is one "
             "place only, check the references' poses.",
         )
     if reason is RejectionReason.LOW_TEXTURE:
@@ -130,7 +130,7 @@ def _advice(case: _Case, options: HintOptions) -> tuple[Advice, str]:
     if reason is RejectionReason.DEGENERATE_REFERENCES:
         return (
             Advice.SPREAD_REFERENCES,
-            f"The {case.reference_count} references stand at one place: use some that stand apart from one another.",
+            f"The {case.reference_count} references were taken from one place: use some from different places.",
         )
     if case.reference_count == 0 and case.has_prior:
         return Advice.CHECK_PRIOR, "Check the prior: it leaves no reference."
@@ -157,13 +157,13 @@ def _of_overlap(case: _Case, options: HintOptions) -> tuple[Advice, str]:
     if case.matches < options.few_matches:
         return (
             Advice.CHOOSE_OTHER_REFERENCES,
-            f"Use references that show what the photograph shows: {shared}, as chance does for another place.",
+            f"Use references that show what the photograph shows: {shared}, no more than chance gives.",
         )
     if case.matches >= options.many_matches and case.tried is not None and case.tried < case.matches / 4:
         return (
             Advice.ADD_REFERENCES,
             f"Add references that show the same as {case.best} from a step aside: {shared}, but of the photograph's "
-            f"matches {case.tried} have a point that a second reference shows as well, which depth takes.",
+            f"matches only {case.tried} have a point that a second reference shows as well, as depth requires.",
         )
     if case.matches >= options.many_matches and case.inliers < case.matches / 4:
         agreeing = f"{case.inliers} of {case.tried} matches with points agree on a pose" if case.tried else "few agree"
@@ -179,6 +179,6 @@ def _of_overlap(case: _Case, options: HintOptions) -> tuple[Advice, str]:
 
 def _retake(case: _Case) -> str:
     return (
-        f"Take the photograph again, with more light, a still hand and something with texture in it: it has "
+        f"Take the photograph again, with more light, without motion blur and of something with texture: it has "
         f"{case.features} local features."
     )

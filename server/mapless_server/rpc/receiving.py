@@ -27,7 +27,7 @@ Context = Any
 
 
 class Receiver:
-    """Reads messages; lives on the event loop."""
+    """Reads messages; runs on the event loop."""
 
     def __init__(self) -> None:
         self._reading: set[asyncio.Future[Any]] = set()  # the loop holds only weak references

@@ -31,7 +31,7 @@ _STATUS_LIMIT_S = 1.0
 
 
 class Sender:
-    """Writes messages and statuses; lives on the event loop."""
+    """Writes messages and statuses; runs on the event loop."""
 
     def __init__(self) -> None:
         self._sending: set[asyncio.Task[None]] = set()  # the loop holds only weak references

@@ -39,7 +39,8 @@ def assess_binding(settings: Settings, resolve: Resolve = resolve_host) -> tuple
     if not tls and not tokens:
         if loopback:
             return logging.INFO, (
-                "neither TLS nor tokens are set: every user of this machine has all rights, and nobody else can connect"
+                "neither TLS nor tokens are set: every user of this machine has all rights, and no other machine can "
+                "connect"
             )
         problem = (
             f"neither TLS nor tokens are set, and on {host} everybody who can reach this machine could read and delete "
@@ -49,7 +50,7 @@ def assess_binding(settings: Settings, resolve: Resolve = resolve_host) -> tuple
             return logging.WARNING, problem
         return logging.CRITICAL, (
             f"{problem}: set tls_certificate and tls_key or tokens_file, or listen on 127.0.0.1, or set insecure if "
-            "another program keeps strangers out"
+            "another program restricts access"
         )
     if loopback:
         return logging.INFO, ""

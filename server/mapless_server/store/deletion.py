@@ -1,4 +1,4 @@
-"""Deletion of scenes: a scene is detached at once, so that nobody finds it, and its rows are deleted in portions.
+"""Deletion of scenes: a scene is detached at once, so that no reader finds it, and its rows are deleted in portions.
 
 Detaching changes one short row per reference; deleting means megabytes. If the server is stopped in between, the rows
 that are left are deleted when the store is opened again, or with the next scene that is deleted.

@@ -94,7 +94,7 @@ class Store(StoreReader):
     def uncached(self, cache_bytes: int = 0) -> Store:
         """The same database without caches, for reading what queries do not: the caches and their counts are kept.
 
-        It lives as long as this store and is not closed. Only features are written through it, which invalidate
+        It is valid as long as this store and is not closed. Only features are written through it, which invalidate
         nothing that is cached here.
 
         Args:

@@ -103,7 +103,7 @@ def trust_text(found: Findings) -> str:
     if not found.trusted:
         return "answers have none"
     if math.isnan(found.auroc):
-        return "nothing to tell apart: all answers are right" if found.right.part else "no answer is right"
+        return "nothing to separate: all answers are right" if found.right.part else "no answer is right"
     return f"a right answer has more of it than a wrong one in {100 * found.auroc:.1f} % of pairs (AUROC)"
 
 

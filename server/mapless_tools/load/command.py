@@ -130,7 +130,7 @@ def _soak(data: Path | None, quick: bool, output: Path, **given: Any) -> list[Ch
             options, place = SoakOptions(**(given | brief)), place_of(data)
         least = least_minutes(options)
         if options.minutes < least:
-            note = f"note: {options.minutes:g} minutes are too short to tell growth from settling; {least} are enough"
+            note = f"note: {options.minutes:g} minutes do not distinguish growth from settling; {least} are enough"
             print(note, file=sys.stderr, flush=True)
         log = _new_log(output, "soak")
         result = measure_soak(place, options, progress, log)

@@ -39,7 +39,7 @@ class PipelineOptions:
         deadline_s: of every call: later a robot that calls once a second has no use for an answer.
         unloaded_s: calls one after the other.
         ramp_s: with each number of calls side by side, until more of them bring less than 3 % more answers.
-        step_s: at each share of saturation; a p99 wants some hundred calls.
+        step_s: at each share of saturation; a p99 needs some hundred calls.
         settle_s: of each step, what its rates leave out: the queue fills meanwhile.
         shares: of saturation that are offered.
         seed: of the arrivals.

@@ -134,7 +134,7 @@ def _advice(reason: RejectionReason, matches: int, image_count: int, options: Hi
     if matches < options.few_matches:
         return (
             Advice.CHOOSE_OTHER_REFERENCES,
-            f"Use references that show what the photographs show: {shared}, as chance does for another place.",
+            f"Use references that show what the photographs show: {shared}, no more than chance gives.",
         )
     if matches >= options.many_matches:
         return (

@@ -132,7 +132,7 @@ def trust_of(evidence: Evidence, options: JudgeOptions, log10_chance: float = 0.
 def _low_trust(evidence: Evidence, trust: float, coverage: float) -> Rejection:
     shown = math.floor(1000 * trust) / 1000  # rounded down, so that it never equals the bound
     message = (
-        f"its trust of {shown:g} is below the {round(1 - coverage, 6):g} that a coverage of {coverage:g} asks for: "
+        f"its trust of {shown:g} is below the {round(1 - coverage, 6):g} that a coverage of {coverage:g} requires: "
         f"{format_evidence(evidence)}"
     )
     return Rejection(RejectionReason.GATE, message)
@@ -140,8 +140,8 @@ def _low_trust(evidence: Evidence, trust: float, coverage: float) -> Rejection:
 
 def _miscalibrated(support: Support, focal: Focal) -> Rejection:
     message = (
-        f"the photograph says {focal.estimated_px / focal.given_px:.3f} times the focal length that its intrinsics say "
-        f"(standard deviation {focal.sigma:.2g}): {focal.agreeing} of the matches looked at agree with the former, "
+        f"the matches give {focal.estimated_px / focal.given_px:.3f} times the focal length of the intrinsics "
+        f"(standard deviation {focal.sigma:.2g}): {focal.agreeing} of the matches considered agree with the former, "
         f"{focal.agreeing_before} with the latter"
     )
     advice = (

@@ -85,7 +85,7 @@ def _message(
     matches = f"{best.inlier_count if best else 0} of {len(comparison.points)} matches"
     seen = f"{matches} with {neighbour_count} neighbours agree"
     if verdict is AuditVerdict.UNVERIFIABLE and other:
-        return f"contradicts {other}, and no other neighbours can tell which of the two is wrong"
+        return f"contradicts {other}, and no other neighbours show which of the two is wrong"
     if verdict is AuditVerdict.UNVERIFIABLE and not (fit and comparison.verdict().is_alarm):
         return f"too little in common with {neighbour_count} neighbours to judge: {seen}"
     if verdict is AuditVerdict.SCENE_CHANGED:

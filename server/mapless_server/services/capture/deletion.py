@@ -122,7 +122,7 @@ class Deletion:
         for thread in self._threads:
             thread.join()
 
-    # Each of these threads goes on after any exception: a fault that nobody expected must not end the deletion.
+    # Each of these threads goes on after any exception: an unexpected fault must not end the deletion.
 
     def _expire(self) -> None:
         pause_s = 0.0

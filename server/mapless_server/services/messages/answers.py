@@ -25,7 +25,7 @@ from .radii import Conditions, ReportedRadii, reported_radii
 
 @dataclass(frozen=True, eq=False)
 class AnswerFrames:
-    """The frames that a caller wants its answer in, beside OpenCV's.
+    """The frames in which a caller requests its answer, beside OpenCV's.
 
     Attributes:
         axes: of the caller's camera.
