@@ -238,7 +238,7 @@ def test_weights_are_exactly_those_of_the_checkpoint(tmp_path: Path) -> None:
     torch.manual_seed(1)
     state = {name: tensor.clone() for name, tensor in LightGlue(128).state_dict().items()}
     save_file(state, tmp_path / "good.safetensors")
-    loaded = load_lightglue("aliked", tmp_path / "good.safetensors").state_dict()
+    loaded = load_lightglue("aliked", tmp_path / "good.safetensors")[0].state_dict()
     assert loaded.keys() == state.keys()
     assert all(torch.equal(loaded[name], state[name]) for name in state)
     save_file({"posenc.Wr.weight": state["posenc.Wr.weight"]}, tmp_path / "short.safetensors")
@@ -278,7 +278,7 @@ def test_superpoints_lightglue_equals_that_of_transformers(tmp_path: Path) -> No
         for layer in theirs.transformer_layers:
             layer.cross_attention.k_proj.load_state_dict(layer.cross_attention.q_proj.state_dict())
     save_file({k: v.contiguous().clone() for k, v in theirs.state_dict().items()}, tmp_path / "w.safetensors")
-    ours = load_superpoint_lightglue(tmp_path / "w.safetensors", config).eval()
+    ours = load_superpoint_lightglue(tmp_path / "w.safetensors", config)[0].eval()
 
     common = unit_rows(random_for("superpoint").standard_normal((64, 256)))
     pair = [view(30, common, 0.05, i) for i in range(2)]

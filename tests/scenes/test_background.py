@@ -329,9 +329,9 @@ class TestPriority:
         server = Server(store, options, lambda: not is_busy.is_set())
         usual = server.matcher.match_pair
 
-        def once(first: PosedView, second: PosedView, wide: bool = False) -> Matches:
+        def once(first: PosedView, second: PosedView, wide: bool = False, strong: bool = False) -> Matches:
             is_busy.set()
-            return usual(first, second, wide)
+            return usual(first, second, wide, strong)
 
         server.matcher.match_pair = once  # type: ignore[method-assign]
         server.background.start()

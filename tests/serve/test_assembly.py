@@ -43,14 +43,23 @@ def test_auto_is_the_default_and_sift_without_weights(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("missing", "expected"),
+    ("missing", "names", "expected"),
     [
-        ("weights", "run `mapless-server weights fetch edgepoint2-l64 aliked`"),
-        ("package", "mapless-absent is not installed: pip install"),
+        (
+            "weights",
+            "edgepoint2-l64 and aliked and aliked-lightglue",
+            "run `mapless-server weights fetch edgepoint2-l64 aliked aliked-lightglue`",
+        ),
+        ("package", "edgepoint2-l64 and aliked", "mapless-absent is not installed: pip install"),
     ],
 )
 def test_auto_leaves_out_what_is_missing_and_logs_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, missing: str, expected: str
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    missing: str,
+    names: str,
+    expected: str,
 ) -> None:
     def without_package(name: str, *arguments: object) -> object:
         if name != "sift":
@@ -66,7 +75,7 @@ def test_auto_leaves_out_what_is_missing_and_logs_it(
     (record,) = caplog.records
     assert expected in record.getMessage()
     assert "\n" not in record.getMessage()
-    assert record.getMessage().startswith("features auto: sift; with edgepoint2-l64 and aliked more ")
+    assert record.getMessage().startswith(f"features auto: sift; with {names} more ")
 
 
 def test_auto_uses_the_best_features_whose_weights_are_there(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -83,8 +92,8 @@ def test_auto_uses_the_best_features_whose_weights_are_there(tmp_path: Path, cap
         (tier,) = make_tiers(settings(tmp_path, device="cpu"))
     assert tier.extractor.name.startswith("edgepoint2-l64-")
     (record,) = caplog.records
-    assert record.getMessage().startswith("features auto: edgepoint2-l64; with aliked more ")
-    assert record.getMessage().endswith("run `mapless-server weights fetch aliked`")
+    assert record.getMessage().startswith("features auto: edgepoint2-l64; with aliked and aliked-")
+    assert record.getMessage().endswith("run `mapless-server weights fetch aliked aliked-lightglue`")
 
 
 def test_features_named_in_the_settings_are_never_replaced(tmp_path: Path) -> None:
@@ -125,7 +134,7 @@ def test_a_missing_device_ends_the_start(tmp_path: Path) -> None:
     assert choose_device("cpu") == "cpu"
 
 
-def test_light_glue_is_used_on_gpus_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_light_glue_matches_alone_on_gpus_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     looked_for: list[str] = []
 
     def find(name: str, weights_dir: Path) -> Path:
@@ -136,3 +145,21 @@ def test_light_glue_is_used_on_gpus_only(tmp_path: Path, monkeypatch: pytest.Mon
     for device in ("cpu", "cuda"):
         assembly._make_matcher("aliked", settings(tmp_path), device).close()
         assert looked_for == [] if device == "cpu" else ["aliked-lightglue"]
+
+
+def test_a_stronger_tier_rematches_by_light_glue(tmp_path: Path) -> None:
+    pytest.importorskip("kornia")
+    from safetensors.torch import save_file
+
+    from mapless_server.networks.lightglue import LightGlue
+
+    missing: dict[str, ImportError | WeightsMissing] = {}
+    without = assembly._make_strong_matcher("aliked", settings(tmp_path), missing)
+    assert without.pair_matching is None
+    assert list(missing) == ["aliked-lightglue"]
+    (tmp_path / "weights").mkdir()
+    save_file(LightGlue(128).state_dict(), tmp_path / "weights" / "aliked-lightglue.safetensors")
+    matcher = assembly._make_strong_matcher("aliked", settings(tmp_path), missing := {})
+    assert not missing
+    assert matcher.pair_matching is not None
+    assert matcher.matching(strong=True) not in {matcher.matching(), without.matching()}

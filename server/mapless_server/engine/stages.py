@@ -92,7 +92,9 @@ class QueryRun:
         attributes: of the scene.
         view: the photograph with this tier's features.
         choice: how the references were chosen; None if they were used as they were named.
-        query_matches: of the photograph with each reference, where they were chosen by these.
+        query_matches: of the photograph with each reference, where they were chosen by these, or are made one by one.
+        unmatched: indices of the references with which the photograph is to be matched again (`Matcher.rematch`), each
+            in a step of its own, so that a busy server computes for other callers in between.
         part: of the method, between two stages.
     """
 
@@ -113,6 +115,7 @@ class QueryRun:
     view: View | None = None
     choice: Choice | None = None
     query_matches: tuple[Matches, ...] | None = None
+    unmatched: tuple[int, ...] = ()
     part: Any = None
 
     @property
@@ -172,6 +175,8 @@ class QueryStages:
 
     def _prepare(self, run: QueryRun, job: Job) -> StageResult:
         tier, query = self._tiers[run.tier], run.query
+        if run.unmatched:
+            return self._rematch(run)
         run = replace(run, context=StageContext(job.check))
         try:
             run = replace(run, attributes=run.source.attributes(query.scene_key))
@@ -185,13 +190,47 @@ class QueryStages:
             if run.choice is not None and run.choice.references:
                 where = "what is stored of the references that resemble the photograph is damaged"
             return self._conclude(run, Answer(Rejection(RejectionReason.NO_USABLE_REFERENCES, where)))
+        matcher = tier.pipeline.matcher
+        if matcher.pair_matching is not None:
+            assert run.view is not None
+            if run.query_matches is None:
+                with run.context.stage("correspond"):
+                    matches = matcher.match_quickly(run.view, run.references, run.context.check)
+                run = replace(run, query_matches=tuple(matches))
+            assert run.query_matches is not None
+            run = replace(run, unmatched=tuple(matcher.to_rematch(run.query_matches)))
+        return self._matched_further(run)
+
+    def _rematch(self, run: QueryRun) -> StageResult:
+        """Matches the photograph with one reference again."""
         assert run.view is not None
+        assert run.query_matches is not None
+        index, *others = run.unmatched
+        matches = list(run.query_matches)
+        with run.context.stage("rematch"):
+            matches[index] = self._tiers[run.tier].pipeline.matcher.rematch(run.view, run.references[index])
+        return self._matched_further(replace(run, query_matches=tuple(matches), unmatched=tuple(others)))
+
+    def _matched_further(self, run: QueryRun) -> StageResult:
+        """Matches with the next reference, or goes on if they are all, or there is no time for more."""
+        tier, query = self._tiers[run.tier], run.query
+        assert run.view is not None
+        if run.unmatched and self._has_time_to_rematch(run, tier):
+            kind = f"{run.kind}, rematch"
+            return self._next(run, Step(PREPARE, kind, kind, run))
+        run = replace(run, unmatched=())
         part = self._method.prepare(
             run.view, run.references, tier.pipeline, query.options, run.context, run.query_matches, query.priors
         )
         if isinstance(part, Answer):
             return self._conclude(run, part)
         return self._next(run, Step(COARSE, run.kind, str(part.bucket), replace(run, part=part)))
+
+    def _has_time_to_rematch(self, run: QueryRun, tier: Tier) -> bool:
+        """Whether another reference can be matched before the tier must pose the photograph by what it has."""
+        until_s = run.give_up_s if run.best is not None else run.deadline_s
+        until_s = run.start_s + self._escalation.rematch_share * (until_s - run.start_s)
+        return time.monotonic() + (tier.pipeline.matcher.pair_s or 0.0) <= until_s
 
     def _with_named(self, run: QueryRun, tier: Tier) -> QueryRun:
         """With the references that the caller named."""
@@ -209,7 +248,7 @@ class QueryStages:
         generation, shortlist = self._load_chosen(run, [it.reference_id for it in choice.references], tier)
         view = run.views.view(tier.extractor, context)
         with context.stage("shortlist"):
-            matches = tier.pipeline.matcher.match_query(view, shortlist, context.check)
+            matches = tier.pipeline.matcher.match_quickly(view, shortlist, context.check)
         centres = [reference.world_from_camera.translation for reference in shortlist]
         order = spread_choice([len(it) for it in matches], centres, query.reference_count)
         references, query_matches = tuple(shortlist[i] for i in order), tuple(matches[i] for i in order)

@@ -38,6 +38,8 @@ class EscalationOptions:
         clearly_more: so many times the inliers of a contradicting pose make the stronger features' pose believed.
         time_share: of the time left, what a stronger tier may take. After that the answer at hand is given: better a
             doubtful one than none, and the rest is enough to send it.
+        rematch_share: of a tier's time, when it stops to match the photograph again by a slow network (see
+            `Matcher.rematch`): the rest is for the pose, which takes a second where matches are few.
     """
 
     doubtful_trust: float = 0.1
@@ -46,11 +48,12 @@ class EscalationOptions:
     same_rotation_deg: float = 2.0
     clearly_more: float = 1.5
     time_share: float = 0.8
+    rematch_share: float = 0.7
 
     def __post_init__(self) -> None:
         check_bounds(self, "doubtful_trust doubtful_radius_m same_position_m same_rotation_deg", at_least=0)
         check_bounds(self, "clearly_more", at_least=1)
-        check_bounds(self, "time_share", above=0, at_most=1)
+        check_bounds(self, "time_share rematch_share", above=0, at_most=1)
 
 
 def is_doubtful(answer: Answer, options: EscalationOptions) -> bool:

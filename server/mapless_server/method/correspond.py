@@ -3,7 +3,8 @@
 Matches between references, whose poses are known, must also satisfy the epipolar constraint; they depend only on the
 two stored references, so they are made once, ahead of the queries (`scenes.background`) or by the first one that needs
 them, and cached. Matches of the query with each reference come from descriptors alone, or from a network that compares
-all keypoints of both photographs: implementations of `QueryMatching`.
+all keypoints of both photographs: implementations of `QueryMatching`. Where such a network is slow, it matches only the
+references with the most matches again, and pairs of references ahead of the queries: `PairMatching`.
 
 Between distant references few matches pass the ratio test over all keypoints. Wide correspondences add matches that
 pass it among the keypoints along the epipolar line: many more, of which more are wrong, so they are used only for
@@ -12,6 +13,7 @@ queries that fail otherwise.
 
 from __future__ import annotations
 
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +21,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from threading import Lock
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +31,9 @@ from mapless.geometry import Array, cross_matrix
 from .choices import EDGEPOINT2
 from .options import check_bounds
 from .views import Features, Matches, PosedView, View
+
+_PAIRS_THAT_COUNT = 10
+"""For `Matcher.pair_s`, about."""
 
 PAIR_RULE = 1
 """Version of how two references are matched; to be raised by every change that can change a match."""
@@ -46,6 +51,8 @@ class CorrespondOptions:
         wide_ratio: the ratio among the keypoints along the line; stricter, because they are few.
         wide_similarity: smallest cosine of descriptors of a match along the line, for the same reason.
         guided_similarity: smallest cosine of descriptors of a match that is searched near a point's projection.
+        rematched_references: so many references of a query, those with the most matches, are matched again by a
+            `PairMatching`, if there is one.
         remembered_pairs: number of cached pairs of references, about 8 KiB each.
     """
 
@@ -55,13 +62,14 @@ class CorrespondOptions:
     wide_ratio: float = 0.8
     wide_similarity: float = 0.85
     guided_similarity: float = 0.89
+    rematched_references: int = 5
     remembered_pairs: int = 20_000
 
     def __post_init__(self) -> None:
         check_bounds(self, "reference_ratio query_ratio wide_ratio", above=0, at_most=1)
         check_bounds(self, "wide_similarity guided_similarity", at_least=-1)
         check_bounds(self, "epipolar_px", above=0)
-        check_bounds(self, "remembered_pairs", at_least=0)
+        check_bounds(self, "rematched_references remembered_pairs", at_least=0)
 
 
 _ALIKED = CorrespondOptions(
@@ -113,6 +121,20 @@ class QueryMatching(Protocol):
         ...
 
 
+class PairMatching(Protocol):
+    """Matches two photographs better than nearest neighbours do, at many times the cost.
+
+    Attributes:
+        name: names everything that determines the matches, except for the photographs.
+    """
+
+    name: str
+
+    def match_one(self, first: View, second: View) -> Matches:
+        """Matches (keypoint of the first, keypoint of the second); each keypoint occurs at most once in them."""
+        ...
+
+
 class StoredPairs(Protocol):
     """Matches of pairs of references that were made before."""
 
@@ -149,6 +171,10 @@ class Matcher:
 
     Attributes:
         options: see there.
+        pair_matching: matches the query again with its best references, and references ahead of the queries; None if
+            nothing does. A query finds *strong* pairs of references, which it made, in `stored` only: it has no time to
+            make them, and matches the others by nearest neighbours. So its answer depends on which are stored.
+        pair_s: how long `pair_matching` took in the mean of the last queries' pairs, seconds; None before the first.
         stored: where pairs are looked up that are not cached; None looks up none.
     """
 
@@ -157,12 +183,15 @@ class Matcher:
         options: CorrespondOptions | None = None,
         threads: int = 1,
         query_matching: QueryMatching | None = None,
+        pair_matching: PairMatching | None = None,
     ) -> None:
         self.options = options or CorrespondOptions()
+        self.pair_matching = pair_matching
+        self.pair_s: float | None = None
         self.stored: StoredPairs | None = None
         self._pool = ThreadPoolExecutor(threads, "match")
         self._query_matching = query_matching or NearestNeighbours(self.options.query_ratio, self._pool)
-        self._remembered: OrderedDict[tuple[str, str, bool], Matches] = OrderedDict()
+        self._remembered: OrderedDict[_Key, Matches] = OrderedDict()
         self._lock = Lock()
 
     def correspond(
@@ -194,48 +223,102 @@ class Matcher:
         self, query: View, references: Sequence[PosedView], check: Callable[[], None] = lambda: None
     ) -> Sequence[Matches]:
         """Matches between the query and each reference; `check` as in `correspond`."""
+        matches = list(self.match_quickly(query, references, check))
+        for i in self.to_rematch(matches):
+            check()
+            matches[i] = self.rematch(query, references[i])
+        return matches
+
+    def match_quickly(
+        self, query: View, references: Sequence[PosedView], check: Callable[[], None] = lambda: None
+    ) -> Sequence[Matches]:
+        """The same before `rematch`, for choosing references; the last word without a `pair_matching`."""
         return self._query_matching.match(query, references, check)
+
+    def to_rematch(self, matches: Sequence[Matches]) -> list[int]:
+        """Indices of the references with which a query is to be matched by `rematch`, the best first."""
+        if self.pair_matching is None:
+            return []
+        best_first = sorted(range(len(matches)), key=lambda i: -len(matches[i]))
+        return best_first[: self.options.rematched_references]
+
+    def rematch(self, query: View, reference: PosedView) -> Matches:
+        """Matches of a query with one reference by the `pair_matching`."""
+        assert self.pair_matching is not None
+        begin_s = time.monotonic()
+        matches = self.pair_matching.match_one(query, reference.view)
+        spent_s = time.monotonic() - begin_s
+        self.pair_s = spent_s if self.pair_s is None else self.pair_s + (spent_s - self.pair_s) / _PAIRS_THAT_COUNT
+        return matches
 
     def close(self) -> None:
         """Ends the threads."""
         self._pool.shutdown()
 
-    def matching(self, wide: bool = False) -> str:
+    def matching(self, wide: bool = False, strong: bool = False) -> str:
         """Names everything that determines the matches of a pair, except for the two references."""
         options = self.options
         strict = f"{PAIR_RULE}-{options.reference_ratio}-{options.epipolar_px}"
+        if strong:
+            assert self.pair_matching is not None
+            strict = f"{PAIR_RULE}-{self.pair_matching.name}-{options.epipolar_px}"
         return f"wide-{strict}-{options.wide_ratio}-{options.wide_similarity}" if wide else f"strict-{strict}"
 
     def match_references(self, first: PosedView, second: PosedView, wide: bool = False) -> Matches:
-        """Matches between two references, each within `epipolar_px` of the epipolar line of the known poses."""
+        """Matches between two references, each within `epipolar_px` of the epipolar line of the known poses.
+
+        Strong ones, if those that are not wide have been looked up; otherwise by nearest neighbours.
+        """
         pair = in_order(first, second)
-        key = _key(pair, wide)
-        with self._lock:
-            matches = self._remembered.get(key)
-            if matches is not None:
-                self._remembered.move_to_end(key)
+        strong = self._recall(_Key.of(pair, False, True)) is not None
+        key = _Key.of(pair, wide, strong)
+        matches = self._recall(key)
         if matches is None:
             matches = self._widened(*pair, self.match_references(*pair)) if wide else self._match_strictly(*pair)
             self._remember(key, matches)
         return matches if pair[0] is first else np.ascontiguousarray(matches[:, ::-1])
 
-    def match_pair(self, first: PosedView, second: PosedView, wide: bool = False) -> Matches:
-        """The same for two references `in_order`, computed anew and not cached."""
-        strict = self._match_strictly(first, second)
+    def match_pair(self, first: PosedView, second: PosedView, wide: bool = False, strong: bool = False) -> Matches:
+        """The same for two references `in_order`, computed anew and not cached; wide strong ones from stored ones."""
+        if not strong:
+            strict = self._match_strictly(first, second)
+        else:
+            found = self.stored.find(self.matching(strong=True), [(first, second)]) if self.stored and wide else [None]
+            strict = self._match_strongly(first, second) if found[0] is None else found[0]
         return self._widened(first, second, strict) if wide else strict
 
     def _look_up(self, pairs: Sequence[tuple[PosedView, PosedView]], wide: bool) -> None:
-        """Caches those of these pairs that are stored."""
+        """Caches those of these pairs that are stored; strong ones if there are."""
         if self.stored is None:
             return
-        with self._lock:
-            missing = [pair for pair in pairs if _key(pair, wide) not in self._remembered]
-        if missing:
-            for pair, matches in zip(missing, self.stored.find(self.matching(wide), missing), strict=True):
-                if matches is not None:
-                    self._remember(_key(pair, wide), matches)
+        strong = self._found(pairs, False, True) if self.pair_matching else [False] * len(pairs)
+        others = [pair for pair, is_strong in zip(pairs, strong, strict=True) if not is_strong]
+        self._found(others, wide, False)
+        if wide and self.pair_matching:
+            self._found([pair for pair, is_strong in zip(pairs, strong, strict=True) if is_strong], wide, True)
 
-    def _remember(self, key: tuple[str, str, bool], matches: Matches) -> None:
+    def _found(self, pairs: Sequence[tuple[PosedView, PosedView]], wide: bool, strong: bool) -> list[bool]:
+        """Which of these pairs are cached, after those that are stored have been cached."""
+        keys = [_Key.of(pair, wide, strong) for pair in pairs]
+        with self._lock:
+            found = [key in self._remembered for key in keys]
+        missing = [i for i, is_cached in enumerate(found) if not is_cached]
+        if missing and self.stored is not None:
+            stored = self.stored.find(self.matching(wide, strong), [pairs[i] for i in missing])
+            for i, matches in zip(missing, stored, strict=True):
+                if matches is not None:
+                    self._remember(keys[i], matches)
+                    found[i] = True
+        return found
+
+    def _recall(self, key: _Key) -> Matches | None:
+        with self._lock:
+            matches = self._remembered.get(key)
+            if matches is not None:
+                self._remembered.move_to_end(key)
+        return matches
+
+    def _remember(self, key: _Key, matches: Matches) -> None:
         with self._lock:
             self._remembered[key] = matches
             while len(self._remembered) > self.options.remembered_pairs:
@@ -244,11 +327,19 @@ class Matcher:
     def forget(self, keys: Collection[str]) -> None:
         """Removes the pairs of deleted references from the cache, in time linear in its size."""
         with self._lock:
-            for pair in [it for it in self._remembered if it[0] in keys or it[1] in keys]:
+            for pair in [it for it in self._remembered if it.first in keys or it.second in keys]:
                 del self._remembered[pair]
 
     def _match_strictly(self, first: PosedView, second: PosedView) -> Matches:
-        matches = mutual_matches(first.view.features, second.view.features, self.options.reference_ratio, either=True)
+        return self._filtered(
+            first, second, mutual_matches(first.view.features, second.view.features, self.options.reference_ratio, True)
+        )
+
+    def _match_strongly(self, first: PosedView, second: PosedView) -> Matches:
+        assert self.pair_matching is not None
+        return self._filtered(first, second, self.pair_matching.match_one(first.view, second.view))
+
+    def _filtered(self, first: PosedView, second: PosedView, matches: Matches) -> Matches:
         return matches[epipolar_distance_px(first, second, matches) < self.options.epipolar_px]
 
     def _widened(self, first: PosedView, second: PosedView, strict: Matches) -> Matches:
@@ -260,6 +351,19 @@ class Matcher:
         return np.concatenate([strict, added[~taken]])
 
 
+class _Key(NamedTuple):
+    """Of a pair of references in the cache."""
+
+    first: str
+    second: str
+    wide: bool
+    strong: bool
+
+    @classmethod
+    def of(cls, pair: tuple[PosedView, PosedView], wide: bool, strong: bool) -> _Key:
+        return cls(pair[0].key, pair[1].key, wide, strong)
+
+
 def in_order(first: PosedView, second: PosedView) -> tuple[PosedView, PosedView]:
     """Two references in the order in which they are matched, whichever comes first in a query.
 
@@ -269,17 +373,14 @@ def in_order(first: PosedView, second: PosedView) -> tuple[PosedView, PosedView]
     return (first, second) if (first.name, first.key) <= (second.name, second.key) else (second, first)
 
 
-def _key(pair: tuple[PosedView, PosedView], wide: bool) -> tuple[str, str, bool]:
-    return pair[0].key, pair[1].key, wide
-
-
 def make_matcher(features: str, threads: int = 1, weights: Path | None = None, device: str = "cpu") -> Matcher:
     """The matcher for an extractor.
 
     Args:
         features: one of `OPTIONS`.
         threads: see Matcher.
-        weights: of the features' LightGlue, which then matches the query; None takes nearest neighbours.
+        weights: of the features' LightGlue; None takes nearest neighbours alone. On a CUDA device LightGlue matches the
+            query; on a CPU, where it is slow, it is the `Matcher.pair_matching`.
         device: "cpu" or a CUDA device, for LightGlue.
 
     Raises:
@@ -295,7 +396,11 @@ def make_matcher(features: str, threads: int = 1, weights: Path | None = None, d
 
     from .lightglue import LightGlueMatching
 
-    return Matcher(OPTIONS[features], threads, LightGlueMatching(load_lightglue(features, weights), device))
+    network, sha256 = load_lightglue(features, weights)
+    light_glue = LightGlueMatching(network, device, sha256=sha256)
+    if device == "cpu":
+        return Matcher(OPTIONS[features], threads, pair_matching=light_glue)
+    return Matcher(OPTIONS[features], threads, light_glue)
 
 
 def mutual_matches(first: Features, second: Features, ratio: float, either: bool = False) -> Matches:

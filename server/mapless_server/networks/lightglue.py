@@ -1,13 +1,18 @@
 """LightGlue (Lindenberger et al. 2023), the network: kornia's layers, the authors' checkpoint.
 
-All layers run, without early stopping and without pruning of keypoints, so that several pairs of photographs can be
-matched in one batch: those with fewer keypoints are padded, and masks keep the padding out of every sum. A pair's
-matches do not depend on the other pairs, and the host waits for the device once.
+On a GPU all layers run, without early stopping and without pruning of keypoints, so that several pairs of photographs
+can be matched in one batch: those with fewer keypoints are padded, and masks keep the padding out of every sum. A
+pair's matches do not depend on the other pairs, and the host waits for the device once.
+
+A CPU does not gain from batches: there pairs are matched one by one, as the authors do, by as many layers and keypoints
+as the pair needs.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,7 +36,7 @@ if TYPE_CHECKING:  # needed for SuperPoint's only
 
 
 class LightGlue(nn.Module):
-    """The network, its parameters under the names of the authors' checkpoint. `token_confidence` is loaded, not used.
+    """The network, its parameters under the names of the authors' checkpoint.
 
     Args:
         input_dim: of descriptors: 128 for ALIKED, 256 for SuperPoint.
@@ -78,6 +83,88 @@ class LightGlue(nn.Module):
         assert isinstance(head, MatchAssignment)
         return _mutual_best(_log_probabilities(head, query, reference, mask))
 
+    def match_one(
+        self,
+        first: tuple[Tensor, Tensor],
+        second: tuple[Tensor, Tensor],
+        depth_confidence: float,
+        width_confidence: float,
+    ) -> tuple[Tensor, Tensor]:
+        """Matches two photographs by as many layers and keypoints as they need, as the authors do.
+
+        Args:
+            first: (1, N, 2) keypoints, normalized, and (1, N, D) their descriptors; at least one.
+            second: (1, M, 2) and (1, M, D), likewise.
+            depth_confidence: the layers end when so large a share of the keypoints has found its final match, or that
+                it has none; 1 runs all.
+            width_confidence: a keypoint that has, with such confidence, no match is left out of the next layers; 1
+                leaves out none.
+
+        Returns:
+            index: (N,) as `forward`, for each keypoint of the first photograph.
+            score: (N,) likewise; 0 for those that were left out.
+        """
+        sides = [_Side.of(self.input_proj(x), self.posenc(position)) for position, x in (first, second)]
+        count, last = sum(len(side.index) for side in sides), len(self.transformers) - 1
+        for number, layer in enumerate(self.transformers):
+            assert isinstance(layer, TransformerLayer)
+            within = [_attend_within(layer.self_attn, side.x, side.rotation, None) for side in sides]
+            across = _attend_across(layer.cross_attn, within[0], within[1], None)
+            sides = [replace(side, x=x) for side, x in zip(sides, across, strict=True)]
+            if number == last:
+                break
+            certain = [self._is_certain(number, side.x) for side in sides]
+            uncertain_count = sum(int((~it).sum()) for it in certain)
+            if 1 - uncertain_count / count > depth_confidence:
+                break
+            head = self.log_assignment[number]
+            assert isinstance(head, MatchAssignment)
+            sides = [
+                side.kept(~sure | (head.matchability(side.x)[0, :, 0].sigmoid() > 1 - width_confidence))
+                for side, sure in zip(sides, certain, strict=True)
+            ]
+            if not all(len(side.index) for side in sides):
+                break
+        index = torch.zeros(first[0].shape[1], dtype=torch.long, device=first[0].device)
+        score = torch.zeros(first[0].shape[1], device=first[0].device)
+        if all(len(side.index) for side in sides):
+            head = self.log_assignment[number]
+            assert isinstance(head, MatchAssignment)
+            everything = torch.ones(1, len(sides[1].index), dtype=torch.bool, device=index.device)
+            column, probability = _mutual_best(_log_probabilities(head, sides[0].x, sides[1].x, everything))
+            index[sides[0].index], score[sides[0].index] = sides[1].index[column[0]], probability[0]
+        return index, score
+
+    def _is_certain(self, number: int, x: Tensor) -> Tensor:
+        """(N,) which keypoints' matches no layer after this one will change; the authors' threshold."""
+        threshold = 0.8 + 0.1 * math.exp(-4 * number / len(self.transformers))
+        certain: Tensor = self.token_confidence[number](x, x)[0][0] >= threshold
+        return certain
+
+
+@dataclass(frozen=True, eq=False)
+class _Side:
+    """One photograph between two layers.
+
+    Attributes:
+        x: (1, N, C) of the keypoints that are left.
+        rotation: their positions, encoded.
+        index: (N,) of each among all.
+    """
+
+    x: Tensor
+    rotation: Tensor
+    index: Tensor
+
+    @classmethod
+    def of(cls, x: Tensor, rotation: Tensor) -> _Side:
+        """With all its keypoints."""
+        return cls(x, rotation, torch.arange(x.shape[1], device=x.device))
+
+    def kept(self, keep: Tensor) -> _Side:
+        """With those of a mask (N,)."""
+        return _Side(self.x[:, keep], self.rotation[..., keep, :], self.index[keep])
+
 
 def _attend_within(block: SelfBlock, x: Tensor, rotation: Tensor, key_mask: Tensor | None) -> Tensor:
     """SelfBlock of kornia with a mask of keys instead of pairs, (B, N, C) to (B, N, C)."""
@@ -90,7 +177,7 @@ def _attend_within(block: SelfBlock, x: Tensor, rotation: Tensor, key_mask: Tens
     return updated
 
 
-def _attend_across(block: CrossBlock, x0: Tensor, x1: Tensor, key_mask: Tensor) -> tuple[Tensor, Tensor]:
+def _attend_across(block: CrossBlock, x0: Tensor, x1: Tensor, key_mask: Tensor | None) -> tuple[Tensor, Tensor]:
     """CrossBlock of kornia, the second photograph's keys masked; never holds a matrix of all similarities."""
 
     def heads(x: Tensor) -> Tensor:
@@ -130,8 +217,8 @@ def _mutual_best(log_probabilities: Tensor) -> tuple[Tensor, Tensor]:
     return column, torch.where(mutual, best.exp(), 0.0)
 
 
-def load_lightglue(features: str, weights: Path) -> LightGlue:
-    """The network that matches an extractor's features, with the authors' weights.
+def load_lightglue(features: str, weights: Path) -> tuple[LightGlue, str]:
+    """The network that matches an extractor's features, with the authors' weights, and their SHA-256.
 
     Args:
         features: "aliked" or "superpoint".
@@ -144,15 +231,14 @@ def load_lightglue(features: str, weights: Path) -> LightGlue:
     """
     if features == "aliked":
         network = LightGlue(input_dim=128)
-        load_strictly(network, weights, optional={})
-        return network
+        return network, load_strictly(network, weights, optional={})
     if features == "superpoint":
         return load_superpoint_lightglue(weights)
     raise ValueError(f"there is no LightGlue for features {features!r}: only for aliked and superpoint")
 
 
-def load_superpoint_lightglue(weights: Path, config: LightGlueConfig | None = None) -> LightGlue:
-    """The network with the weights of the file that transformers reads: the same tensors, split differently.
+def load_superpoint_lightglue(weights: Path, config: LightGlueConfig | None = None) -> tuple[LightGlue, str]:
+    """The network from the file that transformers reads, the same tensors split differently; and the file's SHA-256.
 
     Args:
         weights: safetensors file with transformers' names. What it holds of SuperPoint itself is not used.
@@ -165,10 +251,10 @@ def load_superpoint_lightglue(weights: Path, config: LightGlueConfig | None = No
     from transformers import LightGlueConfig, LightGlueForKeypointMatching
 
     theirs = LightGlueForKeypointMatching(config or LightGlueConfig())
-    load_strictly(theirs, weights, optional={})
+    sha256 = load_strictly(theirs, weights, optional={})
     ours = LightGlue(theirs.descriptor_dim, theirs.num_layers)
     ours.load_state_dict(_translated(theirs.state_dict(), theirs.num_layers), strict=True)
-    return ours
+    return ours, sha256
 
 
 def _translated(theirs: Mapping[str, Tensor], layers: int) -> dict[str, Tensor]:

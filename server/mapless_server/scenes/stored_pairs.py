@@ -25,16 +25,22 @@ class Matching:
         extractor: of the features.
         matcher: of the queries.
         wide: whether the matches are wide ones.
+        strong: whether they are those of `Matcher.pair_matching`.
     """
 
     extractor: FeatureExtractor
     matcher: Matcher
     wide: bool = False
+    strong: bool = False
 
     @property
     def name(self) -> str:
         """As `PairStore` expects it."""
-        return matching_name(self.extractor.name, self.matcher.matching(self.wide))
+        return matching_name(self.extractor.name, self.matcher.matching(self.wide, self.strong))
+
+    def match_pair(self, first: PosedView, second: PosedView) -> Matches:
+        """See `Matcher.match_pair`."""
+        return self.matcher.match_pair(first, second, self.wide, self.strong)
 
 
 def matching_name(extractor: str, rule: str) -> str:

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
 
 from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import Tier
@@ -57,6 +58,10 @@ CACHED_AUDIT_PAIRS = 2000
 """Pairs of references whose matches audits keep in memory, about 10 KB a pair."""
 
 WITH_WEIGHTS = frozenset(entry.name for entry in CATALOGUE)
+
+
+_Missing = dict[str, ImportError | WeightsMissing]
+"""What `auto` would use, and why it cannot, by the names of the weights."""
 
 
 class StartupError(Exception):
@@ -155,12 +160,14 @@ def _background_matching(
     store: Store, indexes: SceneIndexes, engine: QueueEngine, observer: PairObserver
 ) -> BackgroundMatching:
     """Matching for the queries of each tier, the first one first; from now on, queries look for its results."""
-    pairs, matchings = PairStore(store.database), dict[Matching, PairFinder]()
+    pairs, matchings, strong = PairStore(store.database), dict[Matching, PairFinder](), dict[Matching, PairFinder]()
     for tier in engine.tiers:
         matcher = tier.pipeline.matcher
         matcher.stored = finder = PairFinder(pairs, tier.extractor.name, observer)
         matchings |= {Matching(tier.extractor, matcher, wide): finder for wide in (False, True)}
-    return BackgroundMatching(store, indexes, matchings, lambda: engine.queue.job_count == 0, observer)
+        if matcher.pair_matching is not None:  # last, because it takes long
+            strong |= {Matching(tier.extractor, matcher, wide, True): finder for wide in (False, True)}
+    return BackgroundMatching(store, indexes, matchings | strong, lambda: engine.queue.job_count == 0, observer)
 
 
 def feature_names(settings: Settings, device: str) -> tuple[str, ...]:
@@ -186,14 +193,20 @@ def make_tiers(settings: Settings) -> tuple[Tier, ...]:
         ImportError: a package that a network needs is not installed.
     """
     device = device_for(settings)
-    extractors = _make_extractors(settings, device)
+    missing = _Missing()
+    extractors = _make_extractors(settings, device, missing)
+    first = next(iter(extractors))
+    matchers = {
+        name: _make_strong_matcher(name, settings, missing)
+        if device == "cpu" and name != first
+        else _make_matcher(name, settings, device)
+        for name in extractors
+    }
+    _log_missing(extractors, missing)
     reconstructor = make_reconstructor(
         settings.backend, settings.weights_dir, device, compiled_views=settings.compiled_views
     )
-    return tuple(
-        Tier(extractor, Pipeline(reconstructor, _make_matcher(name, settings, device)))
-        for name, extractor in extractors.items()
-    )
+    return tuple(Tier(extractor, Pipeline(reconstructor, matchers[name])) for name, extractor in extractors.items())
 
 
 def make_descriptor(settings: Settings, extractor: FeatureExtractor) -> GlobalDescriptor:
@@ -215,7 +228,10 @@ def make_descriptor(settings: Settings, extractor: FeatureExtractor) -> GlobalDe
 
 def make_first_features(settings: Settings) -> tuple[str, FeatureExtractor]:
     """The first tier's features, and their extractor; errors as `make_tiers`."""
-    return next(iter(_make_extractors(settings, device_for(settings)).items()))
+    missing = _Missing()
+    extractors = _make_extractors(settings, device_for(settings), missing)
+    _log_missing(extractors, missing)
+    return next(iter(extractors.items()))
 
 
 def what_is_missing(error: ImportError | WeightsMissing) -> str:
@@ -293,9 +309,9 @@ def _find_device(device: str) -> str:
     return device
 
 
-def _make_extractors(settings: Settings, device: str) -> dict[str, FeatureExtractor]:
+def _make_extractors(settings: Settings, device: str, missing: _Missing) -> dict[str, FeatureExtractor]:
+    """The features of each tier; adds to `missing` what `auto` leaves out."""
     extractors: dict[str, FeatureExtractor] = {}
-    missing: dict[str, ImportError | WeightsMissing] = {}
     for alternatives in _tiers(settings.features, device):
         for name in alternatives:
             try:
@@ -305,17 +321,21 @@ def _make_extractors(settings: Settings, device: str) -> dict[str, FeatureExtrac
                 if settings.features != AUTO:
                     raise
                 missing[name] = error
-    if missing:
-        log.info(
-            "features auto: %s; with %s more photographs are localized where references are few or far apart: %s",
-            " and ".join(extractors),
-            " and ".join(missing),
-            _remedy(missing),
-        )
+                _find_light_glue(name, settings, missing)
     return extractors
 
 
-def _remedy(missing: Mapping[str, ImportError | WeightsMissing]) -> str:
+def _log_missing(present: Iterable[str], missing: _Missing) -> None:
+    if missing:
+        log.info(
+            "features auto: %s; with %s more photographs are localized where references are few or far apart: %s",
+            " and ".join(present),
+            " and ".join(missing),
+            _remedy(missing),
+        )
+
+
+def _remedy(missing: _Missing) -> str:
     """What brings the missing features: a package first, then all weights at once."""
     for error in missing.values():
         if isinstance(error, ImportError):
@@ -330,14 +350,35 @@ def _make_extractor(name: str, settings: Settings, device: str) -> FeatureExtrac
 
 
 def _make_matcher(name: str, settings: Settings, device: str) -> Matcher:
-    """Nearest neighbours, or LightGlue on a GPU if its weights are present.
-
-    On a CPU LightGlue takes two seconds a pair and gains nothing measurable.
-    """
-    network = f"{name}-lightglue"
-    if device != "cpu" and network in WITH_WEIGHTS:
+    """Nearest neighbours, or LightGlue on a GPU if its weights are present."""
+    network = _light_glue_of(name)
+    if device != "cpu" and network is not None:
         try:
             return make_matcher(name, available_cores(), find_weights(network, settings.weights_dir), device)
         except WeightsMissing as error:
             log.warning("features %s: matched by nearest neighbours: %s", name, error)
     return make_matcher(name, available_cores())
+
+
+def _make_strong_matcher(name: str, settings: Settings, missing: _Missing) -> Matcher:
+    """For a tier that answers where a cheaper one is in doubt, on a CPU: with LightGlue, half a second a pair.
+
+    Adds its weights to `missing` if they are.
+    """
+    return make_matcher(name, available_cores(), _find_light_glue(name, settings, missing))
+
+
+def _find_light_glue(features: str, settings: Settings, missing: _Missing) -> Path | None:
+    """The weights of the LightGlue of some features, if there is one; added to `missing` if they are."""
+    network = _light_glue_of(features)
+    try:
+        return None if network is None else find_weights(network, settings.weights_dir)
+    except WeightsMissing as error:
+        missing[f"{features}-lightglue"] = error
+        return None
+
+
+def _light_glue_of(features: str) -> str | None:
+    """Its name in the catalogue; None if there is none."""
+    network = f"{features}-lightglue"
+    return network if network in WITH_WEIGHTS else None

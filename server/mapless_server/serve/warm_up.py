@@ -21,6 +21,7 @@ from mapless_server.engine.query import Caller, Photo, Query
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.method.answer import Localization
 from mapless_server.method.context import StageContext
+from mapless_server.method.correspond import Matcher
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.views import Photograph, PosedView
@@ -76,6 +77,16 @@ async def warm_up(engine: QueueEngine) -> None:
             raise WarmUpFailed(f"an easy photograph was placed {error_m:.2f} m off")
         if number == 0:
             engine.queue.forget_costs()
+    for tier in engine.tiers:
+        if tier.pipeline.matcher.pair_matching is not None:
+            await asyncio.to_thread(_time_pair, tier.pipeline.matcher, *references.pair(tier.extractor))
+
+
+def _time_pair(matcher: Matcher, first: PosedView, second: PosedView) -> None:
+    """The time of one pair, by which queries know how many there is time for."""
+    for _ in range(ROUNDS):
+        matcher.pair_s = None
+        matcher.rematch(first.view, second)
 
 
 class _RenderedReferences:
@@ -97,6 +108,11 @@ class _RenderedReferences:
     ) -> tuple[int, tuple[PosedView, ...]]:
         """See ReferenceSource."""
         return 1, self._views[extractor.name]
+
+    def pair(self, extractor: FeatureExtractor) -> tuple[PosedView, PosedView]:
+        """The two that are farthest apart."""
+        first, *_, last = self._views[extractor.name]
+        return first, last
 
     def attributes(self, scene_key: SceneKey) -> SceneAttributes:
         """See ReferenceSource."""
