@@ -28,9 +28,9 @@ from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.method.results import PoseStage
-from mapless_server.method.views import Features, PosedView, View
+from mapless_server.method.views import Features, Matches, PosedView, View
 from mapless_server.scenes import Narrowing, Sphere
-from mapless_server.scheduling import Abandoned, CostModel, Ending, Flow, Job
+from mapless_server.scheduling import Abandoned, CostModel, Ending, Flow, Job, Next
 from mapless_server.security import SceneKey
 from mapless_server.serve.assembly import engine_over
 from mapless_server.store import NewReference, Store
@@ -300,6 +300,76 @@ class TestTiers:
         for tiers in ([], [cheap, same_name], [cheap, same_matcher]):
             with pytest.raises(ValueError, match="each with an extractor and a matcher of its own"):
                 engine_over(setting.store, tiers, EngineOptions())
+
+
+class OneMatch:
+    """A pair matching that matches keypoint 0 with the number of its call."""
+
+    name = "one match"
+
+    def __init__(self, seconds: float = 0.0) -> None:
+        self.seconds, self.calls = seconds, 0
+
+    def match_one(self, first: View, second: View) -> Matches:
+        time.sleep(self.seconds)
+        self.calls += 1
+        return np.array([[0, self.calls]], np.int32)
+
+
+class TestRematching:
+    """The strong tier matches a doubtful photograph again, by a slow network, with one reference after another."""
+
+    def pair_matching(self, setting: Setting, seconds: float = 0.0) -> OneMatch:
+        setting.replies = {"cheap": rejected(), "strong": localized(SURE_INLIERS)}
+        planted = setting.engine.tiers[1].pipeline.matcher.pair_matching = OneMatch(seconds)
+        return planted
+
+    @pytest.mark.parametrize("chooses", [False, True])
+    def test_each_reference_is_a_step_of_its_own(self, setting: Setting, chooses: bool) -> None:
+        planted = self.pair_matching(setting)
+        result, job = setting.run(query_of(() if chooses else ("r0", "r1")), caller())
+        assert planted.calls == 2
+        assert [it.stage for it in job.records].count("prepare") == 1 + 1 + 2
+        assert result.stage_seconds["strong/rematch"] >= 0
+        assert result.tier.extractor.name == "strong"
+
+    def test_the_method_gets_the_new_matches(self, setting: Setting) -> None:
+        self.pair_matching(setting)
+        got: list[Sequence[Matches]] = []
+        usual = whole(lambda *_: rejected())
+
+        def prepare(*arguments: Any) -> Any:
+            got.append(arguments[5])
+            return usual.prepare(*arguments)
+
+        stages = QueryStages(setting.engine.tiers, ESCALATION, replace(usual, prepare=prepare))
+        job = setting.engine.query_job(query_of(("r0", "r1")), caller())
+        job.step.payload.__dict__["tier"] = 1
+        steps = 0
+        while job.step.stage == "prepare":
+            (done,) = stages.prepare([job])
+            assert isinstance(done, Next)
+            job.step = done.step
+            steps += 1
+        assert steps == 3
+        assert [it.tolist() for it in got[0]] == [[[0, 1]], [[0, 2]]]
+
+    @pytest.mark.parametrize(("known_s", "calls"), [(None, 1), (100.0, 0)])
+    def test_pairs_that_would_end_too_late_are_not_begun(
+        self, setting: Setting, known_s: float | None, calls: int
+    ) -> None:
+        """The pose is then computed from the matches that there are."""
+        planted = self.pair_matching(setting, seconds=1.0)
+        setting.engine.tiers[1].pipeline.matcher.pair_s = known_s
+        result = setting.localize(deadline_s=3.0)
+        assert planted.calls == calls
+        assert result.tier.extractor.name == "strong"
+
+    def test_a_sure_photograph_is_not_matched_again(self, setting: Setting) -> None:
+        planted = self.pair_matching(setting)
+        setting.replies["cheap"] = localized(SURE_INLIERS)
+        setting.localize()
+        assert planted.calls == 0
 
 
 class TestMemory:

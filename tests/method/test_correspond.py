@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 import pytest
@@ -317,6 +317,95 @@ def test_stored_pairs_are_used_and_give_the_same(wide: bool, matched_pairs: list
     assert matching == matcher.matching(wide)
     assert {tuple(sorted(key)) for key in keys} == set(keys)
     assert len(matched_pairs) == 2 + 2 * 4  # the two that are not stored, and the query's twice
+
+
+class AnyRatio:
+    """A pair matching: nearest neighbours without a ratio."""
+
+    name = "any-ratio"
+
+    def __init__(self) -> None:
+        self.seen: list[tuple[View, View]] = []
+
+    def match_one(self, first: View, second: View) -> Matches:
+        self.seen.append((first, second))
+        return mutual_matches(first.features, second.features, 1.0)
+
+
+class FullShelf(Shelf):
+    """Pairs that were stored of several matchings."""
+
+    def __init__(self, matcher: Matcher, pairs: Sequence[tuple[PosedView, PosedView]], wide: bool = True) -> None:
+        kinds = [(False, True), (True, True)] if wide else [(False, True)]
+        self.of = {
+            matcher.matching(*kind): {(a.key, b.key): matcher.match_pair(a, b, *kind) for a, b in pairs}
+            for kind in kinds
+        }
+
+    def find(self, matching: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> list[Matches | None]:
+        return [self.of.get(matching, {}).get((first.key, second.key)) for first, second in pairs]
+
+
+class TestPairMatching:
+    SCENE = make_scene(random_for("strong"), SceneOptions(outlier_share=0.3, reference_count=4, descriptor_noise=0.5))
+
+    def test_a_query_is_matched_again_with_its_best_references_only(self) -> None:
+        pairs, options = AnyRatio(), CorrespondOptions(rematched_references=2)
+        matcher = Matcher(options, pair_matching=pairs)
+        quick = matcher.match_quickly(self.SCENE.query, self.SCENE.references)
+        found = matcher.match_query(self.SCENE.query, self.SCENE.references)
+        best = sorted(range(4), key=lambda i: -len(quick[i]))[:2]
+        for i, reference in enumerate(self.SCENE.references):
+            ratio = 1.0 if i in best else options.query_ratio
+            np.testing.assert_array_equal(
+                found[i], mutual_matches(self.SCENE.query.features, reference.view.features, ratio)
+            )
+        assert len(pairs.seen) == 2
+        assert matcher.pair_s is not None
+
+    @pytest.mark.parametrize("wide", [False, True])
+    def test_a_query_has_no_time_to_make_strong_pairs(self, wide: bool) -> None:
+        pairs = AnyRatio()
+        matcher = Matcher(CorrespondOptions(rematched_references=0), pair_matching=pairs)
+        found, usual = (it.correspond(self.SCENE.query, self.SCENE.references, wide) for it in (matcher, Matcher()))
+        assert not pairs.seen
+        for pair, matches in usual.reference_pairs.items():
+            np.testing.assert_array_equal(found.reference_pairs[pair], matches)
+
+    @pytest.mark.parametrize("wide", [False, True])
+    @pytest.mark.parametrize("wide_are_stored", [False, True])
+    def test_strong_pairs_are_used_as_soon_as_they_are_stored(self, wide: bool, wide_are_stored: bool) -> None:
+        """Wide ones are the same, whether they were stored or are made from the stored strict ones."""
+        scene, matcher = self.SCENE, Matcher(pair_matching=AnyRatio())
+        usual = matcher.correspond(scene.query, scene.references, wide).reference_pairs
+        ordered = list(combinations(scene.references, 2))[:4]
+        matcher.stored = FullShelf(Matcher(pair_matching=AnyRatio()), ordered, wide_are_stored)
+        found = matcher.correspond(scene.query, scene.references, wide).reference_pairs
+        for pair in combinations(range(4), 2):
+            first, second = (scene.references[i] for i in pair)
+            is_stored = any(first is a and second is b for a, b in ordered)
+            expected = matcher.match_pair(first, second, wide, True) if is_stored else usual[pair]
+            np.testing.assert_array_equal(found[pair], expected)
+        assert sum(map(len, found.values())) > sum(map(len, usual.values()))
+
+    def test_wide_strong_pairs_are_made_from_the_stored_ones(self) -> None:
+        first, second = self.SCENE.references[:2]
+        pairs = AnyRatio()
+        matcher = Matcher(pair_matching=pairs)
+        anew = matcher.match_pair(first, second, True, True)
+        matcher.stored = FullShelf(matcher, [(first, second)])
+        pairs.seen.clear()
+        np.testing.assert_array_equal(matcher.match_pair(first, second, True, True), anew)
+        assert not pairs.seen
+
+    def test_strong_pairs_have_names_of_their_own(self) -> None:
+        one, other = AnyRatio(), AnyRatio()
+        other.name = "other weights"
+        matchers = [Matcher(pair_matching=it) for it in (one, other)]
+        names = [
+            matcher.matching(wide, strong) for matcher in matchers for wide, strong in product((False, True), repeat=2)
+        ]
+        assert len(set(names)) == 2 + 4
 
 
 def test_what_determines_matches_is_in_their_name() -> None:

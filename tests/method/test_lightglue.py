@@ -100,34 +100,97 @@ def test_values_in_the_padding_have_no_effect(views: tuple[View, list[View]]) ->
     torch.testing.assert_close(index[score > 0.01], index_loud[score > 0.01])
 
 
+def test_all_layers_and_keypoints_give_what_the_batch_gives(views: tuple[View, list[View]]) -> None:
+    query, references = views
+    made = network()
+    for other in references:
+        inputs = tensors(query, [other])
+        with torch.inference_mode():
+            index, score = made(*inputs)
+            index_alone, score_alone = made.match_one((inputs[0], inputs[1]), (inputs[2], inputs[3]), 1.0, 1.0)
+        torch.testing.assert_close(score[0], score_alone, atol=1e-6, rtol=0)
+        torch.testing.assert_close(index[0][score_alone > 0.01], index_alone[score_alone > 0.01])
+
+
+@pytest.mark.parametrize(("depth", "width"), [(0.95, 0.99), (0.6, 0.9), (1.0, 0.95), (0.5, 1.0)])
+def test_stopping_and_pruning_equal_kornias(views: tuple[View, list[View]], depth: float, width: float) -> None:
+    query, references = views
+    made = planted_confidence()
+    twin = kornia_twin(made, depth, width)
+    layers = []
+    for other in references:
+        inputs = tensors(query, [other])
+        theirs = twin(kornia_input(query, other))
+        with torch.inference_mode():
+            index, score = made.match_one((inputs[0], inputs[1]), (inputs[2], inputs[3]), depth, width)
+        torch.testing.assert_close(score, theirs["matching_scores0"][0], atol=1e-5, rtol=0)
+        matched = theirs["matches0"][0] >= 0
+        torch.testing.assert_close(index[matched], theirs["matches0"][0][matched])
+        layers.append(int(theirs["stop"]))
+    assert min(layers) < 6 or depth > 0.6, "no pair stopped early"
+
+
+def planted_confidence() -> LightGlue:
+    """Random weights whose keypoints become certain by and by, and of which some match nothing."""
+    made = network(layers=6)
+    with torch.no_grad():
+        for number, confidence in enumerate(made.token_confidence):
+            weight, bias = confidence.parameters()
+            weight.mul_(8)
+            bias.fill_(0.8 * number)
+        for head in made.log_assignment:
+            assert isinstance(head, MatchAssignment)
+            weight, bias = head.matchability.parameters()
+            weight.mul_(8)
+            bias.fill_(0.0)
+    return made
+
+
 def test_a_pair_equals_kornias_own_forward(views: tuple[View, list[View]]) -> None:
     query, references = views
     made = network()
-    twin = KorniaLightGlue(
-        None,  # type: ignore[arg-type]
-        input_dim=DIMENSION,
-        n_layers=len(made.transformers),
-        depth_confidence=-1,
-        width_confidence=-1,
-    )
-    missing = twin.load_state_dict(made.state_dict(), strict=False)
-    assert missing.missing_keys == ["confidence_thresholds"]
-    assert not missing.unexpected_keys
+    twin = kornia_twin(made, -1, -1)
     for other in references:
-        data = [
-            {
-                "keypoints": torch.from_numpy(v.features.keypoints)[None],
-                "descriptors": torch.from_numpy(v.features.descriptors)[None],
-                "image_size": torch.tensor([[CAMERA.width_px, CAMERA.height_px]]),
-            }
-            for v in (query, other)
-        ]
+        theirs = twin(kornia_input(query, other))
         with torch.inference_mode():
-            theirs = twin.eval()({"image0": data[0], "image1": data[1]})
             index, score = made(*tensors(query, [other]))
         torch.testing.assert_close(score[0], theirs["matching_scores0"][0], atol=1e-5, rtol=0)
         matched = theirs["matches0"][0] >= 0
         torch.testing.assert_close(index[0][matched], theirs["matches0"][0][matched])
+
+
+def kornia_twin(made: LightGlue, depth: float, width: float) -> Callable[[dict[str, Any]], dict[str, Any]]:
+    """Kornia's own network with the same weights."""
+    twin = KorniaLightGlue(
+        None,  # type: ignore[arg-type]
+        input_dim=DIMENSION,
+        n_layers=len(made.transformers),
+        depth_confidence=depth,
+        width_confidence=width,
+    )
+    missing = twin.load_state_dict(made.state_dict(), strict=False)
+    assert missing.missing_keys == ["confidence_thresholds"]
+    assert not missing.unexpected_keys
+    twin.eval()
+
+    def forward(data: dict[str, Any]) -> dict[str, Any]:
+        with torch.inference_mode():
+            found: dict[str, Any] = twin(data)
+        return found
+
+    return forward
+
+
+def kornia_input(*pair: View) -> dict[str, Any]:
+    """Two views as kornia wants them."""
+    return {
+        f"image{i}": {
+            "keypoints": torch.from_numpy(v.features.keypoints)[None],
+            "descriptors": torch.from_numpy(v.features.descriptors)[None],
+            "image_size": torch.tensor([[CAMERA.width_px, CAMERA.height_px]]),
+        }
+        for i, v in enumerate(pair)
+    }
 
 
 class NoWaiting(TorchDispatchMode):

@@ -24,7 +24,7 @@ from mapless_server.errors import Unavailable
 from mapless_server.method import correspond
 from mapless_server.method.context import StageContext
 from mapless_server.method.correspond import Matcher, in_order
-from mapless_server.method.views import Features, Matches, PosedView
+from mapless_server.method.views import Features, Matches, PosedView, View
 from mapless_server.scenes.background import BackgroundMatching, BackgroundOptions
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
@@ -82,13 +82,16 @@ class Server:
         options: BackgroundOptions | None = None,
         is_idle: Callable[[], bool] = lambda: True,
         widths: Sequence[bool] = (False, True),
+        strong: bool = False,
     ) -> None:
-        self.store, self.counts, self.matcher = store, Counts(), Matcher()
+        self.store, self.counts = store, Counts()
+        self.matcher = Matcher(pair_matching=AnyRatio() if strong else None)
         self.pairs = PairStore(store.database)
         self.finder = self.matcher.stored = PairFinder(self.pairs, EXTRACTOR.name, self.counts)
         self.library = ReferenceLibrary(store)
         indexes = SceneIndexes(store, self.library, DESCRIPTOR, EXTRACTOR, 2**30)
-        matchings = {Matching(EXTRACTOR, self.matcher, wide): self.finder for wide in widths}
+        kinds = (False, True) if strong else (False,)
+        matchings = {Matching(EXTRACTOR, self.matcher, wide, kind): self.finder for kind in kinds for wide in widths}
         self.background = BackgroundMatching(store, indexes, matchings, is_idle, self.counts, options)
 
     def references(self) -> tuple[PosedView, ...]:
@@ -179,6 +182,37 @@ class TestResults:
         for (a, b), matches in server.stored().items():
             first, second = (next(it for it in server.references() if it.name.endswith(name)) for name in (a, b))
             np.testing.assert_array_equal(matches, Matcher().match_pair(*in_order(first, second)))
+
+
+class AnyRatio:
+    """A pair matching: nearest neighbours without a ratio."""
+
+    name = "any-ratio"
+
+    def match_one(self, first: View, second: View) -> Matches:
+        return correspond.mutual_matches(first.features, second.features, 1.0)
+
+
+class TestStrongPairs:
+    def test_a_query_finds_them_and_their_wide_ones(self, store: Store) -> None:
+        server = Server(store, strong=True)
+        server.background.match_waiting()
+        assert server.counts.made == 40
+        for wide in (False, True):
+            found = server.matcher.correspond(PLANTED.query, server.references(), wide).reference_pairs
+            twin = Matcher(pair_matching=AnyRatio())
+            for (i, j), matches in found.items():
+                first, second = server.references()[i], server.references()[j]
+                pair = in_order(first, second)
+                expected = twin.match_pair(*pair, wide, True)
+                np.testing.assert_array_equal(matches if pair[0] is first else matches[:, ::-1], expected)
+
+    def test_they_are_fewer_and_under_names_of_their_own(self, store: Store) -> None:
+        server = Server(store, BackgroundOptions(strong_pairs=1), widths=[False], strong=True)
+        server.background.match_waiting()
+        assert server.counts.made == 10 + 4
+        Server(store, widths=[False]).background.match_waiting()
+        assert len(server.stored()) == 10
 
 
 class TestDamage:
