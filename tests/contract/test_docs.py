@@ -24,6 +24,8 @@ from mapless import Client, NewReference, RigidTransform
 from mapless import errors as client_errors
 from mapless.cli.arguments import make_parser
 from mapless.exchange import MALFORMED_ANSWER
+from mapless.report.page import HEADLINES
+from mapless.v1 import localization_service_pb2 as pb
 from mapless_server import errors
 from mapless_server.errors import Unavailable
 from mapless_server.method.options import Variant
@@ -108,6 +110,9 @@ def test_files_that_commands_and_text_name_exist() -> None:
     assert {"deploy/compose.postgres.yaml", "deploy/kubernetes/overlays/shared"} <= named
     named |= set(re.findall(r"`((?:client|deploy|docker|docs|proto|server|tests)/[\w./-]+)`", CURRENT))
     assert sorted(name for name in named if not (ROOT / name).exists()) == ["deploy/.env"]
+    tests = set(re.findall(r"`((?!tests/)[a-z]+/test_\w+\.py)`", CURRENT))
+    assert len(tests) >= 8
+    assert sorted(name for name in tests if not (ROOT / "tests" / name).exists()) == []
 
 
 @pytest.mark.parametrize("page", sorted((DOCS / "architecture").iterdir()), ids=page_id)
@@ -192,6 +197,8 @@ def rows(page: Path, heading: str) -> list[list[str]]:
 def test_tables_of_rejections_and_variants_are_complete() -> None:
     reasons = [row[0] for row in rows(DOCS / "reference/answers.md", "reason")]
     assert reasons == [reason.name for reason in RejectionReason]
+    assert {f"REJECTION_REASON_{name}" for name in reasons} < set(pb.RejectionReason.keys())
+    assert set(HEADLINES) == set(reasons)
     variants = [row[0] for row in rows(DOCS / "guides/researcher.md", "variant")]
     assert variants == [variant.value for variant in Variant]
 

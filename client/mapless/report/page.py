@@ -25,7 +25,7 @@ REFERENCE_BYTES = 450_000
 has less than 5 MB, which any mailbox accepts."""
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 """Permits no external resources and no scripts."""
-_REASONS = {
+HEADLINES = {
     "NO_USABLE_REFERENCES": "there were no usable references",
     "DEGENERATE_REFERENCES": "all references have the same position",
     "LOW_TEXTURE": "the photograph shows too little",
@@ -37,6 +37,7 @@ _REASONS = {
     "AMBIGUOUS": "several places fit the photograph",
     "PRIOR_CONFLICT": "the pose contradicts a prior",
 }
+"""Of a rejection, by its reason."""
 
 
 def report_html(
@@ -97,7 +98,7 @@ def _header(answer: LocalizationResult | Rejected, title: str) -> str:
     why = ""
     headline = f'<span class="{kind}">{_verdict(answer)}</span>'
     if isinstance(answer, Rejected):
-        known = _REASONS.get(answer.reason)
+        known = HEADLINES.get(answer.reason)
         headline += f": {text(known)}" if known else ""
         why = f'<p class="why">{text(answer.message)} <span class="note">({text(answer.reason)})</span></p>'
     return (

@@ -104,7 +104,7 @@ class _Children(Generic[M]):
 
 
 class Metrics(Observer, PairObserver):
-    """The metrics of one server. Implements `rpc.CallObserver`, too; never raises.
+    """The metrics of one server. Implements `rpc.guard.CallObserver`, too; never raises.
 
     Attributes:
         registry: of all metrics.
