@@ -10,7 +10,7 @@ views, reconstruction        photographs with features and poses; the result of 
 rejection                    "no pose" is a result
 features/                    local features of a photograph
 lightglue, correspond        matches among references, and of the query with them (lightglue: by a network)
-retrieve, epipolar           the references most similar to a photograph; whether matches fit poses
+retrieve                     the references most similar to a photograph
 tracks                       observations of the same point
 priors/                      what is known of the query's pose beforehand
 results                      scale, structure, matches, pose estimate and its support: data between stages

@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, decode_image
-from mapless_server.method.epipolar import consistent_matches
 from mapless_server.method.features import FeatureExtractor, SiftExtractor
 from mapless_server.method.views import PosedView
 from mapless_server.settings import available_cores
 from mapless_tools.dataset import Frame
 from mapless_tools.progress import Progress
 
+from .epipolar import consistent_matches
 from .errors import MatchedPair
 from .pairs import Pair, more_pairs, pairs_by_order, pairs_by_pose
 from .verdict import Verdict, judge

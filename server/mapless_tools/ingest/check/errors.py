@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapless_server.method.epipolar import pair_error_px
 from mapless_server.method.views import Matches, PosedView
 
+from .epipolar import pair_error_px
 from .pairs import Pair
 
 THRESHOLD_PX = 3.0

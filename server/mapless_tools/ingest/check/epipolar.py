@@ -16,10 +16,9 @@ import numpy as np
 import poselib
 
 from mapless.geometry import Array
-
-from .correspond import fundamental_matrix, mutual_matches
-from .options import check_bounds
-from .views import Matches, PosedView, View
+from mapless_server.method.correspond import fundamental_matrix, mutual_matches
+from mapless_server.method.options import check_bounds
+from mapless_server.method.views import Matches, PosedView, View
 
 
 @dataclass(frozen=True)
