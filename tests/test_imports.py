@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -157,6 +158,21 @@ def test_no_room_inside_method_is_in_a_circle() -> None:
                 ".".join(other.split(".")[:3]) for other in others if room_of(other) == "method"
             )
     assert circles({part: others - {part, "mapless_server.method"} for part, others in parts.items()}) == []
+
+
+def test_the_list_of_the_method_is_complete_and_in_order() -> None:
+    """Of its modules, as the docstring of the room has it; one on the same line may import the one before it."""
+    known = modules_of("mapless_server")
+    text = ast.get_docstring(ast.parse(known["mapless_server.method"].read_text())) or ""
+    listed = [name for line in re.findall(r"^([a-z_, /]+?)  ", text, re.MULTILINE) for name in re.findall(r"\w+", line)]
+    upward = []
+    for module, others in graph("mapless_server", deferred=False).items():
+        if module.startswith("mapless_server.method."):
+            own = module.split(".")[2]
+            parts = {other.split(".")[2] for other in others if other.startswith("mapless_server.method.")} - {own}
+            upward += [f"{own} imports {part}" for part in parts if listed.index(part) > listed.index(own)]
+    assert {module.split(".")[2] for module in known if module.startswith("mapless_server.method.")} == set(listed)
+    assert upward == []
 
 
 def packages_of(room: str) -> set[str]:

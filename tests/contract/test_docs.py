@@ -197,7 +197,9 @@ def rows(page: Path, heading: str) -> list[list[str]]:
 def test_tables_of_rejections_and_variants_are_complete() -> None:
     reasons = [row[0] for row in rows(DOCS / "reference/answers.md", "reason")]
     assert reasons == [reason.name for reason in RejectionReason]
-    assert {f"REJECTION_REASON_{name}" for name in reasons} < set(pb.RejectionReason.keys())
+    assert {f"REJECTION_REASON_{name}" for name in reasons} < set(
+        pb.DESCRIPTOR.enum_types_by_name["RejectionReason"].values_by_name
+    )
     assert set(HEADLINES) == set(reasons)
     variants = [row[0] for row in rows(DOCS / "guides/researcher.md", "variant")]
     assert variants == [variant.value for variant in Variant]

@@ -18,7 +18,6 @@ from mapless_server.method.adjust import AdjustOptions
 from mapless_server.method.answer import Localization
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.correspond import Correspondences, Matcher
-from mapless_server.method.epipolar import sampson_px
 from mapless_server.method.localize import localize
 from mapless_server.method.match import MatchOptions
 from mapless_server.method.options import LocalizeOptions
@@ -39,6 +38,7 @@ from mapless_server.method.two_view.matches import TwoViewMatches
 from mapless_server.method.two_view.pose import RelativePoseOptions, band_chance, disc_chance
 from mapless_server.method.two_view.solve import TwoViewOptions, few_references_factor, solve_two_view
 from mapless_server.method.views import Features, Matches, PosedView, View
+from mapless_tools.ingest.check.epipolar import sampson_px
 
 TRUE = RigidTransform(rotation_from_vector([0.1, -0.15, 0.05]), np.array([0.3, -0.1, -4.2]))
 CENTRES = ((-1.2, 0.1, -4.0), (1.0, -0.2, -4.4), (0.2, 0.5, -3.6))

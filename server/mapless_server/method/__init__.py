@@ -5,8 +5,8 @@ Begin with `localize`, the stages in order. A module imports only modules above 
 choices                      names of backends and features, for settings
 options, context             how options check themselves; cancelling and timing of a computation
 arrays, perturbation         NumPy or torch; small motions of poses, coordinates of their errors
-robust, optimize             robust losses; Levenberg-Marquardt, the only one
-views, reconstruction        photographs with features and poses; the result of the coarse stage
+optimize                     robust losses; Levenberg-Marquardt, the only one
+views                        photographs with features and poses; the result of the coarse stage
 rejection                    "no pose" is a result
 features/                    local features of a photograph
 lightglue, correspond        matches among references, and of the query with them (lightglue: by a network)
@@ -21,6 +21,7 @@ uncertainty/                 the covariance of a pose
 pnp                          pose and inliers
 resection                    pose and focal length from fixed points
 bundle, adjust               (ours) everything adjusted together
+two_view/                    (ours) pose from matches with posed references, without points
 trust/                       whether a pose is accepted, and its trust
 answer, hints                the answer of the method; what would help after a rejection
 coarse/                      query and references reconstructed together, up to scale

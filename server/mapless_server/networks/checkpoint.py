@@ -45,7 +45,6 @@ def load_strictly(
     *,
     optional: Mapping[str, Sequence[float] | None] = IMAGE_NORMALIZATION,
     ignored_prefixes: tuple[str, ...] = (),
-    device: torch.device | str = "cpu",
 ) -> str:
     """Replaces all parameters and persistent buffers of a module by those of a file; other buffers are not changed.
 
@@ -59,7 +58,6 @@ def load_strictly(
         file: safetensors, of any floating-point type.
         optional: names that the file may lack, with their default values; None leaves the module's own.
         ignored_prefixes: further names with these prefixes are allowed; their tensors are hashed and dropped.
-        device: of the loaded tensors.
 
     Returns:
         The weights' identity: SHA-256 of the file, 64 hexadecimal digits.
@@ -74,7 +72,7 @@ def load_strictly(
     check_fit(header, expected_tensors(module), optional.keys(), ignored_prefixes, message)
     with opened(file) as stream:
         digest = hashlib.sha256(stream.read(header.size_bytes))
-        loaded = {name: tensor.to(device) for name, tensor in _defaults(state, header.entries, optional).items()}
+        loaded = _defaults(state, header.entries, optional)
         for name, entry in header.entries.items():
             if entry.dtype not in _DTYPES:
                 raise CheckpointError(f"{file} holds numbers of type {entry.dtype}, in {name}: no network takes them")
@@ -83,7 +81,7 @@ def load_strictly(
             if name in state:
                 if not _is_finite(tensor):
                     raise CheckpointError(f"{file} holds numbers that are not finite, in {name}")
-                loaded[name] = tensor.to(device, state[name].dtype)
+                loaded[name] = tensor.to(state[name].dtype)
         if stream.read(1):
             raise CheckpointError(f"{file} changed while it was read")
     module.load_state_dict(loaded, strict=True, assign=True)

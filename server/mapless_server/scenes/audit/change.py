@@ -73,14 +73,12 @@ class Change:
     Attributes:
         expected_count: points that the image should show.
         found_count: those it shows.
-        judged_share: share of the image's cells with enough expected points to judge.
         changed_share: share of the judged cells that are in the largest connected region of changed cells.
         is_alarm: whether that is a change of the scene.
     """
 
     expected_count: int
     found_count: int
-    judged_share: float
     changed_share: float
     is_alarm: bool
 
@@ -114,9 +112,7 @@ def find_change(comparison: Comparison, options: ChangeOptions | None = None) ->
     largest = max((int((regions == k).sum()) for k in range(1, count)), default=0)
     share = largest / max(int(judged.sum()), 1)
     enough = judged.sum() >= cells / 4
-    return Change(
-        len(visible), int(found.sum()), float(judged.mean()), share, bool(enough and share >= options.alarm_share)
-    )
+    return Change(len(visible), int(found.sum()), share, bool(enough and share >= options.alarm_share))
 
 
 def _missing(

@@ -43,7 +43,6 @@ def report(
         error_px=fit.error_px if fit else None,
         position_offset_m=fit.offset_m if fit else None,
         rotation_offset_deg=fit.turn_deg if fit else None,
-        position_sigma_m=comparison.sigma_m if fit else None,
         focal_ratio=fit.focal_ratio if fit else None,
         changed_share=change.changed_share if change else None,
         other=other,

@@ -56,7 +56,6 @@ class ReferenceAudit:
             processed image; None without inliers.
         position_offset_m: distance of the fitted pose from the given one; None where not judged.
         rotation_offset_deg: the same for the rotation.
-        position_sigma_m: standard deviation of the position offset, along it.
         focal_ratio: fitted by given focal length; 1 where the given one fits.
         changed_share: share of the image that does not show what it should; None where not judged.
         other: name of the partner of a swap or duplicate; empty if there is none.
@@ -71,7 +70,6 @@ class ReferenceAudit:
     error_px: float | None = None
     position_offset_m: float | None = None
     rotation_offset_deg: float | None = None
-    position_sigma_m: float | None = None
     focal_ratio: float | None = None
     changed_share: float | None = None
     other: str = ""

@@ -10,51 +10,36 @@ world axes, which changes no relative pose.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import poselib
 
 from mapless.geometry import Array
 from mapless_server.method.correspond import fundamental_matrix, mutual_matches
-from mapless_server.method.options import check_bounds
 from mapless_server.method.views import Matches, PosedView, View
 
+RATIO = 0.8
+"""Lowe's ratio; strict, since few right matches are better here than many with some wrong ones."""
 
-@dataclass(frozen=True)
-class EpipolarOptions:
-    """Options of finding consistent matches.
+FUNDAMENTAL_PX = 1.5
+"""Largest distance from the epipolar lines; keypoints are accurate to about a pixel."""
 
-    Attributes:
-        ratio: Lowe's ratio; strict, since few right matches are better here than many with some wrong ones.
-        fundamental_px: largest distance from the epipolar lines; keypoints are accurate to about a pixel.
-        min_matches: fewer inliers are no evidence: any eight matches satisfy some fundamental matrix.
-    """
-
-    ratio: float = 0.8
-    fundamental_px: float = 1.5
-    min_matches: int = 24
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "ratio", above=0, at_most=1)
-        check_bounds(self, "fundamental_px", above=0)
-        check_bounds(self, "min_matches", at_least=8)
+MIN_MATCHES = 24
+"""Fewer inliers are no evidence: any eight matches satisfy some fundamental matrix."""
 
 
-def consistent_matches(first: View, second: View, options: EpipolarOptions | None = None) -> Matches:
+def consistent_matches(first: View, second: View) -> Matches:
     """Inlier matches of one fundamental matrix, without use of poses; none if they are too few."""
-    options = options or EpipolarOptions()
-    matches = mutual_matches(first.features, second.features, options.ratio)
-    if len(matches) < options.min_matches:
+    matches = mutual_matches(first.features, second.features, RATIO)
+    if len(matches) < MIN_MATCHES:
         return matches[:0]
     _, info = poselib.estimate_fundamental(
         first.features.keypoints[matches[:, 0]].astype(np.float64),
         second.features.keypoints[matches[:, 1]].astype(np.float64),
-        {"max_epipolar_error": options.fundamental_px},
+        {"max_epipolar_error": FUNDAMENTAL_PX},
         {},
     )
     agreeing = matches[np.asarray(info["inliers"], bool)]
-    return agreeing if len(agreeing) >= options.min_matches else matches[:0]
+    return agreeing if len(agreeing) >= MIN_MATCHES else matches[:0]
 
 
 def sampson_px(first: PosedView, second: PosedView, matches: Matches) -> Array:
