@@ -17,7 +17,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
 from threading import Lock
@@ -30,6 +30,7 @@ from mapless.geometry import Array, cross_matrix
 
 from .choices import EDGEPOINT2
 from .options import check_bounds
+from .tracks import Tracks, build_tracks
 from .views import Features, Matches, PosedView, View
 
 _PAIRS_THAT_COUNT = 10
@@ -108,6 +109,14 @@ class Correspondences:
 
     reference_pairs: Mapping[tuple[int, int], Matches]
     query_matches: tuple[Matches, ...]
+    _tracks: dict[int | None, Tracks] = field(default_factory=dict, init=False, repr=False)
+
+    def tracks(self, references: Sequence[PosedView], anchor: int | None = None) -> Tracks:
+        """The tracks over the references, merged once for all stages; `anchor` as in `build_tracks`."""
+        if anchor not in self._tracks:
+            counts = [len(reference.view.features) for reference in references]
+            self._tracks[anchor] = build_tracks(self.reference_pairs, counts, anchor)
+        return self._tracks[anchor]
 
 
 class QueryMatching(Protocol):

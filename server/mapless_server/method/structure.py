@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array
 
-from .arrays import AnyArray, length, namespace
+from .arrays import AnyArray, columns, length, namespace, take
 from .correspond import Correspondences
 from .observations import (
     FIRST_GUESS,
@@ -34,7 +34,7 @@ from .observations import (
 )
 from .options import check_bounds
 from .results import KeypointNoise, MetricScale, Structure
-from .tracks import Tracks, build_tracks, keypoint_depths, keypoint_offsets, keypoint_rays
+from .tracks import Tracks, keypoint_depths, keypoint_offsets, keypoint_rays
 from .views import PosedView, Reconstruction
 
 
@@ -114,8 +114,7 @@ def build_structure(
 
 def tracks_of(references: Sequence[PosedView], correspondences: Correspondences, options: StructureOptions) -> Tracks:
     """The tracks to triangulate."""
-    counts = [len(r.view.features) for r in references]
-    return build_tracks(correspondences.reference_pairs, counts, None if options.all_references else 0)
+    return correspondences.tracks(references, None if options.all_references else 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,10 +157,10 @@ def trustworthy(observations: Observations, x_in_world: AnyArray, options: Struc
     xp = namespace(x_in_world)
     limit = options.max_residual_sigma
     explained = observations.max_by_point(length(observations.residuals(x_in_world))) < (limit or np.inf)
-    centre, _ = observations.rays()
-    direction = x_in_world[observations.point] - centre
-    direction = direction / length(direction)[:, None]
-    cosine = (direction * direction[observations.tracks.starts][observations.point]).sum(-1)
+    centre, _ = observations.columns.rays()
+    direction = take(columns(x_in_world), observations.point) - centre
+    direction = direction / (direction**2).sum(0) ** 0.5
+    cosine = (direction * take(direction, observations.tracks.starts[observations.point])).sum(0)
     parallax_deg = xp.rad2deg(xp.arccos(xp.clip(cosine, -1, 1)))
     return explained & (observations.max_by_point(parallax_deg) >= options.min_parallax_deg)
 

@@ -26,7 +26,6 @@ from ..priors.known import NO_PRIORS, Priors
 from ..rejection import Rejection, RejectionReason
 from ..results import PointMatches, Structure
 from ..structure import StructureOptions, observe, trustworthy
-from ..tracks import build_tracks
 from ..trust.gate import GateOptions, format_false_alarms, log10_false_alarms
 from ..views import PosedView, ReconstructedView, Reconstruction, View
 from . import Bucket, Outcome, Request
@@ -155,7 +154,7 @@ class GeometricReconstructor:
 
     def _triangulate(self, references: Sequence[PosedView], correspondences: Correspondences) -> Structure:
         options = self.options.structure
-        tracks = build_tracks(correspondences.reference_pairs, [len(r.view.features) for r in references])
+        tracks = correspondences.tracks(references)
         observations = observe(tracks, references, FIRST_GUESS)
         points = triangulate(observations)
         points = adjust_points(observations, points, options.loss_scale_sigma, options.iterations)
