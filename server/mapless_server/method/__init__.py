@@ -9,9 +9,9 @@ optimize                     robust losses; Levenberg-Marquardt, the only one
 views                        photographs with features and poses; the result of the coarse stage
 rejection                    "no pose" is a result
 features/                    local features of a photograph
+tracks                       observations of the same point
 lightglue, correspond        matches among references, and of the query with them (lightglue: by a network)
 retrieve                     the references most similar to a photograph
-tracks                       observations of the same point
 priors/                      what is known of the query's pose beforehand
 results                      scale, structure, matches, pose estimate and its support: data between stages
 scale_equations, scale       metric scale, initial pose

@@ -273,8 +273,9 @@ def triangulate_depths(centre: Array, ray: Array) -> tuple[Array, Array]:
     baseline = centre[:, 1] - centre[:, 0]
     normal = np.cross(ray[:, 0], ray[:, 1])
     squared = (normal**2).sum(axis=1)
-    across = np.cross(baseline[:, None], ray[:, ::-1])  # (M, 2, 3), with the other camera's ray
-    depth_m = (across * normal[:, None]).sum(axis=2) / np.where(squared > 0, squared, np.nan)[:, None]
+    # (b x r) n = r (n x b) for either camera, with the other camera's ray r.
+    turned = np.cross(normal, baseline)
+    depth_m = np.einsum("mvi,mi->mv", ray[:, ::-1], turned) / np.where(squared > 0, squared, np.nan)[:, None]
     parallax = np.arctan2(np.sqrt(squared), (ray[:, 0] * ray[:, 1]).sum(axis=1))
     return depth_m, np.degrees(parallax)
 

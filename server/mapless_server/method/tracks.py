@@ -162,9 +162,10 @@ def build_tracks(
     label = component[node]
     first = np.concatenate([[True], (label[1:] != label[:-1]) | (view[1:] != view[:-1])])
     node, view, label = node[first], view[first], label[first]
-    _, point, count = np.unique(label, return_inverse=True, return_counts=True)
-    seen_twice = count[point] >= 2
-    point = np.unique(point[seen_twice], return_inverse=True)[1]
+    begins = np.diff(label, prepend=-1) > 0  # sorted by component
+    point = np.cumsum(begins) - 1
+    seen_twice = (np.bincount(point) >= 2)[point]
+    point = np.cumsum(begins[seen_twice]) - 1
     return Tracks(point, view[seen_twice], node[seen_twice] - offsets[view[seen_twice]])
 
 

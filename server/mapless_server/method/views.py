@@ -122,7 +122,9 @@ def map_cells(
     map_camera: Camera, pixels: NDArray[np.floating], camera: Camera
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
     """Rows and columns (N,) of the cells of one camera's maps at pixels (N, 2) of another; and which lie inside."""
-    mapped = np.rint(map_camera.project(camera.rays(pixels)))
+    ideal = camera.rays(pixels)[:, :2]
+    focal = map_camera.focal_x_px, map_camera.focal_y_px
+    mapped = np.rint(ideal * focal + (map_camera.principal_x_px, map_camera.principal_y_px))
     inside = np.asarray(((mapped >= 0) & (mapped < (map_camera.width_px, map_camera.height_px))).all(axis=1))
     columns, rows = np.where(inside[:, None], mapped, 0).astype(np.intp).T
     return rows, columns, inside
