@@ -51,7 +51,7 @@ MAX_LISTINGS = 3
 """When a reference is deleted while it is used, the scene is listed again; more often than this it is being emptied."""
 
 ANSWER_MARGIN_S = 0.05
-"""Before the deadline, for an answer at hand to reach its caller."""
+"""Before the deadline, for an answer that exists to reach its caller."""
 
 _COUNTS = (2, 5, 10, 20, 64)
 """Queries with about as many references cost about as much."""
@@ -167,7 +167,7 @@ class QueryStages:
                 return self._next(run, replace(run, listings=run.listings + 1).first_step)
             if run.best is None:
                 return _emptied() if is_outdated else error
-            # A failed attempt at a better answer must not cost the answer at hand.
+            # A failed attempt at a better answer must not cost the first answer.
             if not isinstance(error, FeaturesMissing):
                 name = self._tiers[run.tier].features
                 log.warning("%s failed; the first answer is given", name, exc_info=error)
@@ -264,7 +264,7 @@ class QueryStages:
         return load_usable(lambda some: self._load(run, some, tier), reference_ids, (DataLoss,), report)
 
     def _load(self, run: QueryRun, reference_ids: Sequence[str], tier: Tier) -> Loaded:
-        # Only the first tier waits for its references' features: a stronger one has an answer at hand.
+        # Only the first tier waits for its references' features: before a stronger one there is an answer.
         waits = run.best is None
         return run.source.load(run.query.scene_key, reference_ids, tier.extractor, run.context, waits)
 

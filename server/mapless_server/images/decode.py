@@ -1,7 +1,7 @@
 """Bytes of an image file to pixels, and whatever is wrong with them.
 
 The header is read first, by the parsers below: decoders allocate for whatever size a header claims, and a file of 1 MB
-can claim 900 megapixels. Only JPEG, PNG and WebP are let through, by their first bytes: a decoder library reads many
+can claim 900 megapixels. Only JPEG, PNG and WebP are accepted, by their first bytes: a decoder library reads many
 more formats than have been hardened.
 
 The raster is the one stored in the file. EXIF orientation is a note to viewers; intrinsics and poses belong to the

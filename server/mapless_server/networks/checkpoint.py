@@ -75,7 +75,7 @@ def load_strictly(
         loaded = _defaults(state, header.entries, optional)
         for name, entry in header.entries.items():
             if entry.dtype not in _DTYPES:
-                raise CheckpointError(f"{file} holds numbers of type {entry.dtype}, in {name}: no network takes them")
+                raise CheckpointError(f"{file} holds numbers of type {entry.dtype}, in {name}, which no network uses")
             tensor = _read(stream, entry, file)
             digest.update(_bytes_of(tensor))
             if name in state:

@@ -18,7 +18,7 @@ from mapless_server.errors import DeadlineExceeded, InvalidArgument, Overloaded,
 OPEN_MESSAGE_LIMIT_S = 5.0
 """For the messages of methods without authentication, a few bytes that are sent together with the headers."""
 MAX_OPEN_WAITING = 256
-"""Calls of such methods whose message has not come; a further one ends the oldest. Messages are rarely late."""
+"""Calls of such methods whose message has not arrived; a further one ends the oldest. Messages are rarely late."""
 MAX_OPEN_STREAMS = 256
 """Open streams of such methods (health watches, reflection), which have no deadline."""
 
@@ -53,8 +53,8 @@ class Receiver:
         await asyncio.wait(awaited, timeout=max(0.0, limit_s), return_when=asyncio.FIRST_COMPLETED)
         if not reading.done():
             if evicted is not None and evicted.done():
-                raise Overloaded("too many calls whose message has not come")
-            raise DeadlineExceeded("the message did not come in time", reason="MESSAGE_LATE")
+                raise Overloaded("too many calls whose message has not arrived")
+            raise DeadlineExceeded("the message did not arrive in time", reason="MESSAGE_LATE")
         message = reading.result()
         if message is grpc.aio.EOF:
             raise InvalidArgument("the call has no message, or one that is too large", reason="MALFORMED_MESSAGE")

@@ -20,7 +20,7 @@ class Figure:
         again: the same measured a second time.
         floor_ms: what no program is faster than.
         predicted_ms: before it was measured.
-        target: the wanted value.
+        target: the value to reach.
         target_is_least: whether more is better.
         note: anything else, the reason if it was not measured.
     """

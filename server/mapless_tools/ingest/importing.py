@@ -73,7 +73,7 @@ def run_import(
     """An import, without a connection a dry one; prints what it does and finds.
 
     Returns:
-        whether all that was to be imported is in; of a dry run, whether all could be.
+        whether everything was imported; of a dry run, whether everything could be.
 
     Raises:
         ValueError: the folder, the scene's id or the connection cannot be used.

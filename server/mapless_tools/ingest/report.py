@@ -57,7 +57,7 @@ class ImportReport:
 
     @property
     def went_well(self) -> bool:
-        """Whether all that was to be imported is in; of a dry run, whether all could be."""
+        """Whether everything was imported; of a dry run, whether everything could be."""
         wrong = self.verdict is not None and self.verdict.is_wrong
         return not (self.refused or self.stopped or self.untried_count or (self.is_dry and wrong))
 

@@ -147,8 +147,8 @@ def two_view_failure(evidence: TwoViewEvidence, options: TwoViewGateOptions) -> 
         return f"{count}, which chance could do ({format_false_alarms(evidence.log10_pose)})"
     if lacks_distance(evidence, options):
         return (
-            f"{count}, but all except {evidence.other_inliers} of them are with one reference, and one reference tells "
-            "the direction but no distance"
+            f"{count}, but all except {evidence.other_inliers} of them are with one reference, and one reference determines "
+            "the direction but not the distance"
         )
     if evidence.second_share < options.min_second_share:
         return (
@@ -164,8 +164,8 @@ def one_reference_rejection(reason: RejectionReason, message: str, support: Supp
     """The rejection of a pose without a distance, with what helps."""
     best = support.references[int(np.argmax(support.inliers_by_reference()))].name
     advice = (
-        f"Add references that show the same as {best} from a step aside, or use others: one reference tells the "
-        "direction, but no distance."
+        f"Add references that show the same as {best} from a step aside, or use others: one reference determines the "
+        "direction but not the distance."
     )
     return Rejection(reason, message, Hint("two_view", Advice.ADD_REFERENCES, advice, best))
 
