@@ -268,5 +268,5 @@ def test_figures_about_the_database_hold() -> None:
     reserved = 3  # of PostgreSQL's connections, for superusers
     assert (5 + 1) * CONNECTIONS_AT_MOST + reserved <= 100 < (6 + 1) * CONNECTIONS_AT_MOST + reserved
     assert "100 is enough for five" in text
-    assert f"come back after {RETRY_AFTER_S:.0f} s" in text
+    assert f"retry after {RETRY_AFTER_S:.0f} s" in text
     assert Unavailable.code in text

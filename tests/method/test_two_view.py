@@ -201,7 +201,7 @@ def test_one_reference_tells_the_direction_but_no_distance() -> None:
         LocalizeOptions(),
     )
     assert isinstance(answer.outcome, Rejection)
-    assert "one reference determines the direction but not the distance" in answer.outcome.message
+    assert "determines the direction but not the distance" in answer.outcome.message
     hint = answer.outcome.hint
     assert hint is not None
     assert (hint.advice, hint.best_reference) == (Advice.ADD_REFERENCES, "reference 0")

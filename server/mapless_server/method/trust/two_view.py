@@ -147,7 +147,7 @@ def two_view_failure(evidence: TwoViewEvidence, options: TwoViewGateOptions) -> 
         return f"{count}, which chance could do ({format_false_alarms(evidence.log10_pose)})"
     if lacks_distance(evidence, options):
         return (
-            f"{count}, but all except {evidence.other_inliers} of them are with one reference, and one reference determines "
+            f"{count}, but all except {evidence.other_inliers} of them are with one reference, which determines "
             "the direction but not the distance"
         )
     if evidence.second_share < options.min_second_share:
