@@ -23,7 +23,7 @@ namespace Mapless
     /// <summary>Where the device was, or why that is not known.</summary>
     public sealed class MaplessAnswer
     {
-        /// <summary>Everything that the server said.</summary>
+        /// <summary>The whole response of the server.</summary>
         public LocalizeResponse Response { get; }
 
         internal MaplessAnswer(LocalizeResponse response)

@@ -258,4 +258,4 @@ def test_the_store_may_be_named_by_its_folder(
     assert "as asked" in run(*arguments).output
     assert asked == [tmp_path / "data"]
     both = run(*arguments, "--address", "127.0.0.1:1")
-    assert (both.exit_code, "say one of them" in both.output, len(asked)) == (2, True, 1)
+    assert (both.exit_code, "give one of them" in both.output, len(asked)) == (2, True, 1)

@@ -324,9 +324,9 @@ def test_queries_of_every_outcome_come_and_go() -> None:
             stage.show_query(replace(outcomes[number % 4], number=number + 1))
         stage.show_points(debug.x_in_world, np.zeros((40, 3), np.uint8))
         stage.show_points(debug.x_in_world, np.zeros((40, 3), np.uint8))
-        stage.say("live", True)
+        stage.report("live", True)
         assert "None yet" in stage._nothing.content
-        stage.say("not shown", False)
+        stage.report("not shown", False)
         assert "yet" not in stage._nothing.content
         names = {name for name in server.scene._handle_from_node_name if name.startswith("/queries/")}
     finally:

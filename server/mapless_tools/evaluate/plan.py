@@ -125,7 +125,9 @@ class SuiteOptions:
         sparse: tuple[int, ...] = ()
         if "sparse" in self.protocols:
             if not self.sparse and place.benchmark is None:
-                raise UsageError(f"{place.name} is no benchmark's scene: say how sparse, --sparse 5,10,20,30")
+                raise UsageError(
+                    f"{place.name} is no benchmark's scene: give the numbers of references, --sparse 5,10,20,30"
+                )
             sparse = self.sparse or (place.benchmark.sparse if place.benchmark else ())
         return (*((DENSE,) if "dense" in self.protocols else ()), *sorted(set(sparse), reverse=True))
 

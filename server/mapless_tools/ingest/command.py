@@ -118,7 +118,7 @@ def _settings(data_dir: Path | None, connection: Connection) -> Settings:
     from mapless_server.settings import load_settings
 
     if data_dir is not None and connection.address:
-        raise ValueError("--data-dir is a store, --address a server: say one of them")
+        raise ValueError("--data-dir is a store, --address a server: give one of them")
     return load_settings({"data_dir": data_dir}).settings
 
 

@@ -37,7 +37,7 @@ class Feed:
         options: ConnectOptions,
         scene: str,
         show: Callable[[Query], None],
-        say: Callable[[str, bool], None],
+        report: Callable[[str, bool], None],
     ) -> None:
         """Begins at once.
 
@@ -46,14 +46,14 @@ class Feed:
             options: how to connect.
             scene: its id.
             show: given each query; called in the feed's thread.
-            say: called with the state of the watching, in a few words, and whether there will be queries.
+            report: called with the state of the watching, in a few words, and whether there will be queries.
         """
         self._channel = options.channel(address)
         self._metadata = options.metadata()
         self._timeout_s = options.timeout_s
         self._request = pb.WatchQueriesRequest(scene=scene_name(scene))
         self._stub = LocalizationServiceStub(self._channel)
-        self._show, self._say = show, say
+        self._show, self._report = show, report
         # So that the viewer's own calls are recognized among those that are watched.
         self._own = f"view-{uuid.uuid4().hex[:12]}"
         self._count = 0
@@ -97,7 +97,7 @@ class Feed:
                 failure = from_rpc_error(error)
                 if self._closing.is_set():
                     return
-                self._say(_words(failure), failure.code not in _HOPELESS)
+                self._report(_words(failure), failure.code not in _HOPELESS)
                 if failure.code in _HOPELESS:
                     return
             except FieldError as error:
@@ -110,7 +110,7 @@ class Feed:
         call = self._stub.WatchQueries(self._request, metadata=self._metadata)
         call.initial_metadata()
         if call.is_active():
-            self._say("live", True)
+            self._report("live", True)
         for message in call:
             answer = answer_from_message(message.answer)
             if answer.diagnostics.request_id.startswith(self._own):

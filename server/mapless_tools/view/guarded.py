@@ -40,7 +40,7 @@ class GuardedViser(viser.ViserServer):
             )
         if port not in (0, self.get_port()):  # viser takes the next one
             self.stop()
-            raise RuntimeError(f"port {port} of {host} is taken: say another, or 0 for any")
+            raise RuntimeError(f"port {port} of {host} is taken: give another, or 0 for any")
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         """There is none: what the viewer shows is not public."""

@@ -68,7 +68,7 @@ class Stage:
         self._dots = self._draw_others()
         self._panel(title)
 
-    def say(self, status: str, is_watching: bool) -> None:
+    def report(self, status: str, is_watching: bool) -> None:
         """Shows the state of the watching, and whether there will be queries."""
         with self._lock:
             self._status.content = f"Queries: **{status}**"

@@ -26,7 +26,7 @@ from .stage import Stage
 log = logging.getLogger(__name__)
 
 _TRIES, _BUSY_S = 20, 1.0
-"""Tries of a call to a busy server, and the wait between them where it does not say."""
+"""Tries of a call to a busy server, and the wait between them where it does not state one."""
 _FIRST = 40
 """Photographs that are loaded before the first points."""
 SEED_NEIGHBOURS = 8
@@ -84,7 +84,7 @@ def viewer(address: str, connect: ConnectOptions, scene: str, options: ViewOptio
         stage = Stage(server, scenery, scene, open_photo)
         work = _Background(client, scene, scenery, stage)
         stack.callback(work.close)
-        feed = Feed(address, connect, scene, work.show_query, stage.say)
+        feed = Feed(address, connect, scene, work.show_query, stage.report)
         stack.callback(feed.close)
         work.begin(feed, options.seeds)
         yield f"http://{options.host}:{server.get_port()}"

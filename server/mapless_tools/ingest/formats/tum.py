@@ -63,7 +63,7 @@ def _lens(path: Path) -> Camera:
     found = re.search(r"(?:freiburg|fr)([123])", path.resolve().name, re.IGNORECASE)
     if found is None:
         raise ValueError(
-            f"{path}: its name does not say which camera it is (freiburg1, 2 or 3); give the intrinsics with "
+            f"{path}: its name does not state which camera it is (freiburg1, 2 or 3); give the intrinsics with "
             "--intrinsics"
         )
     k, distortion = _LENSES[found[1]]
