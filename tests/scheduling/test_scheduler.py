@@ -373,6 +373,18 @@ class TestTime:
             toy.finish(toy.take("host"), Next(again, Fallback(lambda: Done("first"), 100.0)))
             assert toy.ending_of(job) is expected
 
+    def test_the_only_job_is_computed_whatever_it_costs(self) -> None:
+        """As an idle server admits any cost; with others it would take their room."""
+        for others, expected in ((0, None), (1, Ending.OK)):
+            toy = Toy()
+            toy.scheduler.costs.observe("prepare", "slow", 50.0)
+            job = toy.admit(stage="refine", client="mine", deadline_s=200.0)
+            for _ in range(others):
+                toy.admit(client="other")
+            again = Step("prepare", "slow", "b", "again")
+            toy.finish(toy.take("host"), Next(again, Fallback(lambda: Done("first"), 150.0)))
+            assert toy.ending_of(job) is expected
+
 
 class Events(RuleBasedStateMachine):
     """Any order of arrivals, batches, failures, cancellations and passing time."""

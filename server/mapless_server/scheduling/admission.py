@@ -197,7 +197,12 @@ class Admission:
             raise Refused(Refusal.TOO_LARGE, f"the call holds {size_bytes} bytes, {most} are allowed")
 
     def fits(self, job: Job, cost_s: Counter[str]) -> bool:
-        """Whether an admitted job may continue although it now needs more than it was admitted with."""
+        """Whether an admitted job may continue although it now needs more than it was admitted with.
+
+        The only one may: it takes nothing from others.
+        """
+        if len(self._ledger.jobs) == 1:
+            return True
         added_s = {lane: own_s - job.booked_s[lane] for lane, own_s in cost_s.items()}
         return all(it <= 0 or self._excess_s(job.flow, lane, it) <= 0 for lane, it in added_s.items())
 
