@@ -361,7 +361,7 @@ def _make_matcher(name: str, settings: Settings, device: str) -> Matcher:
 
 
 def _make_strong_matcher(name: str, settings: Settings, missing: _Missing) -> Matcher:
-    """For a tier that answers where a cheaper one is in doubt, on a CPU: with LightGlue, half a second a pair.
+    """For a tier that answers where a cheaper one is doubtful, on a CPU: with LightGlue, half a second a pair.
 
     Adds its weights to `missing` if they are.
     """
