@@ -11,6 +11,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -377,6 +378,26 @@ class TestPriority:
         finally:
             server.background.close()  # at once, though it waits
         assert len(server.stored()) <= 2
+
+    def test_time_to_load_features_counts_for_the_share(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Features of another kind are extracted when they are loaded."""
+        is_busy = threading.Event()
+        options = BackgroundOptions(poll_s=0.01, busy_share=1e-6, quiet_s=0.01)
+        server = Server(store, options, lambda: not is_busy.is_set())
+        usual = server.background._load
+
+        def then_busy(*arguments: Any) -> tuple[PosedView, ...]:
+            is_busy.set()
+            return usual(*arguments)
+
+        monkeypatch.setattr(server.background, "_load", then_busy)
+        server.background.start()
+        try:
+            wait_until(is_busy.is_set)
+            assert not threading.Event().wait(0.3)
+        finally:
+            server.background.close()
+        assert len(server.stored()) == 0
 
     def test_a_busy_server_gets_its_share(self, store: Store) -> None:
         server = Server(store, BackgroundOptions(busy_share=1.0, quiet_s=0.01), lambda: False)

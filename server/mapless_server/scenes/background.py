@@ -107,7 +107,7 @@ class BackgroundMatching:
         self._progress = {matching.name: Progress() for matching in matchings}
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
-        self._pair_s = 0.0
+        self._step_s = 0.0
         self._counted_s = 0.0
         self._waiting_count = 0
 
@@ -204,7 +204,10 @@ class BackgroundMatching:
         wanted = self._nearest(matching, claim)
         if not wanted:
             return made, True
+        self._let_callers_first()
+        begin_s = time.monotonic()
         (subject,) = self._load(library, matching, claim, [claim.reference_id])
+        self._step_s = time.monotonic() - begin_s
         if subject.key != claim.key:
             raise NotFound("the reference was replaced")
         for reference_id in wanted:
@@ -212,15 +215,15 @@ class BackgroundMatching:
             # One pair at least, so that a busy server ends, too.
             if self._closing.is_set() or (made and time.monotonic() > until_s):
                 return made, False
+            begin_s = time.monotonic()
             try:
                 others = self._load_usable(library, matching, claim, reference_id)
             except _Closed:
                 return made, False
             for other in others:
-                begin_s = time.monotonic()
                 first, second = in_order(subject, other)
                 made[first.key, second.key] = matching.match_pair(first, second)
-                self._pair_s = time.monotonic() - begin_s
+            self._step_s = time.monotonic() - begin_s  # of loading too: features may have to be extracted
         return made, True
 
     def _nearest(self, matching: Matching, claim: Claim) -> list[str]:
@@ -272,7 +275,7 @@ class BackgroundMatching:
         if self._is_idle():
             return
         options, now_s = self.options, time.monotonic()
-        until_s = now_s + min(self._pair_s / options.busy_share, CLAIM_S / 4)  # the claim must not end meanwhile
+        until_s = now_s + min(self._step_s / options.busy_share, CLAIM_S / 4)  # the claim must not end meanwhile
         busy_s = now_s
         while now_s < until_s and now_s - busy_s < options.quiet_s and not self._closing.wait(options.quiet_s / 5):
             now_s = time.monotonic()
