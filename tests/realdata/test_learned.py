@@ -22,6 +22,7 @@ from mapless_tools.dataset import Dataset
 
 pytestmark = [pytest.mark.realdata, pytest.mark.timeout(300)]
 
+WHITE_WALLS = "meeting-room"
 SCENE = "7scenes-redkitchen-seq01-first600"
 REFERENCES = (0, 200, 399, 599)
 QUERIES = (18, 125, 99, 112)
@@ -53,14 +54,38 @@ def test_strong_features_localize_what_cheap_ones_reject(
     assert [error_m(photographs(SCENE), *pair) < 0.05 for pair in zip(QUERIES, strong, strict=True)] == [True] * 4
 
 
+def test_light_glue_localizes_what_nearest_neighbours_reject(
+    photographs: Callable[[str], Dataset], tmp_path: Path
+) -> None:
+    """Five photographs of a room with white walls; from one of the others next to no matches pass the ratio test."""
+    pytest.importorskip("kornia")
+    weights = Path(os.environ.get("TEST_WEIGHTS") or default_weights_dir())
+    for name in ("aliked-n16", "aliked-lightglue"):
+        if not (weights / f"{name}.safetensors").is_file():
+            pytest.skip(f"needs `mapless-server weights fetch aliked aliked-lightglue`; {weights} has no {name}")
+        (tmp_path / f"{name}.safetensors").symlink_to(weights / f"{name}.safetensors")
+    dataset = photographs(WHITE_WALLS)
+    with_light_glue = make_tiers(Settings(device="cpu", weights_dir=tmp_path, data_dir=tmp_path))[-1]
+    (tmp_path / "aliked-lightglue.safetensors").unlink()
+    without = make_tiers(Settings(device="cpu", weights_dir=tmp_path, data_dir=tmp_path))[-1]
+    references = [posed(dataset, i, without) for i in (0, 10, 20, 29, 39)]
+    query = view(dataset, 27, without)
+    first, second = (localize(query, references, it.pipeline, LocalizeOptions()) for it in (without, with_light_glue))
+    assert not isinstance(first.outcome, Localization)
+    assert isinstance(second.outcome, Localization)
+    true = dataset.frames[27].world_from_camera
+    distance = np.linalg.norm(true.translation - dataset.frames[20].world_from_camera.translation)
+    assert error_m(dataset, 27, second) < 0.05 * distance
+
+
+def posed(dataset: Dataset, index: int, tier: Tier) -> PosedView:
+    frame = dataset.frames[index]
+    return PosedView(frame.name, frame.name, view(dataset, index, tier), frame.world_from_camera)
+
+
 def answers(dataset: Dataset, tier: Tier) -> list[Answer]:
     """What one tier says of each query, given all references."""
-    references = [
-        PosedView(
-            dataset.frames[i].name, dataset.frames[i].name, view(dataset, i, tier), dataset.frames[i].world_from_camera
-        )
-        for i in REFERENCES
-    ]
+    references = [posed(dataset, i, tier) for i in REFERENCES]
     return [localize(view(dataset, i, tier), references, tier.pipeline, LocalizeOptions()) for i in QUERIES]
 
 
