@@ -44,7 +44,7 @@ DENSE: Mapping[str, int | None] = {KITCHEN: 30}
 FEWEST: Mapping[str, tuple[int, ...]] = {KITCHEN: (3,)}
 MIN_QUERIES = 3
 MIN_INLIERS = 6
-"""A pose with fewer is none: those with 4 or 5 were wrong. COLMAP's mapper wants 30, with which it would lose many."""
+"""A pose with fewer is none: nearly all with 4 or 5 were wrong. COLMAP's mapper wants 30 and would lose many."""
 RULES = (
     "Medians, p90 and recall are over all queries; one that was not localized counts as infinitely wrong.",
     "References of a query: all of the scene.",
