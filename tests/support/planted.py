@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import RigidTransform, Similarity, rotation_from_vector
+from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
 from mapless_server.method.correspond import Correspondences
 from mapless_server.method.observations import ONE_PIXEL, adjust_points, estimate_noise, triangulate
 from mapless_server.method.pnp import PnpOptions, solve_pose
@@ -94,3 +94,37 @@ def disturbed(
         return RigidTransform(turn @ pose.rotation, pose.translation + random.normal(0, metres, 3))
 
     return tuple(replace(r, world_from_camera=disturb(r.world_from_camera)) for r in references)
+
+
+def drift_field(places: Array, spacing_m: float, random: np.random.Generator, planes: int = 2000) -> Array:
+    """(N, 6) values at places (N, 3), zero at the first, of a random walk over space.
+
+    The differences of two places have the variance |x_i - x_j| / spacing_m: random planes cut the world, each with a
+    random step across it, and the number of planes between two places is in proportion to their distance.
+    """
+    radius_m = 2 * np.linalg.norm(places - places.mean(axis=0), axis=1).max()
+    normals = random.normal(size=(planes, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    offsets = random.uniform(-radius_m, radius_m, planes)
+    beyond = (places - places.mean(axis=0)) @ normals.T > offsets
+    crossed = beyond.astype(float) - beyond[0]
+    # A plane is between two places at distance d with the probability E|cos| d / 2 r = d / 4 r.
+    steps = random.normal(0, np.sqrt(4 * radius_m / planes / spacing_m), (planes, 6))
+    return np.asarray(crossed @ steps)
+
+
+def drifted(
+    references: tuple[PosedView, ...], query_centre: Array, random: np.random.Generator, metres: float, degrees: float
+) -> tuple[PosedView, ...]:
+    """The references with poses that drift with the distance from the query, by so much at their median spacing."""
+    centres = np.array([r.world_from_camera.translation for r in references])
+    spacing_m = float(np.median([np.linalg.norm(a - b) for a, b in combinations(centres, 2)]))
+    errors = drift_field(np.concatenate([query_centre[None], centres]), spacing_m, random)[1:]
+
+    def moved(pose: RigidTransform, error: Array) -> RigidTransform:
+        turn = rotation_from_vector(np.radians(degrees) * error[3:])
+        return RigidTransform(turn @ pose.rotation, pose.translation + metres * error[:3])
+
+    return tuple(
+        replace(r, world_from_camera=moved(r.world_from_camera, e)) for r, e in zip(references, errors, strict=True)
+    )

@@ -20,6 +20,7 @@ match                        2D-3D matches of the query
 uncertainty/                 the covariance of a pose
 pnp                          pose and inliers
 resection                    pose and focal length from fixed points
+pose_errors                  (ours) errors of the references' given poses: how large, and how alike for neighbours
 bundle, adjust               (ours) everything adjusted together
 two_view/                    (ours) pose from matches with posed references, without points
 trust/                       whether a pose is accepted, and its trust

@@ -4,11 +4,11 @@ The paper fixes the points before it solves for the query, and never moves the r
 points too, and reference poses are never exact: they have noise, and errors of the lens model add to it. So here all
 are adjusted together,
 
-    min  sum_obs rho(|r_o|^2 / sigma_o^2) + sum_i |xi_i|^2 / sigma_prior^2,
+    min  sum_obs rho(|r_o|^2 / sigma_o^2) + xi^T C^-1 xi,
 
-over the query's pose, its points and a small motion xi_i of every reference, which a prior holds to its given pose.
-Errors of given poses are alike for neighbours and drift apart with distance, so the nearest references hold the query,
-and the prior of a farther one is wider in proportion to its distance.
+over the query's pose, its points and small motions xi of the references, which a prior holds to their given poses. Its
+covariance C, by which neighbours move together and far references are held less, is found for each query from the
+references' observations (see `pose_errors`).
 Priors on the query's pose add their terms, unless the photograph alone contradicts them. The points are eliminated (see
 `bundle`).
 """
@@ -23,16 +23,20 @@ from numpy.typing import NDArray
 
 from mapless.geometry import RigidTransform
 
-from .bundle import Bundle, BundleProblem, bundle_of, reference_information
+from .bundle import Bundle, BundleProblem, bundle_of
 from .optimize import MinimizeOptions, minimize
 from .options import check_bounds
 from .perturbation import reprojection_errors_px
+from .pose_errors import PoseErrorOptions, most_probable, pose_errors
 from .priors.known import NO_PRIORS, Priors
 from .results import PointMatches, PoseEstimate, PoseStage, Structure
 from .structure import tracks_with_query
 from .uncertainty.covariance import UncertaintyOptions, one_match_covariance, uncertainty_of
 from .uncertainty.dispersion import jackknife_input
 from .views import PosedView, View
+
+LEAST_DAMPING = 1e-9
+"""Keeps the points determined where they are eliminated at the given poses."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +45,6 @@ class AdjustOptions:
 
     Attributes:
         loss_scale_sigma: of the Cauchy loss, under which the influence of outliers vanishes.
-        prior_share: standard deviation of the prior on reference poses, in image pixels, as a share of the noise level
-            of the structure, for the reference nearest to the query; in proportion to the distance for the others. The
-            residuals are an upper bound of the effect of pose errors. With the same prior for all references the
-            medians were 0.69 instead of 0.48 cm on a drive, 0.33 instead of 0.18 cm for a drone with ten references.
-        max_wider: the prior of a far reference is at most so many times as wide. A film's next frame does not hold the
-            query alone. With 5 real scenes gain more, but where the errors of poses have nothing to do with distance,
-            the adjustment then makes the pose worse; with 2.5 it still improves it.
         error_inflation: factor by which standard deviations from the sum over residuals are typically too small; it
             sets the weight of priors. The answer's covariance does not use it (see `uncertainty`).
         inlier_px: as in the pose solver; the inliers of the answer are those of its own pose.
@@ -55,23 +52,22 @@ class AdjustOptions:
         max_error_px: matches with a larger error under the initial pose are not used.
         iterations: at most so many Levenberg-Marquardt steps.
         min_decrease: stop when a step lowers the cost by a smaller share.
+        pose_errors: of the errors of the references' poses.
         uncertainty: of the answer's covariance.
     """
 
     loss_scale_sigma: float = 1.4
-    prior_share: float = 0.2
-    max_wider: float = 2.5
     error_inflation: float = 2.0
     inlier_px: float = 4.0
     min_kept_share: float = 0.8
     max_error_px: float = 8.0
     iterations: int = 8
     min_decrease: float = 1e-5
+    pose_errors: PoseErrorOptions = field(default_factory=PoseErrorOptions)
     uncertainty: UncertaintyOptions = field(default_factory=UncertaintyOptions)
 
     def __post_init__(self) -> None:
-        check_bounds(self, "inlier_px min_kept_share loss_scale_sigma prior_share max_error_px", above=0)
-        check_bounds(self, "max_wider", at_least=1)
+        check_bounds(self, "inlier_px min_kept_share loss_scale_sigma max_error_px", above=0)
         check_bounds(self, "iterations min_decrease", above=0)
 
 
@@ -180,15 +176,14 @@ def pose_problem(
     views = [*references, PosedView("", "", query, world_from_query)]
     tracks, chosen = tracks_with_query(structure, matches.point[used], matches.keypoint[used], len(references))
     observations, start, depth_m = bundle_of(tracks, views, structure, chosen)
-    noise_px = options.prior_share * structure.noise.level_px
+    given = start.poses[:-1]
+    free = np.zeros((6 * len(references),) * 2)
+    problem = BundleProblem(observations, tracks.view, given, free, options.loss_scale_sigma)
     centres = np.array([it.world_from_camera.translation for it in references])
-    distances_m = np.linalg.norm(centres - world_from_query.translation, axis=1)
-    wider = np.minimum(distances_m / max(distances_m.min(), 1e-9), options.max_wider)
-    information = [
-        reference_information(noise_px * factor, it.view.camera.focal_x_px, depth_m)
-        for it, factor in zip(references, np.maximum(wider, 1.0), strict=True)
-    ]
-    problem = BundleProblem(
-        observations, tracks.view, start.poses[:-1], np.array(information), options.loss_scale_sigma
-    )
-    return problem, start
+    focal_px = float(np.median([it.view.camera.focal_x_px for it in references]))
+    level_px = float(structure.noise.level_px)
+    errors = pose_errors(centres, given.rotation, world_from_query.translation, level_px, focal_px, depth_m)
+    matrix, gradient, _ = problem.linearize(start).reduced(LEAST_DAMPING)
+    own, drift = most_probable(errors, matrix, gradient, options.pose_errors)
+    covariance = errors.covariance(own, drift)
+    return replace(problem, information=np.asarray(np.linalg.inv(covariance), np.float64)), start

@@ -1,8 +1,8 @@
 """Bundle adjustment of cameras and points.
 
-    min  sum_obs rho(|r_o|^2 / sigma_o^2) + sum_i |xi_i|^2 / sigma_prior^2      (Cauchy's loss)
+    min  sum_obs rho(|r_o|^2 / sigma_o^2) + xi^T C^-1 xi      (Cauchy's loss)
 
-over the poses of all cameras and the points; xi_i is the motion of a reference away from its given pose. The last
+over the poses of all cameras and the points; xi are the motions of the references away from their given poses. The last
 camera is the query, whose pose may have priors. The points are eliminated (Schur complement), which leaves a dense
 system of 6 unknowns per camera.
 """
@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
@@ -94,7 +95,7 @@ class BundleProblem:
         observations: of the points in all views; their poses are not used.
         view: (O,) of each.
         given: poses of the references.
-        information: (V - 1, 6) of the prior that holds them there; 0 leaves them free.
+        information: C^-1, (6 (V - 1), 6 (V - 1)) of the prior that holds them there; 0 leaves them free.
         loss_scale_sigma: of the Cauchy loss.
         priors: on the query's pose.
         prior_weight: factor on their cost, relative to that of the observations.
@@ -111,7 +112,7 @@ class BundleProblem:
     @cached_property
     def by_view(self) -> ViewColumns:
         """The observations sorted by view, in columns."""
-        return ViewColumns.of(self.observations, self.view, len(self.information) + 1)
+        return ViewColumns.of(self.observations, self.view, len(self.given.rotation) + 1)
 
     def at(self, bundle: Bundle) -> Observations:
         """The observations by cameras at these poses."""
@@ -125,7 +126,8 @@ class BundleProblem:
         """NaN for a point behind a camera."""
         x_in_camera = self.by_view.in_camera(bundle.poses, np.ascontiguousarray(bundle.points.T))
         squared = (self.by_view.residuals(x_in_camera) ** 2).sum(axis=0)
-        prior = float((self.reference_motion(bundle) ** 2 * self.information).sum())
+        motion = self.reference_motion(bundle).ravel()
+        prior = float(motion @ self.information @ motion)
         if self.priors:
             prior += self.prior_weight * self.priors.cost(bundle.world_from_query)
         return cauchy_cost(squared, self.loss_scale_sigma) + prior
@@ -137,13 +139,12 @@ class BundleProblem:
     def linearize(self, bundle: Bundle) -> NormalEquations:
         """See optimize.Problem."""
         equations = self.by_view.equations(bundle, self.loss_scale_sigma)
-        pose_block, pose_gradient = equations.pose_block, equations.pose_gradient.reshape(-1, 6)
-        pose_block[:-1] += self.information[:, :, None] * np.eye(6)
-        pose_gradient[:-1] += self.information * self.reference_motion(bundle)
+        equations.pose_block[:-6, :-6] += self.information
+        equations.pose_gradient[:-6] += self.information @ self.reference_motion(bundle).ravel()
         if self.priors:
-            known_gradient, known = self._query_terms(bundle.world_from_query)
-            pose_gradient[-1] += known_gradient
-            pose_block[-1] += known
+            gradient, information = self._query_terms(bundle.world_from_query)
+            equations.pose_gradient[-6:] += gradient
+            equations.pose_block[-6:, -6:] += information
         return equations
 
     def step(self, bundle: Bundle, equations: NormalEquations, damping: float) -> Bundle | None:
@@ -241,7 +242,7 @@ class ViewColumns:
         point_gradient = (weighted_point * residual[:, None]).sum(axis=0)
         return NormalEquations(
             self,
-            np.stack(blocks),
+            block_diag(*blocks),
             np.concatenate(gradients),
             np.stack([self.sums @ row for row in point_block]),
             np.stack([self.sums @ row for row in point_gradient]),
@@ -251,11 +252,11 @@ class ViewColumns:
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """[B E; E^T C] [d_pose; d_point] = -[g; h], where B and C are block-diagonal.
+    """[B E; E^T C] [d_pose; d_point] = -[g; h], where C is block-diagonal.
 
     Attributes:
         columns: the observations.
-        pose_block: B, (V, 6, 6).
+        pose_block: B, (6 V, 6 V).
         pose_gradient: g, (6 V,).
         point_block: C, (6, P) as in `arrays.SYMMETRIC`.
         point_gradient: h, (3, P).
@@ -280,13 +281,11 @@ class NormalEquations:
         gradient = np.stack(_forward(factor, self.point_gradient))
         factors = take(factor, self.columns.point)
         by_observation = np.stack(_forward(factors, np.swapaxes(self.cross, 0, 1)), axis=1).reshape(18, -1)
-        by_view = np.zeros((len(self.pose_block), 18, self.point_gradient.shape[1]))
+        by_view = np.zeros((len(self.columns.parts), 18, self.point_gradient.shape[1]))
         for cross, part in zip(by_view, self.columns.parts, strict=True):
             cross[:, self.columns.point[part]] = by_observation[:, part]  # one observation per point and view
         wide = by_view.reshape(len(self.pose_gradient), -1)
-        matrix = -(wide @ wide.T)
-        for view, block in enumerate(self.pose_block * (1 + damping * np.eye(6))):
-            matrix[6 * view : 6 * view + 6, 6 * view : 6 * view + 6] += block
+        matrix = self.pose_block + damping * np.diag(np.diag(self.pose_block)) - wide @ wide.T
         return matrix, self.pose_gradient - wide @ gradient.ravel(), EliminatedPoints(factor, gradient, wide)
 
 
@@ -349,12 +348,3 @@ def bundle_of(
     observations = observe(tracks, views, structure.noise)
     bundle = Bundle(Poses.of(view.world_from_camera for view in views), structure.x_in_world[chosen])
     return observations, bundle, float(np.median(observations.in_camera(bundle.points)[:, 2]))
-
-
-def reference_information(level_px: float, focal_px: float, depth_m: float) -> Array:
-    """(6,): inverse variance of a left perturbation, each component of which moves the image by `level_px`.
-
-    A pixel is a rotation of 1 / f, or a shift of depth / f.
-    """
-    angle = level_px / focal_px
-    return np.repeat([angle * depth_m, angle], 3) ** -2.0

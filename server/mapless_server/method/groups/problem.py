@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform
 
 from ..adjust import AdjustOptions
-from ..bundle import Bundle, BundleProblem, NormalEquations, Poses, bundle_of, reference_information
+from ..bundle import Bundle, BundleProblem, NormalEquations, Poses, bundle_of
 from ..optimize import solve_step
 from ..options import check_bounds
 from ..perturbation import reprojection_errors_px
@@ -123,15 +123,20 @@ class JointOptions:
 
     Attributes:
         adjust: as for one photograph.
+        prior_share: standard deviation of the prior on reference poses, each on its own, in image pixels (a rotation by
+            1 / f, a shift by depth / f), as a share of the noise level of the structure. The residuals are an upper
+            bound of the effect of pose errors.
         max_matches: of a photograph, evenly thinned; several photographs have enough together.
         iterations: largest number of Levenberg-Marquardt steps; drift needs more than one photograph's pose.
     """
 
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
+    prior_share: float = 0.2
     max_matches: int = 300
     iterations: int = 15
 
     def __post_init__(self) -> None:
+        check_bounds(self, "prior_share", above=0)
         check_bounds(self, "max_matches", at_least=3)
         check_bounds(self, "iterations", at_least=1)
 
@@ -221,18 +226,19 @@ class GroupProblem(Generic[S]):
         observations, start, depth_m = bundle_of(part.tracks, views, structure, part.chosen)
         observations = replace(observations, sigma_px=observations.sigma_px * np.sqrt(shared.times(part)))
         references = np.array([self._index(it, structure.noise.level_px, depth_m) for it in source.references])
-        free = np.zeros((len(references), 6))
+        free = np.zeros((6 * len(references),) * 2)
         problem = BundleProblem(
             observations, part.tracks.view, start.poses[:-1], free, self.options.adjust.loss_scale_sigma
         )
         return ImageBlock(source.image, problem, references)
 
     def _index(self, reference: PosedView, level_px: float, depth_m: float) -> int:
-        """Index of a reference in the group; a new one gets a prior on its pose as in `adjust`."""
+        """Index of a reference in the group; a new one gets a prior on its pose."""
         if reference.key not in self._references:
             self._references[reference.key] = (len(self._references), reference)
-            noise_px = self.options.adjust.prior_share * level_px
-            self._information.append(reference_information(noise_px, reference.view.camera.focal_x_px, depth_m))
+            noise_px = self.options.prior_share * level_px
+            angle = noise_px / reference.view.camera.focal_x_px
+            self._information.append(np.repeat([angle * depth_m, angle], 3) ** -2.0)
         return self._references[reference.key][0]
 
     def cost(self, point: Point[S]) -> float:
