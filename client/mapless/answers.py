@@ -185,6 +185,7 @@ class LocalizationResult:
         in_axes: the same pose in the requested axes, with `world_from_session`.
         geo_pose: the same pose on the Earth; None unless the scene has a datum.
         prior_checks: how the answer compares with each soft prior.
+        arbitrary_unit: whether its lengths are in the scene's own, arbitrary unit, where these names say metres.
         pose_stage: "REFINED" or "INITIAL"; "COARSE" for an unverified pose, either of a call with `allow_coarse` that
             ran out of time, or the first of `localize_progressively`.
         inlier_count, match_count: number of 2D-3D matches that agree with the pose, and of all matches.
@@ -210,6 +211,7 @@ class LocalizationResult:
     prior_checks: tuple[PriorCheck, ...] = ()
     debug: Debug | None = None
     is_final: bool = True
+    arbitrary_unit: bool = False
 
     @property
     def world_from_session(self) -> RigidTransform | None:

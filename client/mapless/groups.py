@@ -93,6 +93,7 @@ class RigLocalization:
         images: contribution of each photograph, in order.
         world_from_session: transform from the device's session to the world; None without `session_from_rig`.
         geo_pose: the same pose on the Earth; None unless the scene has a datum.
+        arbitrary_unit: as of `LocalizationResult`.
         capture_time: as it was sent.
     """
 
@@ -106,6 +107,7 @@ class RigLocalization:
     world_from_session: RigidTransform | None = None
     geo_pose: GeoPose | None = None
     capture_time: datetime | None = None
+    arbitrary_unit: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +125,7 @@ class SequenceLocalization:
         reprojection_error_px: median of the inliers, pixels of the processed images.
         images: contribution of each photograph, in order.
         axes: of `world_from_session`, "OPENCV".
+        arbitrary_unit: as of `LocalizationResult`.
     """
 
     world_from_session: Similarity
@@ -135,6 +138,7 @@ class SequenceLocalization:
     reprojection_error_px: float
     images: tuple[ImageReport, ...]
     axes: str
+    arbitrary_unit: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -21,6 +22,8 @@ class Scene:
         datum: position of the world on the Earth; None if unknown.
         down_in_world: unit vector of gravity; None if unknown or given by the datum alone.
         calibration: measured factors of radii; None if never measured.
+        arbitrary_unit: whether lengths are in an arbitrary unit, as of a COLMAP model, instead of metres.
+        warnings: contradictions of these properties and the references' poses, which `update_scene` found; else empty.
     """
 
     scene_id: str
@@ -30,6 +33,8 @@ class Scene:
     datum: Datum | None = None
     down_in_world: Vector | None = None
     calibration: Calibration | None = None
+    arbitrary_unit: bool = False
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,8 +118,8 @@ class Coverage:
     references: tuple[str, ...]
 
 
-def scene_from_message(message: pb.Scene) -> Scene:
-    """Scene of a message."""
+def scene_from_message(message: pb.Scene, warnings: Iterable[str] = ()) -> Scene:
+    """Scene of a message, and what `update_scene` found."""
     return wire.filled(
         Scene,
         message,
@@ -123,6 +128,7 @@ def scene_from_message(message: pb.Scene) -> Scene:
         datum=wire.optional(message, "datum", datum_from_message, "datum"),
         down_in_world=wire.optional(message, "down_in_world", direction_from_message, "down_in_world"),
         calibration=wire.optional(message, "calibration", calibration_from_message, "calibration"),
+        warnings=tuple(warnings),
     )
 
 

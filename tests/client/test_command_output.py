@@ -15,7 +15,7 @@ from mapless.answers import PriorCheck
 from mapless.axes import Axes
 from mapless.cameras import read_camera
 from mapless.cli.folder import Tally
-from mapless.cli.output import lines, plain
+from mapless.cli.output import line, lines, plain
 from mapless.errors import Internal
 from mapless.geometry import Camera, Fisheye, RigidTransform
 from mapless.requests import read_image
@@ -33,6 +33,15 @@ def test_each_prior_has_its_line() -> None:
         "prior     HEADING agrees, less certain than the photograph, not needed",
         "prior     POSITION contradicts the photograph: 8.0 standard deviations, not used",
     ]
+
+
+def test_an_arbitrary_unit_is_not_called_metres() -> None:
+    printed = lines(localized(arbitrary_unit=True))
+    assert printed[-1] == "  warning   the scene's unit of length is arbitrary, not the metre"
+    (position,) = (it for it in printed if it.startswith("  position"))
+    assert " units   within 0.02 units (68 %), 0.04 units (95 %, uncalibrated)" in position
+    assert " units " in line("a.jpg", localized(arbitrary_unit=True))
+    assert " cm " in line("a.jpg", localized())
 
 
 def test_low_trust_is_warned_of() -> None:

@@ -77,7 +77,7 @@ def test_a_rig(corner: Client, queries: list[bytes]) -> None:
     assert answer.world_from_session is not None
     assert_pose_close(answer.world_from_session.compose(pose(7.0)), answer.world_from_rig, metres=1e-9, degrees=1e-6)
     assert answer.capture_time == taken
-    assert answer.geo_pose is None
+    assert (answer.geo_pose, answer.arbitrary_unit) == (None, False)
     assert 0 < answer.accuracy.position_68_m < answer.accuracy.position_95_m < 0.2
     assert (np.linalg.eigvalsh(answer.covariance) > 0).all()
     assert [report.rejected_alone for report in answer.images] == [None, "LOW_TEXTURE", None, None]
@@ -87,6 +87,20 @@ def test_a_rig(corner: Client, queries: list[bytes]) -> None:
         assert max(use.inlier_count for use in report.diagnostics.references) > 10
         assert {"features", "pnp"} <= set(report.diagnostics.stage_s)
         assert 0 <= report.diagnostics.queue_s <= report.diagnostics.total_s
+
+
+def test_rigs_and_sequences_say_that_the_unit_is_arbitrary(corner: Client, queries: list[bytes]) -> None:
+    frames = [SequenceFrame(image, CORNER, at) for image, at in zip(queries[:2], WALK, strict=False)]
+    corner.update_scene("corner", arbitrary_unit=True)
+    try:
+        rig = corner.localize_rig(as_rig(queries)[:2], "corner")
+        sequence = corner.localize_sequence(frames, "corner")
+    finally:
+        corner.update_scene("corner", arbitrary_unit=False)
+    assert isinstance(rig, RigLocalization)
+    assert isinstance(sequence, SequenceLocalization)
+    assert rig.arbitrary_unit
+    assert sequence.arbitrary_unit
 
 
 @pytest.mark.parametrize("axes", ["", "unity"])

@@ -10,9 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 from support.messages import set_field
-from support.servers import CAMERA, PHOTO, Stubs, failure_of, make_scene, serving
+from support.servers import CAMERA, PHOTO, Stubs, failure_of, make_scene, pose, serving
 
-from mapless import UNCHANGED, Calibration, Client, Datum, InvalidArgument, NotFound, Quaternion
+from mapless import (
+    UNCHANGED,
+    Calibration,
+    Client,
+    Datum,
+    InvalidArgument,
+    LocalizationResult,
+    NewReference,
+    NotFound,
+    Quaternion,
+)
 from mapless.geodesy import enu_from_y_up
 from mapless.v1 import geometry_pb2 as geometry_pb
 from mapless.v1 import localization_service_pb2 as localization_pb
@@ -67,7 +77,7 @@ def test_an_update_needs_a_mask_and_an_existing_scene(client: Client, stubs: Stu
         request.update_mask.paths.extend(["datum", path])
         error = failure_of(stubs.references.UpdateScene, request)
         assert (error.code, error.field) == ("INVALID_ARGUMENT", "update_mask")
-        assert "datum, down_in_world, calibration" in str(error)
+        assert "datum, down_in_world, calibration, arbitrary_unit" in str(error)
         assert len(str(error)) < 500
     request = pb.UpdateSceneRequest(update_mask={"paths": ["datum"]})
     assert failure_of(stubs.references.UpdateScene, request).field == "scene.name"
@@ -145,6 +155,40 @@ def test_a_datum_of_another_world_is_refused(client: Client, scene: str) -> None
     with pytest.raises(InvalidArgument) as caught:
         client.create_scene("never", datum=upright, down_in_world=(0, -1, 0))
     assert caught.value.field == "down_in_world"
+
+
+def test_answers_say_that_the_unit_is_arbitrary(client: Client) -> None:
+    assert client.create_scene("units", arbitrary_unit=True).arbitrary_unit
+    client.add_references("units", [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(3)])
+    assert client.get_scene("units").arbitrary_unit
+    answer = client.localize(PHOTO, CAMERA, "units")
+    assert isinstance(answer, LocalizationResult)
+    assert answer.arbitrary_unit
+    with pytest.raises(InvalidArgument, match="unit of length") as caught:
+        client.update_scene("units", datum=DATUM)
+    assert caught.value.field == "scene.datum"
+    with pytest.raises(InvalidArgument, match="unit of length") as caught:
+        client.create_scene("never", datum=DATUM, arbitrary_unit=True)
+    assert caught.value.field == "datum"
+    assert not client.update_scene("units", arbitrary_unit=None).arbitrary_unit
+    answer = client.localize(PHOTO, CAMERA, "units")
+    assert isinstance(answer, LocalizationResult)
+    assert not answer.arbitrary_unit
+    client.update_scene("units", datum=replace(DATUM, enu_from_world=Quaternion(0, 0, 0, 1)))
+    with pytest.raises(InvalidArgument, match="unit of length") as caught:
+        client.update_scene("units", arbitrary_unit=True)
+    assert caught.value.field == "scene.arbitrary_unit"
+    client.delete_scene("units")
+
+
+def test_an_update_that_contradicts_the_references_is_stored_and_said(client: Client, scene: str) -> None:
+    """The references' cameras are upright in a world whose y is down."""
+    updated = client.update_scene(scene, down_in_world=(0.0, -1.0, 0.0))
+    assert updated.down_in_world == (0.0, -1.0, 0.0)
+    assert len(updated.warnings) == 1
+    assert "degrees off the down of 3 reference cameras" in updated.warnings[0]
+    assert client.update_scene(scene, down_in_world=(0.0, 1.0, 0.0)).warnings == ()
+    assert client.get_scene(scene).warnings == ()
 
 
 def test_a_quaternion_is_answered_normalized(client: Client, scene: str) -> None:

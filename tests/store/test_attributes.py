@@ -19,7 +19,7 @@ from mapless.geometry import Quaternion, rotation_from_vector
 from mapless.scenes import Calibration, unit_vector
 from mapless_server import errors
 from mapless_server.security import DEFAULT_TENANT, SceneKey
-from mapless_server.store import ContradictingDown, SceneAttributes, Store, codec, deletion, queries
+from mapless_server.store import ContradictingDown, DatumWithoutMetres, SceneAttributes, Store, codec, deletion, queries
 
 OFFICE, HALL, NOWHERE = map(SceneKey, ("office", "hall", "nowhere"))
 DATUM = Datum(47.1 / 3, -8.1 / 3, 400.1 / 3, Quaternion(0.0, 0.0, 0.6, 0.8))
@@ -196,7 +196,8 @@ def test_changes_at_once_lose_none_of_each_other(store: Store) -> None:
     rounds = 5
     with ThreadPoolExecutor(3) as threads:
         for _ in range(rounds):
-            list(threads.map(lambda value: store.update_scene(OFFICE, **dict.fromkeys(value)), values))
+            nothing: list[dict[str, Any]] = [dict.fromkeys(value) for value in values]
+            list(threads.map(lambda value: store.update_scene(OFFICE, **value), nothing))
             assert known_of(store, OFFICE) == SceneAttributes()
             list(threads.map(lambda value: store.update_scene(OFFICE, **value), values))
             found = known_of(store, OFFICE)
@@ -258,3 +259,29 @@ def test_every_bit_comes_back(datum: Datum | None, calibration: Calibration | No
         data = codec.encode_attributes(attributes)
         sha256 = None if data is None else codec.sha256_for("x", data)
         assert codec.decode_attributes("x", data, sha256) == attributes
+
+
+def test_a_unit_is_the_metre_until_marked(store: Store) -> None:
+    store.create_scene(OFFICE, SceneAttributes(arbitrary_unit=True))
+    assert known_of(store, OFFICE).arbitrary_unit
+    assert store.update_scene(OFFICE, down_in_world=DOWN).attributes.arbitrary_unit
+    store.update_scene(OFFICE, datum=None, down_in_world=None, calibration=None)
+    assert known_of(store, OFFICE).arbitrary_unit, "it was not damaged, so not to be replaced"
+    store.update_scene(OFFICE, arbitrary_unit=False)
+    assert known_of(store, OFFICE) == SceneAttributes()
+
+
+def test_a_datum_needs_metres(store: Store) -> None:
+    before = store.create_scene(OFFICE, SceneAttributes(arbitrary_unit=True))
+    with pytest.raises(DatumWithoutMetres):
+        store.update_scene(OFFICE, datum=DATUM)
+    assert store.get_scene(OFFICE) == before
+    assert store.update_scene(OFFICE, datum=DATUM, arbitrary_unit=False).attributes == SceneAttributes(DATUM)
+    with pytest.raises(DatumWithoutMetres):
+        store.update_scene(OFFICE, arbitrary_unit=True)
+
+
+def test_attributes_stored_before_there_was_a_unit_are_read() -> None:
+    data = b'{"datum": null, "down_in_world": [0.0, 0.0, -1.0], "calibration": null}'
+    found = codec.decode_attributes("", data, codec.sha256_for("", data))
+    assert found == SceneAttributes(down_in_world=(0.0, 0.0, -1.0))

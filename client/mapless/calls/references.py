@@ -39,6 +39,7 @@ def create_scene(
     *,
     datum: Datum | None = None,
     down_in_world: ArrayLike | None = None,
+    arbitrary_unit: bool = False,
     timeout_s: float | None = None,
 ) -> Exchange[Scene]:
     """Creates a scene without references.
@@ -47,6 +48,7 @@ def create_scene(
         scene_id: id of the scene.
         datum: position of its world on the Earth, if known.
         down_in_world: (3,) direction of gravity, any length; None for the datum's, if there is one.
+        arbitrary_unit: whether its references' poses are in an arbitrary unit instead of metres.
         timeout_s: deadline of the call.
     """
 
@@ -57,6 +59,7 @@ def create_scene(
         scene_id=scene_id,
         datum=None if datum is None else datum_to_message(datum),
         down_in_world=None if down_in_world is None else wire.vector_to_message(down_in_world),
+        arbitrary_unit=arbitrary_unit,
     )
     response = yield Call(f"{SERVICE}/CreateScene", request, pb.CreateSceneResponse, timeout_s, on_repeat=found)
     return scene_from_message(response.scene)
@@ -75,6 +78,7 @@ def update_scene(
     datum: Datum | UnchangedType | None = UNCHANGED,
     down_in_world: ArrayLike | UnchangedType | None = UNCHANGED,
     calibration: Calibration | UnchangedType | None = UNCHANGED,
+    arbitrary_unit: bool | UnchangedType | None = UNCHANGED,
     timeout_s: float | None = None,
 ) -> Exchange[Scene]:
     """Changes properties of a scene; a property that is not given keeps its value, None deletes it.
@@ -84,10 +88,16 @@ def update_scene(
         datum: position of its world on the Earth.
         down_in_world: (3,) direction of gravity, any length; without it the datum's, if there is one.
         calibration: measured factors of the radii of answers.
+        arbitrary_unit: whether its unit of length is arbitrary instead of the metre; None is False. Changes no pose.
         timeout_s: deadline of the call.
     """
     request = pb.UpdateSceneRequest(scene=pb.Scene(name=scene_name(scene)))
-    values = {"datum": datum, "down_in_world": down_in_world, "calibration": calibration}
+    values = {
+        "datum": datum,
+        "down_in_world": down_in_world,
+        "calibration": calibration,
+        "arbitrary_unit": arbitrary_unit,
+    }
     request.update_mask.paths.extend(name for name, value in values.items() if value is not UNCHANGED)
     if datum is not None and datum is not UNCHANGED:
         request.scene.datum.CopyFrom(datum_to_message(datum))
@@ -95,8 +105,9 @@ def update_scene(
         request.scene.down_in_world.CopyFrom(wire.vector_to_message(down_in_world))
     if calibration is not None and calibration is not UNCHANGED:
         request.scene.calibration.CopyFrom(calibration_to_message(calibration))
+    request.scene.arbitrary_unit = arbitrary_unit is True
     response = yield Call(f"{SERVICE}/UpdateScene", request, pb.UpdateSceneResponse, timeout_s)
-    return scene_from_message(response.scene)
+    return scene_from_message(response.scene, response.warnings)
 
 
 def list_scenes(*, page_size: int = 0, timeout_s: float | None = None) -> Pages[Scene]:

@@ -91,8 +91,8 @@ def _is_same(wanted: pb.Reference, stored: pb.Reference) -> bool:
 
 
 def _of_world(message: Any) -> Array:
-    """World properties of a message: 12 numbers of its datum, if it has one, and 3 of its direction of gravity."""
-    numbers: list[float] = []
+    """World properties of a message: its unit, 12 numbers of its datum if it has one, 3 of its gravity's direction."""
+    numbers: list[float] = [float(message.arbitrary_unit)]
     if message.HasField("datum"):
         datum = datum_from_message(message.datum, "datum")
         numbers += [datum.latitude_deg, datum.longitude_deg, datum.height_m, *datum.enu_from_world.matrix().flat]

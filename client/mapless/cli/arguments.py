@@ -117,7 +117,7 @@ def _add_scene(scene: argparse.ArgumentParser) -> None:
     create.add_argument("scene")
     _add_place(create)
     create.set_defaults(run=commands.create_scene)
-    update = actions.add_parser("update", help="change its datum, direction of gravity or calibration")
+    update = actions.add_parser("update", help="change its datum, direction of gravity, unit or calibration")
     update.add_argument("scene")
     _add_place(update)
     update.add_argument(
@@ -151,6 +151,9 @@ def _add_place(command: argparse.ArgumentParser) -> None:
         help="quaternion that rotates the world's axes to east, north, up (default: the identity)",
     )
     command.add_argument("--down", type=float, nargs=3, metavar=("X", "Y", "Z"), help="direction of gravity")
+    command.add_argument(
+        "--unit", choices=["metre", "arbitrary"], help="of its references' poses (default: metre); changes no pose"
+    )
 
 
 def _add_reference(reference: argparse.ArgumentParser) -> None:

@@ -38,7 +38,10 @@ def health(client: Client, arguments: argparse.Namespace) -> int:
 def create_scene(client: Client, arguments: argparse.Namespace) -> int:
     """Creates a scene."""
     datum, down = _datum(arguments), arguments.down
-    return print_json(client.create_scene(arguments.scene, datum=datum, down_in_world=down))
+    is_arbitrary = arguments.unit == "arbitrary"
+    return print_json(
+        client.create_scene(arguments.scene, datum=datum, down_in_world=down, arbitrary_unit=is_arbitrary)
+    )
 
 
 def update_scene(client: Client, arguments: argparse.Namespace) -> int:
@@ -48,9 +51,14 @@ def update_scene(client: Client, arguments: argparse.Namespace) -> int:
         changes["datum"] = _datum(arguments)
     if arguments.down is not None:
         changes["down_in_world"] = arguments.down
+    if arguments.unit is not None:
+        changes["arbitrary_unit"] = arguments.unit == "arbitrary"
     if not changes:
-        raise ValueError("nothing to change: give --datum, --down or --forget")
-    return print_json(client.update_scene(arguments.scene, **changes))
+        raise ValueError("nothing to change: give --datum, --down, --unit or --forget")
+    scene = client.update_scene(arguments.scene, **changes)
+    for warning in scene.warnings:
+        print(f"mapless: warning: {warning}", file=sys.stderr)
+    return print_json(scene)
 
 
 def _datum(arguments: argparse.Namespace) -> Datum | None:

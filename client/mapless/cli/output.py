@@ -71,9 +71,10 @@ def lines(answer: LocalizationResult | Rejected) -> list[str]:
     frame = "" if answer.in_axes is None else f"   in {answer.in_axes.axes} axes"
     x, y, z = pose.translation
     q = pose.quaternion()
+    unit = "units" if answer.arbitrary_unit else "m"
     text = [
         f"{_outcome(answer)}{frame}",
-        f"  position  {x:.3f}  {y:.3f}  {z:.3f} m{_radius(answer.accuracy, 'position', 'm')}",
+        f"  position  {x:.3f}  {y:.3f}  {z:.3f} {unit}{_radius(answer.accuracy, 'position', unit)}",
         f"  rotation  x {q.x:.4f}  y {q.y:.4f}  z {q.z:.4f}  w {q.w:.4f}{_radius(answer.accuracy, 'rotation', 'deg')}",
     ]
     if answer.geo_pose is not None:
@@ -82,6 +83,8 @@ def lines(answer: LocalizationResult | Rejected) -> list[str]:
     text += [f"  prior     {_checked(check)}" for check in answer.prior_checks]
     captured = f", {_CAPTURED}" if answer.diagnostics.captured else ""
     text.append(f"  support   {_support(answer)}, {answer.diagnostics.total_s:.2f} s{captured}")
+    if answer.arbitrary_unit:
+        text.append("  warning   the scene's unit of length is arbitrary, not the metre")
     if answer.trust is not None and answer.trust < DOUBTFUL_TRUST:
         text.append(
             f"  warning   fewer than {100 * DOUBTFUL_TRUST:g} % of right answers look as doubtful: check the intrinsics"
@@ -94,10 +97,13 @@ def line(name: str, answer: LocalizationResult | Rejected) -> str:
     if isinstance(answer, Rejected):
         return f"{name}  not localized: {answer.reason}"
     x, y, z = answer.world_from_camera.translation
-    radius = f"{100 * answer.accuracy.position_95_m:8.2f} cm" if answer.accuracy is not None else " " * 11
+    unit, radius = "units" if answer.arbitrary_unit else "m", " " * 11
+    if answer.accuracy is not None:
+        radius_m = answer.accuracy.position_95_m
+        radius = f"{radius_m:11.4g}" if answer.arbitrary_unit else f"{100 * radius_m:8.2f} cm"
     trust = f"{answer.trust:6.3f}" if answer.trust is not None else " " * 6
     counts = f"{answer.inlier_count}/{answer.match_count}"
-    return f"{name}  {x:9.3f} {y:9.3f} {z:9.3f} m {radius} {trust}  {counts:>9}"
+    return f"{name}  {x:9.3f} {y:9.3f} {z:9.3f} {unit} {radius} {trust}  {counts:>9}"
 
 
 def heading(width: int) -> str:
@@ -130,7 +136,8 @@ def _checked(check: PriorCheck) -> str:
 def _radius(accuracy: Accuracy | None, kind: str, unit: str) -> str:
     if accuracy is None:
         return ""
-    factor, shown = (100, "cm") if unit == "m" else (1, "deg")
-    radii = [factor * getattr(accuracy, f"{kind}_{share}_{unit}") for share in (68, 95)]
+    factor, shown = (100, "cm") if unit == "m" else (1, unit)
+    suffix = "m" if kind == "position" else "deg"
+    radii = [factor * getattr(accuracy, f"{kind}_{share}_{suffix}") for share in (68, 95)]
     note = "" if accuracy.calibrated else ", uncalibrated"
     return f"   within {radii[0]:.2g} {shown} (68 %), {radii[1]:.2g} {shown} (95 %{note})"

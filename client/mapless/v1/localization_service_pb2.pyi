@@ -252,7 +252,7 @@ class LocalizeProgressivelyResponse(_message.Message):
     def __init__(self, answer: _Optional[_Union[LocalizeResponse, _Mapping]] = ..., is_final: bool = ...) -> None: ...
 
 class Localization(_message.Message):
-    __slots__ = ("world_from_camera", "covariance", "accuracy", "pose_stage", "inlier_count", "match_count", "reprojection_error_px", "trust", "in_axes", "geo_pose", "prior_checks")
+    __slots__ = ("world_from_camera", "covariance", "accuracy", "pose_stage", "inlier_count", "match_count", "reprojection_error_px", "trust", "in_axes", "geo_pose", "prior_checks", "arbitrary_unit")
     WORLD_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
     COVARIANCE_FIELD_NUMBER: _ClassVar[int]
     ACCURACY_FIELD_NUMBER: _ClassVar[int]
@@ -264,6 +264,7 @@ class Localization(_message.Message):
     IN_AXES_FIELD_NUMBER: _ClassVar[int]
     GEO_POSE_FIELD_NUMBER: _ClassVar[int]
     PRIOR_CHECKS_FIELD_NUMBER: _ClassVar[int]
+    ARBITRARY_UNIT_FIELD_NUMBER: _ClassVar[int]
     world_from_camera: _geometry_pb2.RigidTransform
     covariance: PoseCovariance
     accuracy: Accuracy
@@ -275,7 +276,8 @@ class Localization(_message.Message):
     in_axes: FramedPose
     geo_pose: GeoPose
     prior_checks: _containers.RepeatedCompositeFieldContainer[PriorCheck]
-    def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., pose_stage: _Optional[_Union[PoseStage, str]] = ..., inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., trust: _Optional[float] = ..., in_axes: _Optional[_Union[FramedPose, _Mapping]] = ..., geo_pose: _Optional[_Union[GeoPose, _Mapping]] = ..., prior_checks: _Optional[_Iterable[_Union[PriorCheck, _Mapping]]] = ...) -> None: ...
+    arbitrary_unit: bool
+    def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., pose_stage: _Optional[_Union[PoseStage, str]] = ..., inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., trust: _Optional[float] = ..., in_axes: _Optional[_Union[FramedPose, _Mapping]] = ..., geo_pose: _Optional[_Union[GeoPose, _Mapping]] = ..., prior_checks: _Optional[_Iterable[_Union[PriorCheck, _Mapping]]] = ..., arbitrary_unit: bool = ...) -> None: ...
 
 class FramedPose(_message.Message):
     __slots__ = ("axes", "world_from_camera", "covariance", "world_from_session")
@@ -518,7 +520,7 @@ class LocalizeRigResponse(_message.Message):
     def __init__(self, localization: _Optional[_Union[RigLocalization, _Mapping]] = ..., rejection: _Optional[_Union[Rejection, _Mapping]] = ..., images: _Optional[_Iterable[_Union[ImageReport, _Mapping]]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_rig: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ...) -> None: ...
 
 class RigLocalization(_message.Message):
-    __slots__ = ("world_from_rig", "covariance", "accuracy", "inlier_count", "match_count", "reprojection_error_px", "world_from_session", "geo_pose")
+    __slots__ = ("world_from_rig", "covariance", "accuracy", "inlier_count", "match_count", "reprojection_error_px", "world_from_session", "geo_pose", "arbitrary_unit")
     WORLD_FROM_RIG_FIELD_NUMBER: _ClassVar[int]
     COVARIANCE_FIELD_NUMBER: _ClassVar[int]
     ACCURACY_FIELD_NUMBER: _ClassVar[int]
@@ -527,6 +529,7 @@ class RigLocalization(_message.Message):
     REPROJECTION_ERROR_PX_FIELD_NUMBER: _ClassVar[int]
     WORLD_FROM_SESSION_FIELD_NUMBER: _ClassVar[int]
     GEO_POSE_FIELD_NUMBER: _ClassVar[int]
+    ARBITRARY_UNIT_FIELD_NUMBER: _ClassVar[int]
     world_from_rig: _geometry_pb2.RigidTransform
     covariance: PoseCovariance
     accuracy: Accuracy
@@ -535,7 +538,8 @@ class RigLocalization(_message.Message):
     reprojection_error_px: float
     world_from_session: _geometry_pb2.RigidTransform
     geo_pose: GeoPose
-    def __init__(self, world_from_rig: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., world_from_session: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., geo_pose: _Optional[_Union[GeoPose, _Mapping]] = ...) -> None: ...
+    arbitrary_unit: bool
+    def __init__(self, world_from_rig: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., world_from_session: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., geo_pose: _Optional[_Union[GeoPose, _Mapping]] = ..., arbitrary_unit: bool = ...) -> None: ...
 
 class ImageReport(_message.Message):
     __slots__ = ("inlier_count", "match_count", "alone", "diagnostics")
@@ -586,7 +590,7 @@ class LocalizeSequenceResponse(_message.Message):
     def __init__(self, localization: _Optional[_Union[SequenceLocalization, _Mapping]] = ..., rejection: _Optional[_Union[Rejection, _Mapping]] = ..., images: _Optional[_Iterable[_Union[ImageReport, _Mapping]]] = ...) -> None: ...
 
 class SequenceLocalization(_message.Message):
-    __slots__ = ("world_from_session", "session_scale", "session_scale_sigma", "poses", "covariance", "accuracy", "inlier_count", "match_count", "reprojection_error_px", "axes")
+    __slots__ = ("world_from_session", "session_scale", "session_scale_sigma", "poses", "covariance", "accuracy", "inlier_count", "match_count", "reprojection_error_px", "axes", "arbitrary_unit")
     WORLD_FROM_SESSION_FIELD_NUMBER: _ClassVar[int]
     SESSION_SCALE_FIELD_NUMBER: _ClassVar[int]
     SESSION_SCALE_SIGMA_FIELD_NUMBER: _ClassVar[int]
@@ -597,6 +601,7 @@ class SequenceLocalization(_message.Message):
     MATCH_COUNT_FIELD_NUMBER: _ClassVar[int]
     REPROJECTION_ERROR_PX_FIELD_NUMBER: _ClassVar[int]
     AXES_FIELD_NUMBER: _ClassVar[int]
+    ARBITRARY_UNIT_FIELD_NUMBER: _ClassVar[int]
     world_from_session: _geometry_pb2.RigidTransform
     session_scale: float
     session_scale_sigma: float
@@ -607,7 +612,8 @@ class SequenceLocalization(_message.Message):
     match_count: int
     reprojection_error_px: float
     axes: Axes
-    def __init__(self, world_from_session: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., session_scale: _Optional[float] = ..., session_scale_sigma: _Optional[float] = ..., poses: _Optional[_Iterable[_Union[CapturedPose, _Mapping]]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., axes: _Optional[_Union[Axes, str]] = ...) -> None: ...
+    arbitrary_unit: bool
+    def __init__(self, world_from_session: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., session_scale: _Optional[float] = ..., session_scale_sigma: _Optional[float] = ..., poses: _Optional[_Iterable[_Union[CapturedPose, _Mapping]]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., axes: _Optional[_Union[Axes, str]] = ..., arbitrary_unit: bool = ...) -> None: ...
 
 class CapturedPose(_message.Message):
     __slots__ = ("capture_time", "world_from_camera")

@@ -43,7 +43,7 @@ COVERAGE_VERDICT_DOUBTFUL: CoverageVerdict
 COVERAGE_VERDICT_NOT_LOCALIZABLE: CoverageVerdict
 
 class Scene(_message.Message):
-    __slots__ = ("name", "generation", "reference_count", "create_time", "datum", "down_in_world", "calibration")
+    __slots__ = ("name", "generation", "reference_count", "create_time", "datum", "down_in_world", "calibration", "arbitrary_unit")
     NAME_FIELD_NUMBER: _ClassVar[int]
     GENERATION_FIELD_NUMBER: _ClassVar[int]
     REFERENCE_COUNT_FIELD_NUMBER: _ClassVar[int]
@@ -51,6 +51,7 @@ class Scene(_message.Message):
     DATUM_FIELD_NUMBER: _ClassVar[int]
     DOWN_IN_WORLD_FIELD_NUMBER: _ClassVar[int]
     CALIBRATION_FIELD_NUMBER: _ClassVar[int]
+    ARBITRARY_UNIT_FIELD_NUMBER: _ClassVar[int]
     name: str
     generation: int
     reference_count: int
@@ -58,7 +59,8 @@ class Scene(_message.Message):
     datum: Datum
     down_in_world: _geometry_pb2.Vector3
     calibration: SceneCalibration
-    def __init__(self, name: _Optional[str] = ..., generation: _Optional[int] = ..., reference_count: _Optional[int] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., datum: _Optional[_Union[Datum, _Mapping]] = ..., down_in_world: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., calibration: _Optional[_Union[SceneCalibration, _Mapping]] = ...) -> None: ...
+    arbitrary_unit: bool
+    def __init__(self, name: _Optional[str] = ..., generation: _Optional[int] = ..., reference_count: _Optional[int] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., datum: _Optional[_Union[Datum, _Mapping]] = ..., down_in_world: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., calibration: _Optional[_Union[SceneCalibration, _Mapping]] = ..., arbitrary_unit: bool = ...) -> None: ...
 
 class Datum(_message.Message):
     __slots__ = ("latitude_deg", "longitude_deg", "height_m", "enu_from_world")
@@ -115,14 +117,16 @@ class Reference(_message.Message):
     def __init__(self, name: _Optional[str] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., image_sha256: _Optional[str] = ..., feature_count: _Optional[int] = ...) -> None: ...
 
 class CreateSceneRequest(_message.Message):
-    __slots__ = ("scene_id", "datum", "down_in_world")
+    __slots__ = ("scene_id", "datum", "down_in_world", "arbitrary_unit")
     SCENE_ID_FIELD_NUMBER: _ClassVar[int]
     DATUM_FIELD_NUMBER: _ClassVar[int]
     DOWN_IN_WORLD_FIELD_NUMBER: _ClassVar[int]
+    ARBITRARY_UNIT_FIELD_NUMBER: _ClassVar[int]
     scene_id: str
     datum: Datum
     down_in_world: _geometry_pb2.Vector3
-    def __init__(self, scene_id: _Optional[str] = ..., datum: _Optional[_Union[Datum, _Mapping]] = ..., down_in_world: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ...) -> None: ...
+    arbitrary_unit: bool
+    def __init__(self, scene_id: _Optional[str] = ..., datum: _Optional[_Union[Datum, _Mapping]] = ..., down_in_world: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., arbitrary_unit: bool = ...) -> None: ...
 
 class CreateSceneResponse(_message.Message):
     __slots__ = ("scene",)
@@ -151,10 +155,12 @@ class UpdateSceneRequest(_message.Message):
     def __init__(self, scene: _Optional[_Union[Scene, _Mapping]] = ..., update_mask: _Optional[_Union[_field_mask_pb2.FieldMask, _Mapping]] = ...) -> None: ...
 
 class UpdateSceneResponse(_message.Message):
-    __slots__ = ("scene",)
+    __slots__ = ("scene", "warnings")
     SCENE_FIELD_NUMBER: _ClassVar[int]
+    WARNINGS_FIELD_NUMBER: _ClassVar[int]
     scene: Scene
-    def __init__(self, scene: _Optional[_Union[Scene, _Mapping]] = ...) -> None: ...
+    warnings: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, scene: _Optional[_Union[Scene, _Mapping]] = ..., warnings: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class ListScenesRequest(_message.Message):
     __slots__ = ("page_size", "page_token")

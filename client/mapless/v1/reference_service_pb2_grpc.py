@@ -161,7 +161,7 @@ class ReferenceServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def UpdateScene(self, request, context):
-        """Changes properties of a scene: its datum, direction of gravity, calibration. INVALID_ARGUMENT for an
+        """Changes properties of a scene: its datum, direction of gravity, unit of length, calibration. INVALID_ARGUMENT for an
         empty mask or a field that cannot be changed.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)

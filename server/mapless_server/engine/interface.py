@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # services need not load what computes
     from mapless_server.method.rejection import Rejection
     from mapless_server.scenes import Choice, Coverage, Narrowing, ReferenceAudit, Viewpoint
     from mapless_server.security import SceneKey
+    from mapless_server.store import SceneAttributes
 
     from .query import Caller, Description, Photo, Query, Result, Tier
 
@@ -122,6 +123,10 @@ class Engine(Protocol):
 
     async def check_coverage(self, scene_key: SceneKey, view: Viewpoint, caller: Caller) -> tuple[int, Coverage]:
         """The scene's generation, and whether a photograph would be localized there."""
+        ...
+
+    def contradictions(self, poses: Sequence[RigidTransform], attributes: SceneAttributes) -> list[str]:
+        """What a scene's attributes contradict in the poses of its references, one sentence each."""
         ...
 
     def forget_references(self, keys: Collection[str]) -> None:

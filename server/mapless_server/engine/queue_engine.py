@@ -16,6 +16,7 @@ from mapless_server.method.groups.sequence import SequenceEstimate
 from mapless_server.method.rejection import Rejection
 from mapless_server.scenes import Choice, Coverage, Narrowing, ReferenceAudit, Selection, Viewpoint
 from mapless_server.scenes.background import BackgroundMatching
+from mapless_server.scenes.plausibility import contradictions
 from mapless_server.scheduling import (
     ComputeItem,
     Expired,
@@ -33,6 +34,7 @@ from mapless_server.scheduling import (
     compute_items,
 )
 from mapless_server.security import SceneKey
+from mapless_server.store import SceneAttributes
 
 from . import joint
 from .failures import failure_of
@@ -278,6 +280,10 @@ class QueueEngine:
             if len(refusals) == jobs:  # else those that were admitted have done it all
                 raise refusals[0]
         return work.results
+
+    def contradictions(self, poses: Sequence[RigidTransform], attributes: SceneAttributes) -> list[str]:
+        """What a scene's attributes contradict in the poses of its references, one sentence each."""
+        return contradictions(poses, attributes)
 
     def forget_references(self, keys: Collection[str]) -> None:
         """Frees the memory of deleted references."""

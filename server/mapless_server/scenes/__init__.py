@@ -1,8 +1,8 @@
 """Scenes in memory: references with their features, retrieval indexes, audits.
 
 May import store, security, method, networks and images. Begin with `library` (loads references), `indexes` and
-`retrieval` (choose references), `background` (matches references ahead of queries), and `audit`. Here are
-the values that other rooms give and get.
+`retrieval` (choose references), `background` (matches references ahead of queries), `audit` and `plausibility`. Here
+are the values that other rooms give and get.
 """
 
 from .audit.verdict import AuditVerdict, Coverage, CoverageVerdict, ReferenceAudit, Viewpoint

@@ -16,11 +16,19 @@ from mapless.v1 import reference_service_pb2_grpc as rpcs
 from mapless.wire import FieldError
 from mapless_server.engine.interface import Engine
 from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Photo
-from mapless_server.errors import AlreadyExists
+from mapless_server.errors import AlreadyExists, DataLoss
 from mapless_server.rpc import Call
 from mapless_server.scenes import Viewpoint
 from mapless_server.security import SceneKey, key_of, scene_id_of
-from mapless_server.store import ContradictingDown, NewReference, ReferenceRecord, SceneAttributes, Store
+from mapless_server.store import (
+    ContradictingDown,
+    DatumWithoutMetres,
+    NewReference,
+    ReferenceRecord,
+    SceneAttributes,
+    SceneRecord,
+    Store,
+)
 
 from .messages.priors import priors_from_message
 from .messages.queries import photo_from_message, reference_ids_from_names, reference_key_from_name, scene_key_from_name
@@ -40,6 +48,7 @@ MAX_BATCH = 1000
 MAX_RETRIEVED = 1000
 DEFAULT_AUDITS, MAX_AUDITS = 10, 100
 MAX_NOTED = 10  # names in a line of the log
+MAX_COMPARED = 1000  # references, the first by id, with which a change of the scene is compared
 STORE_THREADS = 4  # writers share one lock; the other threads keep readers from waiting for it
 
 T = TypeVar("T")
@@ -84,7 +93,20 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         except ContradictingDown as error:
             field = "down_in_world" if changes.get("down_in_world") else "datum"
             raise FieldError(f"scene.{field}", str(error)) from None
-        return pb.UpdateSceneResponse(scene=scene_to_message(scene))
+        except DatumWithoutMetres as error:
+            field = "datum" if changes.get("datum") else "arbitrary_unit"
+            raise FieldError(f"scene.{field}", str(error)) from None
+        warnings = await self._stored(self._contradictions, scene) if changes.keys() != {"calibration"} else []
+        if warnings:
+            call.note(contradictions=warnings)
+        return pb.UpdateSceneResponse(scene=scene_to_message(scene), warnings=warnings)
+
+    def _contradictions(self, scene: SceneRecord) -> list[str]:
+        try:
+            references = self._store.list_references(scene.scene_key, MAX_COMPARED, "")
+        except DataLoss as error:
+            return [f"the references were not compared with the change: {error}"]
+        return self._engine().contradictions([it.world_from_camera for it in references], scene.attributes)
 
     async def ListScenes(self, request: pb.ListScenesRequest, call: Call) -> pb.ListScenesResponse:
         """Implements ReferenceService.ListScenes."""

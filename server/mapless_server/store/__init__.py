@@ -11,6 +11,7 @@ from .database import StoreError
 from .pairs import Claim, Pair, PairStore, Progress
 from .records import (
     ContradictingDown,
+    DatumWithoutMetres,
     DescribedReference,
     IndexedReference,
     NewReference,
@@ -26,6 +27,7 @@ from .store import Store
 __all__ = [
     "Claim",
     "ContradictingDown",
+    "DatumWithoutMetres",
     "DescribedReference",
     "IndexedReference",
     "LruCache",

@@ -109,6 +109,7 @@ def decode_attributes(owner: str, data: bytes | None, sha256: str | None) -> Sce
             Datum(**{**datum, "enu_from_world": Quaternion(**datum["enu_from_world"])}) if datum else None,
             tuple(down) if down else None,
             Calibration(**calibration) if calibration else None,
+            content.get("arbitrary_unit", False),  # which 0.2.0 did not write
         )
 
 

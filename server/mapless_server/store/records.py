@@ -24,6 +24,10 @@ class ContradictingDown(ValueError):
     """A scene's datum and its down_in_world contradict each other."""
 
 
+class DatumWithoutMetres(ValueError):
+    """A scene has a datum, although its unit of length is not the metre."""
+
+
 @dataclass(frozen=True)
 class SceneAttributes:
     """Attributes of a scene as a whole; None where unknown.
@@ -32,16 +36,21 @@ class SceneAttributes:
         datum: where its world is on the Earth.
         down_in_world: unit vector in the direction of gravity; None for the datum's, if there is one.
         calibration: measured errors of answers.
+        arbitrary_unit: whether the unit of length is arbitrary instead of the metre.
 
     Raises:
         ContradictingDown: datum and down_in_world do not belong to the same world.
+        DatumWithoutMetres: there is a datum, and the unit is arbitrary.
     """
 
     datum: Datum | None = None
     down_in_world: Vector | None = None
     calibration: Calibration | None = None
+    arbitrary_unit: bool = False
 
     def __post_init__(self) -> None:
+        if self.datum is not None and self.arbitrary_unit:
+            raise DatumWithoutMetres("needs a scene in metres: the unit of length of this one is arbitrary")
         if self.datum is None or self.down_in_world is None:
             return
         cosine = float(self.datum.down_in_world() @ self.down_in_world)

@@ -52,7 +52,9 @@ def scene_attributes(row: Row[Any]) -> SceneAttributes:
         return codec.decode_attributes(attributes_owner(row.scene_id), row.attributes, row.attributes_sha256)
     except codec.Damaged as error:
         scene_id = scene_id_of(SceneKey(row.scene_id))
-        raise DataLoss(f"scene {scene_id!r} is damaged in the store ({error}); set all three again") from error
+        raise DataLoss(
+            f"scene {scene_id!r} is damaged in the store ({error}); set all three and the unit again"
+        ) from error
 
 
 def attributes_owner(scene_key: str) -> str:

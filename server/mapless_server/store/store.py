@@ -15,7 +15,7 @@ from sqlalchemy import Connection, insert, select, update
 
 from mapless.geodesy import Datum
 from mapless.scenes import UNCHANGED, Calibration, UnchangedType, Vector
-from mapless_server.errors import AlreadyExists, NotFound
+from mapless_server.errors import AlreadyExists, DataLoss, NotFound
 from mapless_server.method.views import View
 from mapless_server.security import SceneKey, scene_id_of
 
@@ -139,22 +139,33 @@ class Store(StoreReader):
         datum: Datum | UnchangedType | None = UNCHANGED,
         down_in_world: Vector | UnchangedType | None = UNCHANGED,
         calibration: Calibration | UnchangedType | None = UNCHANGED,
+        arbitrary_unit: bool | UnchangedType = UNCHANGED,
     ) -> SceneRecord:
-        """Changes attributes of a scene; None removes one. If all three are given, damaged ones are replaced.
+        """Changes attributes of a scene; None removes one.
+
+        Damaged attributes are replaced if datum, down_in_world and calibration are given; then the unit is the metre
+        unless it is given.
 
         Raises:
             NotFound: there is no such scene.
             DataLoss: an attribute that is not given is damaged.
             ContradictingDown: datum and down_in_world do not belong to the same world.
+            DatumWithoutMetres: there would be a datum, and an arbitrary unit.
         """
         if isinstance(calibration, Calibration):
             calibration = replace(calibration, create_time=_now())
         given: dict[str, Any] = {"datum": datum, "down_in_world": down_in_world, "calibration": calibration}
+        replaces_damaged = UNCHANGED not in given.values()
+        given["arbitrary_unit"] = arbitrary_unit
         changes = {name: value for name, value in given.items() if value is not UNCHANGED}
         with self._changing() as connection:
             queries.begin_change(connection, scene_key)
-            is_new = len(changes) == len(given)
-            found = NO_ATTRIBUTES if is_new else rows.scene_attributes(queries.find_attributes(connection, scene_key))
+            stored, found = queries.find_attributes(connection, scene_key), NO_ATTRIBUTES
+            try:
+                found = rows.scene_attributes(stored)
+            except DataLoss:
+                if not replaces_damaged:
+                    raise
             row = rows.attributes_row(scene_key, replace(found, **changes))
             connection.execute(update(tables.scene).where(tables.scene.c.scene_id == scene_key).values(row))
             return rows.scene_record(queries.find_scene(connection, scene_key))

@@ -52,8 +52,8 @@ def check_target(folder: Path, layout: str) -> None:
 def export_scene(client: Client, scene: str, folder: Path, layout: str, progress: Progress) -> Export:
     """Writes a scene's references into a folder, but for those that are damaged.
 
-    The layout `cameras` has the scene's datum and down, too. A calibration is of these references on a server of this
-    version, and is measured anew elsewhere; a backup keeps it.
+    The layout `cameras` has the scene's datum, down and unit, too. A calibration is of these references on a server of
+    this version, and is measured anew elsewhere; a backup keeps it.
 
     The description is written last, so that a folder without it is an interrupted export. Where every reference is
     damaged, nothing is left in the folder.

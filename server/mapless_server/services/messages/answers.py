@@ -77,6 +77,7 @@ def _localization_to_message(
         frames.session_from_camera,
         attributes.datum,
     )
+    message.arbitrary_unit = attributes.arbitrary_unit
     return message
 
 

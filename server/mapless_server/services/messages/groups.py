@@ -146,9 +146,10 @@ def rig_to_message(
         if session_from_rig is not None:
             world_from_session = outcome.world_from_rig.compose(session_from_rig.inverse())
             message.world_from_session.CopyFrom(wire.transform_to_message(world_from_session))
-        datum = group.results[0].attributes.datum
-        if datum is not None:
-            message.geo_pose.CopyFrom(geo_pose_to_message(outcome.world_from_rig, datum))
+        attributes = group.results[0].attributes
+        message.arbitrary_unit = attributes.arbitrary_unit
+        if attributes.datum is not None:
+            message.geo_pose.CopyFrom(geo_pose_to_message(outcome.world_from_rig, attributes.datum))
         response = pb.LocalizeRigResponse(localization=message)
     response.images.extend(_reports(outcome, group, queries))
     for echoed in ("capture_time", "session_from_rig"):
@@ -174,6 +175,7 @@ def sequence_to_message(
             session_scale=session.scale,
             session_scale_sigma=session.scale * outcome.scale_sigma,
             axes=enum_to_message(axes, pb.Axes),
+            arbitrary_unit=group.results[0].attributes.arbitrary_unit,
         )
         for frame, pose in zip(request.frames, outcome.world_from_camera, strict=True):
             captured = message.poses.add(world_from_camera=wire.transform_to_message(pose))

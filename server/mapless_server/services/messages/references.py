@@ -21,7 +21,7 @@ from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.wire import FieldError, joined
 from mapless_server.scenes import Choice, Coverage, ReferenceAudit
-from mapless_server.store import ContradictingDown, ReferenceRecord, SceneAttributes, SceneRecord
+from mapless_server.store import ContradictingDown, DatumWithoutMetres, ReferenceRecord, SceneAttributes, SceneRecord
 
 from .queries import enum_to_message
 
@@ -149,6 +149,7 @@ def scene_to_message(scene: SceneRecord) -> pb.Scene:
         datum=datum_to_message(known.datum) if known.datum else None,
         down_in_world=direction_to_message(known.down_in_world) if known.down_in_world else None,
         calibration=calibration_to_message(known.calibration) if known.calibration else None,
+        arbitrary_unit=known.arbitrary_unit,
     )
     message.create_time.FromDatetime(scene.create_time)
     return message
@@ -162,9 +163,12 @@ def attributes_from_message(request: pb.CreateSceneRequest) -> SceneAttributes:
             direction_from_message(request.down_in_world, "down_in_world")
             if request.HasField("down_in_world")
             else None,
+            arbitrary_unit=request.arbitrary_unit,
         )
     except ContradictingDown as error:
         raise FieldError("down_in_world", str(error)) from None
+    except DatumWithoutMetres as error:
+        raise FieldError("datum", str(error)) from None
 
 
 def changes_from_message(request: pb.UpdateSceneRequest) -> dict[str, Any]:
@@ -180,10 +184,12 @@ def changes_from_message(request: pb.UpdateSceneRequest) -> dict[str, Any]:
         if path not in _READERS:
             raise FieldError("update_mask", f"must name only {', '.join(_READERS)}, names {names.shown(path)}")
     scene = request.scene
-    return {
-        path: _READERS[path](getattr(scene, path), joined("scene", path)) if scene.HasField(path) else None
-        for path in paths
-    }
+    return {path: _READERS[path](scene, path) for path in paths}
+
+
+def _optional(read: Callable[[Any, str], object]) -> Callable[[pb.Scene, str], object]:
+    """Reads a field of a scene that may be absent."""
+    return lambda scene, path: read(getattr(scene, path), joined("scene", path)) if scene.HasField(path) else None
 
 
 def _measured(message: pb.SceneCalibration, field: str) -> Calibration:
@@ -197,8 +203,9 @@ def _measured(message: pb.SceneCalibration, field: str) -> Calibration:
     return calibration_from_message(measured, field)
 
 
-_READERS: dict[str, Any] = {
-    "datum": datum_from_message,
-    "down_in_world": direction_from_message,
-    "calibration": _measured,
+_READERS: dict[str, Callable[[pb.Scene, str], object]] = {
+    "datum": _optional(datum_from_message),
+    "down_in_world": _optional(direction_from_message),
+    "calibration": _optional(_measured),
+    "arbitrary_unit": lambda scene, path: scene.arbitrary_unit,
 }

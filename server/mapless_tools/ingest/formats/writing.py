@@ -36,8 +36,9 @@ class Layout(Protocol):
 
 
 def cameras_files(images: Sequence[PosedImage], source: str, scene: Scene | None = None) -> dict[str, str]:
-    """`cameras.json`, with the scene's datum and down."""
-    content: dict[str, Any] = {"source": source, "metric": True, "units": "metre"}
+    """`cameras.json`, with the scene's datum, down and unit."""
+    is_metric = scene is None or not scene.arbitrary_unit
+    content: dict[str, Any] = {"source": source, "metric": is_metric, "units": "metre" if is_metric else "arbitrary"}
     if scene is not None and scene.datum is not None:
         content["datum"] = scene.datum.to_json()
     if scene is not None and scene.down_in_world is not None:
