@@ -310,7 +310,7 @@ class OneMatch:
     def __init__(self, seconds: float = 0.0) -> None:
         self.seconds, self.calls = seconds, 0
 
-    def match_one(self, first: View, second: View) -> Matches:
+    def match_one(self, first: View, second: View, pause: Callable[[], None] = lambda: None) -> Matches:
         time.sleep(self.seconds)
         self.calls += 1
         return np.array([[0, self.calls]], np.int32)

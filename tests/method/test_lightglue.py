@@ -112,6 +112,14 @@ def test_all_layers_and_keypoints_give_what_the_batch_gives(views: tuple[View, l
         torch.testing.assert_close(index[0][score_alone > 0.01], index_alone[score_alone > 0.01])
 
 
+def test_it_pauses_between_layers(views: tuple[View, list[View]]) -> None:
+    query, references = views
+    made, inputs, pauses = network(), tensors(query, references[:1]), list[None]()
+    with torch.inference_mode():
+        made.match_one((inputs[0], inputs[1]), (inputs[2], inputs[3]), 1.0, 1.0, lambda: pauses.append(None))
+    assert len(pauses) == len(made.transformers) - 1
+
+
 @pytest.mark.parametrize(("depth", "width"), [(0.95, 0.99), (0.6, 0.9), (1.0, 0.95), (0.5, 1.0)])
 def test_stopping_and_pruning_equal_kornias(views: tuple[View, list[View]], depth: float, width: float) -> None:
     query, references = views

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -24,7 +25,7 @@ from support.waiting import wait_until
 from mapless_server.errors import Unavailable
 from mapless_server.method import correspond
 from mapless_server.method.context import StageContext
-from mapless_server.method.correspond import Matcher, in_order
+from mapless_server.method.correspond import CorrespondOptions, Matcher, PairMatching, in_order
 from mapless_server.method.views import Features, Matches, PosedView, View
 from mapless_server.scenes.background import BackgroundMatching, BackgroundOptions
 from mapless_server.scenes.indexes import SceneIndexes
@@ -84,9 +85,14 @@ class Server:
         is_idle: Callable[[], bool] = lambda: True,
         widths: Sequence[bool] = (False, True),
         strong: bool = False,
+        strong_matching: PairMatching | None = None,
+        enough_matches: int = 500,
     ) -> None:
         self.store, self.counts = store, Counts()
-        self.matcher = Matcher(pair_matching=AnyRatio() if strong else None)
+        self.matcher = Matcher(
+            CorrespondOptions(enough_matches=enough_matches),
+            pair_matching=strong_matching or AnyRatio() if strong else None,
+        )
         self.pairs = PairStore(store.database)
         self.finder = self.matcher.stored = PairFinder(self.pairs, EXTRACTOR.name, self.counts)
         self.library = ReferenceLibrary(store)
@@ -157,6 +163,12 @@ class TestResults:
             assert found.reference_pairs[pair].dtype == matches.dtype
         assert (server.counts.made, server.counts.waiting, server.counts.failures) == (20, 0, 0)
 
+    def test_wide_pairs_begin_with_the_stored_strict_ones(self, store: Store, compared: Counter[int]) -> None:
+        server = Server(store)
+        server.background.match_waiting()
+        assert (compared.total(), server.counts.made) == (10, 20)
+        assert not server.counts.found  # what queries find
+
     def test_nothing_is_made_twice(self, store: Store, compared: Counter[int]) -> None:
         for _ in range(2):
             Server(store, widths=[False]).background.match_waiting()
@@ -190,8 +202,28 @@ class AnyRatio:
 
     name = "any-ratio"
 
-    def match_one(self, first: View, second: View) -> Matches:
+    def match_one(self, first: View, second: View, pause: Callable[[], None] = lambda: None) -> Matches:
+        pause()
         return correspond.mutual_matches(first.features, second.features, 1.0)
+
+
+class NeverCalled(AnyRatio):
+    def match_one(self, first: View, second: View, pause: Callable[[], None] = lambda: None) -> Matches:
+        raise AssertionError
+
+
+class Halfway(AnyRatio):
+    """Pauses once in each pair; a caller comes before that."""
+
+    def __init__(self) -> None:
+        self.is_busy, self.is_resumed = threading.Event(), threading.Event()
+
+    def match_one(self, first: View, second: View, pause: Callable[[], None] = lambda: None) -> Matches:
+        self.is_busy.set()
+        time.sleep(0.05)  # a step
+        pause()
+        self.is_resumed.set()
+        return super().match_one(first, second)
 
 
 class TestStrongPairs:
@@ -207,6 +239,12 @@ class TestStrongPairs:
                 pair = in_order(first, second)
                 expected = twin.match_pair(*pair, wide, True)
                 np.testing.assert_array_equal(matches if pair[0] is first else matches[:, ::-1], expected)
+
+    def test_nearest_neighbours_that_find_enough_suffice(self, store: Store) -> None:
+        server = Server(store, strong=True, strong_matching=NeverCalled(), enough_matches=1)
+        server.background.match_waiting()
+        assert (server.counts.made, server.counts.waiting, server.counts.failures) == (20, 0, 0)
+        assert min(len(it) for it in server.stored().values() if it is not None) >= 1
 
     def test_they_are_fewer_and_under_names_of_their_own(self, store: Store) -> None:
         server = Server(store, BackgroundOptions(strong_pairs=1), widths=[False], strong=True)
@@ -358,17 +396,17 @@ class TestSharing:
 
 
 class TestPriority:
-    def test_a_busy_server_matches_little(self, store: Store) -> None:
+    def test_a_busy_server_matches_little(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
         is_busy = threading.Event()
         options = BackgroundOptions(poll_s=0.01, busy_share=1e-6, quiet_s=0.01)
         server = Server(store, options, lambda: not is_busy.is_set())
         usual = server.matcher.match_pair
 
-        def once(first: PosedView, second: PosedView, wide: bool = False, strong: bool = False) -> Matches:
+        def once(*arguments: Any) -> Matches:
             is_busy.set()
-            return usual(first, second, wide, strong)
+            return usual(*arguments)
 
-        server.matcher.match_pair = once  # type: ignore[method-assign]
+        monkeypatch.setattr(server.matcher, "match_pair", once)
         server.background.start()
         try:
             wait_until(is_busy.is_set)
@@ -398,6 +436,36 @@ class TestPriority:
         finally:
             server.background.close()
         assert len(server.stored()) == 0
+
+    @pytest.mark.parametrize("ends", ["the caller", "the server"])
+    def test_a_slow_pair_waits_in_its_middle(self, store: Store, ends: str) -> None:
+        slow = Halfway()
+        options = BackgroundOptions(poll_s=0.01, busy_share=1e-6, quiet_s=0.01)
+        server = Server(store, options, lambda: not slow.is_busy.is_set(), [False], True, slow)
+        server.background.start()
+        try:
+            wait_until(slow.is_busy.is_set)
+            assert not slow.is_resumed.wait(0.3)
+            if ends == "the caller":
+                slow.is_busy.clear()
+                wait_until(slow.is_resumed.is_set)
+        finally:
+            server.background.close()  # at once, though it waits
+        assert server.counts.failures == 0
+
+    def test_references_are_not_chosen_while_callers_are_served(
+        self, store: Store, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """What is not described yet would be described first, which takes long."""
+        server = Server(store, BackgroundOptions(poll_s=0.01, busy_share=1e-9, quiet_s=0.01), lambda: False)
+        monkeypatch.setattr(server.background, "_nearest", lambda *_: pytest.fail("references were chosen"))
+        server.background.start()
+        try:
+            wait_until(lambda: server.counts.waiting is not None)  # counted after the first claim
+            assert not threading.Event().wait(0.1)
+        finally:
+            server.background.close()
+        assert server.counts.failures == 0
 
     def test_a_busy_server_gets_its_share(self, store: Store) -> None:
         server = Server(store, BackgroundOptions(busy_share=1.0, quiet_s=0.01), lambda: False)

@@ -54,6 +54,9 @@ class CorrespondOptions:
         guided_similarity: smallest cosine of descriptors of a match that is searched near a point's projection.
         rematched_references: so many references of a query, those with the most matches, are matched again by a
             `PairMatching`, if there is one.
+        enough_matches: pairs of references for which nearest neighbours find so many are not matched by it: from about
+            250 on LightGlue finds fewer, of fewer keypoints. In the kitchen with 3 references (433, 267 and 179
+            matches) 300 instead of 500 costs one of 40 photographs; in meeting-room with 5 (141 at most) 50 costs none.
         remembered_pairs: number of cached pairs of references, about 8 KiB each.
     """
 
@@ -64,13 +67,14 @@ class CorrespondOptions:
     wide_similarity: float = 0.85
     guided_similarity: float = 0.89
     rematched_references: int = 5
+    enough_matches: int = 500
     remembered_pairs: int = 20_000
 
     def __post_init__(self) -> None:
         check_bounds(self, "reference_ratio query_ratio wide_ratio", above=0, at_most=1)
         check_bounds(self, "wide_similarity guided_similarity", at_least=-1)
         check_bounds(self, "epipolar_px", above=0)
-        check_bounds(self, "rematched_references remembered_pairs", at_least=0)
+        check_bounds(self, "rematched_references enough_matches remembered_pairs", at_least=0)
 
 
 _ALIKED = CorrespondOptions(
@@ -139,8 +143,11 @@ class PairMatching(Protocol):
 
     name: str
 
-    def match_one(self, first: View, second: View) -> Matches:
-        """Matches (keypoint of the first, keypoint of the second); each keypoint occurs at most once in them."""
+    def match_one(self, first: View, second: View, pause: Callable[[], None] = lambda: None) -> Matches:
+        """Matches (keypoint of the first, keypoint of the second); each keypoint occurs at most once in them.
+
+        Calls `pause`, which may wait, between its steps.
+        """
         ...
 
 
@@ -270,7 +277,7 @@ class Matcher:
         strict = f"{PAIR_RULE}-{options.reference_ratio}-{options.epipolar_px}"
         if strong:
             assert self.pair_matching is not None
-            strict = f"{PAIR_RULE}-{self.pair_matching.name}-{options.epipolar_px}"
+            strict = f"{PAIR_RULE}-{self.pair_matching.name}-{options.epipolar_px}-{options.enough_matches}"
         return f"wide-{strict}-{options.wide_ratio}-{options.wide_similarity}" if wide else f"strict-{strict}"
 
     def match_references(self, first: PosedView, second: PosedView, wide: bool = False) -> Matches:
@@ -287,14 +294,32 @@ class Matcher:
             self._remember(key, matches)
         return matches if pair[0] is first else np.ascontiguousarray(matches[:, ::-1])
 
-    def match_pair(self, first: PosedView, second: PosedView, wide: bool = False, strong: bool = False) -> Matches:
-        """The same for two references `in_order`, computed anew and not cached; wide strong ones from stored ones."""
-        if not strong:
-            strict = self._match_strictly(first, second)
-        else:
-            found = self.stored.find(self.matching(strong=True), [(first, second)]) if self.stored and wide else [None]
-            strict = self._match_strongly(first, second) if found[0] is None else found[0]
+    def match_pair(
+        self,
+        first: PosedView,
+        second: PosedView,
+        wide: bool = False,
+        strong: bool = False,
+        strict: Matches | None = None,
+        pause: Callable[[], None] = lambda: None,
+    ) -> Matches:
+        """The same for two references `in_order`, computed anew and not cached.
+
+        Args:
+            first: reference.
+            second: another one.
+            wide: whether the matches are wide ones.
+            strong: whether they are those of `pair_matching`.
+            strict: those that are not wide, if they are known.
+            pause: see PairMatching.
+        """
+        if strict is None:
+            strict = self._match_strongly(first, second, pause) if strong else self._match_strictly(first, second)
         return self._widened(first, second, strict) if wide else strict
+
+    def has_enough(self, nearest: Matches) -> bool:
+        """Whether a pair of references that nearest neighbours match so well is not matched by `pair_matching`."""
+        return len(nearest) >= self.options.enough_matches
 
     def _look_up(self, pairs: Sequence[tuple[PosedView, PosedView]], wide: bool) -> None:
         """Caches those of these pairs that are stored; strong ones if there are."""
@@ -344,9 +369,9 @@ class Matcher:
             first, second, mutual_matches(first.view.features, second.view.features, self.options.reference_ratio, True)
         )
 
-    def _match_strongly(self, first: PosedView, second: PosedView) -> Matches:
+    def _match_strongly(self, first: PosedView, second: PosedView, pause: Callable[[], None]) -> Matches:
         assert self.pair_matching is not None
-        return self._filtered(first, second, self.pair_matching.match_one(first.view, second.view))
+        return self._filtered(first, second, self.pair_matching.match_one(first.view, second.view, pause))
 
     def _filtered(self, first: PosedView, second: PosedView, matches: Matches) -> Matches:
         return matches[epipolar_distance_px(first, second, matches) < self.options.epipolar_px]

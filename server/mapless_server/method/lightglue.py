@@ -82,14 +82,13 @@ class LightGlueMatching:
         return matches
 
     @torch.inference_mode()
-    def match_one(self, first: View, second: View) -> Matches:
+    def match_one(self, first: View, second: View, pause: Callable[[], None] = lambda: None) -> Matches:
         """See correspond.PairMatching."""
         if not len(first.features) or not len(second.features):
             return NOTHING
         with torch.autocast(self._device.type, torch.float16, enabled=self.options.half):
-            found = self._network.match_one(
-                self._inputs(first), self._inputs(second), self.options.depth_confidence, self.options.width_confidence
-            )
+            confidences = self.options.depth_confidence, self.options.width_confidence
+            found = self._network.match_one(self._inputs(first), self._inputs(second), *confidences, pause)
         index, score = (it.cpu().numpy() for it in found)
         return self._probable(index, score)
 

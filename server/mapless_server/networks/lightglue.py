@@ -11,7 +11,7 @@ as the pair needs.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -89,6 +89,7 @@ class LightGlue(nn.Module):
         second: tuple[Tensor, Tensor],
         depth_confidence: float,
         width_confidence: float,
+        pause: Callable[[], None] = lambda: None,
     ) -> tuple[Tensor, Tensor]:
         """Matches two photographs by as many layers and keypoints as they need, as the authors do.
 
@@ -99,6 +100,7 @@ class LightGlue(nn.Module):
                 it has none; 1 runs all.
             width_confidence: a keypoint that has, with such confidence, no match is left out of the next layers; 1
                 leaves out none.
+            pause: called between layers; may wait.
 
         Returns:
             index: (N,) as `forward`, for each keypoint of the first photograph.
@@ -125,6 +127,7 @@ class LightGlue(nn.Module):
             ]
             if not all(len(side.index) for side in sides):
                 break
+            pause()
         index = torch.zeros(first[0].shape[1], dtype=torch.long, device=first[0].device)
         score = torch.zeros(first[0].shape[1], device=first[0].device)
         if all(len(side.index) for side in sides):

@@ -9,6 +9,7 @@ too.
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -62,7 +63,7 @@ class BackgroundOptions:
     """
 
     pairs: int = 30
-    strong_pairs: int = 7
+    strong_pairs: int = 5
     busy_share: float = 0.05
     quiet_s: float = 0.05
     poll_s: float = 2.0
@@ -107,7 +108,7 @@ class BackgroundMatching:
         self._progress = {matching.name: Progress() for matching in matchings}
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
-        self._step_s = 0.0
+        self._step_begin_s = 0.0
         self._counted_s = 0.0
         self._waiting_count = 0
 
@@ -127,6 +128,7 @@ class BackgroundMatching:
 
     def match_waiting(self) -> None:
         """Matches the references that may be claimed now, until there are none; raises if the store fails."""
+        self._step_begin_s = time.monotonic()
         found = self._claim()
         if found is None:
             if self._waiting_count:  # another server may have matched them
@@ -175,7 +177,7 @@ class BackgroundMatching:
 
     def _match_claimed(self, library: ReferenceLibrary, matching: Matching, claim: Claim) -> None:
         """Matches one reference, or postpones it if that fails."""
-        until_s = time.monotonic() + CLAIM_S / 2
+        until_s = time.monotonic() + CLAIM_S / 3
         begin_s = time.thread_time()
         try:
             made, is_complete = self._match(library, matching, claim, until_s)
@@ -201,13 +203,13 @@ class BackgroundMatching:
     ) -> tuple[dict[Pair, Matches], bool]:
         """Pairs of a reference, and whether they are all; those that were made until a time, or until it is closed."""
         made: dict[Pair, Matches] = {}
+        self._let_callers_first()
+        self._check()
         wanted = self._nearest(matching, claim)
         if not wanted:
             return made, True
         self._let_callers_first()
-        begin_s = time.monotonic()
         (subject,) = self._load(library, matching, claim, [claim.reference_id])
-        self._step_s = time.monotonic() - begin_s
         if subject.key != claim.key:
             raise NotFound("the reference was replaced")
         for reference_id in wanted:
@@ -215,16 +217,21 @@ class BackgroundMatching:
             # One pair at least, so that a busy server ends, too.
             if self._closing.is_set() or (made and time.monotonic() > until_s):
                 return made, False
-            begin_s = time.monotonic()
             try:
                 others = self._load_usable(library, matching, claim, reference_id)
+                for other in others:
+                    self._let_callers_first()
+                    made |= self._match_pair(matching, *in_order(subject, other))
             except _Closed:
                 return made, False
-            for other in others:
-                first, second = in_order(subject, other)
-                made[first.key, second.key] = matching.match_pair(first, second)
-            self._step_s = time.monotonic() - begin_s  # of loading too: features may have to be extracted
         return made, True
+
+    def _match_pair(self, matching: Matching, first: PosedView, second: PosedView) -> dict[Pair, Matches]:
+        """The pair, unless it needs no matches of this kind."""
+        base = matching.base
+        begun = None if base is None else self._matchings[matching].find_one(base.name, first, second)
+        matches = matching.match_pair(first, second, begun, self._pause)
+        return {} if matches is None else {(first.key, second.key): matches}
 
     def _nearest(self, matching: Matching, claim: Claim) -> list[str]:
         """Ids of the references that a query from the claimed one's place would choose first, without stored pairs.
@@ -270,14 +277,21 @@ class BackgroundMatching:
         if self._closing.is_set():
             raise _Closed
 
-    def _let_callers_first(self) -> None:
-        """Waits while the server computes for callers, but not for more than the share of a busy server allows."""
-        if self._is_idle():
-            return
+    def _pause(self) -> None:
+        """In the middle of a pair that takes long; a pair has some ten steps."""
+        self._check()
+        self._let_callers_first(1 / 30)
+
+    def _let_callers_first(self, share_of_claim: float = 1 / 4) -> None:
+        """Ends a step: waits while the server computes for callers, as long as a busy server's share demands.
+
+        But for no longer than this share of the time that a claim holds, so that it does not end meanwhile.
+        """
         options, now_s = self.options, time.monotonic()
-        until_s = now_s + min(self._step_s / options.busy_share, CLAIM_S / 4)  # the claim must not end meanwhile
-        busy_s = now_s
+        until_s = now_s + min((now_s - self._step_begin_s) / options.busy_share, CLAIM_S * share_of_claim)
+        busy_s = now_s if not self._is_idle() else -math.inf
         while now_s < until_s and now_s - busy_s < options.quiet_s and not self._closing.wait(options.quiet_s / 5):
             now_s = time.monotonic()
             if not self._is_idle():
                 busy_s = now_s
+        self._step_begin_s = time.monotonic()

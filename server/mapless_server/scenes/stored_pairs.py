@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 
 from mapless_server.method.correspond import Matcher
 from mapless_server.method.features import FeatureExtractor
@@ -38,9 +38,32 @@ class Matching:
         """As `PairStore` expects it."""
         return matching_name(self.extractor.name, self.matcher.matching(self.wide, self.strong))
 
-    def match_pair(self, first: PosedView, second: PosedView) -> Matches:
-        """See `Matcher.match_pair`."""
-        return self.matcher.match_pair(first, second, self.wide, self.strong)
+    @property
+    def base(self) -> Matching | None:
+        """The one whose matches of a pair this one begins with."""
+        if self.wide:
+            return replace(self, wide=False)
+        return replace(self, strong=False) if self.strong else None
+
+    def match_pair(
+        self, first: PosedView, second: PosedView, begun: Matches | None, pause: Callable[[], None]
+    ) -> Matches | None:
+        """Matches of two references `in_order`, or None if the pair needs none of this kind.
+
+        Args:
+            first: reference.
+            second: another one.
+            begun: those of `base`, if they are stored.
+            pause: see `PairMatching`.
+        """
+        if self.strong and not self.wide:
+            nearest = self.matcher.match_pair(first, second) if begun is None else begun
+            if self.matcher.has_enough(nearest):
+                return None
+            return self.matcher.match_pair(first, second, strong=True, pause=pause)
+        if self.strong and begun is None:
+            return None
+        return self.matcher.match_pair(first, second, self.wide, self.strong, begun)
 
 
 def matching_name(extractor: str, rule: str) -> str:
@@ -61,14 +84,24 @@ class PairFinder:
 
     def find(self, matching: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> list[Matches | None]:
         """See StoredPairs.find."""
-        name = matching_name(self._extractor, matching)
-        keys = [(first.key, second.key) for first, second in pairs]
         try:
-            stored = self._pairs.load(name, keys)
+            found, damaged_count = self._read(matching_name(self._extractor, matching), pairs)
         except Exception as error:  # the query can do without
             log.warning("stored matches cannot be read, and are made by the query: %s", error)
             self._observer.pair_lookup_failed()
             return [None] * len(pairs)
+        stored_count = sum(matches is not None for matches in found)
+        self._observer.pairs_looked_up(stored_count, len(pairs) - stored_count - damaged_count, damaged_count)
+        return found
+
+    def find_one(self, name: str, first: PosedView, second: PosedView) -> Matches | None:
+        """The matches of a pair, given `in_order`, for the background; None if there are none. Errors as PairStore."""
+        return self._read(name, [(first, second)])[0][0]
+
+    def _read(self, name: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> tuple[list[Matches | None], int]:
+        """The matches of each pair that are stored and whole, and how many are damaged."""
+        keys = [(first.key, second.key) for first, second in pairs]
+        stored = self._pairs.load(name, keys)
         found = {
             key: matches
             for key, pair in zip(keys, pairs, strict=True)
@@ -79,8 +112,7 @@ class PairFinder:
             log.error("%d damaged pairs of references are matched again", len(damaged))
             with self._guard:
                 self._damaged.setdefault(name, set()).update(damaged)
-        self._observer.pairs_looked_up(len(found), len(keys) - len(stored), len(damaged))
-        return [found.get(key) for key in keys]
+        return [found.get(key) for key in keys], len(damaged)
 
     def take_damaged(self, name: str) -> Collection[Pair]:
         """The pairs of a matching that were found damaged since the last call."""
