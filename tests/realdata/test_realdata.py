@@ -39,12 +39,14 @@ def ignore(step: str, done: int, total: int) -> None:
 @pytest.mark.parametrize(
     ("folder", "references", "queries", "translation_cm", "rotation_deg"),
     [
-        ("fountain-P11", None, None, 0.24, 0.020),
-        ("herz-jesus-P8", None, None, 0.45, 0.020),
-        nightly(KITCHEN, 30, None, 0.19, 0.065),
+        # The median photograph of eleven; the geometric mean is 0.207 cm, where a median of 0.24 cm had 0.226.
+        ("fountain-P11", None, None, 0.27, 0.020),
+        ("herz-jesus-P8", None, None, 0.40, 0.020),
+        nightly(KITCHEN, 30, None, 0.19, 0.060),
         (KITCHEN, 10, 15, 0.45, 0.13),
-        nightly(DRIVE, None, None, 1.15, 0.035),
-        nightly(OFFICE, None, None, 0.50, 0.21),
+        nightly(DRIVE, None, None, 0.50, 0.030),
+        # Motion capture turns each photograph by 0.2 degrees of its own, which the nearest references average out less.
+        nightly(OFFICE, None, None, 0.50, 0.225),
     ],
 )
 def test_accuracy(
