@@ -11,7 +11,7 @@ import pytest
 
 from mapless.geometry import RigidTransform
 from mapless_tools.dataset import Dataset, Frame
-from mapless_tools.ingest.check import check_frames
+from mapless_tools.ingest.check import check_frames, implausible_depth
 from mapless_tools.ingest.check.verdict import Verdict
 
 pytestmark = pytest.mark.realdata
@@ -42,6 +42,9 @@ def test_real_poses_pass_without_a_warning(photographs: Photographs, folder: str
     assert verdict.median_px < median_px
     assert (verdict.is_wrong, verdict.suspects) == (False, ())
     assert len(verdict.pairs) > 10
+    assert verdict.median_depth is not None
+    assert implausible_depth(verdict.median_depth) == ""
+    assert "millimetres" in implausible_depth(1000 * verdict.median_depth)
 
 
 @pytest.mark.parametrize("folder", [FOUNTAIN, nightly(OFFICE)])

@@ -259,3 +259,121 @@ def test_the_store_may_be_named_by_its_folder(
     assert asked == [tmp_path / "data"]
     both = run(*arguments, "--address", "127.0.0.1:1")
     assert (both.exit_code, "give one of them" in both.output, len(asked)) == (2, True, 1)
+
+
+def without_metres(folder: Path, scale: float = 1.0, **properties: object) -> Path:
+    """The folder as one of an arbitrary unit, its positions multiplied by a factor."""
+    file = folder / "cameras.json"
+    content = json.loads(file.read_text()) | {"metric": False} | properties
+    for frame in content["frames"]:
+        for row in frame["world_from_camera"][:3]:
+            row[3] *= scale
+    file.write_text(json.dumps(content))
+    return folder
+
+
+def test_a_folder_without_metres_marks_its_scene(
+    server: RunningServer, client: Client, scene: str, folder: Path, tmp_path: Path
+) -> None:
+    done = run_import(server, without_metres(folder), scene, "--skip-check")
+    assert done.exit_code == 0, done.output
+    assert "its unit of length is arbitrary: --scale, --distance or --align gives metres" in done.stderr
+    assert client.get_scene(scene).arbitrary_unit
+    assert "12 skipped as duplicates" in run_import(server, folder, scene, "--skip-check").stdout
+    mixed = run_import(server, folder, scene, "--skip-check", "--scale", 2)
+    assert mixed.exit_code == 1
+    assert "has 12 references in an arbitrary unit, and these are in metres" in mixed.stdout
+    assert run("export", scene, tmp_path / "copy", "--address", server.address).exit_code == 0
+    assert json.loads((tmp_path / "copy" / "cameras.json").read_text())["metric"] is False
+
+
+def test_known_distances_and_positions_give_a_scene_metres(
+    server: RunningServer, client: Client, scene: str, folder: Path, tmp_path: Path
+) -> None:
+    planted = truth(COUNT).poses
+    without_metres(folder, 1 / 0.37)
+    apart_m = np.linalg.norm(planted[0].translation - planted[7].translation)
+    known = "\n".join(f"p{i:02d},{','.join(map(str, planted[i].translation))}" for i in (0, 4, 9))
+    (tmp_path / "known.csv").write_text(known)
+    ways: tuple[tuple[object, ...], ...] = (("--scale", 0.37), ("--distance", "p00", "p07.png", apart_m))
+    for i, way in enumerate(ways):
+        done = run_import(server, folder, f"{scene}-{i}", "--skip-check", *way)
+        assert done.exit_code == 0, done.output
+        assert "one unit of the folder is 0.37 m" in done.stderr
+        assert not client.get_scene(f"{scene}-{i}").arbitrary_unit
+        for reference, pose in zip(client.list_references(f"{scene}-{i}"), planted, strict=True):
+            assert_same_pose(reference.world_from_camera, pose, 1e-6)
+    done = run_import(server, folder, scene, "--skip-check", "--align", tmp_path / "known.csv")
+    assert done.exit_code == 2
+    assert "on one line" in done.stderr
+
+
+def test_a_scene_made_before_the_import_gets_the_unit_of_its_references(
+    server: RunningServer, client: Client, scene: str, folder: Path
+) -> None:
+    client.create_scene(scene)
+    assert run_import(server, without_metres(folder), scene, "--skip-check").exit_code == 0
+    assert client.get_scene(scene).arbitrary_unit
+    client.update_scene(scene, arbitrary_unit=False)
+    refused = run_import(server, folder, scene, "--skip-check", "--id-prefix", "other-")
+    assert refused.exit_code == 1
+    assert "--scale 1 if it is the metre" in refused.stdout
+    for same in ((), ("--scale", 1)):  # the positions that both have show that the unit is the same
+        assert "12 skipped as duplicates" in run_import(server, folder, scene, "--skip-check", *same).stdout
+
+
+def test_a_datum_of_a_folder_without_metres_is_refused(folder: Path) -> None:
+    without_metres(folder, datum={"latitude_deg": 47.0, "longitude_deg": 8.0, "height_m": 400.0})
+    done = run("import", folder, "nowhere", "--dry-run", "--skip-check")
+    assert done.exit_code == 2
+    assert "the folder has a datum, which needs metres" in done.stderr
+    assert run("import", folder, "nowhere", "--dry-run", "--skip-check", "--scale", 1).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("factor", "properties", "warning"),
+    [
+        (1, {"down_in_world": [0, 1, 0]}, ""),
+        (1, {"down_in_world": [0, -1, 0]}, "down_in_world (0, -1, 0) is 1"),
+        (1, {"down_in_world": [0, 0, -1]}, "degrees off the down of 9 reference cameras"),
+        (1, {"datum": {"latitude_deg": 47.0, "longitude_deg": 8.0, "height_m": 400.0}}, "the datum's down"),
+        (1000, {}, "m away, in the median (0.05 to 500 m are plausible): are the poses in millimetres?"),
+        (0.001, {}, "are the poses in kilometres?"),
+    ],
+)
+def test_what_contradicts_the_photographs_is_warned_of(
+    tmp_path: Path, factor: float, properties: dict[str, object], warning: str
+) -> None:
+    folder = without_metres(write_wall(tmp_path / "wall"), factor, metric=True, **properties)
+    done = run("import", folder, "nowhere", "--dry-run", "--report", tmp_path / "report.json")
+    assert done.exit_code == 0, done.output
+    warnings = json.loads((tmp_path / "report.json").read_text())["warnings"]
+    assert [line.removeprefix("warning: ") for line in done.stderr.splitlines() if "warning: " in line] == warnings
+    assert any(warning in text for text in warnings) if warning else (warnings == [])
+
+
+def test_references_in_another_unit_than_their_scene_are_warned_of(
+    server: RunningServer, client: Client, scene: str, folder: Path
+) -> None:
+    assert run_import(server, folder, scene, "--skip-check", "--split", "train").exit_code == 0
+    more = ("--skip-check", "--id-prefix", "mm-")
+    done = run_import(server, without_metres(folder, 1000, metric=True), scene, *more)
+    assert "are they in another unit" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--distance", "p00", "p07"), "--distance takes three values"),
+        (("--distance", "p00", "p07", "far"), "--distance p00 p07 far: "),
+        (("--distance", "p00", "nobody", 3), "no reference 'nobody'"),
+        (("--scale", 0), "--scale is metres per unit"),
+        (("--scale", 2, "--align", "known.csv"), "give one of --scale, --distance and --align"),
+        (("--align", "no-such.csv"), "no-such.csv cannot be read"),
+    ],
+)
+def test_wrong_metres_are_named_in_one_line(folder: Path, arguments: tuple[object, ...], message: str) -> None:
+    done = run("import", folder, "nowhere", "--dry-run", "--skip-check", *arguments)
+    assert done.exit_code == 2
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("mapless-server:")]
+    assert message in line

@@ -7,13 +7,14 @@ from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from mapless_server import __version__
 from mapless_server.extras import missing_package
 from mapless_server.serve.command import fail, serve_command
 from mapless_tools.calibrate.command import calibrate_command
 from mapless_tools.evaluate.cli import evaluate_command
-from mapless_tools.ingest.command import export_command, import_command
+from mapless_tools.ingest.command import ImportCommand, export_command, import_command
 from mapless_tools.load.command import load_app
 from mapless_tools.replay.command import replay_command
 from mapless_tools.view.command import view_command
@@ -48,7 +49,9 @@ def _options(
     pass
 
 
-def _add_tool(name: str, command: Callable[..., None], extra: str = "tools") -> None:
+def _add_tool(
+    name: str, command: Callable[..., None], extra: str = "tools", cls: type[TyperCommand] | None = None
+) -> None:
     """Adds a command that first checks that the packages of its extra are installed."""
 
     @functools.wraps(command)
@@ -56,7 +59,7 @@ def _add_tool(name: str, command: Callable[..., None], extra: str = "tools") -> 
         _require(extra, name)
         command(**arguments)
 
-    app.command(name)(checked)
+    app.command(name, cls=cls)(checked)
 
 
 def _require(extra: str, command: str) -> None:
@@ -68,7 +71,7 @@ app.command("serve")(serve_command)
 app.add_typer(store_app, name="store")
 app.add_typer(token_app, name="token")
 app.add_typer(weights_app, name="weights")
-_add_tool("import", import_command)
+_add_tool("import", import_command, cls=ImportCommand)
 _add_tool("export", export_command)
 _add_tool("audit", audit_command)
 _add_tool("calibrate", calibrate_command)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import sys
+from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from mapless_server.serve.command import fail
 from mapless_tools.connection import Connection, Scene, with_connection_flags
@@ -17,12 +19,33 @@ if TYPE_CHECKING:
     from mapless_server.settings import Settings
 
     from .formats import Intrinsics
+    from .metres import KnownDistance
 
 FORMAT_NAMES = ", ".join(["auto", *FORMATS])
 
 DataDir = Annotated[
     Path | None, typer.Option(help="Folder of the store, where no --address is given; default: that of the settings.")
 ]
+
+
+DISTANCE_SEPARATOR = "\0"
+
+
+class ImportCommand(TyperCommand):
+    """Takes three values for --distance each time it is given, which typer can but once."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Reads arguments, the three values of a distance as one."""
+        joined: list[str] = []
+        rest = iter(args)
+        for argument in rest:
+            joined.append(argument)
+            if argument == "--distance":
+                values = [*islice(rest, 3)]
+                if len(values) < 3:
+                    fail("--distance takes three values: two references and metres")
+                joined.append(DISTANCE_SEPARATOR.join(values))
+        return super().parse_args(ctx, joined)
 
 
 @with_connection_flags
@@ -37,6 +60,16 @@ def import_command(
     intrinsics: Annotated[
         str, typer.Option(help="fx,fy,cx,cy in pixels, for layouts without; (0, 0) is the first pixel's centre.")
     ] = "",
+    scale: Annotated[
+        float | None, typer.Option(help="Metres per unit of the folder, where that is not the metre.")
+    ] = None,
+    distance: Annotated[
+        list[str] | None,
+        typer.Option(metavar="A B METRES", help="Measured distance of the cameras of two references; may be repeated."),
+    ] = None,
+    align: Annotated[
+        Path | None, typer.Option(help="CSV file of known camera positions: reference, x, y, z in metres.")
+    ] = None,
     split: Annotated[str, typer.Option(help="Take only this split: train or test.")] = "",
     stride: Annotated[int, typer.Option(help="Take only the first of every so many photographs.")] = 1,
     max_count: Annotated[int | None, typer.Option("--max", help="Take so many at most, spread evenly.")] = None,
@@ -54,12 +87,14 @@ def import_command(
 
     from .formats import ReadOptions
     from .importing import ImportOptions, run_import
+    from .metres import MetreOptions
     from .upload import UploadOptions
 
     try:
         options = ImportOptions(
             format=format,
             read=ReadOptions(images=images, ground_truth=ground_truth, intrinsics=_intrinsics(intrinsics)),
+            metres=MetreOptions(scale, tuple(map(_known_distance, distance or ())), align),
             split=split,
             stride=stride,
             max_count=max_count,
@@ -120,6 +155,16 @@ def _settings(data_dir: Path | None, connection: Connection) -> Settings:
     if data_dir is not None and connection.address:
         raise ValueError("--data-dir is a store, --address a server: give one of them")
     return load_settings({"data_dir": data_dir}).settings
+
+
+def _known_distance(text: str) -> KnownDistance:
+    from .metres import KnownDistance
+
+    first, second, metres = text.split(DISTANCE_SEPARATOR)
+    try:
+        return KnownDistance(first, second, float(metres))
+    except ValueError as error:
+        raise ValueError(f"--distance {first} {second} {metres}: {error}") from None
 
 
 def _intrinsics(text: str) -> Intrinsics | None:

@@ -3,28 +3,32 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from rich.console import Console
 
-from mapless import AlreadyExists, Client, MaplessError, Reference
+from mapless import MaplessError
 from mapless.names import check_id
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, image_size
+from mapless_server.scenes.plausibility import contradictions
 from mapless_server.serve.signals import terminable
 from mapless_server.settings import Settings
+from mapless_server.store import ContradictingDown, DatumWithoutMetres, SceneAttributes
 from mapless_tools.child import ServerFailed
 from mapless_tools.connection import Connection, connected
 from mapless_tools.dataset import MAX_NAME_LENGTH, Dataset, Frame, Refusal
 from mapless_tools.output_files import check_writable, write_json
 from mapless_tools.progress import progress_bars
 
-from .check import check_frames
+from .check import check_frames, implausible_depth
 from .existing import KnownReferences
 from .formats import ReadOptions, read_dataset
+from .metres import MetreOptions, in_metres
+from .opening import NO_METRES, WrongUnit, another_unit, open_scene
 from .report import ImportReport, print_report, to_json, verdict_lines
 from .upload import Uploader, UploadOptions
 
@@ -36,6 +40,7 @@ class ImportOptions:
     Attributes:
         format: name of the folder's layout, or "auto".
         read: options of its reader.
+        metres: where metres come from if the folder's unit is another.
         split: take only frames of this split, "train" or "test"; empty for all.
         stride: take only the first of every so many frames.
         max_count: take so many at most, spread evenly; None for all.
@@ -46,6 +51,7 @@ class ImportOptions:
 
     format: str = "auto"
     read: ReadOptions = field(default_factory=ReadOptions)
+    metres: MetreOptions = field(default_factory=MetreOptions)
     split: str = ""
     stride: int = 1
     max_count: int | None = None
@@ -85,8 +91,8 @@ def run_import(
     _print(f"{folder}: {len(dataset.frames)} frames in layout {dataset.format}, {len(frames)} of them chosen")
     for note in dataset.notes:
         _print(f"note: {note}")
-    if not dataset.metric and not dataset.notes:
-        _print("note: its unit of length is not the metre; it is taken for metres, so all distances are in that unit")
+    if not dataset.metric:
+        _print(f"note: {NO_METRES}")
     report = ImportReport(scene, dataset, frames, is_dry=connection is None)
     with terminable(), _reported(report, report_file):
         if options.check:
@@ -94,7 +100,10 @@ def run_import(
                 report.verdict = check_frames(frames, progress)
             for line in verdict_lines(report.verdict, frames):
                 _print(line)
+            if dataset.metric:
+                _warn(report, [implausible_depth(report.verdict.median_depth)])
         if connection is None:
+            _warn(report, contradictions([frame.world_from_camera for frame in frames], _attributes(dataset)))
             refuse_wrong_images(report)
         elif report.verdict is not None and report.verdict.is_wrong:
             report.stopped = "nothing is stored while the poses do not fit the photographs; --skip-check does it anyhow"
@@ -107,9 +116,10 @@ def read_frames(folder: Path, options: ImportOptions) -> tuple[Dataset, tuple[Fr
     """The dataset, and those of its frames that are to be imported.
 
     Raises:
-        ValueError: the folder cannot be read, or nothing is left to import.
+        ValueError: the folder cannot be read, its metres or its datum contradict it, or nothing is left to import.
     """
-    dataset = read_dataset(folder, options.format, options.read)
+    dataset = in_metres(read_dataset(folder, options.format, options.read), options.metres, options.id_prefix)
+    _attributes(dataset)
     frames = [frame for frame in dataset.frames if not options.split or frame.split == options.split]
     if not frames:
         known = sorted({frame.split for frame in dataset.frames} - {""})
@@ -141,18 +151,33 @@ def _store(report: ImportReport, options: UploadOptions, settings: Settings, con
     """Stores the chosen frames in the scene, which is made with the dataset's datum and down if there is none."""
     try:
         with connected(connection, settings) as client, progress_bars() as progress:
-            known = KnownReferences(_existing(client, report.scene, report.dataset))
-            Uploader(client, known, report, options, progress).run()
+            existing = open_scene(client, report.scene, report.dataset, report.chosen)
+            scene = client.get_scene(report.scene)
+            poses = [frame.world_from_camera for frame in report.chosen]
+            attributes = SceneAttributes(scene.datum, scene.down_in_world, arbitrary_unit=scene.arbitrary_unit)
+            _warn(report, contradictions(poses, attributes))
+            _warn(report, [another_unit([it.world_from_camera for it in existing], poses)])
+            Uploader(client, KnownReferences(existing), report, options, progress).run()
+    except WrongUnit as error:
+        report.stopped = str(error)
     except (MaplessError, ServerFailed) as error:
         report.stopped = str(error)
 
 
-def _existing(client: Client, scene: str, dataset: Dataset) -> list[Reference]:
+def _attributes(dataset: Dataset) -> SceneAttributes:
+    """Of the scene that the dataset makes; ValueError if they contradict each other."""
     try:
-        client.create_scene(scene, datum=dataset.datum, down_in_world=dataset.down_in_world)
-    except AlreadyExists:
-        return list(client.list_references(scene, page_size=1000))
-    return []
+        return SceneAttributes(dataset.datum, dataset.down_in_world, arbitrary_unit=not dataset.metric)
+    except DatumWithoutMetres:
+        raise ValueError(f"the folder has a datum, which needs metres, but {NO_METRES}") from None
+    except ContradictingDown as error:
+        raise ValueError(f"the folder's down_in_world {error}") from None
+
+
+def _warn(report: ImportReport, texts: Sequence[str]) -> None:
+    for text in filter(None, texts):
+        report.warnings.append(text)
+        _print(f"warning: {text}")
 
 
 @contextmanager

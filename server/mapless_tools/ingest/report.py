@@ -26,6 +26,7 @@ class ImportReport:
         dataset: what was read.
         chosen: frames of it that were to be imported.
         verdict: of the epipolar check; None if there was none.
+        warnings: what contradicts itself among poses, datum, direction of gravity and unit.
         added: ids of references that this run stored.
         blank: ids of those of them without local features, with which nothing can be matched.
         skipped: references that are there already, and where.
@@ -38,6 +39,7 @@ class ImportReport:
     dataset: Dataset
     chosen: Sequence[Frame]
     verdict: Verdict | None = None
+    warnings: list[str] = field(default_factory=list)
     added: list[str] = field(default_factory=list)
     blank: list[str] = field(default_factory=list)
     skipped: list[Refusal] = field(default_factory=list)
@@ -126,6 +128,8 @@ def to_json(report: ImportReport) -> dict[str, Any]:
         "source": report.dataset.source,
         "ground_truth": report.dataset.ground_truth,
         "notes": list(report.dataset.notes),
+        "metric": report.dataset.metric,
+        "warnings": list(report.warnings),
         "dry_run": report.is_dry,
         "chosen": len(report.chosen),
         "added": list(report.added),
@@ -144,6 +148,7 @@ def _verdict_json(verdict: Verdict, frames: Sequence[Frame]) -> dict[str, Any]:
         "median_px": _number(verdict.median_px),
         "bad_share": _number(verdict.bad_share),
         "threshold_px": verdict.threshold_px,
+        "median_depth": verdict.median_depth,
         "pairs_without_matches": verdict.unmatched_count,
         "wrong": verdict.is_wrong,
         "explanation": verdict.explanation,

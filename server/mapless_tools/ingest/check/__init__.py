@@ -4,6 +4,7 @@ Imports the method of `mapless_server`, and nothing of the import itself. Begin 
 """
 
 from .comparing import check_frames
+from .depth import implausible_depth
 from .verdict import Verdict
 
-__all__ = ["Verdict", "check_frames"]
+__all__ = ["Verdict", "check_frames", "implausible_depth"]

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .depth import median_depth
 from .errors import THRESHOLD_PX, MatchedPair, PairError, Views, errors_of, summary
 from .explaining import explain
 
@@ -31,6 +32,7 @@ class Verdict:
             is about if it is not about all.
         explanation: the likely mistake if the scene as a whole is wrong; empty if none was found.
         explained_px: the median if that mistake were corrected.
+        median_depth: of the photographed points, in the unit of the poses; None if unknown, or the scene is wrong.
     """
 
     pairs: tuple[PairError, ...]
@@ -41,6 +43,7 @@ class Verdict:
     suspects: tuple[int, ...] = ()
     explanation: str = ""
     explained_px: float = math.nan
+    median_depth: float | None = None
 
     @property
     def is_known(self) -> bool:
@@ -70,6 +73,8 @@ def judge(views: Views, matched: Sequence[MatchedPair], unmatched_count: int = 0
     if verdict.is_wrong:
         found = explain(views, matched, median_px)
         verdict = replace(verdict, explanation=found.text, explained_px=found.error_px, suspects=found.photographs)
+    else:
+        verdict = replace(verdict, median_depth=median_depth(views, matched))
     return verdict if verdict.explanation else replace(verdict, suspects=suspects_of(errors))
 
 

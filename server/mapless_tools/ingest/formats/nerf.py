@@ -41,10 +41,6 @@ def read(path: Path, options: ReadOptions) -> Dataset:
         raise ValueError(f"{path} holds no {FILE_NAME}")
     for name in names:
         _read_file(path / name, SPLIT_FILES.get(name, ""), collector)
-    collector.notes.append(
-        f"{names[0]} does not say its unit of length; it is taken for metres, which it is not if the poses were made "
-        "by COLMAP or scaled to fit a box"
-    )
     return collector.dataset(path.resolve().name, "nerf", metric=False, source=", ".join(names))
 
 

@@ -46,7 +46,6 @@ def read(path: Path, options: ReadOptions) -> Dataset:
     for name, reason in model.refused:
         with collector.attempt(name):
             raise ValueError(reason)
-    collector.notes.append("a COLMAP model does not say its unit of length; it is taken for metres")
     return collector.dataset(
         path.resolve().name, "colmap", metric=False, source=f"COLMAP model {folders[0]}", ground_truth="SfM (COLMAP)"
     )

@@ -1,0 +1,318 @@
+"""Metres for a dataset whose unit of length is arbitrary, as that of a COLMAP model.
+
+Three ways: the factor itself; distances between camera centres that were measured; or known coordinates of camera
+centres, to which the similarity is fitted that minimizes their squared distances (Umeyama, "Least-squares estimation of
+transformation parameters between two point patterns", PAMI 1991). The rotation is SciPy's.
+
+What contradicts itself is refused with each residual, for a wrong scale cannot be noticed once it is stored.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mapless.geometry import MAX_COORDINATE_M, Array, Similarity
+from mapless.scenes import unit_vector
+from mapless_server.scenes.plausibility import typical_down
+from mapless_tools.dataset import Dataset, Frame, finite_numbers
+
+DISTANCE_SHARE, DISTANCE_M = 0.03, 0.02
+"""A measured distance may differ from the scaled model's by 3 %, or by 2 cm if that is more: the precision of a tape
+measure held to a camera, and the drift of a model."""
+
+POSITION_SHARE, POSITION_M = 0.02, 0.05
+"""A known position may be off by 2 % of the largest distance between two, or by 5 cm if that is more."""
+
+LINE_SHARE, LINE_RESIDUALS = 0.01, 3.0
+"""Positions are collinear if they are nearer to a line than 1 % of their extent along it, or than three times their
+residual: the rotation about the line is then that of the noise."""
+
+PLACE_SHARE = 1e-6
+"""Of a model's extent: cameras closer than this are at one place, but for rounding."""
+
+
+@dataclass(frozen=True)
+class KnownDistance:
+    """The measured distance of the camera centres of two references, metres."""
+
+    first: str
+    second: str
+    metres: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.metres < math.inf:
+            raise ValueError(f"distance of {self.first} and {self.second}: must be above 0 m, is {self.metres:g}")
+
+
+@dataclass(frozen=True)
+class MetreOptions:
+    """Where metres come from; at most one of the three.
+
+    Attributes:
+        scale: metres per unit of the folder; None if not given.
+        distances: between camera centres.
+        positions: CSV file of camera centres with known coordinates; None if not given.
+    """
+
+    scale: float | None = None
+    distances: tuple[KnownDistance, ...] = ()
+    positions: Path | None = None
+
+    def __post_init__(self) -> None:
+        if sum((self.scale is not None, bool(self.distances), self.positions is not None)) > 1:
+            raise ValueError("give one of --scale, --distance and --align: each of them determines the scale")
+        if self.scale is not None and not 0 < self.scale < math.inf:
+            raise ValueError(f"--scale is metres per unit of the folder, above 0, not {self.scale:g}")
+
+    def __bool__(self) -> bool:
+        return self.scale is not None or bool(self.distances) or self.positions is not None
+
+
+def in_metres(dataset: Dataset, options: MetreOptions, id_prefix: str = "") -> Dataset:
+    """The dataset in metres, with notes of what was done; unchanged if the options say nothing.
+
+    A position file has a frame of its own: the dataset is turned and moved into it, its direction of gravity with it.
+    Its datum, which places another frame on the Earth, is dropped.
+
+    Raises:
+        ValueError: a reference is unknown, the known values contradict each other or do not suffice, or a pose would
+            lie too far from the origin.
+    """
+    if not options:
+        return dataset
+    find = Finder(dataset.frames, id_prefix)
+    if options.positions is not None:
+        metres_from_units, notes = _aligned(options.positions, find)
+        if dataset.datum is not None:
+            notes.append("the folder's datum is dropped: it is of the frame before the alignment")
+            dataset = replace(dataset, datum=None)
+    elif options.distances:
+        scale, notes = scale_of_distances(options.distances, find)
+        metres_from_units = Similarity(scale, np.eye(3), np.zeros(3))
+    else:
+        assert options.scale is not None
+        metres_from_units, notes = Similarity(options.scale, np.eye(3), np.zeros(3)), []
+    notes.append(f"poses are in metres: one unit of the folder is {metres_from_units.scale:.6g} m")
+    frames = tuple(_transformed(frame, metres_from_units) for frame in dataset.frames)
+    upright = typical_down([frame.world_from_camera for frame in frames])
+    if options.positions is not None and upright is not None:
+        x, y, z = np.round(upright.direction, 2) + 0.0
+        notes.append(f"in the aligned frame down is about ({x:g}, {y:g}, {z:g}), if the cameras are upright")
+    down = dataset.down_in_world
+    if down is not None:
+        down = unit_vector(*(metres_from_units.rotation @ np.array(down)).tolist())
+    return replace(dataset, frames=frames, metric=True, down_in_world=down, notes=(*dataset.notes, *notes))
+
+
+def scale_of_distances(distances: Sequence[KnownDistance], find: Finder) -> tuple[float, list[str]]:
+    """Metres per unit, and a line for each distance; ValueError if they contradict each other.
+
+    The scale minimizes the squared differences, each in units of its bound.
+    """
+    units = np.array([_length_in_units(it, find) for it in distances])
+    metres = np.array([it.metres for it in distances])
+    bounds = np.maximum(DISTANCE_SHARE * metres, DISTANCE_M)
+
+    def fit(chosen: Array) -> float:
+        weights = chosen / bounds**2
+        return float(weights @ (units * metres) / (weights @ units**2))
+
+    def residuals(scale: float) -> Array:
+        return np.asarray(scale * units - metres)
+
+    scale = fit(np.ones(len(distances)))
+    names = [f"{it.first} - {it.second}" for it in distances]
+    differences = residuals(scale)
+    lines = [
+        f"distance {name}: {known:.3f} m, {known + off:.3f} m in the scaled folder ({100 * off / known:+.1f} %)"
+        for name, known, off in zip(names, metres, differences, strict=True)
+    ]
+    if (np.abs(differences) <= bounds).all():
+        return scale, lines
+    guilty = _outlier(names, lambda chosen: np.abs(residuals(fit(chosen))) / bounds, least=3)
+    raise ValueError(
+        f"the known distances contradict each other by more than {100 * DISTANCE_SHARE:.0f} % and "
+        f"{100 * DISTANCE_M:.0f} cm: {'; '.join(lines)}{guilty}"
+    )
+
+
+def umeyama(source: Array, target: Array) -> Similarity:
+    """The similarity ``target_from_source`` with the least squared distances of points (N, 3) to points (N, 3).
+
+    Collinear points leave the rotation about their line free; points at one place, the scale.
+    """
+    centre, target_centre = source.mean(axis=0), target.mean(axis=0)
+    here, there = source - centre, target - target_centre
+    rotation = Rotation.align_vectors(there, here)[0].as_matrix()
+    # With the best rotation the best scale is sum(there . R here) / sum |here|^2.
+    scale = float((there * (here @ rotation.T)).sum() / (here**2).sum())
+    return Similarity(scale, rotation, target_centre - scale * (rotation @ centre))
+
+
+def read_positions(file: Path) -> dict[str, Array]:
+    """Known camera centres (3,) in metres by the name of the reference: a CSV file with columns name, x, y, z.
+
+    A first line that has no numbers is a heading. ValueError names the line that is malformed.
+    """
+    try:
+        rows = list(csv.reader(file.read_text(encoding="utf-8-sig").splitlines()))
+    except OSError as error:
+        raise ValueError(f"{file} cannot be read: {error.strerror}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{file} is not CSV: {error}") from error
+    found: dict[str, Array] = {}
+    for number, row in enumerate(rows, 1):
+        cells = [cell.strip() for cell in row]
+        if not any(cells) or cells[0].startswith("#"):
+            continue
+        try:
+            if len(cells) != 4:
+                raise ValueError(f"must be name, x, y, z, has {len(cells)} cells")
+            position = finite_numbers(cells[1:], "x, y, z", (3,))
+        except ValueError as error:
+            if number == 1 and not any(map(_is_number, cells[1:])):
+                continue
+            raise ValueError(f"{file}, line {number}: {error}") from None
+        if cells[0] in found:
+            raise ValueError(f"{file}, line {number}: {cells[0]} occurs twice")
+        found[cells[0]] = position
+    return found
+
+
+class Finder:
+    """Frames by their ids, as they are read or as they will be stored, or by their photographs' file names."""
+
+    def __init__(self, frames: Sequence[Frame], id_prefix: str) -> None:
+        self._frames: dict[str, Frame] = {}
+        files = Counter(frame.image_path.name for frame in frames)
+        for frame in frames:
+            if files[frame.image_path.name] == 1:
+                self._frames[frame.image_path.name] = frame
+        self._frames |= {f"{id_prefix}{frame.name}": frame for frame in frames} | {it.name: it for it in frames}
+
+    def __call__(self, name: str) -> Frame:
+        """The frame of a name; ValueError if there is none."""
+        if name not in self._frames:
+            known = ", ".join(sorted(frame.name for frame in set(self._frames.values()))[:3])
+            raise ValueError(f"the folder has no reference {name!r}, by its id or file name; it has {known}, ...")
+        return self._frames[name]
+
+    @property
+    def extent(self) -> float:
+        """Largest coordinate difference of camera centres, units."""
+        centres = np.array([frame.world_from_camera.translation for frame in self._frames.values()])
+        return float(np.ptp(centres, axis=0).max())
+
+
+def _length_in_units(distance: KnownDistance, find: Finder) -> float:
+    first, second = (find(name).world_from_camera.translation for name in (distance.first, distance.second))
+    length = float(np.linalg.norm(first - second))
+    if not length > PLACE_SHARE * find.extent:
+        raise ValueError(f"{distance.first} and {distance.second} are at one place: their distance gives no scale")
+    return length
+
+
+def _aligned(file: Path, find: Finder) -> tuple[Similarity, list[str]]:
+    known = read_positions(file)
+    frames = {name: find(name) for name in known}
+    if len({frame.name for frame in frames.values()}) < len(frames):
+        raise ValueError(f"{file} names a reference twice, by its id and by its file")
+    return align(known, {name: frame.world_from_camera.translation for name, frame in frames.items()}, str(file))
+
+
+def align(known: Mapping[str, Array], centres: Mapping[str, Array], where: str) -> tuple[Similarity, list[str]]:
+    """The similarity from the folder's frame and unit to that of known camera centres, and a line for each of them.
+
+    Args:
+        known: (3,) each, metres, by name.
+        centres: (3,) each, in the folder's frame and unit, by the same names.
+        where: file of the known ones, for messages.
+
+    Raises:
+        ValueError: they are too few, collinear, or contradict each other.
+    """
+    names = list(known)
+    if len(names) < 3:
+        raise ValueError(
+            f"{where} has {len(names)} known positions: three that are not on one line are needed, or --distance, "
+            "which gives the scale alone"
+        )
+    source, target = np.array([centres[name] for name in names]), np.array([known[name] for name in names])
+    extent_m = float(np.linalg.norm(target[:, None] - target[None], axis=2).max())
+    bound_m = max(POSITION_SHARE * extent_m, POSITION_M)
+    for points, text in ((target, "known positions"), (source, "cameras of the known positions")):
+        _check_spread(points, 0.0, f"{where}: the {text}")
+
+    def residuals(chosen: Array) -> Array:
+        use = chosen > 0
+        return np.asarray(np.linalg.norm(umeyama(source[use], target[use]).apply(source) - target, axis=1))
+
+    off_m = residuals(np.ones(len(names)))
+    lines = [f"known position of {name}: {off:.3f} m off" for name, off in zip(names, off_m, strict=True)]
+    if (off_m > bound_m).any():
+        mirrored = umeyama(source * [1, 1, -1], target)
+        likely = _outlier(names, lambda chosen: residuals(chosen) / bound_m, least=5)
+        if (np.linalg.norm(mirrored.apply(source * [1, 1, -1]) - target, axis=1) <= bound_m).all():
+            likely = "; they fit if they are mirrored: are two coordinates exchanged, or is the frame left-handed?"
+        raise ValueError(
+            f"{where}: the known positions contradict the folder's poses by more than {bound_m:.3g} m "
+            f"({100 * POSITION_SHARE:.0f} % of {extent_m:.3g} m, at least {100 * POSITION_M:.0f} cm): "
+            f"{'; '.join(lines)}{likely}"
+        )
+    _check_spread(target, float(np.sqrt((off_m**2).mean())), f"{where}: the known positions")
+    return umeyama(source, target), lines
+
+
+def _check_spread(points: Array, residual: float, what: str) -> None:
+    """ValueError if points (N, 3), whose residual is known, lie at one place or on a line."""
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / math.sqrt(len(points))
+    if not spread[0] > 0:
+        raise ValueError(f"{what} are all at one place: three that are not on one line are needed")
+    if spread[1] <= max(LINE_SHARE * spread[0], LINE_RESIDUALS * residual):
+        raise ValueError(
+            f"{what} are on one line, within {spread[1]:.3g} of {spread[0]:.3g} along it (RMS): at least one is needed "
+            f"that is farther from it, by {100 * LINE_SHARE:.0f} % of that and {LINE_RESIDUALS:.0f} times the residual "
+            f"({residual:.3g})"
+        )
+
+
+def _outlier(names: Sequence[str], residuals: Callable[[Array], Array], least: int) -> str:
+    """Names the one without which all others fit, if there is one and enough remain.
+
+    Args:
+        names: of the items.
+        residuals: of all items in units of their bounds, after a fit to those that are chosen (1, else 0).
+        least: fewer items show no single wrong one.
+    """
+    if len(names) < least:
+        return ""
+    without = []
+    for i, name in enumerate(names):
+        chosen = np.ones(len(names))
+        chosen[i] = 0
+        without.append((float(np.delete(residuals(chosen), i).max()), name))
+    (worst, name), others = min(without), sorted(without)[1:]
+    return f"; without {name} the others fit" if worst <= 1 < others[0][0] else ""
+
+
+def _transformed(frame: Frame, metres_from_units: Similarity) -> Frame:
+    pose = metres_from_units.transform_pose(frame.world_from_camera)
+    if not np.abs(pose.translation).max() <= MAX_COORDINATE_M:
+        raise ValueError(f"{frame.name} would lie more than {MAX_COORDINATE_M:g} m from the origin")
+    return replace(frame, world_from_camera=pose)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

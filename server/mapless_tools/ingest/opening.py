@@ -1,0 +1,79 @@
+"""The scene that an import fills: made, or there already with references whose unit of length must be the same."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mapless import AlreadyExists, Client, Reference
+from mapless.geometry import RigidTransform
+from mapless_server.scenes.plausibility import radius_m
+from mapless_tools.dataset import Dataset, Frame
+
+from .existing import SAME_POSITION_M
+
+NO_METRES = "its unit of length is arbitrary: --scale, --distance or --align gives metres"
+
+MIN_COMPARED, UNIT_RATIO = 5, 300.0
+"""References on either side whose spreads are compared, and the ratio of spreads that indicates another unit: 1000
+where both are of the same place, and parts of a place differ by less."""
+
+
+class WrongUnit(Exception):
+    """References and their scene have units that differ."""
+
+
+def open_scene(client: Client, scene: str, dataset: Dataset, chosen: Sequence[Frame]) -> list[Reference]:
+    """The references of a scene, which is made with the dataset's datum, down and unit if there is none.
+
+    A scene without references gets the dataset's unit.
+
+    Raises:
+        WrongUnit: its references are in metres and the dataset is not, or the other way round.
+    """
+    is_arbitrary = not dataset.metric
+    try:
+        client.create_scene(
+            scene, datum=dataset.datum, down_in_world=dataset.down_in_world, arbitrary_unit=is_arbitrary
+        )
+    except AlreadyExists:
+        pass
+    else:
+        return []
+    there = client.get_scene(scene)
+    existing = list(client.list_references(scene, page_size=1000))
+    if there.arbitrary_unit == is_arbitrary or (is_arbitrary and _share_positions(existing, chosen)):
+        return existing
+    if not existing:
+        client.update_scene(scene, arbitrary_unit=is_arbitrary)
+        return []
+    count = f"scene {scene} has {len(existing)} references in"
+    if is_arbitrary:
+        raise WrongUnit(f"{count} metres, and this folder is not: {NO_METRES} (--scale 1 if it is the metre)")
+    raise WrongUnit(f"{count} an arbitrary unit, and these are in metres: import them into a new scene")
+
+
+def another_unit(there: Sequence[RigidTransform], new: Sequence[RigidTransform]) -> str:
+    """One sentence if references of one scene spread hundreds of times as far as others; empty if they do not."""
+    if min(len(there), len(new)) < MIN_COMPARED:
+        return ""
+    radii = [radius_m(np.array([pose.translation for pose in poses])) for poses in (there, new)]
+    if not (min(radii) > 0 and max(radii) / min(radii) >= UNIT_RATIO):
+        return ""
+    return (
+        f"these references are {radii[1]:.3g} m from their median position, in the median, those of the scene "
+        f"{radii[0]:.3g} m: are they in another unit (ratios under {UNIT_RATIO:g} are plausible)?"
+    )
+
+
+def _share_positions(existing: Sequence[Reference], chosen: Sequence[Frame]) -> bool:
+    """Whether two references apart are in both, by id, at the same positions: then the unit is the same, too."""
+    there = {reference.reference_id: reference.world_from_camera.translation for reference in existing}
+    shared = [
+        frame.world_from_camera.translation
+        for frame in chosen
+        if frame.name in there
+        and np.linalg.norm(frame.world_from_camera.translation - there[frame.name]) <= SAME_POSITION_M
+    ]
+    return len(shared) >= 2 and float(np.ptp(shared, axis=0).max()) > 10 * SAME_POSITION_M
