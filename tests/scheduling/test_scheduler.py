@@ -385,6 +385,18 @@ class TestTime:
             toy.finish(toy.take("host"), Next(again, Fallback(lambda: Done("first"), 150.0)))
             assert toy.ending_of(job) is expected
 
+    def test_the_only_job_leaves_room_for_the_next_caller(self) -> None:
+        """Though it costs more than the server computes for all callers, and another thread is free."""
+        toy = Toy()
+        toy.scheduler.costs.observe("prepare", "slow", 50.0)
+        job = toy.admit(stage="refine", client="mine", deadline_s=200.0)
+        again = Step("prepare", "slow", "b", "again")
+        toy.finish(toy.take("host"), Next(again, Fallback(lambda: Done("first"), 150.0)))
+        toy.take("host")
+        other = toy.admit(client="other", deadline_s=5.0)
+        assert toy.take("host").jobs == (other,)
+        assert toy.ending_of(job) is None
+
 
 class Events(RuleBasedStateMachine):
     """Any order of arrivals, batches, failures, cancellations and passing time."""

@@ -199,12 +199,20 @@ class Admission:
     def fits(self, job: Job, cost_s: Counter[str]) -> bool:
         """Whether an admitted job may continue although it now needs more than it was admitted with.
 
-        The only one may: it takes nothing from others.
+        The only one may: no other job waits. It is booked `within_bounds`, so that others are still admitted.
         """
         if len(self._ledger.jobs) == 1:
             return True
         added_s = {lane: own_s - job.booked_s[lane] for lane, own_s in cost_s.items()}
         return all(it <= 0 or self._excess_s(job.flow, lane, it) <= 0 for lane, it in added_s.items())
+
+    def within_bounds(self, job: Job, cost_s: Counter[str]) -> Counter[str]:
+        """Of what an admitted job now needs, as much as its caller may hold, but no less than it was admitted with."""
+        bounded_s: Counter[str] = Counter()
+        for lane, own_s in cost_s.items():
+            room_s = max(0.0, -self._excess_s(job.flow, lane, 0.0))
+            bounded_s[lane] = min(own_s, job.booked_s[lane] + room_s)  # type: ignore[assignment]  # not int
+        return bounded_s
 
     def _excess_s(self, flow: Flow, lane: str, added_s: float) -> float:
         """Computing time by which a caller would exceed its bound with so much more."""

@@ -287,7 +287,7 @@ class Scheduler:
         elif not self._is_worthwhile(job, cost_s, now_s) and not self._is_tried_anyway(job.step):
             self._give_fallback(job, job.fallback, now_s)
             return
-        self._ledger.rebook(job, cost_s)
+        self._ledger.rebook(job, self._admission.within_bounds(job, cost_s))
         self._enqueue(job, now_s)
 
     def _is_worthwhile(self, job: Job, cost_s: Counter[str], now_s: float) -> bool:
