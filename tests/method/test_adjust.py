@@ -193,6 +193,21 @@ def test_references_that_drift_hold_the_pose_by_the_nearest() -> None:
     assert (after < 0.9 * before).all()
 
 
+def test_references_in_another_room_do_not_change_the_pose() -> None:
+    scene = make_scene(random_for("another room"), MANY_POINTS)
+    angle = 1 / MANY_POINTS.camera.focal_x_px
+    centre = scene.world_from_query.translation
+    errors = angle * MANY_POINTS.distance_m, float(np.degrees(angle))
+    references = drifted(scene.references, centre, random_for("another room drifts"), *errors)
+    structure, matches, estimate = stages(scene, references)
+    far = [replace(it, world_from_camera=it.world_from_camera.shifted([200.0, 0, 0])) for it in references[:7]]
+    alone, beside = (
+        adjust_pose(scene.query, views, structure, matches, estimate, AdjustOptions())
+        for views in (references, (*references, *far))
+    )
+    assert_pose_close(beside.world_from_camera, alone.world_from_camera, metres=1e-6, degrees=1e-5)
+
+
 def test_a_rough_pose_converges_to_the_planted_one() -> None:
     scene = make_scene(random_for("pulled"), replace(FEW_POINTS, noise_px=0.0))
     structure, matches = true_structure(scene, NOISE)

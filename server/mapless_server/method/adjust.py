@@ -180,9 +180,10 @@ def pose_problem(
     free = np.zeros((6 * len(references),) * 2)
     problem = BundleProblem(observations, tracks.view, given, free, options.loss_scale_sigma)
     centres = np.array([it.world_from_camera.translation for it in references])
-    focal_px = float(np.median([it.view.camera.focal_x_px for it in references]))
+    observing = np.unique(tracks.view)[:-1]  # the last is the query
+    focal_px = float(np.median([references[i].view.camera.focal_x_px for i in observing]))
     level_px = float(structure.noise.level_px)
-    errors = pose_errors(centres, given.rotation, world_from_query.translation, level_px, focal_px, depth_m)
+    errors = pose_errors(centres, given.rotation, world_from_query.translation, level_px, focal_px, depth_m, observing)
     matrix, gradient, _ = problem.linearize(start).reduced(LEAST_DAMPING)
     own, drift = most_probable(errors, matrix, gradient, options.pose_errors)
     covariance = errors.covariance(own, drift)

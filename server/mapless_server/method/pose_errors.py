@@ -9,8 +9,8 @@ j have the covariance
     C_ij = a^2 delta_ij + b^2 (|x_i - x_q| + |x_j - x_q| - |x_i - x_j|) / 2 d,
 
 in units of the structure's noise in the image (a shift by depth / focal length, or a rotation by 1 / focal length, for
-each pixel), where d is the median distance between two references. So references near the query hold it, far ones hold
-little, and several far ones that are neighbours no more than one of them.
+each pixel), where d is the median distance between two references that observe the points. So references near the query
+hold it, far ones hold little, and several far ones that are neighbours no more than one of them.
 
 The sizes a and b are the most probable ones under the observations of the references. At the given poses, with points
 and query eliminated from the normal equations of the adjustment, the gradient g of the references' motions has the
@@ -26,6 +26,7 @@ from itertools import combinations
 
 import numpy as np
 import scipy.linalg
+from numpy.typing import NDArray
 
 from mapless.geometry import Array
 
@@ -84,7 +85,13 @@ class PoseErrors:
 
 
 def pose_errors(
-    centres: Array, rotations: Array, query_centre: Array, level_px: float, focal_px: float, depth_m: float
+    centres: Array,
+    rotations: Array,
+    query_centre: Array,
+    level_px: float,
+    focal_px: float,
+    depth_m: float,
+    observing: NDArray[np.intp] | None = None,
 ) -> PoseErrors:
     """The parts of the covariance of references' errors.
 
@@ -95,11 +102,13 @@ def pose_errors(
         level_px: noise of the structure.
         focal_px: focal length of the references.
         depth_m: of the points.
+        observing: indices of the references that observe points; None are all. The others, which may be in another
+            part of the scene, have no part in d.
     """
     unit = level_px / focal_px * np.array([depth_m, 1.0])
     between = np.linalg.norm(centres[:, None] - centres, axis=2)
     to_query = np.linalg.norm(centres - query_centre, axis=1)
-    distances = [between[i, j] for i, j in combinations(range(len(centres)), 2)]
+    distances = [between[i, j] for i, j in combinations(range(len(centres)) if observing is None else observing, 2)]
     spacing = max(float(np.median(distances)) if distances else 0.0, LEAST_SPACING * depth_m)
     drift = (to_query[:, None] + to_query - between) / (2 * spacing)
     return PoseErrors(_of_motions(np.eye(len(centres)), rotations, unit), _of_motions(drift, rotations, unit))
