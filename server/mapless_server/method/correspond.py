@@ -248,7 +248,7 @@ class Matcher:
     def match_quickly(
         self, query: View, references: Sequence[PosedView], check: Callable[[], None] = lambda: None
     ) -> Sequence[Matches]:
-        """The same before `rematch`, for choosing references; the last word without a `pair_matching`."""
+        """The same before `rematch`, for choosing references; final without a `pair_matching`."""
         return self._query_matching.match(query, references, check)
 
     def to_rematch(self, matches: Sequence[Matches]) -> list[int]:

@@ -376,7 +376,8 @@ class Metrics(Observer, PairObserver):
         )
         self._background_pairs = counter("mapless_background_pairs", "Pairs of references matched in the background.")
         self._background_seconds = counter(
-            "mapless_background_cpu_seconds", "Processor time of matching references in the background."
+            "mapless_background_cpu_seconds",
+            "Processor time of the background matching's own thread, without that of the threads of BLAS and torch.",
         )
         self._background_failures = counter(
             "mapless_background_failures", "Failures of matching references in the background; each is tried again."
