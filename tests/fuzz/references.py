@@ -18,6 +18,7 @@ import numpy as np
 from google.protobuf.message_factory import GetMessageClass
 
 from mapless import wire
+from mapless.geometry import RigidTransform
 from mapless.names import check_id
 from mapless.scenes import UNCHANGED
 from mapless.v1 import geometry_pb2
@@ -28,6 +29,7 @@ from mapless_server.engine.query import Caller, Description, Photo
 from mapless_server.method.views import Features, View
 from mapless_server.rpc import Call
 from mapless_server.scenes import Choice, Coverage, CoverageVerdict, Narrowing, Viewpoint
+from mapless_server.scenes.plausibility import contradictions
 from mapless_server.security import Principal, SceneKey, key_of, scene_id_of, tenant_of
 from mapless_server.services import references as reference_service
 from mapless_server.services.messages.references import MAX_PAGE_SIZE
@@ -68,6 +70,9 @@ class WatchfulEngine:
         check_key(key)
 
     def forget_references(self, keys: Collection[str]) -> None: ...
+
+    def contradictions(self, poses: Sequence[RigidTransform], attributes: SceneAttributes) -> list[str]:
+        return contradictions(poses, attributes)
 
     async def describe(self, photos: Sequence[Photo], caller: Caller) -> list[Description]:
         for photo in photos:

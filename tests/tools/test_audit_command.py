@@ -5,16 +5,18 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import datetime, timezone
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from mapless import ReferenceAudit, Unavailable
+from mapless import DataLoss, ReferenceAudit, RigidTransform, Scene, Unavailable
 from mapless_tools.cli.app import app
 from mapless_tools.cli.audit import Examined, cells_of, summary_of, table_of, timeout_s, to_html, to_json, worst_first
 
@@ -73,7 +75,12 @@ def test_findings_before_the_interruption_are_printed(
 
     class Ending:
         def get_scene(self, scene: str) -> Any:
-            return SimpleNamespace(reference_count=40)
+            return Scene(scene, 7, 40, datetime.now(timezone.utc), down_in_world=(0.0, -1.0, 0.0))
+
+        def list_references(self, scene: str, *, page_size: int) -> Iterator[Any]:
+            upright = RigidTransform(np.eye(3), np.zeros(3))
+            yield from [SimpleNamespace(world_from_camera=upright)] * 3
+            raise DataLoss("DATA_LOSS", "the fourth is damaged")
 
         def audit_scene(self, scene: str, *, page_size: int, timeout_s: float | None) -> Iterator[ReferenceAudit]:
             asked.append(timeout_s)
@@ -92,6 +99,8 @@ def test_findings_before_the_interruption_are_printed(
     content = json.loads(report.read_text())
     assert [r["verdict"] for r in content["references"]] == [a.verdict for a in worst_first(FINDINGS)]
     assert why in content["stopped"]
+    assert "180 degrees off the down of 3 reference cameras" in content["warnings"][0]
+    assert content["warnings"][0] in html.read_text()
     assert f"stopped after {len(FINDINGS)} of 40 references" in result.output.replace("\n", "")
     assert "stopped after" in html.read_text()
     assert asked == [35.0]

@@ -6,7 +6,9 @@ import signal
 import sys
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,12 +20,16 @@ from mapless_tools.connection import Connection, Scene, with_connection_flags
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from mapless import ReferenceAudit
+    from mapless import Client, ReferenceAudit, RigidTransform
+    from mapless import Scene as KnownScene
 
 ALARMS = ("SWAPPED_IMAGE", "WRONG_POSE_AND_INTRINSICS", "WRONG_POSE", "WRONG_INTRINSICS", "SCENE_CHANGED")
 """Findings that cause wrong poses, the worst first."""
 
 MAX_PAGE = 100
+COMPARED = 1000
+"""References whose poses are compared with what is known of the scene."""
+
 MAX_TIMEOUT_S = 600.0
 """The default of the server's setting max_deadline_s."""
 
@@ -58,7 +64,9 @@ def audit_command(
             check_writable(file)
         settings = load_settings({}).settings
         with terminable(), connected(connection, settings) as client, progress_bars() as progress:
-            examined.total = client.get_scene(scene).reference_count
+            known = client.get_scene(scene)
+            examined.total = known.reference_count
+            examined.warnings = warnings_of(client, known)
             progress("audit", 0, examined.total)
             for found in client.audit_scene(scene, page_size=page_size, timeout_s=timeout_s(page_size)):
                 examined.audits.append(found)
@@ -91,12 +99,28 @@ class Examined:
         audits: of the references so far, in the server's order.
         total: number of references of the scene; None before it is known.
         stopped: why it ended early; empty if it did not.
+        warnings: what the scene's datum, down and unit contradict in the poses of its references.
     """
 
     scene: str
     audits: list[ReferenceAudit] = field(default_factory=list)
     total: int | None = None
     stopped: str = ""
+    warnings: list[str] = field(default_factory=list)
+
+
+def warnings_of(client: Client, known: KnownScene) -> list[str]:
+    """What a scene's datum, down and unit contradict in the poses of its first references by id."""
+    from mapless import DataLoss
+    from mapless_server.scenes.plausibility import contradictions
+    from mapless_server.store import SceneAttributes
+
+    attributes = SceneAttributes(known.datum, known.down_in_world, arbitrary_unit=known.arbitrary_unit)
+    poses: list[RigidTransform] = []
+    references = client.list_references(known.scene_id, page_size=COMPARED)
+    with suppress(DataLoss):  # the audit names what is damaged
+        poses.extend(reference.world_from_camera for reference in islice(references, COMPARED))
+    return contradictions(poses, attributes)
 
 
 def timeout_s(page_size: int) -> float:
@@ -113,6 +137,8 @@ def _report(examined: Examined, everything: bool, report: Path | None, html: Pat
     examined = replace(examined, audits=worst_first(examined.audits))
     shown = [a for a in examined.audits if everything or a.verdict != "CONSISTENT"]
     console = Console(soft_wrap=True)
+    for warning in examined.warnings:
+        console.print(f"warning: {warning}", markup=False, highlight=False)
     if shown:
         Console().print(table_of(shown))
         for audit in shown:
@@ -185,6 +211,7 @@ def to_json(examined: Examined) -> dict[str, Any]:
         "scene": examined.scene,
         "summary": summary_of(examined),
         "stopped": examined.stopped,
+        "warnings": examined.warnings,
         "reference_count": examined.total,
         "references": [asdict(a) for a in examined.audits],
     }
@@ -198,7 +225,7 @@ def to_html(examined: Examined) -> str:
     return render(
         "audit.html",
         title=f"Audit of scene {examined.scene}",
-        summary=summary_of(examined),
+        summary="; ".join([summary_of(examined), *examined.warnings]),
         columns=COLUMNS,
         rows=map(cells_of, examined.audits),
         kinds=kinds,
