@@ -274,6 +274,7 @@ def test_a_scene_has_its_place_on_the_earth(run: Run) -> None:
     assert run("scene", "update", "placed")[0] == 2
     code, made, _ = run("scene", "create", "without-metres", "--unit", "arbitrary")
     assert (code, made["arbitrary_unit"]) == (0, True)
+    assert "unit of length is arbitrary" in run("reference", "list", "without-metres")[2]
     code, changed, _ = run("scene", "update", "without-metres", "--unit", "metre")
     assert (code, changed["arbitrary_unit"], changed["warnings"]) == (0, False, [])
     assert run("scene", "create", "x", "--enu-from-world", "0", "0", "0", "1")[0] == 2

@@ -112,6 +112,8 @@ def _id_of(photo: Path) -> str:
 
 def list_references(client: Client, arguments: argparse.Namespace) -> int:
     """Lists the references of a scene."""
+    if client.get_scene(arguments.scene).arbitrary_unit:
+        print("mapless: note: the scene's unit of length is arbitrary, not the metre", file=sys.stderr)
     return print_json(list(client.list_references(arguments.scene)))
 
 

@@ -49,6 +49,11 @@ def notices(answer: LocalizationResult | Rejected) -> str:
         stage = f' <span class="note">(stage: {text(hint.stage)})</span>' if hint.stage else ""
         parts.append(f'<p class="hint"><b>What helps.</b> {text(hint.message)}{best}{stage}</p>')
     if isinstance(answer, LocalizationResult):
+        if answer.arbitrary_unit:
+            parts.append(
+                '<p class="hint conflict">The scene\'s unit of length is arbitrary: where lengths say metres, they are in '
+                "that unit.</p>"
+            )
         if answer.pose_stage == "COARSE":
             parts.append('<p class="hint conflict">This pose is not verified: there was no time to refine it.</p>')
         parts += [

@@ -48,6 +48,8 @@ class Query:
             lines.append(f"**Matches** {answer.inlier_count} of {answer.match_count} agree with the pose")
             x, y, z = answer.world_from_camera.translation
             lines.append(f"**Position** {x:.3f}, {y:.3f}, {z:.3f} m")
+            if answer.arbitrary_unit:
+                lines.append("**Unit** arbitrary: lengths are not in metres")
             lines += [
                 f"**Prior contradicts:** {_code(it.kind.lower())}, at Mahalanobis distance {it.mahalanobis:.1f}"
                 for it in answer.prior_checks
