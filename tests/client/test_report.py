@@ -231,8 +231,8 @@ def test_an_uncalibrated_answer_is_marked_in_the_header() -> None:
 
 
 def test_an_arbitrary_unit_is_announced() -> None:
-    assert "unit of length is arbitrary" in report_html(localized(arbitrary_unit=True), PHOTO, CAMERA)
-    assert "unit of length is arbitrary" not in report_html(localized(), PHOTO, CAMERA)
+    assert "unit of length of this scene is arbitrary" in report_html(localized(arbitrary_unit=True), PHOTO, CAMERA)
+    assert "unit of length of this scene is arbitrary" not in report_html(localized(), PHOTO, CAMERA)
 
 
 def test_capture_is_announced() -> None:

@@ -51,8 +51,8 @@ def notices(answer: LocalizationResult | Rejected) -> str:
     if isinstance(answer, LocalizationResult):
         if answer.arbitrary_unit:
             parts.append(
-                '<p class="hint conflict">The scene\'s unit of length is arbitrary: where lengths say metres, they are in '
-                "that unit.</p>"
+                '<p class="hint conflict">The unit of length of this scene is arbitrary: where lengths say metres, '
+                "they are in that unit.</p>"
             )
         if answer.pose_stage == "COARSE":
             parts.append('<p class="hint conflict">This pose is not verified: there was no time to refine it.</p>')
