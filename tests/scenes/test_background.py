@@ -27,13 +27,14 @@ from mapless_server.method import correspond
 from mapless_server.method.context import StageContext
 from mapless_server.method.correspond import CorrespondOptions, Matcher, PairMatching, in_order
 from mapless_server.method.views import Features, Matches, PosedView, View
+from mapless_server.scenes import background
 from mapless_server.scenes.background import BackgroundMatching, BackgroundOptions
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.scenes.pair_observer import PairObserver
 from mapless_server.scenes.stored_pairs import Matching, PairFinder
 from mapless_server.security import SceneKey
-from mapless_server.store import NewReference, PairStore, Store, pairs
+from mapless_server.store import NewReference, PairStore, Store, matching_use, pairs
 
 SCENE = SceneKey("s")
 EXTRACTOR, DESCRIPTOR = StandInExtractor(), StandInDescriptor()
@@ -318,6 +319,38 @@ class TestDamage:
         assert server.counts.lookup_failures == 1
         for pair, matches in Matcher().correspond(PLANTED.query, references).reference_pairs.items():
             np.testing.assert_array_equal(found.reference_pairs[pair], matches)
+
+
+class TestUnused:
+    @pytest.fixture(autouse=True)
+    def hours(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(background, "_USE_IS_RECORDED_S", 0.0)
+
+    def pass_days(self, monkeypatch: pytest.MonkeyPatch, share: float) -> None:
+        now_us = matching_use._now_us
+        monkeypatch.setattr(matching_use, "_now_us", lambda: now_us() + round(1e6 * share * matching_use.KEPT_S))
+
+    def test_servers_with_other_settings_keep_one_anothers_pairs(
+        self, store: Store, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        servers = [Server(store, widths=[False]), Server(store, widths=[True])]
+        for _ in range(4):
+            for server in servers:
+                server.background.match_waiting()
+            self.pass_days(monkeypatch, 0.6)
+        assert [len(servers[0].stored(wide)) for wide in (False, True)] == [10, 10]
+        for _ in range(2):
+            servers[0].background.match_waiting()
+            self.pass_days(monkeypatch, 0.6)
+        assert [len(servers[0].stored(wide)) for wide in (False, True)] == [10, 0]
+
+    def test_a_server_that_makes_none_keeps_what_it_uses(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+        Server(store, widths=[False]).background.match_waiting()
+        self.pass_days(monkeypatch, 1.1)
+        reader, other = Server(store, widths=[False]), Server(store, widths=[True])
+        reader.background.maintain()
+        other.background.match_waiting()
+        assert [len(reader.stored(wide)) for wide in (False, True)] == [10, 10]
 
 
 class TestFailures:

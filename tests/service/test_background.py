@@ -129,11 +129,21 @@ def test_answers_are_the_same_with_stored_pairs(matched: Path, expected: list[by
 
 
 def test_switched_off_nothing_is_made(data_dir: Path, expected: list[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(BackgroundMatching, "start", lambda _: pytest.fail("it was started"))
+    monkeypatch.setattr(BackgroundMatching, "_claim", lambda _: pytest.fail("a reference was claimed"))
     with serving(data_dir, **OFF) as served:
         assert served.answers() == expected
         assert served.value("mapless_stored_pairs_total", result="stored") == 0
         assert served.value("mapless_stored_pairs_total", result="absent") > 0
+        assert served.value("mapless_background_failures_total") == 0
+
+
+def test_switched_off_damaged_pairs_are_deleted(matched: Path, expected: list[bytes]) -> None:
+    Folder(matched).execute("UPDATE reference_pair SET data = zeroblob(16)")
+    with serving(matched, **OFF) as served:
+        assert served.answers() == expected
+        damaged = served.value("mapless_stored_pairs_total", result="damaged")
+        wait_until(lambda: count_pairs(matched) == 2 * PAIRS - damaged)
+        assert served.value("mapless_background_pairs_total") == 0
 
 
 def test_damaged_pairs_change_no_answer_and_are_made_again(matched: Path, expected: list[bytes]) -> None:

@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.method.context import StageContext
@@ -22,6 +23,7 @@ from mapless_server.method.correspond import in_order
 from mapless_server.method.options import check_bounds
 from mapless_server.method.views import Matches, PosedView
 from mapless_server.store import Claim, Pair, PairStore, Progress, Store
+from mapless_server.store.matching_use import delete_unused, record_use
 from mapless_server.store.pairs import CLAIM_S
 
 from .indexes import SceneIndexes
@@ -39,6 +41,7 @@ _CACHE_BYTES = 64 * 2**20
 """Features that are kept from one reference to the next, of about 60; in addition to what queries have in memory."""
 
 _WAITING_IS_COUNTED_S = 30.0
+_USE_IS_RECORDED_S = 3600.0
 
 
 class _Closed(Exception):
@@ -109,15 +112,20 @@ class BackgroundMatching:
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self._step_begin_s = 0.0
+        self._use_is_due_s = -math.inf
         self._counted_s = 0.0
         self._waiting_count = 0
 
-    def start(self) -> None:
-        """Starts the thread, unless the store can only be read."""
+    def start(self, makes_pairs: bool = True) -> None:
+        """Starts the thread, unless the store can only be read.
+
+        If it does not make pairs, it still deletes damaged ones that queries find, and those without use.
+        """
         if self._store.database.only_reads:
             log.warning("references are not matched in the background: the store can only be read")
             return
-        self._thread = threading.Thread(target=self._run, name="background matching", daemon=True)
+        run = partial(self._run, self.match_waiting if makes_pairs else self.maintain)
+        self._thread = threading.Thread(target=run, name="background matching", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -144,16 +152,30 @@ class BackgroundMatching:
                 found = self._claim()
         self._count_waiting()
 
-    def _run(self) -> None:
+    def maintain(self) -> None:
+        """Deletes damaged pairs, and those of matchings without use, unless the last time is less than an hour ago."""
+        for matching, finder in self._matchings.items():
+            damaged = finder.take_damaged(matching.name)
+            if damaged:
+                self._pairs.discard(matching.name, damaged)
+        if time.monotonic() < self._use_is_due_s:
+            return
+        record_use(self._store.database, [matching.name for matching in self._matchings])
+        delete_unused(self._store.database, self._pause)
+        self._use_is_due_s = time.monotonic() + _USE_IS_RECORDED_S
+
+    def _run(self, work: Callable[[], None]) -> None:
         poll_s = self.options.poll_s
         while not self._closing.wait(poll_s):
-            has_failed = self._fails()
+            has_failed = self._fails(work)
             poll_s = min(2 * poll_s, self.options.longest_poll_s) if has_failed else self.options.poll_s
 
-    def _fails(self) -> bool:
-        """Matches what waits; whether the store failed."""
+    def _fails(self, work: Callable[[], None]) -> bool:
+        """Does the work; whether the store failed."""
         try:
-            self.match_waiting()
+            work()
+        except _Closed:
+            return False
         except Exception as error:
             self._observer.matching_failed()
             log.warning("matching references in the background failed, and is tried again: %s", error)
@@ -161,10 +183,8 @@ class BackgroundMatching:
         return False
 
     def _claim(self) -> tuple[Matching, Claim] | None:
-        for matching, finder in self._matchings.items():
-            damaged = finder.take_damaged(matching.name)
-            if damaged:
-                self._pairs.discard(matching.name, damaged)
+        self.maintain()
+        for matching in self._matchings:
             claim = self._pairs.claim(matching.name, self._progress[matching.name])
             if claim is not None:
                 return matching, claim

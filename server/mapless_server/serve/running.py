@@ -138,8 +138,8 @@ async def _start(
     _run_task(stack, _stop_serving(services, failed))
     await _warm_up(settings, engine, metrics)
     await services.open(engine)
-    if settings.background_matching and engine.background is not None:
-        engine.background.start()
+    if engine.background is not None:
+        engine.background.start(settings.background_matching)
         stack.push_async_callback(asyncio.to_thread, engine.background.close)
     stack.push_async_callback(listener.stop)
     stack.push_async_callback(services.drain, settings.drain_delay_s, settings.drain_grace_s)

@@ -17,7 +17,7 @@ from sqlalchemy import (
     text,
 )
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 
 metadata = MetaData()
 
@@ -140,4 +140,12 @@ reference_matching = Table(
     Column("due_time_us", BigInteger),
     Column("failure_count", Integer, nullable=False, server_default=_NONE_YET),
     Index("reference_matching_by_due_time", "matching", "due_time_us"),
+)
+
+# When a server last had use for a matching, to within an hour.
+matching_use = Table(
+    "matching_use",
+    metadata,
+    Column("matching", _Matching, primary_key=True),
+    Column("used_time_us", BigInteger, nullable=False),
 )
