@@ -365,6 +365,32 @@ class TestRematching:
         assert planted.calls == calls
         assert result.tier.extractor.name == "strong"
 
+    @pytest.mark.parametrize(("deadline_s", "calls"), [(20.0, 0), (30.0, 2)])
+    def test_where_only_the_pose_is_in_time_it_is_computed(
+        self, setting: Setting, monkeypatch: pytest.MonkeyPatch, deadline_s: float, calls: int
+    ) -> None:
+        """From the matches at hand: the pair alone would be in time, the pose after it would not."""
+        planted = self.pair_matching(setting)
+        setting.engine.tiers[1].pipeline.matcher.pair_s = 8.0
+        cost_s = {"prepare": 0.1, "coarse": 0.5, "refine": 9.0}
+        monkeypatch.setattr(CostModel, "predict", lambda _, stage, kind: 8.0 if "rematch" in kind else cost_s[stage])
+        result = setting.localize(deadline_s)
+        assert result.tier.extractor.name == "strong"
+        assert planted.calls == calls
+
+    def test_a_pair_that_waited_too_long_is_not_begun(self, setting: Setting) -> None:
+        planted = self.pair_matching(setting)
+        stages = QueryStages(setting.engine.tiers, ESCALATION, whole(lambda *_: rejected()))
+        job = setting.engine.query_job(query_of(("r0", "r1")), caller())
+        job.step.payload.__dict__["tier"] = 1
+        for stage in ("prepare", "coarse"):
+            (done,) = stages.prepare([job])
+            assert isinstance(done, Next)
+            job.step = done.step
+            assert job.step.stage == stage
+            job.step.payload.__dict__["deadline_s"] = time.monotonic()
+        assert planted.calls == 0
+
     def test_a_sure_photograph_is_not_matched_again(self, setting: Setting) -> None:
         planted = self.pair_matching(setting)
         setting.replies["cheap"] = localized(SURE_INLIERS)

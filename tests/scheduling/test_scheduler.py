@@ -385,6 +385,25 @@ class TestTime:
             toy.finish(toy.take("host"), Next(again, Fallback(lambda: Done("first"), 150.0)))
             assert toy.ending_of(job) is expected
 
+    @pytest.mark.parametrize(
+        ("due_s", "others", "kind"),
+        [(3.0, 0, "slow"), (1.0, 0, "toy"), (FAR_S, 5, "toy"), (0.7, 0, None), (FAR_S, 6, None)],
+    )
+    def test_the_alternative_is_computed_where_the_step_is_not(
+        self, due_s: float, others: int, kind: str | None
+    ) -> None:
+        """Too late or too much for the room; the fallback is given only if that holds for the alternative as well."""
+        toy = Toy()
+        toy.scheduler.costs.observe("prepare", "slow", 2.0)
+        toy.scheduler.costs.observe("refine", "another", 50.0)  # says nothing about `later_kind`
+        step, alternative = Step("prepare", "slow", "b", 0, "toy"), Step("prepare", "toy", "b", 0)
+        job = toy.admit(stage="refine", client="mine")
+        for i in range(others):
+            toy.admit(client=f"other {i}")
+        toy.finish(toy.take("host"), Next(step, Fallback(lambda: Done("first"), due_s), alternative))
+        assert toy.ending_of(job) is (None if kind else Ending.OK)
+        assert kind in (None, job.step.kind)
+
     def test_the_only_job_leaves_room_for_the_next_caller(self) -> None:
         """Though it costs more than the server computes for all callers, and another thread is free."""
         toy = Toy()

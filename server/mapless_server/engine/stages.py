@@ -90,7 +90,7 @@ class QueryRun:
         references: those that are used, in order.
         generation: of the scene when they were read.
         attributes: of the scene.
-        view: the photograph with this tier's features.
+        view: the photograph with this tier's features; None until the tier's first step has found them.
         choice: how the references were chosen; None if they were used as they were named.
         query_matches: of the photograph with each reference, where they were chosen by these, or are made one by one.
         unmatched: indices of the references with which the photograph is to be matched again (`Matcher.rematch`), each
@@ -164,7 +164,7 @@ class QueryStages:
             # A reference deleted since the scene was listed was not the caller's choice: the next list is without it.
             is_outdated = isinstance(error, NotFound) and error.field != "scene" and not run.query.reference_ids
             if is_outdated and run.listings < MAX_LISTINGS:
-                return self._next(run, replace(run, listings=run.listings + 1).first_step)
+                return self._next(run, replace(run, listings=run.listings + 1, view=None).first_step)
             if run.best is None:
                 return _emptied() if is_outdated else error
             # A failed attempt at a better answer must not cost the first answer.
@@ -175,8 +175,8 @@ class QueryStages:
 
     def _prepare(self, run: QueryRun, job: Job) -> StageResult:
         tier, query = self._tiers[run.tier], run.query
-        if run.unmatched:
-            return self._rematch(run)
+        if run.view is not None:  # its first step is done
+            return self._matched_further(self._rematched(run) if self._has_time_to_rematch(run, tier) else run)
         run = replace(run, context=StageContext(job.check))
         try:
             run = replace(run, attributes=run.source.attributes(query.scene_key))
@@ -201,23 +201,25 @@ class QueryStages:
             run = replace(run, unmatched=tuple(matcher.to_rematch(run.query_matches)))
         return self._matched_further(run)
 
-    def _rematch(self, run: QueryRun) -> StageResult:
-        """Matches the photograph with one reference again."""
+    def _rematched(self, run: QueryRun) -> QueryRun:
+        """With the photograph matched again with one reference."""
         assert run.view is not None
         assert run.query_matches is not None
         index, *others = run.unmatched
         matches = list(run.query_matches)
         with run.context.stage("rematch"):
             matches[index] = self._tiers[run.tier].pipeline.matcher.rematch(run.view, run.references[index])
-        return self._matched_further(replace(run, query_matches=tuple(matches), unmatched=tuple(others)))
+        return replace(run, query_matches=tuple(matches), unmatched=tuple(others))
 
     def _matched_further(self, run: QueryRun) -> StageResult:
         """Matches with the next reference, or goes on if they are all, or there is no time for more."""
         tier, query = self._tiers[run.tier], run.query
         assert run.view is not None
-        if run.unmatched and self._has_time_to_rematch(run, tier):
-            kind = f"{run.kind}, rematch"
-            return self._next(run, Step(PREPARE, kind, kind, run))
+        if self._has_time_to_rematch(run, tier):
+            # If the queue finds no time for that, the pose is computed from the matches at hand.
+            again = Step(PREPARE, f"{run.kind}, rematch", f"{run.kind}, rematch", run, run.kind)
+            pose = Step(PREPARE, f"{run.kind}, matched", f"{run.kind}, matched", replace(run, unmatched=()), run.kind)
+            return self._next(run, again, pose)
         run = replace(run, unmatched=())
         part = self._method.prepare(
             run.view, run.references, tier.pipeline, query.options, run.context, run.query_matches, query.priors
@@ -227,7 +229,9 @@ class QueryStages:
         return self._next(run, Step(COARSE, run.kind, str(part.bucket), replace(run, part=part)))
 
     def _has_time_to_rematch(self, run: QueryRun, tier: Tier) -> bool:
-        """Whether another reference can be matched before the tier must pose the photograph by what it has."""
+        """Whether another reference is to be matched, and can be before the tier must compute the pose."""
+        if not run.unmatched:
+            return False
         until_s = run.give_up_s if run.best is not None else run.deadline_s
         until_s = run.start_s + self._escalation.rematch_share * (until_s - run.start_s)
         return time.monotonic() + (tier.pipeline.matcher.pair_s or 0.0) <= until_s
@@ -310,11 +314,11 @@ class QueryStages:
             return self._next(stronger, stronger.first_step)
         return Done(result, _ending(result))
 
-    def _next(self, run: QueryRun, step: Step) -> Next:
-        """Where there is an answer, it is given in time if the step does not lead to a better one."""
+    def _next(self, run: QueryRun, step: Step, alternative: Step | None = None) -> Next:
+        """Where there is an answer, it is given in time if neither step leads to a better one."""
         if run.best is None:
             return Next(step)
-        return Next(step, Fallback(lambda: self._unfinished(run), run.give_up_s))
+        return Next(step, Fallback(lambda: self._unfinished(run), run.give_up_s), alternative)
 
     def _unfinished(self, run: QueryRun) -> Done:
         assert run.best is not None

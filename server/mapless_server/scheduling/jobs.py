@@ -94,12 +94,14 @@ class Step:
         kind: jobs of one kind take about the same time there.
         bucket: jobs of one bucket can be computed together.
         payload: the stage's input.
+        later_kind: the kind in the stages that usually follow; empty if it is the same.
     """
 
     stage: str
     kind: str
     bucket: str
     payload: Any
+    later_kind: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,10 +122,17 @@ class Fallback:
 
 @dataclass(frozen=True, eq=False)
 class Next:
-    """The job needs another step. From now on it ends with the fallback, if there is one, instead of expiring."""
+    """The job needs another step. From now on it ends with the fallback, if there is one, instead of expiring.
+
+    Attributes:
+        step: what it needs.
+        fallback: also given at once if the step would end too late or cost too much.
+        alternative: a cheaper step, which is then tried before the fallback is given.
+    """
 
     step: Step
     fallback: Fallback | None = None
+    alternative: Step | None = None
 
 
 StageResult = Next | Done | Exception

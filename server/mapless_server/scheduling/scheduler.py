@@ -273,20 +273,29 @@ class Scheduler:
         """Computing time of a step and of those that usually follow, by lane."""
         cost_s: Counter[str] = Counter()
         stage: Stage | None = self._stages[step.stage]
+        kind = step.kind
         while stage is not None:
-            cost_s[stage.lane] += self.costs.predict(stage.name, step.kind)  # type: ignore[assignment]  # not int
+            cost_s[stage.lane] += self.costs.predict(stage.name, kind)  # type: ignore[assignment]  # not int
             stage = self._stages[stage.then] if stage.then else None
+            kind = step.later_kind or step.kind
         return cost_s
 
     def _continue(self, job: Job, result: Next, now_s: float) -> None:
-        """Queues a job for its next step, or gives its fallback if the step would end too late or cost too much."""
+        """Queues a job for its next step, or if that would end too late or cost too much, for the alternative.
+
+        Gives the fallback if neither is worthwhile.
+        """
         job.step, job.fallback = result.step, result.fallback
         cost_s = self._predict(job.step)
         if job.fallback is None:
             cost_s &= job.booked_s  # it was admitted for no more
-        elif not self._is_worthwhile(job, cost_s, now_s) and not self._is_tried_anyway(job.step):
-            self._give_fallback(job, job.fallback, now_s)
-            return
+        elif not self._is_worthwhile(job, cost_s, now_s):
+            if result.alternative is not None:  # never tried anyway: that could cost what the alternative gives
+                self._continue(job, Next(result.alternative, job.fallback), now_s)
+                return
+            if not self._is_tried_anyway(job.step):
+                self._give_fallback(job, job.fallback, now_s)
+                return
         self._ledger.rebook(job, self._admission.within_bounds(job, cost_s))
         self._enqueue(job, now_s)
 
