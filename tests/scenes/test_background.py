@@ -500,6 +500,19 @@ class TestPriority:
             server.background.close()
         assert server.counts.failures == 0
 
+    def test_a_gap_between_calls_is_not_idleness(self, store: Store) -> None:
+        """The server is idle whenever a step could begin, except for once."""
+        looks = iter([False])
+        options = BackgroundOptions(poll_s=0.01, busy_share=1e-9, quiet_s=60.0)
+        server = Server(store, options, lambda: next(looks, True))
+        server.background.start()
+        try:
+            wait_until(lambda: server.counts.waiting is not None)
+            assert not threading.Event().wait(0.2)
+        finally:
+            server.background.close()
+        assert (server.counts.made, len(server.stored())) == (0, 0)
+
     def test_a_busy_server_gets_its_share(self, store: Store) -> None:
         server = Server(store, BackgroundOptions(busy_share=1.0, quiet_s=0.01), lambda: False)
         server.background.match_waiting()
