@@ -58,6 +58,10 @@ class TestDoubt:
         assert is_doubtful(rejected(reason), OPTIONS) is (reason not in UNRECOVERABLE)
         assert {it.name for it in UNRECOVERABLE} == {"NO_USABLE_REFERENCES", "DEGENERATE_REFERENCES"}
 
+    def test_a_wrong_focal_length_is_not_doubtful(self) -> None:
+        rejection = Rejection(RejectionReason.GATE, "planted", focal_ratio=1.2)
+        assert not is_doubtful(Answer(rejection), OPTIONS)
+
     @given(trust=st.floats(0, 1), sigma_m=st.floats(1e-4, 1.0))
     def test_low_trust_or_a_large_radius_is_doubtful(self, trust: float, sigma_m: float) -> None:
         radius_m = float(error_radii(np.eye(3) * sigma_m**2, [0.68])[0])

@@ -78,6 +78,7 @@ def test_the_judge_rejects_with_both_numbers_and_a_hint() -> None:
     found = re.search(r"give ([0-9.]+) times the focal length", rejection.message)
     assert found is not None
     assert float(found[1]) == pytest.approx(1 / 1.15, rel=0.01)
+    assert rejection.focal_ratio == pytest.approx(1 / 1.15, rel=0.01)
     assert rejection.hint is not None
     assert rejection.hint.advice is Advice.CHECK_CALIBRATION
     assert rejection.hint.best_reference in {reference.name for reference in support.references}

@@ -542,6 +542,14 @@ def test_queries_of_a_batch_have_the_answers_they_have_alone(backend: str, weak_
         assert same_bits(refine(part), answer_of(pipeline, option, query))
 
 
+@pytest.mark.parametrize("reason", RejectionReason)
+def test_two_views_rescue_no_pose_that_was_not_accepted(reason: RejectionReason) -> None:
+    prepared = prepare(SCENE.query, SCENE.references, pipeline_of("geometric"), LocalizeOptions(), StageContext())
+    assert isinstance(prepared, Prepared)
+    found = {RejectionReason.GATE, RejectionReason.AMBIGUOUS, RejectionReason.DEGENERATE_REFERENCES}
+    assert prepared.can_use_two_views(Answer(Rejection(reason, "planted"))) is (reason not in found)
+
+
 def test_a_coarse_answer_has_the_initial_pose_and_its_stage() -> None:
     for backend in ("geometric", "network", "device"):
         offset = np.full(3, 1e5)

@@ -59,11 +59,12 @@ class EscalationOptions:
 def is_doubtful(answer: Answer, options: EscalationOptions) -> bool:
     """Whether stronger features could improve the answer.
 
-    A pose that nothing has checked (`Variant.COARSE`) has no trust and claims nothing, so there is nothing to doubt.
+    Not if the focal length is wrong: other features do not correct it, but may determine it too little to notice. A
+    pose that nothing has checked (`Variant.COARSE`) has no trust and claims nothing, so there is nothing to doubt.
     """
     outcome = answer.outcome
     if isinstance(outcome, Rejection):
-        return outcome.reason not in UNRECOVERABLE
+        return outcome.reason not in UNRECOVERABLE and outcome.focal_ratio is None
     if outcome.covariance is None or outcome.trust is None:
         return False
     radius_m = accuracy_from_covariance(outcome.covariance).position_68_m

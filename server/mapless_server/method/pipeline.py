@@ -145,13 +145,15 @@ class Prepared:
     def can_use_two_views(self, answer: Answer) -> bool:
         """Whether a pose may be found from matches with the references themselves, after this answer.
 
-        Not where a stage has found what is wrong: a second place, the focal length, or references at one place.
+        Not where a stage has found what is wrong: a second place, the focal length, or references at one place. Nor
+        where matches with points gave a pose that was not accepted: the same matches without points are no better
+        evidence. Of four photographs that they rescued in `office-lockers`, two were wrong.
         """
         outcome = answer.outcome
         if self.options.variant is not Variant.BEST or len(self.references) < 2 or isinstance(outcome, Localization):
             return False
-        starved = outcome.reason not in (RejectionReason.DEGENERATE_REFERENCES, RejectionReason.AMBIGUOUS)
-        return starved and outcome.hint is None
+        found = (RejectionReason.DEGENERATE_REFERENCES, RejectionReason.AMBIGUOUS, RejectionReason.GATE)
+        return outcome.reason not in found
 
 
 @dataclass(frozen=True, eq=False)

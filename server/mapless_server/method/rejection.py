@@ -88,6 +88,7 @@ class Rejection:
         message: one sentence for a person, with the numbers that decided.
         hint: what would help; None until `hints` has added it.
         tried: number of 2D-3D matches that were used; None if there are none yet.
+        focal_ratio: the focal length that the matches give over that of the intrinsics; None unless it is the reason.
         hypotheses: the poses that explain it, the better supported first; empty unless AMBIGUOUS.
     """
 
@@ -96,3 +97,4 @@ class Rejection:
     hint: Hint | None = None
     hypotheses: tuple[Hypothesis, ...] = ()
     tried: int | None = None
+    focal_ratio: float | None = None

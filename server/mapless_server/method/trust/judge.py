@@ -149,7 +149,8 @@ def _miscalibrated(support: Support, focal: Focal) -> Rejection:
         "resized, and have another principal point when it is cropped."
     )
     best = support.references[int(np.argmax(support.inliers_by_reference()))].name
-    return Rejection(RejectionReason.GATE, message, Hint("judge", Advice.CHECK_CALIBRATION, advice, best))
+    hint = Hint("judge", Advice.CHECK_CALIBRATION, advice, best)
+    return Rejection(RejectionReason.GATE, message, hint, focal_ratio=focal.estimated_px / focal.given_px)
 
 
 def format_evidence(evidence: Evidence) -> str:
