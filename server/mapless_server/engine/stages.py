@@ -216,7 +216,7 @@ class QueryStages:
         tier, query = self._tiers[run.tier], run.query
         assert run.view is not None
         if self._has_time_to_rematch(run, tier):
-            # If the queue finds no time for that, the pose is computed from the matches at hand.
+            # If the queue finds no time for that, the pose is computed from the matches there are.
             again = Step(PREPARE, f"{run.kind}, rematch", f"{run.kind}, rematch", run, run.kind)
             pose = Step(PREPARE, f"{run.kind}, matched", f"{run.kind}, matched", replace(run, unmatched=()), run.kind)
             return self._next(run, again, pose)

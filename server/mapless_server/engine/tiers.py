@@ -36,7 +36,7 @@ class EscalationOptions:
         same_position_m, same_rotation_deg: two poses closer than this never contradict each other, however small the
             claimed radii, which leave out the errors of the references' poses.
         clearly_more: so many times the inliers of a contradicting pose make the stronger features' pose believed.
-        time_share: of the time left, what a stronger tier may take. After that the answer at hand is given: better a
+        time_share: of the time left, what a stronger tier may take. After that the first answer is given: better a
             doubtful one than none, and the rest is enough to send it.
         rematch_share: of a tier's time, when it stops to match the photograph again by a slow network (see
             `Matcher.rematch`): the rest is for the pose, which takes a second where matches are few.
