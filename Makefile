@@ -10,7 +10,7 @@ TORCH  ?= torch==2.13.0
 PROTO_TOOLS := grpcio-tools==1.71.2 setuptools==80.9.0
 PROTO_VENV  := $(VENV)/proto-tools
 
-.PHONY: help setup test nightly weights lint format proto demo bench bench-gpu load load-ray fuzz docs clean
+.PHONY: help setup test nightly weights lint format proto released demo bench bench-gpu load load-ray fuzz docs clean
 
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -47,6 +47,7 @@ lint: setup  ## Check style, types and protos
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/buf lint
+	$(BIN)/buf breaking --against proto/released.binpb.gz
 
 format: setup  ## Format the code
 	$(BIN)/ruff check --fix .
@@ -60,6 +61,9 @@ $(PROTO_VENV)/.installed: Makefile $(VENV)/.installed
 proto: $(PROTO_VENV)/.installed  ## Regenerate client/mapless/v1 from proto/
 	$(PROTO_VENV)/bin/python -m grpc_tools.protoc -I proto --python_out=client --pyi_out=client \
 	    --grpc_python_out=client $(wildcard proto/mapless/v1/*.proto)
+
+released: setup  ## At a release: keep the interface that later ones must not break
+	$(BIN)/buf build --exclude-source-info -o proto/released.binpb.gz
 
 demo: setup  ## Localize photographs end to end; DATA=folder for real ones
 	$(BIN)/mapless-server demo $(if $(DATA),--data '$(DATA)')

@@ -277,14 +277,14 @@ class RetrieveReferencesRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., count: _Optional[int] = ..., position_prior: _Optional[_Union[_localization_service_pb2.PositionPrior, _Mapping]] = ..., heading_prior: _Optional[_Union[_localization_service_pb2.HeadingPrior, _Mapping]] = ...) -> None: ...
 
 class RetrieveReferencesResponse(_message.Message):
-    __slots__ = ("references", "descriptor", "store_generation")
+    __slots__ = ("references", "retrieval", "store_generation")
     REFERENCES_FIELD_NUMBER: _ClassVar[int]
-    DESCRIPTOR_FIELD_NUMBER: _ClassVar[int]
+    RETRIEVAL_FIELD_NUMBER: _ClassVar[int]
     STORE_GENERATION_FIELD_NUMBER: _ClassVar[int]
     references: _containers.RepeatedCompositeFieldContainer[RetrievedReference]
-    descriptor: str
+    retrieval: str
     store_generation: int
-    def __init__(self, references: _Optional[_Iterable[_Union[RetrievedReference, _Mapping]]] = ..., descriptor: _Optional[str] = ..., store_generation: _Optional[int] = ...) -> None: ...
+    def __init__(self, references: _Optional[_Iterable[_Union[RetrievedReference, _Mapping]]] = ..., retrieval: _Optional[str] = ..., store_generation: _Optional[int] = ...) -> None: ...
 
 class RetrievedReference(_message.Message):
     __slots__ = ("name", "similarity", "world_from_camera")

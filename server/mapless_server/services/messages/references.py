@@ -100,7 +100,7 @@ def reference_to_message(reference: ReferenceRecord) -> pb.Reference:
 
 def choice_to_message(choice: Choice, scene_id: str) -> pb.RetrieveReferencesResponse:
     """Message of chosen references."""
-    message = pb.RetrieveReferencesResponse(descriptor=choice.descriptor, store_generation=choice.generation)
+    message = pb.RetrieveReferencesResponse(retrieval=choice.descriptor, store_generation=choice.generation)
     for chosen in choice.references:
         message.references.add(
             name=names.reference_name(scene_id, chosen.reference_id),
