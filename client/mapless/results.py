@@ -48,6 +48,8 @@ class Reference:
         feature_count: local features found in it; with none it is blank, and nothing can be matched with it.
         create_time: by the server's clock.
         image: the file's bytes, if requested.
+        warnings: contradictions of the scene's datum, direction of gravity and unit and the poses stored in the same
+            message, which `add_reference` and `add_references` found; else empty.
     """
 
     scene_id: str
@@ -58,6 +60,7 @@ class Reference:
     feature_count: int
     create_time: datetime
     image: bytes | None = None
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +111,7 @@ class Coverage:
         image_share: share of the image with matches, 0 to 1.
         position_68_m: expected 68 % radius of the position, metres; None if not predicted.
         references: names of the usable references, those with most matches first.
+        arbitrary_unit: whether it is in the scene's own, arbitrary unit instead of metres.
     """
 
     verdict: str
@@ -116,6 +120,7 @@ class Coverage:
     image_share: float
     position_68_m: float | None
     references: tuple[str, ...]
+    arbitrary_unit: bool = False
 
 
 def scene_from_message(message: pb.Scene, warnings: Iterable[str] = ()) -> Scene:
@@ -132,8 +137,8 @@ def scene_from_message(message: pb.Scene, warnings: Iterable[str] = ()) -> Scene
     )
 
 
-def reference_from_message(message: pb.Reference) -> Reference:
-    """Reference of a message."""
+def reference_from_message(message: pb.Reference, warnings: Iterable[str] = ()) -> Reference:
+    """Reference of a message, and what was found when it was added."""
     scene_id, reference_id = names.parse_reference_name(message.name)
     return wire.filled(
         Reference,
@@ -144,6 +149,7 @@ def reference_from_message(message: pb.Reference) -> Reference:
         world_from_camera=wire.transform_from_message(message.world_from_camera, "world_from_camera"),
         create_time=wire.time_from_message(message.create_time),
         image=message.image or None,
+        warnings=tuple(warnings),
     )
 
 

@@ -71,8 +71,10 @@ class WatchfulEngine:
 
     def forget_references(self, keys: Collection[str]) -> None: ...
 
-    def contradictions(self, poses: Sequence[RigidTransform], attributes: SceneAttributes) -> list[str]:
-        return contradictions(poses, attributes)
+    def contradictions(
+        self, poses: Sequence[RigidTransform], attributes: SceneAttributes, added: Sequence[RigidTransform] = ()
+    ) -> list[str]:
+        return contradictions(poses, attributes, added)
 
     async def describe(self, photos: Sequence[Photo], caller: Caller) -> list[Description]:
         for photo in photos:

@@ -32,6 +32,34 @@ def cameras(
     return poses
 
 
+def moved(poses: list[RigidTransform], factor: float, offset_m: float = 0.0) -> list[RigidTransform]:
+    """Poses in another unit, or elsewhere."""
+    return [RigidTransform(it.rotation, factor * it.translation + offset_m) for it in poses]
+
+
+def test_a_few_added_references_are_examined_alone() -> None:
+    """Ten among a hundred change no median: in millimetres, upside down, or far from a datum's origin."""
+    stored, upright = cameras(360, count=100), SceneAttributes(down_in_world=Y_DOWN)
+    added = cameras(200, count=10)
+    assert contradictions(stored, upright, added) == contradictions(stored, upright, added[:1]) == []
+    (text,) = contradictions(stored, upright, moved(added, 1000))
+    assert "are they in another unit" in text
+    upside_down = [RigidTransform(it.rotation @ np.diag([-1.0, -1, 1]), it.translation) for it in added]
+    (text,) = contradictions(stored, upright, upside_down)
+    assert "degrees off the down of 10 reference cameras" in text
+    datum = SceneAttributes(Datum(47, 8, 400, enu_from_y_up(0)))
+    upright_in_it = [RigidTransform(np.diag([1.0, -1, -1]) @ it.rotation, it.translation) for it in stored]
+    (text,) = contradictions(upright_in_it, datum, moved(upright_in_it[:1], 1, 50_000))
+    assert "km from the world's origin" in text
+
+
+def test_photographs_of_one_place_are_no_contradiction() -> None:
+    """A burst is the first thing that many a scene gets."""
+    burst = at(np.zeros((4, 3)) + np.arange(4)[:, None] * 1e-3)
+    assert contradictions([], SceneAttributes(), burst) == contradictions(burst, SceneAttributes()) == []
+    assert contradictions(at(np.zeros((5, 3))), SceneAttributes())
+
+
 def at(positions: Array) -> list[RigidTransform]:
     """Upright cameras at positions (N, 3)."""
     return [RigidTransform(np.eye(3), position) for position in positions]

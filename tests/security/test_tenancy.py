@@ -95,8 +95,8 @@ class StandInEngine:
         self.store.get_scene(scene_key)
         return Choice((), "stand-in", 1)
 
-    def contradictions(self, poses: Sequence[Any], _: Any) -> list[str]:
-        return [f"{len(poses)} references, of this tenant alone"]
+    def contradictions(self, poses: Sequence[Any], _: Any, added: Sequence[Any] = ()) -> list[str]:
+        return [f"{len(poses)} references, of this tenant alone, and {len(added)} added"]
 
     async def audit(self, scene_key: SceneKey, reference_ids: Sequence[str], _: Any) -> Any:
         return self.store.get_scene(scene_key).generation, []

@@ -24,6 +24,7 @@ from mapless import (
     Quaternion,
 )
 from mapless.geodesy import enu_from_y_up
+from mapless.requests import create_request
 from mapless.v1 import geometry_pb2 as geometry_pb
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
@@ -189,6 +190,29 @@ def test_an_update_that_contradicts_the_references_is_stored_and_said(client: Cl
     assert "degrees off the down of 3 reference cameras" in updated.warnings[0]
     assert client.update_scene(scene, down_in_world=(0.0, 1.0, 0.0)).warnings == ()
     assert client.get_scene(scene).warnings == ()
+
+
+def test_added_references_that_contradict_their_scene_are_said(client: Client, stubs: Stubs) -> None:
+    """Cameras are upright in a world whose y is down: said at once, of one reference and of a batch, and stored."""
+    client.create_scene("added", down_in_world=(0.0, -1.0, 0.0))
+    first = client.add_reference("added", NewReference("a", PHOTO, CAMERA, pose(0.0)))
+    assert first.warnings == ()  # one shows no typical direction
+    news = [NewReference(f"b{i}", PHOTO, CAMERA, pose(i)) for i in (1.0, 2.0)]
+    for stored in client.add_references("added", news):
+        assert "degrees off the down of 3 reference cameras" in stored.warnings[0]
+    request = create_request("scenes/added", NewReference("c", PHOTO, CAMERA, pose(3.0)))
+    (text,) = stubs.references.CreateReference(request, timeout=20).warnings
+    assert "degrees off the down of 4 reference cameras" in text
+    assert client.get_scene("added").reference_count == 4
+    client.update_scene("added", down_in_world=None)
+    assert client.add_reference("added", NewReference("d", PHOTO, CAMERA, pose(4.0))).warnings == ()
+    client.delete_scene("added")
+
+
+def test_coverage_has_the_mark_of_an_arbitrary_unit(client: Client, scene: str) -> None:
+    for is_arbitrary in (True, False):
+        client.update_scene(scene, arbitrary_unit=is_arbitrary)
+        assert client.check_coverage(scene, pose(0.5), CAMERA).arbitrary_unit is is_arbitrary
 
 
 def test_a_quaternion_is_answered_normalized(client: Client, scene: str) -> None:

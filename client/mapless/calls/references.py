@@ -135,7 +135,7 @@ def add_reference(scene: str, reference: NewReference, *, timeout_s: float | Non
         return pb.CreateReferenceResponse(reference=(yield from repeats.stored_reference(request, error)))
 
     response = yield Call(f"{SERVICE}/CreateReference", request, pb.CreateReferenceResponse, timeout_s, on_repeat=found)
-    return reference_from_message(response.reference)
+    return reference_from_message(response.reference, response.warnings)
 
 
 def add_batch(
@@ -160,7 +160,7 @@ def add_batch(
     except MaplessError as error:
         _name_reference(error, requests)
         raise
-    return list(map(reference_from_message, response.references))
+    return [reference_from_message(reference, response.warnings) for reference in response.references]
 
 
 def _name_reference(error: MaplessError, requests: Sequence[pb.CreateReferenceRequest]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -56,9 +57,13 @@ def update_scene(client: Client, arguments: argparse.Namespace) -> int:
     if not changes:
         raise ValueError("nothing to change: give --datum, --down, --unit or --forget")
     scene = client.update_scene(arguments.scene, **changes)
-    for warning in scene.warnings:
-        print(f"mapless: warning: {warning}", file=sys.stderr)
+    _warn(scene.warnings)
     return print_json(scene)
+
+
+def _warn(warnings: Sequence[str]) -> None:
+    for warning in warnings:
+        print(f"mapless: warning: {warning}", file=sys.stderr)
 
 
 def _datum(arguments: argparse.Namespace) -> Datum | None:
@@ -99,6 +104,7 @@ def add_reference(client: Client, arguments: argparse.Namespace) -> int:
     stored = client.add_reference(arguments.scene, reference)
     if not stored.feature_count:
         print(f"mapless: warning: {arguments.photo} is stored, but has no local features: {_BLANK}", file=sys.stderr)
+    _warn(stored.warnings)
     return print_json(stored)
 
 

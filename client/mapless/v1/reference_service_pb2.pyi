@@ -199,10 +199,12 @@ class CreateReferenceRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., reference_id: _Optional[str] = ..., reference: _Optional[_Union[Reference, _Mapping]] = ...) -> None: ...
 
 class CreateReferenceResponse(_message.Message):
-    __slots__ = ("reference",)
+    __slots__ = ("reference", "warnings")
     REFERENCE_FIELD_NUMBER: _ClassVar[int]
+    WARNINGS_FIELD_NUMBER: _ClassVar[int]
     reference: Reference
-    def __init__(self, reference: _Optional[_Union[Reference, _Mapping]] = ...) -> None: ...
+    warnings: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, reference: _Optional[_Union[Reference, _Mapping]] = ..., warnings: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class BatchCreateReferencesRequest(_message.Message):
     __slots__ = ("scene", "requests")
@@ -213,10 +215,12 @@ class BatchCreateReferencesRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., requests: _Optional[_Iterable[_Union[CreateReferenceRequest, _Mapping]]] = ...) -> None: ...
 
 class BatchCreateReferencesResponse(_message.Message):
-    __slots__ = ("references",)
+    __slots__ = ("references", "warnings")
     REFERENCES_FIELD_NUMBER: _ClassVar[int]
+    WARNINGS_FIELD_NUMBER: _ClassVar[int]
     references: _containers.RepeatedCompositeFieldContainer[Reference]
-    def __init__(self, references: _Optional[_Iterable[_Union[Reference, _Mapping]]] = ...) -> None: ...
+    warnings: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, references: _Optional[_Iterable[_Union[Reference, _Mapping]]] = ..., warnings: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class GetReferenceRequest(_message.Message):
     __slots__ = ("name", "include_image")
@@ -355,7 +359,7 @@ class CheckCoverageRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ...) -> None: ...
 
 class CheckCoverageResponse(_message.Message):
-    __slots__ = ("verdict", "message", "expected_match_count", "image_share", "position_68_m", "references", "store_generation")
+    __slots__ = ("verdict", "message", "expected_match_count", "image_share", "position_68_m", "references", "store_generation", "arbitrary_unit")
     VERDICT_FIELD_NUMBER: _ClassVar[int]
     MESSAGE_FIELD_NUMBER: _ClassVar[int]
     EXPECTED_MATCH_COUNT_FIELD_NUMBER: _ClassVar[int]
@@ -363,6 +367,7 @@ class CheckCoverageResponse(_message.Message):
     POSITION_68_M_FIELD_NUMBER: _ClassVar[int]
     REFERENCES_FIELD_NUMBER: _ClassVar[int]
     STORE_GENERATION_FIELD_NUMBER: _ClassVar[int]
+    ARBITRARY_UNIT_FIELD_NUMBER: _ClassVar[int]
     verdict: CoverageVerdict
     message: str
     expected_match_count: int
@@ -370,4 +375,5 @@ class CheckCoverageResponse(_message.Message):
     position_68_m: float
     references: _containers.RepeatedScalarFieldContainer[str]
     store_generation: int
-    def __init__(self, verdict: _Optional[_Union[CoverageVerdict, str]] = ..., message: _Optional[str] = ..., expected_match_count: _Optional[int] = ..., image_share: _Optional[float] = ..., position_68_m: _Optional[float] = ..., references: _Optional[_Iterable[str]] = ..., store_generation: _Optional[int] = ...) -> None: ...
+    arbitrary_unit: bool
+    def __init__(self, verdict: _Optional[_Union[CoverageVerdict, str]] = ..., message: _Optional[str] = ..., expected_match_count: _Optional[int] = ..., image_share: _Optional[float] = ..., position_68_m: _Optional[float] = ..., references: _Optional[_Iterable[str]] = ..., store_generation: _Optional[int] = ..., arbitrary_unit: bool = ...) -> None: ...

@@ -125,8 +125,10 @@ class Engine(Protocol):
         """The scene's generation, and whether a photograph would be localized there."""
         ...
 
-    def contradictions(self, poses: Sequence[RigidTransform], attributes: SceneAttributes) -> list[str]:
-        """What a scene's attributes contradict in the poses of its references, one sentence each."""
+    def contradictions(
+        self, poses: Sequence[RigidTransform], attributes: SceneAttributes, added: Sequence[RigidTransform] = ()
+    ) -> list[str]:
+        """What a scene's attributes contradict in the poses of its references and of added ones, one sentence each."""
         ...
 
     def forget_references(self, keys: Collection[str]) -> None:

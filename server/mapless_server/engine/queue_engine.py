@@ -281,9 +281,11 @@ class QueueEngine:
                 raise refusals[0]
         return work.results
 
-    def contradictions(self, poses: Sequence[RigidTransform], attributes: SceneAttributes) -> list[str]:
-        """What a scene's attributes contradict in the poses of its references, one sentence each."""
-        return contradictions(poses, attributes)
+    def contradictions(
+        self, poses: Sequence[RigidTransform], attributes: SceneAttributes, added: Sequence[RigidTransform] = ()
+    ) -> list[str]:
+        """What a scene's attributes contradict in the poses of its references and of added ones, one sentence each."""
+        return contradictions(poses, attributes, added)
 
     def forget_references(self, keys: Collection[str]) -> None:
         """Frees the memory of deleted references."""

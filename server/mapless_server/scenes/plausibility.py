@@ -54,6 +54,10 @@ DEGREES_SPREAD, DEGREES_SHARE, DEGREES_RATIO = 0.05, 0.01, 100.0
 """Latitudes and longitudes of a scene differ by 5 km at most, and by a hundredth of their own value; heights, in
 metres, differ by a hundred times as much."""
 
+MIN_COMPARED, UNIT_RATIO = 5, 300.0
+"""References whose spread says something, and the ratio of two spreads that indicates another unit: 1000 where both are
+of the same place, and parts of a place differ by less."""
+
 
 @dataclass(frozen=True, eq=False)
 class TypicalDown:
@@ -77,14 +81,36 @@ def typical_down(poses: Sequence[RigidTransform]) -> TypicalDown | None:
     return TypicalDown(mean_y / constancy, UPRIGHT_BOUND_DEG) if constancy >= UPRIGHT_CONSTANCY else None
 
 
-def contradictions(poses: Sequence[RigidTransform], attributes: SceneAttributes) -> list[str]:
-    """What a scene's attributes contradict in the poses of its references: one sentence each, with what was found."""
-    if not poses:
+def contradictions(
+    poses: Sequence[RigidTransform], attributes: SceneAttributes, added: Sequence[RigidTransform] = ()
+) -> list[str]:
+    """What a scene's attributes contradict in the poses of its references: one sentence each, with what was found.
+
+    Poses of references that are added are examined together with the others, and alone if that shows nothing: they
+    may be too few to matter among the others.
+    """
+    together = [*poses, *added]
+    if not together:
         return []
-    found = [_down(poses, attributes), _origin(poses, attributes)]
+    found = [_down(together, attributes), _origin(together, attributes)]
     if not attributes.arbitrary_unit:
-        found.append(_unit(np.array([pose.translation for pose in poses])))
+        found.append(_unit(np.array([pose.translation for pose in together])))
+    if poses and added and not any(found):
+        found = [_down(added, attributes), _origin(added, attributes), another_unit(poses, added)]
     return [text for text in found if text]
+
+
+def another_unit(stored: Sequence[RigidTransform], added: Sequence[RigidTransform]) -> str:
+    """One sentence if poses spread hundreds of times as far as others of the scene, or less; empty if they do not."""
+    if min(len(stored), len(added)) < MIN_COMPARED:
+        return ""
+    radii = [radius_m(np.array([pose.translation for pose in poses])) for poses in (stored, added)]
+    if not (min(radii) > 0 and max(radii) / min(radii) >= UNIT_RATIO):
+        return ""
+    return (
+        f"these references are {radii[1]:.3g} m from their median position, in the median, those of the scene "
+        f"{radii[0]:.3g} m: are they in another unit (ratios under {UNIT_RATIO:g} are plausible)?"
+    )
 
 
 def radius_m(positions: Array) -> float:
@@ -147,7 +173,7 @@ def _unit(positions: Array) -> str:
     if text:
         return text
     radius = radius_m(positions)
-    if MIN_RADIUS_M <= radius <= MAX_RADIUS_M:
+    if MIN_RADIUS_M <= radius <= MAX_RADIUS_M or (radius < MIN_RADIUS_M and len(positions) < MIN_COMPARED):
         return ""
     likely = "millimetres?" if radius > MAX_RADIUS_M else "kilometres or degrees? or did the camera only turn?"
     return (

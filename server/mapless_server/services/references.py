@@ -49,6 +49,7 @@ MAX_RETRIEVED = 1000
 DEFAULT_AUDITS, MAX_AUDITS = 10, 100
 MAX_NOTED = 10  # names in a line of the log
 MAX_COMPARED = 1000  # references, the first by id, with which a change of the scene is compared
+MAX_COMPARED_ADDED = 100  # the same, with which references are compared that are added: a millisecond beside hundreds
 STORE_THREADS = 4  # writers share one lock; the other threads keep readers from waiting for it
 
 T = TypeVar("T")
@@ -96,17 +97,31 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         except DatumWithoutMetres as error:
             field = "datum" if changes.get("datum") else "arbitrary_unit"
             raise FieldError(f"scene.{field}", str(error)) from None
-        warnings = await self._stored(self._contradictions, scene) if changes.keys() != {"calibration"} else []
-        if warnings:
-            call.note(contradictions=warnings)
+        warnings: list[str] = []
+        if changes.keys() != {"calibration"}:
+            warnings = await self._stored(self._contradictions, scene, MAX_COMPARED, call)
         return pb.UpdateSceneResponse(scene=scene_to_message(scene), warnings=warnings)
 
-    def _contradictions(self, scene: SceneRecord) -> list[str]:
+    def _contradictions(
+        self, scene: SceneRecord, count: int, call: Call, added: Sequence[RigidTransform] = ()
+    ) -> list[str]:
+        """What contradicts the scene's attributes in its first references and in added ones; noted in the log."""
         try:
-            references = self._store.list_references(scene.scene_key, MAX_COMPARED, "")
+            references = self._store.list_references(scene.scene_key, count, "")
         except DataLoss as error:
-            return [f"the references were not compared with the change: {error}"]
-        return self._engine().contradictions([it.world_from_camera for it in references], scene.attributes)
+            return [f"the scene was not compared with its references: {error}"]
+        poses = [it.world_from_camera for it in references]
+        found = self._engine().contradictions(poses, scene.attributes, added)
+        if found:
+            call.note(contradictions=found)
+        return found
+
+    def _contradictions_of_added(self, scene_key: SceneKey, added: Sequence[RigidTransform], call: Call) -> list[str]:
+        try:
+            scene = self._store.get_scene(scene_key)
+        except DataLoss as error:
+            return [f"the references were not compared with the scene: {error}"]
+        return self._contradictions(scene, MAX_COMPARED_ADDED, call, added)
 
     async def ListScenes(self, request: pb.ListScenesRequest, call: Call) -> pb.ListScenesResponse:
         """Implements ReferenceService.ListScenes."""
@@ -134,10 +149,10 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
         draft = self._draft(request, "")
         try:
-            (record,) = await self._add(scene_key, [draft], call)
+            (record,), warnings = await self._add(scene_key, [draft], call)
         except AlreadyExists as error:
             raise AlreadyExists(str(error), field="reference_id") from error
-        return pb.CreateReferenceResponse(reference=reference_to_message(record))
+        return pb.CreateReferenceResponse(reference=reference_to_message(record), warnings=warnings)
 
     async def BatchCreateReferences(
         self, request: pb.BatchCreateReferencesRequest, call: Call
@@ -157,8 +172,9 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         drafts = await asyncio.to_thread(
             lambda: [self._draft(item, f"requests[{i}]") for i, item in enumerate(request.requests)]
         )
-        records = await self._add(scene_key, drafts, call)
-        return pb.BatchCreateReferencesResponse(references=await _many(reference_to_message, records))
+        records, warnings = await self._add(scene_key, drafts, call)
+        messages = await _many(reference_to_message, records)
+        return pb.BatchCreateReferencesResponse(references=messages, warnings=warnings)
 
     async def GetReference(self, request: pb.GetReferenceRequest, call: Call) -> pb.GetReferenceResponse:
         """Implements ReferenceService.GetReference."""
@@ -235,6 +251,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         generation, coverage = await engine.check_coverage(scene_key, view, call.caller)
         message = coverage_to_message(coverage)
         message.store_generation = generation
+        message.arbitrary_unit = (await self._stored(self._store.get_scene, scene_key)).attributes.arbitrary_unit
         return message
 
     def _draft(self, request: pb.CreateReferenceRequest, path: str) -> Draft:
@@ -252,9 +269,13 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         photo = photo_from_message(reference, path, self._engine().options.image_limits)
         return reference_id, photo, world_from_camera
 
-    async def _add(self, scene_key: SceneKey, drafts: Sequence[Draft], call: Call) -> Sequence[ReferenceRecord]:
+    async def _add(
+        self, scene_key: SceneKey, drafts: Sequence[Draft], call: Call
+    ) -> tuple[Sequence[ReferenceRecord], list[str]]:
+        """Stores references; what they are now, and what contradicts the scene's attributes."""
         # Describing takes long, so an unknown scene is rejected before. The store checks again when it adds.
-        await self._stored(self._store.get_generation, scene_key)
+        added = [world_from_camera for _, _, world_from_camera in drafts]
+        warnings = await self._stored(self._contradictions_of_added, scene_key, added, call)
         call.note(scene=scene_key, references=len(drafts))
         described = await self._engine().describe([photo for _, photo, _ in drafts], call.caller)
         references = [
@@ -264,7 +285,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         records = await self._stored(self._store.add_references, scene_key, references)
         if blank := [record.reference_id for record in records if not record.feature_count]:
             call.note(references_without_features=blank[:MAX_NOTED])
-        return records
+        return records, warnings
 
     async def _stored(self, operation: Callable[..., T], *arguments: object) -> T:
         """Runs an operation of the store in a thread; raises Unavailable while the server starts."""

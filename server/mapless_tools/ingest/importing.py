@@ -14,7 +14,7 @@ from mapless import MaplessError
 from mapless.names import check_id
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, image_size
-from mapless_server.scenes.plausibility import contradictions
+from mapless_server.scenes.plausibility import another_unit, contradictions
 from mapless_server.serve.signals import terminable
 from mapless_server.settings import Settings
 from mapless_server.store import ContradictingDown, DatumWithoutMetres, SceneAttributes
@@ -28,7 +28,7 @@ from .check import check_frames, implausible_depth
 from .existing import KnownReferences
 from .formats import ReadOptions, read_dataset
 from .metres import MetreOptions, in_metres
-from .opening import NO_METRES, WrongUnit, another_unit, open_scene
+from .opening import NO_METRES, WrongUnit, open_scene
 from .report import ImportReport, print_report, to_json, verdict_lines
 from .upload import Uploader, UploadOptions
 

@@ -7,17 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from mapless import AlreadyExists, Client, Reference
-from mapless.geometry import RigidTransform
-from mapless_server.scenes.plausibility import radius_m
 from mapless_tools.dataset import Dataset, Frame
 
 from .existing import SAME_POSITION_M
 
 NO_METRES = "its unit of length is arbitrary: --scale, --distance or --align gives metres"
-
-MIN_COMPARED, UNIT_RATIO = 5, 300.0
-"""References on either side whose spreads are compared, and the ratio of spreads that indicates another unit: 1000
-where both are of the same place, and parts of a place differ by less."""
 
 
 class WrongUnit(Exception):
@@ -52,19 +46,6 @@ def open_scene(client: Client, scene: str, dataset: Dataset, chosen: Sequence[Fr
     if is_arbitrary:
         raise WrongUnit(f"{count} metres, and this folder is not: {NO_METRES} (--scale 1 if it is the metre)")
     raise WrongUnit(f"{count} an arbitrary unit, and these are in metres: import them into a new scene")
-
-
-def another_unit(there: Sequence[RigidTransform], new: Sequence[RigidTransform]) -> str:
-    """One sentence if references of one scene spread hundreds of times as far as others; empty if they do not."""
-    if min(len(there), len(new)) < MIN_COMPARED:
-        return ""
-    radii = [radius_m(np.array([pose.translation for pose in poses])) for poses in (there, new)]
-    if not (min(radii) > 0 and max(radii) / min(radii) >= UNIT_RATIO):
-        return ""
-    return (
-        f"these references are {radii[1]:.3g} m from their median position, in the median, those of the scene "
-        f"{radii[0]:.3g} m: are they in another unit (ratios under {UNIT_RATIO:g} are plausible)?"
-    )
 
 
 def _share_positions(existing: Sequence[Reference], chosen: Sequence[Frame]) -> bool:
