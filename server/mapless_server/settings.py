@@ -72,7 +72,7 @@ class Settings(BaseModel):
     database_url: SecretStr | None = None
     """URL of a PostgreSQL that several servers share, postgresql://user:password@host/name; else data_dir."""
     backend: str = Field(default="geometric", json_schema_extra={"enum": [AUTO, *BACKENDS]})
-    """Backend of the coarse stage; the weights of pi3 and pi3x are for non-commercial use."""
+    """Backend of the coarse stage; the weights of pi3 and pi3x are for non-commercial use only."""
     features: str = Field(default=AUTO, json_schema_extra={"enum": [AUTO, *FEATURES, *BEST_VARIANTS]})
     """Local features; superpoint is for research only."""
     device: str = "auto"

@@ -14,6 +14,7 @@ pytest.importorskip("PIL", reason="the networks' extra is not installed")
 import torch
 from support.small_networks import GRIDS, small_network, small_request
 
+from mapless_server.method.choices import NETWORKS
 from mapless_server.method.coarse import Outcome, Request, reconstruct_one
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
@@ -54,7 +55,7 @@ def outcomes_of(backend: NetworkReconstructor, requests: Sequence[Any], times: i
     return [reconstruct_one(backend, *request) for _ in range(times) for request in requests]
 
 
-@pytest.mark.parametrize("name", ["pi3", "pi3x"])
+@pytest.mark.parametrize("name", NETWORKS)
 @pytest.mark.parametrize("views_on_device", [0, 2, 100])
 def test_cached_tokens_give_the_same_bits(name: str, views_on_device: int) -> None:
     """From the device, from the host, and where views push one another back and forth."""

@@ -26,7 +26,8 @@ from safetensors.torch import save_file
 from support.images import textured
 from support.small_networks import (
     GRIDS,
-    SMALL,
+    MAPANYTHING,
+    PI3,
     photograph,
     references_of,
     small_network,
@@ -38,7 +39,7 @@ from support.small_networks import (
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.engine.failures import failure_of
 from mapless_server.method.choices import NETWORKS
-from mapless_server.method.coarse import Bucket, Outcome, Request, reconstruct_one
+from mapless_server.method.coarse import Bucket, Outcome, Request, make, reconstruct_one
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.geometric import GeometricReconstructor
 from mapless_server.method.coarse.make import make_reconstructor
@@ -46,13 +47,13 @@ from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstr
 from mapless_server.method.coarse.token_cache import TokenCacheOptions
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.views import PosedView, Reconstruction, View
-from mapless_server.networks import pi3
-from mapless_server.networks import runner as runner_module
+from mapless_server.networks import mapanything, pi3, pi3x
 from mapless_server.networks.conditions import normalize_poses
+from mapless_server.networks.mapanything import MapAnything
 from mapless_server.networks.network import NetworkOutput
 from mapless_server.networks.pi3 import Pi3
 from mapless_server.networks.runner import NetworkRunner
-from mapless_server.networks.weights import CATALOGUE, CheckpointError, WeightsMissing
+from mapless_server.networks.weights import CATALOGUE, CheckpointError, WeightsMissing, named
 from mapless_server.scheduling import Done, Flow, Job, Observer, Stage, StageResult, Step, WorkQueue, WorkQueueOptions
 
 OPTIONS = NetworkOptions(grids=GRIDS)
@@ -515,7 +516,7 @@ def test_pi3x_normalizes_by_the_references_alone(monkeypatch: pytest.MonkeyPatch
     posed = torch.tensor([[True, True, True, False]])
 
     misled = runner.reconstruct(tokens, (4, 5), 3, poses, posed).local_points[0].numpy()
-    monkeypatch.setattr(runner_module, "normalize_poses", _normalize_without_the_last)
+    monkeypatch.setattr(pi3x, "normalize_poses", _normalize_without_the_last)
     plain = runner.reconstruct(tokens, (4, 5), 3, poses, posed).local_points[0].numpy()
     np.testing.assert_allclose(ours, plain, atol=5e-5 * float(np.abs(plain).max()))
     assert np.abs(misled - plain).max() > 1e-3 * float(np.abs(plain).max())
@@ -558,7 +559,7 @@ def test_pi3_gets_no_poses() -> None:
 
 
 def test_an_unknown_name_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="known: auto, geometric, pi3, pi3x"):
+    with pytest.raises(ValueError, match="known: auto, geometric, pi3, pi3x, mapanything"):
         make_reconstructor("vggt", tmp_path)
 
 
@@ -568,7 +569,7 @@ def test_a_network_needs_its_weights(tmp_path: Path) -> None:
 
 
 def test_a_network_is_loaded_from_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pi3, "Pi3", lambda: Pi3(SMALL["pi3"]))
+    monkeypatch.setattr(pi3, "Pi3", lambda: Pi3(PI3))
     network = small_network("pi3", seed=4)
     save_file(network.state_dict(), tmp_path / "pi3.safetensors")
     made = make_reconstructor("pi3", tmp_path, "cpu", OPTIONS)
@@ -582,6 +583,24 @@ def test_a_network_is_loaded_from_its_file(tmp_path: Path, monkeypatch: pytest.M
         stream.truncate(1000)
     with pytest.raises(CheckpointError):
         make_reconstructor("pi3", tmp_path, "cpu", OPTIONS)
+
+
+def test_a_file_under_another_licence_does_not_serve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also if it is put into the folder by hand: its tensors are those of the file that a company may use."""
+    monkeypatch.setattr(mapanything, "MapAnything", lambda: MapAnything(MAPANYTHING))
+    file = tmp_path / "mapanything.safetensors"
+    save_file(small_network("mapanything").state_dict(), file)
+    assert make_reconstructor("mapanything", tmp_path, "cpu", OPTIONS).name == "mapanything"
+    known = named("mapanything")
+    other = replace(known.look_alikes[0], sha256=hashlib.sha256(file.read_bytes()).hexdigest())
+    monkeypatch.setattr(make, "named", lambda _: replace(known, look_alikes=(other,)))
+    with pytest.raises(CheckpointError) as caught:
+        make_reconstructor("mapanything", tmp_path, "cpu", OPTIONS)
+    assert str(caught.value) == (
+        f"{file} is the file of facebook/map-anything, whose licence is CC BY-NC 4.0, non-commercial. mapanything is "
+        "the file of facebook/map-anything-apache, whose licence is Apache-2.0: "
+        "`mapless-server weights fetch mapanything`"
+    )
 
 
 @pytest.mark.parametrize(("device", "reason"), [("cpu", "there is no CUDA device"), ("cuda", "weights fetch pi3`")])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,8 @@ import pytest
 torch = pytest.importorskip("torch")
 library = pytest.importorskip("safetensors.torch")
 
-from mapless_server.networks.checkpoint import UNUSED, expected_tensors, load_strictly  # noqa: E402
+from mapless_server.networks.checkpoint import FileNames, expected_tensors, load_strictly  # noqa: E402
+from mapless_server.networks.mapanything import canonical_name  # noqa: E402
 from mapless_server.networks.weights import CATALOGUE, CheckpointError  # noqa: E402
 
 Tensors = dict[str, Any]
@@ -153,9 +154,12 @@ def test_all_differences_are_in_one_message(tensors: Tensors, file: Path) -> Non
     )
 
 
-def test_tensors_with_ignored_prefixes_are_skipped(tensors: Tensors, file: Path) -> None:
+def test_tensors_with_unused_prefixes_are_skipped(
+    tensors: Tensors, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Network, "file_names", FileNames(unused_prefixes=("omega", "flow_head.")), raising=False)
     surplus = {"omega": torch.tensor([math.nan]), "flow_head.weight": torch.zeros(3)}
-    network, identity = load(tensors | surplus, file, ignored_prefixes=UNUSED)
+    network, identity = load(tensors | surplus, file)
     assert torch.equal(network.scale, tensors["scale"])
     assert identity == hashlib.sha256(file.read_bytes()).hexdigest()
 
@@ -173,11 +177,12 @@ def test_files_of_other_formats_are_refused_unopened(tensors: Tensors, file: Pat
         load_strictly(on_meta(), file)
 
 
-@pytest.mark.parametrize("name", ["pi3", "pi3x", "megaloc"])
+@pytest.mark.parametrize("name", ["pi3", "pi3x", "mapanything", "megaloc"])
 def test_the_official_file_has_the_size_of_its_tensors(name: str) -> None:
-    """The header of a float32 file without metadata, as the library writes it, and its data, to the byte.
+    """The header of a float32 file, as the library writes it, and its data, to the byte.
 
-    Pi3X's holds, besides ours, a second encoder for depths, of two channels.
+    Pi3X's holds, besides ours, a second encoder for depths, of two channels; MapAnything's, as metadata, the other
+    names of tensors that its modules share.
     """
     (weights,) = [weights for weights in CATALOGUE if weights.name == name]
     module, class_name = weights.network.split(":")
@@ -187,9 +192,26 @@ def test_the_official_file_has_the_size_of_its_tensors(name: str) -> None:
     if name == "pi3x":
         shapes |= {f"depth_{key}": shape for key, shape in shapes.items() if key.startswith("encoder.")}
         shapes |= {"depth_encoder.patch_embed.proj.weight": [1024, 2, 14, 14], "depth_emb": [1, 1, 1024]}
-    header, end = {}, 0
+    header: dict[str, Any] = {}
+    if name == "mapanything":
+        header["__metadata__"] = {alias: canonical_name(alias) for alias in mapanything_aliases(shapes)}
+    end = 0
     for key, shape in sorted(shapes.items()):
         begin, end = end, end + 4 * math.prod(shape)
         header[key] = {"dtype": "F32", "shape": shape, "data_offsets": [begin, end]}
     length = len(json.dumps(header, separators=(",", ":")))
     assert weights.size_bytes == 8 + length + -length % 8 + end
+
+
+def mapanything_aliases(names: Iterable[str]) -> Iterator[str]:
+    """The 76 further names of tensors of the official network."""
+    inputs, regression = "dense_head.0.", "dense_head.1."
+    for name in names:
+        if name.startswith(regression):
+            yield "dpt_regressor_head." + name.removeprefix(regression)
+        elif name.startswith(inputs):
+            yield "dpt_feature_head." + name.removeprefix(inputs)
+    for i in range(4):
+        for head in (inputs, "dpt_feature_head."):
+            yield f"{head}scratch.layer{i + 1}_rn.weight"
+            yield f"{head}scratch.layer_rn.{i}.weight"

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from safetensors.torch import save_file
 from support.parity_rule import images, network_without_weights, ruled_network, weights
 
-from mapless_server.networks.checkpoint import UNUSED, load_strictly
+from mapless_server.networks.checkpoint import load_strictly
 from mapless_server.networks.conditions import normalize_poses
 from mapless_server.networks.network import Network, NetworkOutput, patch_grid
+from mapless_server.networks.pi import UNUSED
 from mapless_server.networks.pi3x import Pi3X
 
 HERE = Path(__file__).parents[1] / "fixtures" / "networks"

@@ -7,12 +7,14 @@ from collections.abc import Iterator
 
 import pytest
 import torch
-from support.parity_rule import images, ruled_network, weights
+from support.parity_rule import images, mapanything_weights, ruled_network, weights
 from torch import Tensor
 from torch._dynamo.utils import counters
 
 from mapless_server.networks.blocks import Attention, flash_attention
-from mapless_server.networks.network import Network, NetworkOutput, Sizes
+from mapless_server.networks.mapanything import MapAnything, MapAnythingSizes
+from mapless_server.networks.network import Network, NetworkOutput
+from mapless_server.networks.pi import Sizes
 from mapless_server.networks.pi3 import Pi3
 from mapless_server.networks.pi3x import Pi3X
 from mapless_server.networks.runner import CompiledShape, NetworkRunner, RunnerOptions, UnsuitableDevice
@@ -46,12 +48,16 @@ def shallow_network(name: str) -> Network:
     """Every kind of block once, for tracing is slow."""
     sizes = Sizes(32, 2, 1, 2, 1, 16, (16,), 4, metric_width=16, metric_heads=1, metric_depth=1)
     network: Network = Pi3(sizes) if name == "pi3" else Pi3X(sizes)
-    state = {key: torch.from_numpy(weights(key, value.shape)) for key, value in network.state_dict().items()}
+    rule = weights
+    if name == "mapanything":
+        network = MapAnything(MapAnythingSizes(32, 2, 1, 2, 4, (0, 1), (8, 8), (8, 8), (4, 4, 4, 4), 8, 8, 16, 8))
+        rule = mapanything_weights
+    state = {key: torch.from_numpy(rule(key, value.shape)) for key, value in network.state_dict().items()}
     network.load_state_dict(state)
     return network
 
 
-@pytest.fixture(params=["pi3", "pi3x"])
+@pytest.fixture(params=["pi3", "pi3x", pytest.param("mapanything", marks=pytest.mark.nightly)])
 def name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 

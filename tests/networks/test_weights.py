@@ -37,7 +37,7 @@ from mapless_server.networks.weights import (
     named,
     sources,
 )
-from mapless_server.networks.weights.catalogue import HubFile, Licence, TorchFile, Weights, WheelMember
+from mapless_server.networks.weights.catalogue import HubFile, Licence, LookAlike, TorchFile, Weights, WheelMember
 from mapless_server.networks.weights.folder import Status, look_up, temporary_folder
 from mapless_server.networks.weights.install import add, check, fetch
 from mapless_server.networks.weights.safetensors_header import Header, opened, read_header
@@ -278,6 +278,23 @@ def test_an_unofficial_file_needs_the_option(folder: Path, file: Path) -> None:
     assert add(weights, file, folder, unofficial=True).is_official is False
     stored = look_up(weights, folder)
     assert (stored.status, stored.size_bytes) == (Status.UNOFFICIAL, len(CONTENT))
+
+
+def test_a_file_under_another_licence_is_never_taken(folder: Path, file: Path) -> None:
+    """MapAnything is published twice, with the same tensors: for everyone, and for non-commercial use."""
+    other = LookAlike(sha256(CONTENT), "o/for-research", Licence("CC BY-NC 4.0", "url", "non-commercial"))
+    weights = entry_of(b"another", look_alikes=(other,))
+    for unofficial in (False, True):
+        with pytest.raises(CheckpointError) as caught:
+            add(weights, file, folder, unofficial=unofficial)
+        assert str(caught.value) == (
+            f"{file} is the file of o/for-research, whose licence is CC BY-NC 4.0, non-commercial. net is the file of "
+            "o/n, whose licence is MIT: `mapless-server weights fetch net`"
+        )
+    assert names_in(folder) == []
+    file.write_bytes(pickle.dumps([1] * 40))
+    with pytest.raises(CheckpointError, match=r"it is a pickle\. net is the file of o/n, whose licence is MIT"):
+        add(weights, file, folder)
 
 
 def test_weights_without_a_known_digest_are_added_and_recorded(folder: Path, file: Path) -> None:

@@ -77,7 +77,7 @@ def test_the_file_may_be_named_by_the_environment(config: Path, monkeypatch: pyt
         ('workers = "many"', "workers (file)"),
         ("max_image_mib = 33", "max_image_mib must not exceed max_message_mib (32), is 33"),
         ("max_deadline_s = 20", "default_deadline_s must not exceed max_deadline_s (20), is 30"),
-        ('backend = "pi4"', "backend (file): must be one of auto, geometric, pi3, pi3x, is 'pi4'"),
+        ('backend = "pi4"', "backend (file): must be one of auto, geometric, pi3, pi3x, mapanything, is 'pi4'"),
         ('features = "surf"', "features (file): must be one of auto, sift, "),
         ('retrieval = "bow"', "retrieval (file): must be one of auto, vlad, megaloc, is 'bow'"),
         ('log_level = "loud"', "log_level (file)"),

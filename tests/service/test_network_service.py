@@ -27,6 +27,7 @@ from mapless.geometry import Camera, RigidTransform
 from mapless_server.engine.query import Tier
 from mapless_server.engine.stages import Method
 from mapless_server.method import pipeline
+from mapless_server.method.choices import NETWORKS
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.method.features import SiftExtractor
 from mapless_server.method.pipeline import Pipeline
@@ -72,7 +73,7 @@ def on_network(
         yield client, backend, server
 
 
-@pytest.mark.parametrize("name", ["pi3", "pi3x"])
+@pytest.mark.parametrize("name", NETWORKS)
 def test_a_random_network_is_answered_for(tmp_path: Path, name: str) -> None:
     """Nothing but the answer's form is known: the network is random, but matches and poses of references are true."""
     with on_network(tmp_path, small_network(name), name) as (client, backend, _):

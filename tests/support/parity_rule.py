@@ -15,12 +15,27 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mapless_server.networks.network import IMAGE_MEAN, IMAGE_STD, Network, Sizes
+from mapless_server.networks.mapanything import MapAnything, MapAnythingSizes
+from mapless_server.networks.network import IMAGE_MEAN, IMAGE_STD, Network
+from mapless_server.networks.pi import Sizes
 from mapless_server.networks.pi3 import Pi3
 from mapless_server.networks.pi3x import Pi3X
 
 SMALL_PI3 = Sizes(64, 4, encoder_depth=3, decoder_depth=4, head_depth=2, camera_width=32)
 SMALL_PI3X = Sizes(64, 4, 3, 10, 2, 32, (64, 32, 16), 8, metric_width=32, metric_heads=2, metric_depth=2)
+SMALL_MAPANYTHING = MapAnythingSizes(
+    width=96,
+    encoder_heads=4,
+    encoder_depth=4,
+    heads=6,
+    depth=6,
+    taps=(1, 3),
+    map_widths=(40, 48, 56),
+    vector_widths=(16, 24, 32),
+    dense_map_widths=(8, 16, 24, 32),
+    dense_width=32,
+    dense_hidden=16,
+)
 
 CONSTANTS = {"image_mean": IMAGE_MEAN, "image_std": IMAGE_STD}
 TOKENS = ("cls_token", "pos_embed", "register_tokens", "register_token", "metric_token", "depth_emb")
@@ -45,8 +60,48 @@ def images(tag: str, shape: Sequence[int]) -> NDArray[np.float32]:
     return (uniform(f"image:{tag}", math.prod(shape)).reshape(shape) + np.float32(1.0)) * np.float32(0.5)
 
 
+MAPANYTHING_OFFSET = {"dense_head.1.conv2.2.bias": (0, 0, 1, 0.5, 0, 0), "pose_head.fc_rot.bias": (0, 0, 0, 1)}
+"""Keep rays pointing forwards, and quaternions away from zero."""
+MAPANYTHING_GAIN = {
+    r"^encoder\.model\.patch_embed\.proj\.weight$": 0.05,
+    r"^\w+_encoder\.encoder\.[12]\.weight$": 0.2,
+    r"^dense_head\.1\.conv2\.2\.weight$": 0.5,
+}
+MAPANYTHING_BIAS = {
+    r"^fusion_norm_layer\.|\.norm_layer\.": 0.02,
+    r"^\w+_encoder\.encoder\.[12]\.bias$": 0.1,
+    r"^\w+_encoder\.": 0.5,
+    r"": 0.05,
+}
+
+
+def mapanything_weights(key: str, shape: Sequence[int]) -> NDArray[np.float32]:
+    """The entry of a checkpoint of MapAnything."""
+    if key == "info_sharing.view_pos_table":
+        return np.broadcast_to(np.arange(shape[-1]) % 2, shape).astype(np.float32)
+    noise = uniform(key, math.prod(shape)).reshape(shape)
+    name, top = key.rsplit(".", 1)[-1], key.split(".", 1)[0]
+    if name in ("cls_token", "pos_embed", "scale_token"):
+        return np.float32(0.15) * noise
+    if name == "gamma":
+        return np.float32(0.06 if top == "info_sharing" else 0.03) * (np.float32(1.0) + np.float32(0.5) * noise)
+    if len(shape) == 1 and name == "weight":
+        is_small = re.search(r"^fusion_norm_layer\.|\.norm_layer\.", key)
+        return np.float32(0.1 if is_small else 1.0) * (np.float32(1.0) + np.float32(0.2) * noise)
+    if len(shape) == 1:
+        biases = np.float32(_matching(MAPANYTHING_BIAS, key)) * noise
+        offset = MAPANYTHING_OFFSET.get(key)
+        return biases if offset is None else biases + np.asarray(offset, np.float32)
+    transposed = re.search(r"input_process\.[01]\.0\.1\.weight$", key)
+    fan_in = shape[0] if transposed else math.prod(shape[1:])
+    values = np.float32(_matching(MAPANYTHING_GAIN, key) * math.sqrt(3.0 / fan_in)) * noise
+    if key.endswith(".attn.qkv.weight"):
+        values[: shape[0] * 2 // 3] *= np.float32(1.5)
+    return values
+
+
 def weights(key: str, shape: Sequence[int]) -> NDArray[np.float32]:
-    """The entry of a checkpoint."""
+    """The entry of a checkpoint of Pi3 or Pi3X."""
     if key in CONSTANTS:
         return np.asarray(CONSTANTS[key], np.float32).reshape(shape)
     noise = uniform(key, math.prod(shape)).reshape(shape)
@@ -75,16 +130,19 @@ def _matching(factors: Mapping[str, float], key: str) -> float:
 
 
 def network_without_weights(name: str, small: bool = True) -> Network:
-    """Pi3 or Pi3X, on the meta device."""
+    """A network on the meta device."""
     with torch.device("meta"):
+        if name == "mapanything":
+            return MapAnything(SMALL_MAPANYTHING if small else None)
         if name == "pi3":
             return Pi3(SMALL_PI3 if small else None)
         return Pi3X(SMALL_PI3X if small else None)
 
 
 def ruled_network(name: str, small: bool = True) -> Network:
-    """Pi3 or Pi3X with the rule's weights."""
+    """A network with the rule's weights."""
     network = network_without_weights(name, small)
-    state = {key: torch.from_numpy(weights(key, value.shape)) for key, value in network.state_dict().items()}
+    rule = mapanything_weights if name == "mapanything" else weights
+    state = {key: torch.from_numpy(rule(key, value.shape)) for key, value in network.state_dict().items()}
     network.load_state_dict(state, assign=True)
     return network.eval().requires_grad_(False)

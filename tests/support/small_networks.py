@@ -12,24 +12,25 @@ from numpy.typing import NDArray
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_server.method.coarse.grids import GridOptions
 from mapless_server.method.views import Features, Photograph, PosedView, View
-from mapless_server.networks.network import Network, Sizes
+from mapless_server.networks.mapanything import MapAnything, MapAnythingSizes
+from mapless_server.networks.network import Network
+from mapless_server.networks.pi import Sizes
 from mapless_server.networks.pi3 import Pi3
 from mapless_server.networks.pi3x import Pi3X
 from mapless_server.networks.runner import NetworkRunner
 from support.images import textured
 
-SMALL = {
-    "pi3": Sizes(64, 4, encoder_depth=3, decoder_depth=4, head_depth=2, camera_width=32),
-    "pi3x": Sizes(64, 4, 3, 10, 2, 32, (64, 32, 16), 8, metric_width=32, metric_heads=2, metric_depth=2),
-}
+PI3 = Sizes(64, 4, encoder_depth=3, decoder_depth=4, head_depth=2, camera_width=32)
+PI3X = Sizes(64, 4, 3, 10, 2, 32, (64, 32, 16), 8, metric_width=32, metric_heads=2, metric_depth=2)
+MAPANYTHING = MapAnythingSizes(64, 4, 3, 4, 6, (1, 3), (32, 48), (16, 32), (8, 8, 16, 16), 16, 8, 32, 16)
 GRIDS = GridOptions(pixel_limit=20 * 14**2)
 """5 x 4 patches for 4:3."""
 NOTHING = Features(np.empty((0, 2), np.float32), np.empty((0, 4), np.float32), np.empty(0, np.float32))
 
 
 def small_network(name: str, seed: int = 0) -> Network:
-    """A small Pi3 or Pi3X whose every part has its say."""
-    network: Network = Pi3(SMALL[name]) if name == "pi3" else Pi3X(SMALL[name])
+    """A small network whose every part has an effect, and which masks no pixel."""
+    network = network_without_weights(name)
     random = torch.Generator().manual_seed(seed)
     for key, parameter in network.named_parameters():
         noise = torch.randn(parameter.shape, generator=random)
@@ -42,7 +43,17 @@ def small_network(name: str, seed: int = 0) -> Network:
         else:
             noise = noise / parameter[0].numel() ** 0.5
         parameter.data.copy_(noise)
+    if isinstance(network, MapAnything):
+        network.info_sharing.view_pos_table.copy_(torch.arange(MAPANYTHING.width) % 2)
+        network.get_parameter("dense_head.1.conv2.2.bias").data[5] = 50.0
     return network
+
+
+def network_without_weights(name: str) -> Network:
+    """A small network, on the CPU."""
+    if name == "mapanything":
+        return MapAnything(MAPANYTHING)
+    return Pi3(PI3) if name == "pi3" else Pi3X(PI3X)
 
 
 def small_runner(name: str, seed: int = 0) -> NetworkRunner:

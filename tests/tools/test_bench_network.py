@@ -10,16 +10,17 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812
-from support.small_networks import SMALL, references_of, small_runner
+from support.small_networks import PI3, references_of, small_runner
 from support.small_networks import photograph as photograph_of
 from torch.nn.attention import SDPBackend
 
 from mapless.geometry import Camera
+from mapless_server.method.choices import NETWORKS
 from mapless_server.method.coarse import reconstruct_one
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.method.views import Features, Reconstruction, View
-from mapless_server.networks.network import Sizes
+from mapless_server.networks.pi import PiNetwork, Sizes
 from mapless_tools.bench_network import host
 from mapless_tools.bench_network.command import bench_network
 from mapless_tools.bench_network.forward import Forward, max_difference, with_low_precision_stream
@@ -29,7 +30,7 @@ from mapless_tools.bench_network.report import Figure, markdown, table
 from mapless_tools.bench_network.subject import Work, make_network, operations_of
 
 GRID = (3, 4)
-SIZES = SMALL["pi3"]
+SIZES = PI3
 
 
 def test_the_full_network_has_the_published_operation_count() -> None:
@@ -95,9 +96,9 @@ def test_prediction_is_above_the_floor_and_compiling_is_faster() -> None:
     assert operations.floor_s(H200) < operations.predicted_s(H200, True) <= operations.predicted_s(H200, False)
 
 
-@pytest.mark.parametrize("name", ["pi3", "pi3x"])
+@pytest.mark.parametrize("name", NETWORKS)
 def test_a_random_network_is_nowhere_zero_and_finite(name: str) -> None:
-    network = make_network(name, SMALL[name], seed=3)
+    network = make_network(name, host.SMALL[name], seed=3)
     assert all(float((parameter != 0).float().mean()) > 0.99 for parameter in network.parameters())
     layout = network.layout((3, 4))
     output = network.reconstruct(network.encode(torch.rand(2, 3, 42, 56), layout)[None], layout, 2)
@@ -116,6 +117,7 @@ def test_forward_from_kept_tokens_is_the_forward_of_everything() -> None:
     other = forward.run(Work(1, 2, 3, GRID))
     assert max_difference(kept, everything) <= 1e-6
     assert max_difference(other, everything) > 1e-2
+    assert isinstance(network, PiNetwork)
     with_low_precision_stream(network)
     low = Forward(network, SDPBackend.MATH, 3, GRID).run(Work(3, 2, 3, GRID))
     assert 0 < max_difference(low, everything) < 0.3

@@ -9,9 +9,10 @@ EDGEPOINT2 = ("edgepoint2-s64", "edgepoint2-m64", "edgepoint2-l64", "edgepoint2-
 FEATURES = ("sift", *EDGEPOINT2, "aliked", "xfeat", "superpoint")
 """Kinds of local features; all but the first need weights of the same name. `features.make_extractor` makes them."""
 
-NETWORKS = ("pi3", "pi3x")
-"""Backends with a network, whose weights, of the same name, are licensed for non-commercial use. `auto` looks for them
-in this order: the paper's method and figures are pi^3's, and it is the smaller one. `coarse.make` makes them."""
+NETWORKS = ("pi3", "pi3x", "mapanything")
+"""Backends with a network, which need weights of the same name; those of pi3 and pi3x are licensed for non-commercial
+use. `auto` looks for them in this order: the paper's method and figures are pi^3's, and it is the smallest one.
+`coarse.make` makes them."""
 
 BACKENDS = ("geometric", *NETWORKS)
 

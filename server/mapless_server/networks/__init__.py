@@ -1,19 +1,30 @@
-"""The feed-forward 3D networks pi^3 (Wang et al. 2025) and its successor Pi3X, written from a description of them.
+"""The feed-forward 3D networks pi^3 (Wang et al. 2025), its successor Pi3X, and MapAnything (Keetha et al. 2025).
 
-A network takes images of one scene and computes, up to one similarity, each view's pose and the point seen at each of
-its pixels. The modules' names are those of the official checkpoints' entries. This room imports only
-`mapless_server.extras`, and this file imports nothing: torch takes seconds. Begin with `pi3`, then `network`.
+They are written from descriptions. A network takes images of one scene and computes, up to one similarity, each view's
+pose and the point seen at each of its pixels. The modules' names are those of the official checkpoints' entries. This
+room imports only `mapless_server.extras`, and this file imports nothing: torch takes seconds. Begin with `network`,
+then `pi3`.
 
+    network.py     the interface of all
     blocks.py      attention, normalization, rotary positions
     encoder.py     each image to patch tokens
+    checkpoint.py  weights from a file, checked to be exactly the network's
+    runner.py      a network on a device
+
+Pi3 and Pi3X:
+
     decoder.py     blocks within views and over the scene in turn
     heads.py       poses, points and confidence from decoded tokens
     rotation.py    the nearest rotation
     conditions.py  the further input of Pi3X: rays, poses
-    network.py     the common part of both networks
+    pi.py          the common part of both
     pi3.py, pi3x.py
-    checkpoint.py  weights from a file, checked to be exactly the network's
-    runner.py      a network on a device
+
+MapAnything:
+
+    view_conditions.py  the further input: rays, depths, poses, each for any subset of the views
+    dpt.py              values for each pixel
+    mapanything.py
 
 A network for retrieval, which computes one vector for a whole image:
 

@@ -61,6 +61,21 @@ class Mlp(nn.Module):
         return self.fc2(F.gelu(self.fc1(x)))
 
 
+class SwiGlu(nn.Module):
+    """w3(silu(a) * b), where a and b are the halves of w12(x), 8/3 times as wide (Shazeer 2020; as in DINOv2)."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        hidden = -(-(4 * width * 2 // 3) // 8) * 8  # a multiple of 8, not smaller
+        self.w12 = Linear(width, 2 * hidden)
+        self.w3 = Linear(hidden, width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., C) to (..., C)."""
+        gate, value = self.w12(x).chunk(2, dim=-1)
+        return self.w3(F.silu(gate) * value)
+
+
 @dataclass(frozen=True, eq=False)
 class Rope:
     """Rotary positions in two dimensions (Su et al. 2021; Heo et al. 2024), the table for T tokens of one view.
@@ -135,20 +150,38 @@ class Attention(nn.Module):
             q, k = rope.rotate(q), rope.rotate(k)
         return self.merge(self.attend(q, k, v))
 
+    def of_last(self, x: Tensor, count: int) -> Tensor:
+        """The output (B, count, C) at the last tokens alone, of tokens (B, T, C), without rotation."""
+        width = x.shape[-1]
+        weight, bias = self.qkv.weight, self.qkv.bias
+        q = F.linear(x[:, -count:].to(weight.dtype), weight[:width], bias[:width])
+        kv = F.linear(x.to(weight.dtype), weight[width:], bias[width:])
+        k, v = kv.unflatten(-1, (2, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        q = q.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+        return self.merge(self.attend(self.q_norm(q), self.k_norm(k), v))
+
 
 class Block(nn.Module):
     """A transformer block, normalized before attention and before the MLP."""
 
-    def __init__(self, width: int, heads: int, *, normalize_qk: bool = False, layer_scale: bool = True) -> None:
+    def __init__(
+        self, width: int, heads: int, *, normalize_qk: bool = False, layer_scale: bool = True, gated: bool = False
+    ) -> None:
+        """A gated block has a SwiGLU in place of the MLP."""
         super().__init__()
         self.norm1 = LayerNorm(width, eps=BLOCK_EPS)
         self.attn = Attention(width, heads, normalize_qk)
         self.ls1: nn.Module = LayerScale(width) if layer_scale else nn.Identity()
         self.norm2 = LayerNorm(width, eps=BLOCK_EPS)
-        self.mlp = Mlp(width)
+        self.mlp: nn.Module = SwiGlu(width) if gated else Mlp(width)
         self.ls2: nn.Module = LayerScale(width) if layer_scale else nn.Identity()
 
     def forward(self, x: Tensor, rope: Rope | None = None) -> Tensor:
         """Tokens (B, T, C) to (B, T, C); tokens of one row of the batch attend to each other."""
         x = x + self.ls1(self.attn(self.norm1(x), rope))
         return x + self.ls2(self.mlp(self.norm2(x)))
+
+    def of_last(self, x: Tensor, count: int) -> Tensor:
+        """The output (B, count, C) at the last tokens alone, of tokens (B, T, C), without rotation."""
+        last = x[:, -count:] + self.ls1(self.attn.of_last(self.norm1(x), count))
+        return last + self.ls2(self.mlp(self.norm2(last)))

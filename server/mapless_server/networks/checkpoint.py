@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from io import BufferedReader
 from pathlib import Path
 
 import torch
 
 from .weights.errors import CheckpointError
-from .weights.safetensors_header import Entry, check_fit, opened, read_header
+from .weights.safetensors_header import Entry, Header, check_fit, opened, read_header
 
 IMAGE_NORMALIZATION: Mapping[str, Sequence[float]] = {
     "image_mean": (0.485, 0.456, 0.406),
@@ -19,11 +20,31 @@ IMAGE_NORMALIZATION: Mapping[str, Sequence[float]] = {
 }
 """ImageNet's constants, red, green, blue, for images in 0..1: buffers of Pi3 and Pi3X that a checkpoint may lack."""
 
-UNUSED = (
-    *("omega", "flow_decoder.", "flow_head.", "global_points_decoder.", "global_point_head."),
-    *("depth_encoder.", "depth_emb"),
-)
-"""Prefixes of names in checkpoints of Pi3 and Pi3X that are not used here: for training, and for given depths."""
+
+def _no_further_words(_: Mapping[str, tuple[int, ...]]) -> str:
+    return ""
+
+
+@dataclass(frozen=True)
+class FileNames:
+    """How the files of a network may differ from its tensors; a class has it as its attribute `file_names`.
+
+    Attributes:
+        canonical: the name of a tensor in the network, of any name that files may give it.
+        unused_prefixes: files may hold further tensors with these prefixes, which are not loaded.
+        describe_misfit: what a file is that does not fit, from the shapes of its tensors; empty if that is not known.
+    """
+
+    canonical: Callable[[str], str] = str
+    unused_prefixes: tuple[str, ...] = ()
+    describe_misfit: Callable[[Mapping[str, tuple[int, ...]]], str] = _no_further_words
+
+
+def file_names_of(network: type[torch.nn.Module]) -> FileNames:
+    """Those of its class; without any, a file must have exactly the network's names."""
+    names: FileNames = getattr(network, "file_names", FileNames())
+    return names
+
 
 _DTYPES = {
     "F64": torch.float64,
@@ -44,7 +65,6 @@ def load_strictly(
     file: Path,
     *,
     optional: Mapping[str, Sequence[float] | None] = IMAGE_NORMALIZATION,
-    ignored_prefixes: tuple[str, ...] = (),
 ) -> str:
     """Replaces all parameters and persistent buffers of a module by those of a file; other buffers are not changed.
 
@@ -57,35 +77,63 @@ def load_strictly(
         module: on any device; the meta device saves memory.
         file: safetensors, of any floating-point type.
         optional: names that the file may lack, with their default values; None leaves the module's own.
-        ignored_prefixes: further names with these prefixes are allowed; their tensors are hashed and dropped.
 
     Returns:
         The weights' identity: SHA-256 of the file, 64 hexadecimal digits.
 
     Raises:
         CheckpointError: the file cannot be read, is not a safetensors file or a damaged one, holds other tensors than
-            the module, or numbers that are not finite. The module is then unchanged.
+            the module (see FileNames for what is allowed), two of one name that differ, or numbers that are not finite.
+            The module is then unchanged.
     """
     state = module.state_dict()
     header = read_header(file)
-    message = f"{file} does not fit {type(module).__name__}"
-    check_fit(header, expected_tensors(module), optional.keys(), ignored_prefixes, message)
+    names = file_names_of(type(module))
+    compare_tensors(header, module, str(file), optional)
     with opened(file) as stream:
         digest = hashlib.sha256(stream.read(header.size_bytes))
-        loaded = _defaults(state, header.entries, optional)
-        for name, entry in header.entries.items():
+        loaded: dict[str, torch.Tensor] = {}
+        for given, entry in header.entries.items():
+            name = names.canonical(given)
             if entry.dtype not in _DTYPES:
-                raise CheckpointError(f"{file} holds numbers of type {entry.dtype}, in {name}, which no network uses")
+                raise CheckpointError(f"{file} holds numbers of type {entry.dtype}, in {given}, which no network uses")
             tensor = _read(stream, entry, file)
             digest.update(_bytes_of(tensor))
             if name in state:
                 if not _is_finite(tensor):
-                    raise CheckpointError(f"{file} holds numbers that are not finite, in {name}")
-                loaded[name] = tensor.to(state[name].dtype)
+                    raise CheckpointError(f"{file} holds numbers that are not finite, in {given}")
+                tensor = tensor.to(state[name].dtype)
+                if name in loaded and not torch.equal(tensor, loaded[name]):
+                    raise CheckpointError(f"{file} holds {name} twice, with other numbers as {given}")
+                loaded[name] = tensor
         if stream.read(1):
             raise CheckpointError(f"{file} changed while it was read")
+    loaded |= _defaults(state, loaded.keys(), optional)
     module.load_state_dict(loaded, strict=True, assign=True)
     return digest.hexdigest()
+
+
+def compare_tensors(
+    header: Header,
+    module: torch.nn.Module,
+    description: str,
+    optional: Mapping[str, Sequence[float] | None] = IMAGE_NORMALIZATION,
+) -> None:
+    """Raises CheckpointError unless a file has the module's tensors, under any of their names.
+
+    Args:
+        header: of the file.
+        module: on any device.
+        description: of the file in messages.
+        optional: names that the file may lack.
+    """
+    names = file_names_of(type(module))
+    renamed = replace(header, entries={names.canonical(name): entry for name, entry in header.entries.items()})
+    message = f"{description} does not fit {type(module).__name__}"
+    further = names.describe_misfit({name: entry.shape for name, entry in renamed.entries.items()})
+    if further:
+        message += f": {further}"
+    check_fit(renamed, expected_tensors(module), optional.keys(), names.unused_prefixes, message)
 
 
 def expected_tensors(module: torch.nn.Module) -> dict[str, tuple[tuple[int, ...], bool]]:
@@ -94,12 +142,12 @@ def expected_tensors(module: torch.nn.Module) -> dict[str, tuple[tuple[int, ...]
 
 
 def _defaults(
-    state: Mapping[str, torch.Tensor], entries: Mapping[str, Entry], optional: Mapping[str, Sequence[float] | None]
+    state: Mapping[str, torch.Tensor], loaded: Collection[str], optional: Mapping[str, Sequence[float] | None]
 ) -> dict[str, torch.Tensor]:
     """Values of the optional tensors that the file lacks."""
     values: dict[str, torch.Tensor] = {}
     for name, given in optional.items():
-        if name not in state or name in entries:
+        if name not in state or name in loaded:
             continue
         own = state[name]
         if given is None and own.is_meta:

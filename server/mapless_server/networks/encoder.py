@@ -1,4 +1,8 @@
-"""The image encoder: DINOv2 ViT-L/14 with registers (Oquab, Darcet et al. 2023). It encodes each view alone."""
+"""The image encoders: DINOv2 with registers (Oquab, Darcet et al. 2023), and the older one without.
+
+They encode each view alone. Pi3 and Pi3X have a ViT-L/14 with registers; MapAnything a ViT-g/14 and MegaLoc a ViT-B/14
+without.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +16,9 @@ PATCH_PX = 14
 POSITION_SIDE = 37
 """The learned position grid has 37 x 37 cells, for images of 518 x 518."""
 REGISTERS = 4
+POSITION_OFFSET = 0.1
+"""DINOv2 without registers resizes its learned positions by the factor (cells + 0.1) / 37, once a guard against
+rounding. Weights were trained with it: on 23 x 23 patches it moves the last samples by a sixth of a cell."""
 
 
 class PatchEmbedding(nn.Module):
@@ -67,4 +74,38 @@ class Encoder(nn.Module):
         of_class, of_patches = self.pos_embed.split([1, POSITION_SIDE**2], dim=1)
         learned = of_patches.transpose(1, 2).unflatten(2, (POSITION_SIDE, POSITION_SIDE))
         resized = F.interpolate(learned, grid, mode="bicubic", antialias=True, align_corners=False)
+        return torch.cat([of_class, resized.flatten(2).transpose(1, 2)], dim=1)
+
+
+class PlainEncoder(nn.Module):
+    """Normalized images to tokens of all blocks, without registers and without a final normalization."""
+
+    def __init__(self, width: int, heads: int, depth: int, *, gated: bool = False) -> None:
+        super().__init__()
+        self.cls_token = nn.Parameter(torch.empty(1, 1, width))
+        self.pos_embed = nn.Parameter(torch.empty(1, 1 + POSITION_SIDE**2, width))
+        self.patch_embed = PatchEmbedding(3, width)
+        self.blocks = nn.ModuleList(Block(width, heads, gated=gated) for _ in range(depth))
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Images (V, 3, H, W), sides multiples of 14, to tokens (V, 1 + P, C) float32; the class token comes first."""
+        grid = (images.shape[2] // PATCH_PX, images.shape[3] // PATCH_PX)
+        patches = self.patch_embed(images)
+        of_class = self.cls_token.expand(len(images), -1, -1)
+        x = torch.cat([of_class, patches.to(of_class.dtype)], dim=1) + self.positions(grid)
+        for block in self.blocks:
+            x = block(x)
+        return x
+
+    def positions(self, grid: tuple[int, int]) -> Tensor:
+        """Position embeddings (1, 1 + P, C) of the class token and of a grid (rows, columns) of patches.
+
+        The learned grid is resized bicubically without antialiasing, see POSITION_OFFSET.
+        """
+        if grid == (POSITION_SIDE, POSITION_SIDE):
+            return self.pos_embed
+        of_class, of_patches = self.pos_embed.split([1, POSITION_SIDE**2], dim=1)
+        learned = of_patches.transpose(1, 2).unflatten(2, (POSITION_SIDE, POSITION_SIDE))
+        factors = [(cells + POSITION_OFFSET) / POSITION_SIDE for cells in grid]
+        resized = F.interpolate(learned, scale_factor=factors, mode="bicubic", align_corners=False)
         return torch.cat([of_class, resized.flatten(2).transpose(1, 2)], dim=1)

@@ -7,7 +7,7 @@ and their decoders, which have no LayerScale, carry their residual stream in the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -55,14 +55,15 @@ class LinearHead(nn.Module):
 class ResidualMlp(nn.Module):
     """x + relu(L3 relu(L2 relu(L1 x)))."""
 
-    def __init__(self, width: int) -> None:
+    def __init__(self, width: int, layer: Callable[[int, int], nn.Module] = nn.Linear) -> None:
+        """With a convolution of 1 x 1 as `layer`, the channels are axis 1 of the input; else its last axis."""
         super().__init__()
-        self.res_conv1 = nn.Linear(width, width)
-        self.res_conv2 = nn.Linear(width, width)
-        self.res_conv3 = nn.Linear(width, width)
+        self.res_conv1 = layer(width, width)
+        self.res_conv2 = layer(width, width)
+        self.res_conv3 = layer(width, width)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(..., C) to (..., C)."""
+        """As large as the input."""
         inner = x
         for layer in (self.res_conv1, self.res_conv2, self.res_conv3):
             inner = F.relu(layer(inner))

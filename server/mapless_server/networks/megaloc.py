@@ -13,14 +13,10 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from .blocks import BLOCK_EPS, Block, LayerNorm, Linear
-from .encoder import POSITION_SIDE, PatchEmbedding
+from .blocks import BLOCK_EPS, LayerNorm, Linear
+from .encoder import PatchEmbedding, PlainEncoder
 from .network import IMAGE_MEAN, IMAGE_STD, patch_grid
 from .salad import Salad
-
-POSITION_OFFSET = 0.1
-"""DINOv2 resizes its learned positions by the factor (cells + 0.1) / 37, once a guard against rounding. The weights
-were trained with it: on 23 x 23 patches it moves the last samples by a sixth of a cell."""
 
 REDUCTION_SEED = 2025
 """Of the signed sums; another one makes descriptors that cannot be compared."""
@@ -47,39 +43,22 @@ class MegaLocSizes:
     length: int = 8448
 
 
-class Backbone(nn.Module):
-    """Normalized images to tokens: DINOv2 without registers."""
+class Backbone(PlainEncoder):
+    """Normalized images to tokens: DINOv2 without registers, with its final normalization."""
 
     def __init__(self, width: int, heads: int, depth: int) -> None:
-        super().__init__()
-        self.cls_token = nn.Parameter(torch.empty(1, 1, width))
-        self.pos_embed = nn.Parameter(torch.empty(1, 1 + POSITION_SIDE**2, width))
-        self.patch_embed = PatchEmbedding(3, width)
-        self.blocks = nn.ModuleList(Block(width, heads) for _ in range(depth))
+        super().__init__(width, heads, depth)
         self.norm = LayerNorm(width, eps=BLOCK_EPS)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Images (B, 3, H, W), sides multiples of 14, to tokens (B, 1 + P, C) float32; the class token comes first."""
-        patches = self.patch_embed(images)
-        of_class = self.cls_token.expand(len(images), -1, -1)
-        x = torch.cat([of_class, patches.to(of_class.dtype)], dim=1) + self.positions(patch_grid(images))
-        for block in self.blocks:
-            x = block(x)
-        tokens: Tensor = self.norm(x)
-        return tokens
+        """Images (B, 3, H, W), sides multiples of 14, to tokens (B, 1 + P, C) float32; the class token comes first.
 
-    def positions(self, grid: tuple[int, int]) -> Tensor:
-        """Position embeddings (1, 1 + P, C) of the class token and of a grid (rows, columns) of patches.
-
-        The learned grid is resized bicubically without antialiasing, see POSITION_OFFSET.
+        Raises:
+            ValueError: sides that are not.
         """
-        if grid == (POSITION_SIDE, POSITION_SIDE):
-            return self.pos_embed
-        of_class, of_patches = self.pos_embed.split([1, POSITION_SIDE**2], dim=1)
-        learned = of_patches.transpose(1, 2).unflatten(2, (POSITION_SIDE, POSITION_SIDE))
-        factors = [(cells + POSITION_OFFSET) / POSITION_SIDE for cells in grid]
-        resized = F.interpolate(learned, scale_factor=factors, mode="bicubic", align_corners=False)
-        return torch.cat([of_class, resized.flatten(2).transpose(1, 2)], dim=1)
+        patch_grid(images)
+        tokens: Tensor = self.norm(super().forward(images))
+        return tokens
 
 
 class Mixing(nn.Module):

@@ -7,10 +7,11 @@ from torch import Tensor
 
 from .decoder import TokenLayout
 from .heads import LinearHead
-from .network import Network, NetworkOutput, Sizes
+from .network import NetworkOutput
+from .pi import PiNetwork, Sizes
 
 
-class Pi3(Network):
+class Pi3(PiNetwork):
     """The paper's network."""
 
     conditioned = False
@@ -22,7 +23,7 @@ class Pi3(Network):
         self.conf_head = LinearHead(sizes.width, 1)
 
     def embed(self, images: Tensor, intrinsics: Tensor | None = None) -> Tensor:
-        """See Network.embed; ``intrinsics`` must be None."""
+        """See PiNetwork.embed; ``intrinsics`` must be None."""
         if intrinsics is not None:
             raise ValueError("Pi3 takes no intrinsics")
         return self.encode_images(images)
@@ -34,6 +35,7 @@ class Pi3(Network):
         mapped: int,
         poses: Tensor | None = None,
         posed: Tensor | None = None,
+        metric: Tensor | None = None,
     ) -> NetworkOutput:
         """See Network.reconstruct; ``poses`` and ``posed`` must be None."""
         if poses is not None or posed is not None:
@@ -43,7 +45,7 @@ class Pi3(Network):
         return NetworkOutput(points, logits, self.cameras(decoded, layout))
 
     def read_maps(self, decoded: Tensor, layout: TokenLayout) -> tuple[Tensor, Tensor]:
-        """See Network.read_maps."""
+        """See PiNetwork.read_maps."""
         x, y, log_z = self.point_head(self.point_decoder(decoded, layout.rope), layout.grid).unbind(-1)
         z = torch.exp(log_z)
         confidence = self.conf_head(self.conf_decoder(decoded, layout.rope), layout.grid)

@@ -9,18 +9,19 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from .conditions import PoseInjection, prope, rays_from_intrinsics
+from .conditions import PoseInjection, normalize_poses, prope, rays_from_intrinsics
 from .decoder import SPECIALS, Injection, TokenLayout
 from .encoder import PatchEmbedding
 from .heads import ConvHead, MetricDecoder
-from .network import Network, NetworkOutput, Sizes
+from .network import NetworkOutput
+from .pi import PiNetwork, Sizes
 
 INJECTION_PERIOD = 8
 """Poses are injected after block 1 and every eighth from there."""
 MAX_LOG_DEPTH = 15.0
 
 
-class Pi3X(Network):
+class Pi3X(PiNetwork):
     """The network of Pi3X, without its part for depths."""
 
     conditioned = True
@@ -38,11 +39,26 @@ class Pi3X(Network):
         self.metric_head = nn.Linear(sizes.metric_width, 1)
 
     def embed(self, images: Tensor, intrinsics: Tensor | None = None) -> Tensor:
-        """See Network.embed."""
+        """See PiNetwork.embed."""
         patches = self.encode_images(images)
         if intrinsics is None:
             return patches
         return patches + self.ray_embed(rays_from_intrinsics(intrinsics, *images.shape[-2:]))
+
+    def conditions(self, poses: Tensor, posed: Tensor, metric: Tensor) -> tuple[Tensor, ...] | None:
+        """See Network.conditions: normalized poses, and the indices (B, M') of the views that have one, two at least.
+
+        The unit does not matter. Views without a pose need plausible values, for these enter the scale.
+
+        Raises:
+            ValueError: scenes with different numbers of posed views.
+        """
+        counts = posed.sum(1)
+        if (counts != counts[0]).any():
+            raise ValueError(f"scenes with different numbers of posed views in one batch: {counts.tolist()}")
+        if counts[0] < 2:
+            return None
+        return normalize_poses(poses), posed.nonzero()[:, 1].view(len(posed), -1)
 
     def reconstruct(
         self,
@@ -51,6 +67,7 @@ class Pi3X(Network):
         mapped: int,
         poses: Tensor | None = None,
         posed: Tensor | None = None,
+        metric: Tensor | None = None,
     ) -> NetworkOutput:
         """See Network.reconstruct; the output is roughly metric."""
         inject = None if poses is None or posed is None else self._injection(poses, posed, layout.grid)
@@ -84,7 +101,7 @@ class Pi3X(Network):
         return scale.exp()[:, 0]
 
     def read_maps(self, decoded: Tensor, layout: TokenLayout) -> tuple[Tensor, Tensor]:
-        """See Network.read_maps; before the metric scale."""
+        """See PiNetwork.read_maps; before the metric scale."""
         x, y, log_z = self.point_head(self.point_decoder(decoded, layout.rope), layout.grid).unbind(-1)
         z = torch.exp(log_z.clamp_max(MAX_LOG_DEPTH))
         confidence = self.conf_head(self.conf_decoder(decoded, layout.rope), layout.grid)

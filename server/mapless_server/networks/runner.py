@@ -15,8 +15,6 @@ from torch import Tensor
 from torch.torch_version import TorchVersion
 
 from .blocks import Attention
-from .conditions import normalize_poses
-from .decoder import TokenLayout
 from .encoder import PATCH_PX
 from .network import Network, NetworkOutput
 
@@ -64,7 +62,7 @@ class NetworkRunner:
     """Runs a network. Safe to call from several threads; one thread of its own computes, in order of arrival.
 
     Attributes:
-        name: "pi3" or "pi3x".
+        name: one of `method.choices.NETWORKS`.
         weights_sha256: of the checkpoint.
         device: on which it computes.
         dtype: of the computation in transformer blocks, and of tokens.
@@ -91,7 +89,7 @@ class NetworkRunner:
         self.network.set_compute_type(self.dtype)
         self.network.to(self.device)
         self._warm: set[object] = set()
-        self._layouts: dict[tuple[int, int], TokenLayout] = {}
+        self._layouts: dict[tuple[int, int], Any] = {}
         # CUDA graphs belong to the thread that recorded them.
         self._thread = ThreadPoolExecutor(1, f"network {name}", initializer=_keep_graphs_in_this_thread)
         self._check_kernels(name)
@@ -150,6 +148,7 @@ class NetworkRunner:
         mapped: int,
         poses: Tensor | None = None,
         posed: Tensor | None = None,
+        metric: Tensor | None = None,
     ) -> NetworkOutput:
         """Poses of all views of each scene, and maps of the first ``mapped`` ones.
 
@@ -157,14 +156,15 @@ class NetworkRunner:
             tokens: (B, N, T, C) from `encode`.
             grid: rows and columns of patches.
             mapped: M; see Network.reconstruct.
-            poses: (B, N, 4, 4) world_from_camera in any unit and frame, for a conditioned network. Views without a pose
-                need plausible values, for these enter the scale.
-            posed: (B, N) bool on the CPU, whether a view has a pose; as many in each scene. A single pose is ignored.
+            poses: (B, N, 4, 4) world_from_camera, for a conditioned network; see its `conditions` for what it makes of
+                the unit and of views without a pose.
+            posed: (B, N) bool on the CPU, whether a view has a pose.
+            metric: (B, N) bool on the CPU, whether its unit is the metre; None if all are.
 
         Raises:
-            ValueError: scenes with different numbers of posed views.
+            ValueError: the network cannot take poses of such views.
         """
-        return self._run(self._reconstruct_scenes, tokens, grid, mapped, poses, posed)
+        return self._run(self._reconstruct_scenes, tokens, grid, mapped, poses, posed, metric)
 
     def _run(self, work: Callable[..., T], *arguments: Any) -> T:
         return self._thread.submit(self._without_gradients, work, *arguments).result()
@@ -174,7 +174,7 @@ class NetworkRunner:
         with torch.no_grad():
             return work(*arguments)
 
-    def _layout(self, grid: tuple[int, int]) -> TokenLayout:
+    def _layout(self, grid: tuple[int, int]) -> Any:
         if grid not in self._layouts:
             self._layouts[grid] = self.network.layout(grid)
         return self._layouts[grid]
@@ -184,7 +184,8 @@ class NetworkRunner:
         if intrinsics is not None:
             intrinsics = intrinsics.to(self.device, torch.float32, non_blocking=True)
         grid = (images.shape[2] // PATCH_PX, images.shape[3] // PATCH_PX)
-        encode = self._encode if ("encode", grid) in self._warm else self.network.encode
+        is_warm = ("encode", grid, intrinsics is not None) in self._warm
+        encode = self._encode if is_warm else self.network.encode
         parts = []
         for view in range(len(images)):
             of_view = None if intrinsics is None else intrinsics[view : view + 1]
@@ -194,44 +195,54 @@ class NetworkRunner:
         return torch.cat(parts)
 
     def _reconstruct_scenes(
-        self, tokens: Tensor, grid: tuple[int, int], mapped: int, poses: Tensor | None, posed: Tensor | None
+        self,
+        tokens: Tensor,
+        grid: tuple[int, int],
+        mapped: int,
+        poses: Tensor | None,
+        posed: Tensor | None,
+        metric: Tensor | None,
     ) -> NetworkOutput:
         tokens = tokens.to(self.device, non_blocking=True)
-        normalized, indices = self._conditions(poses, posed)
-        count = 0 if indices is None else indices.shape[1]
-        shape = ("reconstruct", grid, *tokens.shape[:2], mapped, count)
-        reconstruct = self._reconstruct if shape in self._warm else self.network.reconstruct
-        output = reconstruct(tokens, self._layout(grid), mapped, normalized, indices)
+        conditions = self._conditions(poses, posed, metric)
+        reconstruct = self.network.reconstruct
+        if self._shape(tokens, grid, mapped, conditions) in self._warm:
+            reconstruct = self._reconstruct
+        output = reconstruct(tokens, self._layout(grid), mapped, *conditions)
         return NetworkOutput(*(tensor.clone() for tensor in vars(output).values()))
 
-    def _conditions(self, poses: Tensor | None, posed: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
-        """Normalized poses, and the indices (B, M') of the views that have one."""
+    def _conditions(self, poses: Tensor | None, posed: Tensor | None, metric: Tensor | None) -> tuple[Tensor, ...]:
+        """What the network makes of the poses, on the device; empty if they are of no use to it."""
         if poses is None or posed is None:
-            return None, None
-        counts = posed.sum(1)
-        if (counts != counts[0]).any():
-            raise ValueError(f"scenes with different numbers of posed views in one batch: {counts.tolist()}")
-        if counts[0] < 2:
-            return None, None
-        indices = posed.nonzero()[:, 1].view(len(posed), -1)
+            return ()
+        metric = torch.ones_like(posed) if metric is None else metric
         poses = poses.to(self.device, torch.float32, non_blocking=True)
-        return normalize_poses(poses), indices.to(self.device, non_blocking=True)
+        conditions = self.network.conditions(poses, posed, metric) or ()
+        return tuple(it.to(self.device, non_blocking=True) for it in conditions)
+
+    @staticmethod
+    def _shape(tokens: Tensor, grid: tuple[int, int], mapped: int, conditions: Sequence[Tensor]) -> object:
+        """What the compiled code depends on."""
+        return ("reconstruct", grid, *tokens.shape[:2], mapped, *(it.shape for it in conditions))
 
     def _warm_up(self, shape: CompiledShape) -> None:
         height, width = (side * PATCH_PX for side in shape.grid)
-        self._warm.add(("encode", shape.grid))
+        self._warm.add(("encode", shape.grid, self.conditioned))
         references = shape.views - 1
-        posed = torch.arange(shape.views).expand(shape.scenes, -1) < references if self.conditioned else None
-        count = references if self.conditioned and references > 1 else 0
-        self._warm.add(("reconstruct", shape.grid, shape.scenes, shape.views, references, count))
-        poses = torch.eye(4).repeat(shape.scenes, shape.views, 1, 1)
-        poses[..., 0, 3] = torch.arange(shape.views)
+        posed = poses = None
+        if self.conditioned:
+            posed = torch.arange(shape.views).expand(shape.scenes, -1) < references
+            poses = torch.eye(4).repeat(shape.scenes, shape.views, 1, 1)
+            poses[..., 0, 3] = torch.arange(shape.views)
         with torch._dynamo.config.patch(recompile_limit=MAX_COMPILED_SHAPES):
             for _ in range(3):  # compiles, records, replays
                 intrinsics = torch.eye(3)[None] if self.conditioned else None
                 tokens = self._without_gradients(self._encode_views, torch.rand(1, 3, height, width), intrinsics)
                 tokens = tokens.expand(shape.scenes, shape.views, -1, -1).contiguous()
-                self._without_gradients(self._reconstruct_scenes, tokens, shape.grid, references, poses, posed)
+                conditions = self._conditions(poses, posed, None)
+                self._warm.add(self._shape(tokens, shape.grid, references, conditions))
+                arguments = (tokens, shape.grid, references, poses, posed, None)
+                self._without_gradients(self._reconstruct_scenes, *arguments)
 
 
 def _keep_graphs_in_this_thread() -> None:

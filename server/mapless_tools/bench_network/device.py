@@ -84,10 +84,9 @@ def measure_memory(make_runner: Callable[[], NetworkRunner], device: torch.devic
     scene = Scene(runner.network, REFERENCES + 1, GRID)
     intrinsics = None if scene.intrinsics is None else scene.intrinsics[:1]
     kept = [runner.encode(scene.images[:1], intrinsics).clone() for _ in range(CACHED)]
-    posed = None if scene.posed is None else (torch.arange(REFERENCES + 1) < REFERENCES)[None]
     for _ in range(3):
         query = runner.encode(scene.images[:1], intrinsics)
-        runner.reconstruct(torch.cat([*kept[:REFERENCES], query])[None], GRID, REFERENCES, scene.poses, posed)
+        runner.reconstruct(torch.cat([*kept[:REFERENCES], query])[None], GRID, REFERENCES, scene.poses, scene.posed)
     torch.cuda.synchronize(device)
     yield Figure(part, f"tokens of {CACHED} references", sum(it.nbytes for it in kept) / 1e9, "GB")
     peak = torch.cuda.max_memory_allocated(device) / 1e9

@@ -18,6 +18,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from mapless_server.networks.blocks import Attention
 from mapless_server.networks.network import Network, NetworkOutput
+from mapless_server.networks.pi import PiNetwork
 
 from .device import median_s
 from .operations import ATTENTION_EFFICIENCY, Rates
@@ -99,7 +100,7 @@ class Forward:
             encoded: Tensor = encode(scene.images[kept:], scene.layout, intrinsics)
             # Recorded graphs write into the same memory again and again: joining copies.
             tokens = torch.cat([self.kept[:kept], encoded.to(torch.bfloat16)])[None]
-            output: NetworkOutput = reconstruct(tokens, scene.layout, work.mapped, scene.poses, scene.posed)
+            output: NetworkOutput = reconstruct(tokens, scene.layout, work.mapped, *scene.conditions)
             return output
 
 
@@ -179,8 +180,7 @@ def measure_kernels(name: str, device: torch.device) -> tuple[list[Figure], dict
     for event in kernels:
         milliseconds[_kind(event.key)] += event.self_device_time_total / 1000
         flash_count += event.count if "flash" in event.key else 0
-    sizes = forward.network.sizes
-    blocks = sizes.encoder_depth + sizes.decoder_depth + 3 * sizes.head_depth
+    blocks = sum(isinstance(module, Attention) for module in forward.network.modules())
     part = f"{name} kernels, eager, tokens kept"
     figures = [Figure(part, kind, value, "ms") for kind, value in milliseconds.items()]
     note = f"{blocks} blocks; and all else that attends"
@@ -237,10 +237,10 @@ def measure_variants(name: str, device: torch.device, repeats: int) -> Iterator[
     network = make_network(name, device=device)
     for label, backend in BACKENDS.items():
         yield _figure(part, f"{label} attention", network, backend, device, repeats)
-    with_low_precision_stream(network)
-    yield _figure(
-        part, "main decoder's residual stream in bfloat16", network, SDPBackend.FLASH_ATTENTION, device, repeats
-    )
+    if isinstance(network, PiNetwork):
+        with_low_precision_stream(network)
+        label = "main decoder's residual stream in bfloat16"
+        yield _figure(part, label, network, SDPBackend.FLASH_ATTENTION, device, repeats)
     yield _rounding(part, make_network(name, device=device))
 
 
@@ -263,7 +263,7 @@ def _figure(part: str, label: str, network: Network, backend: SDPBackend, device
     return Figure(part, label, 1e3 * times[0], "ms", 1e3 * times[1])
 
 
-def with_low_precision_stream(network: Network) -> None:
+def with_low_precision_stream(network: PiNetwork) -> None:
     """Lets the main decoder carry bfloat16, which the official code does not."""
     network.set_compute_type(torch.bfloat16)
     network.decoder.to(torch.bfloat16)

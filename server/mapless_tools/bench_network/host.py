@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from mapless_server.networks.decoder import SPECIALS
-from mapless_server.networks.network import Network, NetworkOutput, Sizes
+from mapless_server.method.choices import NETWORKS
+from mapless_server.networks.mapanything import MapAnythingSizes
+from mapless_server.networks.network import Network, NetworkOutput
+from mapless_server.networks.pi import PiNetwork, Sizes
 from mapless_server.networks.runner import CompiledShape, NetworkRunner, RunnerOptions
 
 from .device import CACHED, median_s
 from .forward import max_difference
 from .operations import H200, Operations, Rates, compiled_graphs, count_operations
 from .report import Figure
-from .subject import GRID, REFERENCES, Scene, Work, make_network, meta_network, operations_of
+from .subject import GRID, REFERENCES, AnySizes, Scene, Work, make_network, meta_network, operations_of
 
 VIEWS = REFERENCES + 1
 GRIDS = {"518x392": GRID, "504x378": (27, 36), "392x294": (21, 28)}
@@ -24,8 +27,14 @@ WORKS = {
     "references mapped": Work(VIEWS, REFERENCES),
     "references' tokens kept, references mapped": Work(1, REFERENCES),
     "references' tokens kept, cameras only": Work(1, 0),
+    "references' tokens kept, the query's camera only": Work(1, 0, query_only=True),
 }
-SMALL = Sizes(64, 4, 3, 10, 2, 32, (64, 32, 16), 8, 32, 2, 2)
+SMALL_PI = Sizes(64, 4, 3, 10, 2, 32, (64, 32, 16), 8, 32, 2, 2)
+SMALL: dict[str, AnySizes] = {
+    "pi3": SMALL_PI,
+    "pi3x": SMALL_PI,
+    "mapanything": MapAnythingSizes(64, 4, 3, 4, 6, (1, 3), (32, 32), (16, 32), (8, 8, 16, 16), 16, 8, 32, 16),
+}
 MEDIUM = Sizes(384, 6, encoder_depth=8, decoder_depth=12, head_depth=3, camera_width=128)
 
 
@@ -38,13 +47,15 @@ def count_all(rates: Rates, quick: bool) -> Iterator[Figure]:
 
 def count_forward(rates: Rates = H200, quick: bool = False) -> Iterator[Figure]:
     """Operations of forward passes of the official networks, and the floor and the prediction that follow from them."""
-    for name in ("pi3", "pi3x"):
+    for name in NETWORKS:
         for size, grid in GRIDS.items():
             if quick and grid is not GRID:
                 continue
             part = f"{name}, {VIEWS} views of {size}; times are those of {rates.device}, compiled"
             for label, work in WORKS.items():
-                operations = operations_of(name, Work(work.encoded, work.mapped, grid=grid))
+                if work.query_only and name != "mapanything":
+                    continue
+                operations = operations_of(name, replace(work, grid=grid))
                 yield _counted(part, label, operations, rates)
 
 
@@ -62,10 +73,10 @@ def _counted(part: str, label: str, operations: Operations, rates: Rates) -> Fig
 
 def count_memory() -> Iterator[Figure]:
     """Bytes that lie on the device between queries."""
-    for name in ("pi3", "pi3x"):
+    for name in NETWORKS:
         network = meta_network(name)
         weights = sum(it.nbytes for it in network.parameters())
-        tokens = CACHED * (SPECIALS + GRID[0] * GRID[1]) * network.sizes.width * torch.bfloat16.itemsize
+        tokens = CACHED * network.token_count(GRID) * network.width * torch.bfloat16.itemsize
         yield Figure(f"{name} memory", "weights, linear layers in bfloat16", weights / 1e9, "GB")
         yield Figure(f"{name} memory", f"tokens of {CACHED} references of 518x392", tokens / 1e9, "GB")
 
@@ -75,7 +86,7 @@ def count_pixel_heads() -> Iterator[Figure]:
     for name in ("pi3", "pi3x"):
         network = meta_network(name)
         heads = [network.get_submodule(head) for head in ("point_head", "conf_head")]
-        tokens = torch.empty(REFERENCES, GRID[0] * GRID[1], network.sizes.width, device="meta")
+        tokens = torch.empty(REFERENCES, GRID[0] * GRID[1], network.width, device="meta")
         operations = count_operations(lambda: [head(tokens, GRID) for head in heads])  # noqa: B023
         whole = operations_of(name, Work(1, REFERENCES))
         note = f"{operations.flop / 1e12:.3f} of {whole.flop / 1e12:.2f} TFLOP; tokens kept, {REFERENCES} mapped"
@@ -88,6 +99,7 @@ def measure_blocks(repeats: int) -> Iterator[Figure]:
     sizes = Sizes(encoder_depth=1, decoder_depth=2, head_depth=1)
     for dtype in (torch.float32, torch.bfloat16):
         network = make_network("pi3", sizes)
+        assert isinstance(network, PiNetwork)
         network.set_compute_type(dtype)
         rope, count = network.layout(grid).rope, 5 + grid[0] * grid[1]
         x = torch.randn(views, count, sizes.width, generator=torch.Generator().manual_seed(1))
@@ -110,7 +122,7 @@ def measure_blocks(repeats: int) -> Iterator[Figure]:
 
 def compare_kept_tokens() -> Iterator[Figure]:
     """Outputs with kept tokens against those without: encoded one by one the same bits, encoded together nearly."""
-    for name, label, sizes in (("pi3", "small", SMALL), ("pi3x", "small", SMALL), ("pi3", "medium", MEDIUM)):
+    for name, label, sizes in (*((name, "small", SMALL[name]) for name in NETWORKS), ("pi3", "medium", MEDIUM)):
         for dtype in (torch.float32, torch.bfloat16):
             network = make_network(name, sizes)
             network.set_compute_type(dtype)
@@ -162,8 +174,9 @@ def compare_rounding() -> Iterator[Figure]:
 
 def count_compilations() -> Iterator[Figure]:
     """Graphs that are compiled after the warm-up, by shapes that are warm and one that is not."""
-    for name in ("pi3", "pi3x"):
-        runner = NetworkRunner(make_network(name, SMALL), name, "random", "cpu", RunnerOptions(compile_backend="eager"))
+    for name in NETWORKS:
+        network = make_network(name, SMALL[name])
+        runner = NetworkRunner(network, name, "random", "cpu", RunnerOptions(compile_backend="eager"))
         runner.warm_up([CompiledShape((3, 4), 3), CompiledShape((4, 3), 4)])
         before = compiled_graphs()
         for grid, views in (((3, 4), 3), ((4, 3), 4), ((3, 4), 3), ((2, 2), 3)):
@@ -181,5 +194,4 @@ def _run(runner: NetworkRunner, grid: tuple[int, int], views: int) -> None:
             for i in range(views)
         ]
     )
-    posed = None if scene.poses is None else (torch.arange(views) < views - 1)[None]
-    runner.reconstruct(tokens[None], grid, views - 1, scene.poses, posed)
+    runner.reconstruct(tokens[None], grid, views - 1, scene.poses, scene.posed)

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mapless_server.networks.conditions import normalize_poses
 from mapless_server.networks.encoder import PATCH_PX
-from mapless_server.networks.network import Network, NetworkOutput, Sizes
+from mapless_server.networks.mapanything import MapAnything, MapAnythingSizes
+from mapless_server.networks.network import Network, NetworkOutput
+from mapless_server.networks.pi import Sizes
 from mapless_server.networks.pi3 import Pi3
 from mapless_server.networks.pi3x import Pi3X
 
@@ -21,35 +22,61 @@ REFERENCES = 10
 QK_GAIN = 1.5
 """Selective attention, like a trained network's: with uniform attention everything averages out, rounding too."""
 
+EXPONENTIALS = ("point_head.proj", "conf_head.proj", "metric_head", "dense_head.1.conv2.2", "scale_head.output_proj")
+"""Last layers, exponentials of whose output are depths or scales."""
 
-def make_network(name: str, sizes: Sizes | None = None, device: torch.device | str = "cpu", seed: int = 0) -> Network:
-    """A Pi3 or Pi3X, float32, with seeded random weights that keep all activations finite and of a trained one's order.
+AnySizes = Sizes | MapAnythingSizes
+
+
+def network_without_weights(name: str, sizes: AnySizes | None = None) -> Network:
+    """A Pi3, Pi3X or MapAnything, on the meta device, of its own kind of sizes; None are the official ones."""
+    with torch.device("meta"):
+        if name == "mapanything":
+            if isinstance(sizes, Sizes):
+                raise TypeError("MapAnything has sizes of its own")
+            return MapAnything(sizes)
+        if isinstance(sizes, MapAnythingSizes):
+            raise TypeError(f"these are sizes of MapAnything, not of {name}")
+        return Pi3(sizes) if name == "pi3" else Pi3X(sizes)
+
+
+def make_network(
+    name: str, sizes: AnySizes | None = None, device: torch.device | str = "cpu", seed: int = 0
+) -> Network:
+    """A network, float32, with seeded random weights that keep all activations finite and of a trained one's order.
 
     Zeros would be computed faster, and would show no error.
     """
-    with torch.device("meta"):
-        network: Network = Pi3(sizes) if name == "pi3" else Pi3X(sizes)
+    network = network_without_weights(name, sizes)
     random = torch.Generator(device).manual_seed(seed)
-    weights = {
-        key: _scaled(key, torch.randn(parameter.shape, generator=random, device=device))
-        for key, parameter in network.named_parameters()
-    }
-    network.load_state_dict({**network.state_dict(), **weights}, assign=True)
+    parameters = dict(network.named_parameters())
+    state = {}
+    for key, tensor in network.state_dict().items():
+        if key in parameters:
+            state[key] = _scaled(key, torch.randn(tensor.shape, generator=random, device=device))
+        else:
+            state[key] = _marker(tensor) if tensor.is_meta else tensor
+    network.load_state_dict(state, assign=True)
     return network.eval().requires_grad_(False).to(device)
+
+
+def _marker(buffer: Tensor) -> Tensor:
+    """MapAnything's mark of the first view: 0 on even channels, 1 on odd ones."""
+    return (torch.arange(buffer.shape[-1]) % 2).float().expand(buffer.shape).clone()
 
 
 def _scaled(key: str, noise: Tensor) -> Tensor:
     name = key.rsplit(".", 1)[-1]
     if name == "gamma":
         return 0.1 + 0.03 * noise
-    if name in ("cls_token", "pos_embed", "register_tokens", "register_token", "metric_token"):
+    if name in ("cls_token", "pos_embed", "register_tokens", "register_token", "metric_token", "scale_token"):
         return 0.3 * noise
     if noise.ndim == 1:
         return (1.0 if name == "weight" else 0.0) + 0.05 * noise
     weights: Tensor = noise / noise[0].numel() ** 0.5
     if key.endswith("qkv.weight"):
         weights[: 2 * len(weights) // 3] *= QK_GAIN
-    if key.startswith(("point_head.proj", "conf_head.proj", "metric_head")) or "_head.output_block" in key:
+    if key.startswith(EXPONENTIALS) or "_head.output_block" in key:
         weights *= 0.3  # depths are exponentials
     return weights
 
@@ -63,32 +90,36 @@ class Work:
         mapped: of how many views points and confidence are computed.
         views: of the scene.
         grid: rows and columns of patches.
+        query_only: whether the last view's pose is all that is computed; only of MapAnything.
     """
 
     encoded: int
     mapped: int
     views: int = REFERENCES + 1
     grid: tuple[int, int] = GRID
+    query_only: bool = False
 
 
 class Scene:
     """Random views of one scene, and what is known of them, on the network's device."""
 
     def __init__(self, network: Network, views: int, grid: tuple[int, int], seed: int = 0) -> None:
-        device = network.register_token.device
+        device = next(network.parameters()).device
         height, width = (PATCH_PX * side for side in grid)
         on_meta = device.type == "meta"
         random = None if on_meta else torch.Generator(device).manual_seed(seed)
         self.layout = network.layout(grid)
         self.images = torch.rand(views, 3, height, width, generator=random, device=device)
         self.intrinsics = self.poses = self.posed = None
+        self.conditions: tuple[Tensor, ...] = ()
         if network.conditioned:
             k = torch.tensor([[0.8 * width, 0.0, width / 2], [0.0, 0.8 * width, height / 2], [0.0, 0.0, 1.0]])
             self.intrinsics = k.repeat(views, 1, 1).to(device)
-            poses = torch.eye(4).repeat(1, views, 1, 1)
-            poses[..., 0, 3] = torch.arange(views)
-            self.poses = normalize_poses(poses).to(device)
-            self.posed = torch.arange(views - 1, device=device)[None]
+            self.poses = torch.eye(4).repeat(1, views, 1, 1)
+            self.poses[..., 0, 3] = torch.arange(views)
+            self.posed = (torch.arange(views) < views - 1)[None]
+            given = network.conditions(self.poses, self.posed, torch.ones_like(self.posed)) or ()
+            self.conditions = tuple(it.to(device) for it in given)
 
     def encode(self, network: Network, views: slice) -> Tensor:
         """Tokens (V, T, C) of some views."""
@@ -97,22 +128,30 @@ class Scene:
 
     def reconstruct(self, network: Network, tokens: Tensor, mapped: int) -> NetworkOutput:
         """The scene of tokens (1, N, T, C)."""
-        return network.reconstruct(tokens, self.layout, mapped, self.poses, self.posed)
+        return network.reconstruct(tokens, self.layout, mapped, *self.conditions)
+
+    def query_pose(self, network: Network, tokens: Tensor) -> Tensor:
+        """The pose of the last view alone, which only MapAnything computes alone."""
+        assert isinstance(network, MapAnything)
+        return network.query_pose(tokens, self.layout, *self.conditions)
 
 
-def operations_of(name: str, work: Work, sizes: Sizes | None = None, dtype: torch.dtype = torch.bfloat16) -> Operations:
+def operations_of(
+    name: str, work: Work, sizes: AnySizes | None = None, dtype: torch.dtype = torch.bfloat16
+) -> Operations:
     """What a forward pass executes."""
     network = meta_network(name, sizes, dtype)
     scene = Scene(network, work.views, work.grid)
-    width, count = network.sizes.width, 5 + work.grid[0] * work.grid[1]
-    tokens = torch.empty(1, work.views, count, width, dtype=dtype, device="meta")
+    shape = (1, work.views, network.token_count(work.grid), network.width)
+    tokens = torch.empty(shape, dtype=dtype, device="meta")
     encoded = count_operations(lambda: scene.encode(network, slice(work.encoded))) if work.encoded else Operations()
+    if work.query_only:
+        return encoded + count_operations(lambda: scene.query_pose(network, tokens))
     return encoded + count_operations(lambda: scene.reconstruct(network, tokens, work.mapped))
 
 
-def meta_network(name: str, sizes: Sizes | None = None, dtype: torch.dtype = torch.bfloat16) -> Network:
+def meta_network(name: str, sizes: AnySizes | None = None, dtype: torch.dtype = torch.bfloat16) -> Network:
     """A network without memory, to count on."""
-    with torch.device("meta"):
-        network: Network = Pi3(sizes) if name == "pi3" else Pi3X(sizes)
+    network = network_without_weights(name, sizes)
     network.requires_grad_(False).set_compute_type(dtype)
     return network.to("meta")

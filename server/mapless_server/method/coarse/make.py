@@ -66,7 +66,7 @@ def _choose(weights_dir: Path, device: str) -> str:
         missing = {name: _missing(name, weights_dir) for name in NETWORKS}
         for name, sentence in missing.items():
             if sentence is None:
-                log.info("backend auto: %s serves, whose weights are licensed for non-commercial use", name)
+                log.info("backend auto: %s serves, whose weights have the licence %s", name, named(name).licence)
                 return name
         problem = missing[NETWORKS[0]]
     log.warning("backend auto: geometric serves, not a network: %s", problem)
@@ -91,7 +91,7 @@ def _load(
 ) -> Reconstructor:
     import torch
 
-    from mapless_server.networks.checkpoint import UNUSED, load_strictly
+    from mapless_server.networks.checkpoint import load_strictly
     from mapless_server.networks.runner import CompiledShape, NetworkRunner, RunnerOptions
 
     from .grids import GridOptions, fitted_grid
@@ -99,10 +99,13 @@ def _load(
 
     if device == "cpu":
         log.warning("backend %s on the CPU: minutes for a query, so calls need longer deadlines", backend)
+    known = named(backend)
     with torch.device("meta"):
-        network = named(backend).network_class()()
+        network = known.network_class()()
     # On the host, where the runner reduces the precision before the weights are copied to the device.
-    weights_sha256 = load_strictly(network, weights, ignored_prefixes=UNUSED)
+    with known.naming_the_licence():
+        weights_sha256 = load_strictly(network, weights)
+        known.check_terms(weights_sha256, str(weights))
     runner_options = RunnerOptions(compile_backend="inductor" if compiled_views else None)
     runner = NetworkRunner(network, backend, weights_sha256, device, runner_options)
     if compiled_views:

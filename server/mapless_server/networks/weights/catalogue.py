@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from .errors import UnknownWeights
+from .errors import CheckpointError, UnknownWeights
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,21 @@ class WheelMember(TorchFile):
 
 
 @dataclass(frozen=True)
+class LookAlike:
+    """A published file with the same tensors as another one's, under other terms.
+
+    Attributes:
+        sha256: of the file.
+        repository: where it is published.
+        licence: its terms.
+    """
+
+    sha256: str
+    repository: str
+    licence: Licence
+
+
+@dataclass(frozen=True)
 class Weights:
     """One file in the weights folder.
 
@@ -91,6 +108,7 @@ class Weights:
         size_bytes, sha256: of the official file in the folder; None where not known, and then not checked.
         network: the class whose tensors the file must hold, as module:class; empty if the file is small enough to be
             checked by loading it.
+        look_alikes: files that must not be taken for this one.
     """
 
     name: str
@@ -101,6 +119,26 @@ class Weights:
     size_bytes: int | None = None
     sha256: str | None = None
     network: str = ""
+    look_alikes: tuple[LookAlike, ...] = ()
+
+    def check_terms(self, sha256: str, description: str) -> None:
+        """Raises CheckpointError if a file of this digest is a look-alike, whatever the operator allows."""
+        for other in self.look_alikes:
+            if other.sha256 == sha256:
+                raise CheckpointError(
+                    f"{description} is the file of {other.repository}, whose licence is {other.licence}"
+                )
+
+    @contextmanager
+    def naming_the_licence(self) -> Iterator[None]:
+        """Adds to a CheckpointError of a file that has look-alikes, which file it must be and under which licence."""
+        try:
+            yield
+        except CheckpointError as error:
+            if not self.look_alikes or not isinstance(self.source, HubFile):
+                raise
+            wanted = f"{self.name} is the file of {self.source.repository}, whose licence is {self.licence}"
+            raise CheckpointError(f"{error}. {wanted}: `mapless-server weights fetch {self.name}`") from None
 
     def network_class(self) -> Any:
         """The class that `network` names, which must not be empty; imports torch.
@@ -135,9 +173,9 @@ def _edgepoint2(variant: str, original_sha256: str, size_bytes: int, sha256: str
     )
 
 
-# Sizes and digests of Pi3, Pi3X and MegaLoc are those that several independent users published of the official files.
-# The sizes are also, to the byte, what a file of exactly our networks' tensors in float32 has. Those of the converted
-# files were computed here, from originals with the digests of their authors' repositories and releases.
+# Sizes and digests of Pi3, Pi3X, MapAnything and MegaLoc are those that several independent users published of the
+# official files. The sizes are also, to the byte, what a file of exactly our networks' tensors in float32 has. Those of
+# the converted files were computed here, from originals with the digests of their authors' repositories and releases.
 CATALOGUE = (
     Weights(
         "pi3",
@@ -158,6 +196,21 @@ CATALOGUE = (
         5_440_325_620,
         "69972d6e1c4492cb4d737a84fe940e357087d81c52f5c9b7c160b49c1f41669a",
         "mapless_server.networks.pi3x:Pi3X",
+    ),
+    Weights(
+        "mapanything",
+        "mapanything.safetensors",
+        "backend",
+        Licence("Apache-2.0", "https://github.com/facebookresearch/map-anything/blob/main/LICENSE"),
+        HubFile("facebook/map-anything-apache", "00f9c245bbcb60522d1ed7f9e9d88462c6e3f38a"),
+        4_914_062_480,
+        "fa06c0fdccefc5048e072c85935d5789b1e36b307f3859033c17f9dcb9fd5201",
+        "mapless_server.networks.mapanything:MapAnything",
+        (
+            LookAlike(
+                "981f060c64664dff3272b5f5a823d350abe71a2f144444db4cfc325f3ed5a3a0", "facebook/map-anything", _CC_BY_NC
+            ),
+        ),
     ),
     Weights(
         "aliked",

@@ -12,7 +12,7 @@ from mapless_server.extras import install_hint
 from .catalogue import TorchFile, Weights
 from .errors import CheckpointError, FolderError
 from .folder import find_weights, path_of, put_in_place, record, recorded, temporary_folder
-from .safetensors_header import Header, check_fit, opened, read_header, sha256_of
+from .safetensors_header import Header, opened, read_header, sha256_of
 from .sources import convert, download, is_original
 
 Progress = Callable[[int], object]
@@ -51,7 +51,7 @@ def fetch(weights: Weights, weights_dir: Path, folder: Path) -> Installed:
         FolderError: the folder cannot be written, or is full.
     """
     path_of(weights, weights_dir)
-    with _writing(weights_dir):
+    with _writing(weights_dir), weights.naming_the_licence():
         ready = download(weights, folder)
         description = f"the file received for {weights.name}"
         found = _read_through(ready, weights, description=description)
@@ -84,10 +84,11 @@ def add(
         FolderError: the folder cannot be written, or is full.
     """
     path_of(weights, weights_dir)
-    original = _original(file, weights)
+    with weights.naming_the_licence():
+        original = _original(file, weights)
     if original and link:
         raise CheckpointError(f"{file} must be converted to safetensors: add it without --link")
-    with temporary_folder(weights_dir) as folder, _writing(weights_dir):
+    with temporary_folder(weights_dir) as folder, _writing(weights_dir), weights.naming_the_licence():
         ready = folder / weights.file_name
         if original:
             convert(file.read_bytes(), original, ready)
@@ -111,7 +112,8 @@ def check(weights: Weights, weights_dir: Path, progress: Progress = lambda _: No
         CheckpointError: it cannot be read or used, or its digest is neither the official nor the recorded one.
     """
     path = find_weights(weights.name, weights_dir)
-    found = _read_through(path, weights, progress)
+    with weights.naming_the_licence():
+        found = _read_through(path, weights, progress)
     known = recorded(path)
     if found.sha256 != known:
         _require_official(found, weights, str(path))
@@ -165,6 +167,7 @@ def _read_through(
         not_compared = _compare_names(header, weights, description)
     with opened(file) as stream:
         sha256 = sha256_of(stream, to)
+    weights.check_terms(sha256, description)
     is_official = None if weights.sha256 is None else sha256 == weights.sha256
     if is_official:
         not_compared = None
@@ -198,14 +201,14 @@ def _compare_names(header: Header, weights: Weights, description: str) -> str | 
     try:
         import torch
 
-        from ..checkpoint import IMAGE_NORMALIZATION, UNUSED, expected_tensors
+        from ..checkpoint import compare_tensors
 
         network = weights.network_class()
     except ImportError as error:
         return install_hint(error)
     with torch.device("meta"):
-        expected = expected_tensors(network())
-    check_fit(header, expected, IMAGE_NORMALIZATION.keys(), UNUSED, f"{description} does not fit {network.__name__}")
+        module = network()
+    compare_tensors(header, module, description)
     return None
 
 
