@@ -26,7 +26,8 @@ from mapless_server.method.adjust import AdjustOptions
 from mapless_server.method.answer import Localization
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import StageOptions
-from mapless_server.method.uncertainty.covariance import UncertaintyOptions, error_radii
+from mapless_server.method.uncertainty.covariance import UncertaintyOptions
+from mapless_server.method.uncertainty.radii import error_radii
 
 from .places import METRIC, answered, read_places, right_pairs, weights_alike
 

@@ -16,7 +16,7 @@ from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import PoseStage
-from mapless_server.method.uncertainty.covariance import accuracy_from_covariance, error_radii
+from mapless_server.method.uncertainty.radii import accuracy_from_covariance, error_radii
 
 OPTIONS = EscalationOptions()
 CAMERA = Camera(96, 64, 80.0, 81.0, 47.5, 31.5)

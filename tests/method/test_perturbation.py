@@ -19,7 +19,7 @@ from mapless_server.method.perturbation import (
     world_covariance,
     world_jacobian,
 )
-from mapless_server.method.uncertainty.covariance import TAIL_95, accuracy_from_covariance, error_radii
+from mapless_server.method.uncertainty.radii import TAIL_95, accuracy_from_covariance, error_radii
 
 POSE = RigidTransform(rotation_from_vector([0.7, -1.1, 0.4]), np.array([3.0, -2.0, 1.5]))
 

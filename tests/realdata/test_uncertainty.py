@@ -11,7 +11,7 @@ from scipy.special import bdtrik
 
 from mapless_server.method.answer import Localization
 from mapless_server.method.options import LocalizeOptions
-from mapless_server.method.uncertainty.covariance import accuracy_from_covariance
+from mapless_server.method.uncertainty.radii import accuracy_from_covariance
 from mapless_tools.dataset import Dataset
 from research.places import answered, read_places, right_pairs
 

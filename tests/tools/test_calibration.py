@@ -17,7 +17,7 @@ from support.scenes import random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless.scenes import Calibration
-from mapless_server.method.uncertainty.covariance import Accuracy, accuracy_from_covariance
+from mapless_server.method.uncertainty.radii import Accuracy, accuracy_from_covariance
 from mapless_server.services.messages.radii import (
     Conditions,
     Factors,

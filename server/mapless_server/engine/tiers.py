@@ -16,7 +16,7 @@ from mapless.geometry import rotation_angle_deg
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.options import check_bounds
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
-from mapless_server.method.uncertainty.covariance import Accuracy, accuracy_from_covariance
+from mapless_server.method.uncertainty.radii import Accuracy, accuracy_from_covariance
 
 from .query import Result
 

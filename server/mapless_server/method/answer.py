@@ -12,7 +12,7 @@ from mapless.geometry import Array, RigidTransform
 from .priors.known import PriorCheck
 from .rejection import Rejection
 from .results import MetricScale, PoseEstimate, PoseStage, Support, TwoViewSupport
-from .uncertainty.covariance import accuracy_from_covariance
+from .uncertainty.radii import accuracy_from_covariance
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapless import Client, InvalidArgument, LocalizationResult, Reference, Rejected, RigidTransform
-from mapless_server.method.uncertainty.covariance import Accuracy
+from mapless_server.method.uncertainty.radii import Accuracy
 from mapless_server.services.messages.radii import Conditions, Factors, scaled_accuracy, scaled_covariance
 from mapless_tools.child import CONNECT
 from mapless_tools.dataset import Frame

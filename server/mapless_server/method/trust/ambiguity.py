@@ -28,7 +28,7 @@ from ..perturbation import pose_hessian, world_covariance
 from ..pnp import PnpOptions, ransac
 from ..rejection import Hypothesis
 from ..results import Support
-from ..uncertainty.covariance import Accuracy, accuracy_from_covariance
+from ..uncertainty.radii import Accuracy, accuracy_from_covariance
 from .gate import false_alarms
 from .votes import Votes
 

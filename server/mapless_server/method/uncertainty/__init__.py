@@ -1,1 +1,1 @@
-"""The covariance of a pose: `covariance` combines its parts, `dispersion` is the jackknife over the references."""
+"""The covariance of a pose: `covariance` combines its parts, `dispersion` is the jackknife; `radii` follow from it."""

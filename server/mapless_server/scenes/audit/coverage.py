@@ -17,7 +17,7 @@ from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian
 from mapless_server.method.options import check_bounds
 from mapless_server.method.perturbation import motion_jacobian, world_covariance
 from mapless_server.method.structure import StructureOptions
-from mapless_server.method.uncertainty.covariance import accuracy_from_covariance
+from mapless_server.method.uncertainty.radii import accuracy_from_covariance
 
 from .finder import ReferenceFinder
 from .neighbourhood import Neighbourhood, PairMatches, build_neighbourhood

@@ -15,7 +15,7 @@ from mapless.wire import FieldError
 from mapless_server.engine.query import Query
 from mapless_server.method.options import Variant
 from mapless_server.method.rejection import Rejection
-from mapless_server.method.uncertainty.covariance import accuracy_from_covariance
+from mapless_server.method.uncertainty.radii import accuracy_from_covariance
 from mapless_server.scenes import Narrowing
 from mapless_server.security import key_of
 

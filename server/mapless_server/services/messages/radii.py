@@ -9,7 +9,7 @@ import numpy as np
 
 from mapless.geometry import Array
 from mapless.scenes import MAX_FACTOR, MIN_FACTOR, Calibration
-from mapless_server.method.uncertainty.covariance import Accuracy
+from mapless_server.method.uncertainty.radii import Accuracy
 
 
 @dataclass(frozen=True)
