@@ -237,7 +237,9 @@ def test_the_covariance_is_symmetric_and_names_its_source() -> None:
     structure, matches, estimate = stages(scene, scene.references)
     adjusted = adjust_pose(scene.query, scene.references, structure, matches, estimate, AdjustOptions())
     assert adjusted.uncertainty
-    np.testing.assert_array_equal(adjusted.covariance, adjusted.uncertainty.covariance)
+    assert adjusted.intrinsics
+    parts = adjusted.uncertainty.covariance + adjusted.intrinsics.pose_covariance
+    np.testing.assert_array_equal(adjusted.covariance, parts)
     np.testing.assert_allclose(adjusted.covariance, adjusted.covariance.T)
     assert np.linalg.eigvalsh(adjusted.covariance).min() > 0
     assert adjusted.uncertainty.motions.shape == (len(scene.references), 6)

@@ -13,6 +13,7 @@ tracks                       observations of the same point
 lightglue, correspond        matches among references, and of the query with them (lightglue: by a network)
 retrieve                     the references most similar to a photograph
 priors/                      what is known of the query's pose beforehand
+intrinsics                   errors of the query's intrinsics, and the evidence of them
 results                      scale, structure, matches, pose estimate and its support: data between stages
 scale_equations, scale       metric scale, initial pose
 observations, structure      metric points

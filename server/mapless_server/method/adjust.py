@@ -9,6 +9,10 @@ are adjusted together,
 over the query's pose, its points and small motions xi of the references, which a prior holds to their given poses. Its
 covariance C, by which neighbours move together and far references are held less, is found for each query from the
 references' observations (see `pose_errors`).
+
+The query's intrinsics stay as given: where they are right, poses are twice as accurate without these four unknowns.
+What the photograph says of their errors follows from the same normal equations, and the pose's covariance contains them
+(see `intrinsics`).
 Priors on the query's pose add their terms, unless the photograph alone contradicts them. The points are eliminated (see
 `bundle`).
 """
@@ -24,9 +28,10 @@ from numpy.typing import NDArray
 from mapless.geometry import RigidTransform
 
 from .bundle import Bundle, BundleProblem, bundle_of
+from .intrinsics import IntrinsicsEvidence, IntrinsicsSigma, intrinsics_evidence, keypoint_motion
 from .optimize import MinimizeOptions, minimize
 from .options import check_bounds
-from .perturbation import reprojection_errors_px
+from .perturbation import reprojection_errors_px, world_jacobian
 from .pose_errors import PoseErrorOptions, most_probable, pose_errors
 from .priors.known import NO_PRIORS, Priors
 from .results import PointMatches, PoseEstimate, PoseStage, Structure
@@ -37,6 +42,10 @@ from .views import PosedView, View
 
 LEAST_DAMPING = 1e-9
 """Keeps the points determined where they are eliminated at the given poses."""
+
+SHARED_CAMERA = 0.1
+"""Share of the intrinsics' usual errors that differ between photographs of one camera. What they share is in the
+references' points too, and moves the pose but little: focus and stabilization remain."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +88,7 @@ def adjust_pose(
     estimate: PoseEstimate,
     options: AdjustOptions,
     priors: Priors = NO_PRIORS,
+    intrinsics: IntrinsicsSigma | None = None,
 ) -> PoseEstimate:
     """Refines an estimate together with its points and, within their noise, the references.
 
@@ -91,13 +101,14 @@ def adjust_pose(
         options: see there.
         priors: on the query's pose. Each is checked against the pose from the photograph alone; only consistent ones
             are used.
+        intrinsics: standard deviations of the query's intrinsics; None for the defaults.
 
     Returns:
         The estimate with a refined pose and its covariance; unchanged if the adjustment fails.
     """
 
     def adjusted(start: PoseEstimate, active: Priors) -> PoseEstimate | None:
-        return _adjusted(query, references, structure, matches, start, options, active)
+        return _adjusted(query, references, structure, matches, start, options, active, intrinsics)
 
     # If no prior is used, the answer is bit-identical to the one without priors.
     without_priors = estimate.without_priors or estimate
@@ -118,6 +129,7 @@ def _adjusted(
     estimate: PoseEstimate,
     options: AdjustOptions,
     priors: Priors,
+    intrinsics: IntrinsicsSigma | None,
 ) -> PoseEstimate | None:
     """The estimate at the optimum with priors; None if it diverges or has too few matches."""
     used = np.flatnonzero(estimate.errors_px < options.max_error_px)
@@ -129,6 +141,9 @@ def _adjusted(
     found = _conclude(query, structure, matches, used, estimate, problem, bundle, options)
     if found is None:
         return None
+    evidence = _evidence(query, references, problem, bundle, options, intrinsics)
+    if evidence is not None:
+        found = replace(found, covariance=found.covariance + evidence.pose_covariance, intrinsics=evidence)
     return replace(found, covariance=priors.sharpened(found.covariance, found.world_from_camera))
 
 
@@ -161,6 +176,34 @@ def _conclude(
         return None
     covariance = uncertainty.covariance
     return PoseEstimate(pose, PoseStage.REFINED, inliers, errors_px, covariance, uncertainty=uncertainty)
+
+
+def _evidence(
+    query: View,
+    references: Sequence[PosedView],
+    problem: BundleProblem,
+    bundle: Bundle,
+    options: AdjustOptions,
+    intrinsics: IntrinsicsSigma | None,
+) -> IntrinsicsEvidence | None:
+    """What the photograph's matches say of its intrinsics, at the optimum."""
+    wider, there = with_intrinsics(problem, bundle, query)
+    matrix, gradient, _ = wider.linearize(there).reduced(LEAST_DAMPING)
+    sigma = (intrinsics or IntrinsicsSigma()).of(query.camera)
+    if intrinsics is None and 2 * sum(query.has_camera_of(it.view) for it in references) > len(references):
+        sigma = SHARED_CAMERA * sigma
+    to_world = world_jacobian(bundle.world_from_query)
+    return intrinsics_evidence(matrix, gradient, there.intrinsics, sigma, options.error_inflation, to_world)
+
+
+def with_intrinsics(problem: BundleProblem, bundle: Bundle, query: View) -> tuple[BundleProblem, Bundle]:
+    """The same problem and values with errors of the query's intrinsics as unknowns, without a prior on them."""
+    is_query = problem.view == len(problem.given.rotation)
+    observations = problem.observations
+    motion = keypoint_motion(query.camera, query.distortion, observations.pixel[is_query])
+    motion = motion / observations.sigma_px[is_query, None, None]
+    wider = replace(problem, keypoint_motion=motion, intrinsics_information=np.zeros(4))
+    return wider, replace(bundle, intrinsics=np.zeros(4))
 
 
 def pose_problem(

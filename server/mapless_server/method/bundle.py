@@ -3,15 +3,16 @@
     min  sum_obs rho(|r_o|^2 / sigma_o^2) + xi^T C^-1 xi      (Cauchy's loss)
 
 over the poses of all cameras and the points; xi are the motions of the references away from their given poses. The last
-camera is the query, whose pose may have priors. The points are eliminated (Schur complement), which leaves a dense
-system of 6 unknowns per camera.
+camera is the query, whose pose may have priors. Its intrinsics may be unknowns too: four errors with a prior of mean 0
+(see `intrinsics`). They move its keypoints, which is linear, so that derivatives by poses and points do not depend on
+them. The points are eliminated (Schur complement), which leaves a dense system of 6 unknowns per camera and those 4.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -72,14 +73,16 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Poses of the references, then the query, and points (P, 3)."""
+    """Poses of the references, then the query, points (P, 3), and errors (I,) of the query's intrinsics, 4 or none."""
 
     poses: Poses
     points: Array
+    intrinsics: Array = field(default_factory=lambda: np.zeros(0))
 
-    def moved(self, motion: Array, steps: Array) -> Bundle:
-        """After left perturbations (V, 6) of the poses and steps (P, 3) of the points."""
-        return Bundle(self.poses.moved(motion), self.points + steps)
+    def moved(self, motion: Array, steps: Array, intrinsics: Array | None = None) -> Bundle:
+        """After left perturbations (V, 6) of the poses, and steps (P, 3) of the points and (I,) of the intrinsics."""
+        errors = self.intrinsics if intrinsics is None else self.intrinsics + intrinsics
+        return Bundle(self.poses.moved(motion), self.points + steps, errors)
 
     @property
     def world_from_query(self) -> RigidTransform:
@@ -99,6 +102,9 @@ class BundleProblem:
         loss_scale_sigma: of the Cauchy loss.
         priors: on the query's pose.
         prior_weight: factor on their cost, relative to that of the observations.
+        keypoint_motion: (O_q, 2, I) of the query's observations, in their order, by errors of its intrinsics, in
+            standard deviations; I = 0 if they are no unknowns.
+        intrinsics_information: (I,) inverse variances of the prior on these errors.
     """
 
     observations: Observations
@@ -108,11 +114,19 @@ class BundleProblem:
     loss_scale_sigma: float
     priors: Priors = NO_PRIORS
     prior_weight: float = 1.0
+    keypoint_motion: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))
+    intrinsics_information: Array = field(default_factory=lambda: np.zeros(0))
 
     @cached_property
     def by_view(self) -> ViewColumns:
         """The observations sorted by view, in columns."""
-        return ViewColumns.of(self.observations, self.view, len(self.given.rotation) + 1)
+        return ViewColumns.of(self.observations, self.view, len(self.given.rotation) + 1, self.keypoint_motion)
+
+    @property
+    def query_rows(self) -> slice:
+        """The rows of the query's pose in the normal equations; those of its intrinsics follow."""
+        count = 6 * len(self.given.rotation)
+        return slice(count, count + 6)
 
     def at(self, bundle: Bundle) -> Observations:
         """The observations by cameras at these poses."""
@@ -125,26 +139,36 @@ class BundleProblem:
     def cost(self, bundle: Bundle) -> float:
         """NaN for a point behind a camera."""
         x_in_camera = self.by_view.in_camera(bundle.poses, np.ascontiguousarray(bundle.points.T))
-        squared = (self.by_view.residuals(x_in_camera) ** 2).sum(axis=0)
+        squared = (self.by_view.residuals(x_in_camera, bundle.intrinsics) ** 2).sum(axis=0)
         motion = self.reference_motion(bundle).ravel()
-        prior = float(motion @ self.information @ motion)
+        prior = float(motion @ self.information @ motion + self.intrinsics_information @ bundle.intrinsics**2)
         if self.priors:
             prior += self.prior_weight * self.priors.cost(bundle.world_from_query)
         return cauchy_cost(squared, self.loss_scale_sigma) + prior
 
     def rows(self, bundle: Bundle) -> Linearization:
-        """The observations linearized."""
-        return linearize(self.at(bundle), bundle.points, self.loss_scale_sigma)
+        """The observations linearized, at these intrinsics."""
+        found = self.at(bundle)
+        if bundle.intrinsics.size:
+            pixel = found.pixel.copy()
+            is_query = self.view == len(self.given.rotation)
+            pixel[is_query] -= (self.keypoint_motion @ bundle.intrinsics) * found.sigma_px[is_query, None]
+            found = replace(found, pixel=pixel)
+        return linearize(found, bundle.points, self.loss_scale_sigma)
 
     def linearize(self, bundle: Bundle) -> NormalEquations:
         """See optimize.Problem."""
         equations = self.by_view.equations(bundle, self.loss_scale_sigma)
-        equations.pose_block[:-6, :-6] += self.information
-        equations.pose_gradient[:-6] += self.information @ self.reference_motion(bundle).ravel()
+        query = self.query_rows
+        references, intrinsics = slice(query.start), slice(query.stop, None)
+        equations.pose_block[references, references] += self.information
+        equations.pose_gradient[references] += self.information @ self.reference_motion(bundle).ravel()
+        equations.pose_block[intrinsics, intrinsics] += np.diag(self.intrinsics_information)
+        equations.pose_gradient[intrinsics] += self.intrinsics_information * bundle.intrinsics
         if self.priors:
             gradient, information = self._query_terms(bundle.world_from_query)
-            equations.pose_gradient[-6:] += gradient
-            equations.pose_block[-6:, -6:] += information
+            equations.pose_gradient[query] += gradient
+            equations.pose_block[query, query] += information
         return equations
 
     def step(self, bundle: Bundle, equations: NormalEquations, damping: float) -> Bundle | None:
@@ -153,7 +177,8 @@ class BundleProblem:
         motion = solve_step(matrix, gradient)
         if motion is None:
             return None
-        return bundle.moved(motion.reshape(-1, 6), points.steps(motion))
+        cameras = self.query_rows.stop
+        return bundle.moved(motion[:cameras].reshape(-1, 6), points.steps(motion), motion[cameras:])
 
     def _query_terms(self, world_from_query: RigidTransform) -> tuple[Array, Array]:
         """Gradient (6,) and information (6, 6) of the query's priors, by a left perturbation of camera_from_world.
@@ -174,6 +199,7 @@ class ViewColumns:
         parts: the columns of each view.
         focal, offset: (2, O) as in `observations.Columns`.
         sums: (P, O): a product with it sums over the observations of each point.
+        by_intrinsics: (2, I, O_q) derivative of the last view's residuals by errors of its intrinsics.
     """
 
     point: NDArray[np.intp]
@@ -182,10 +208,11 @@ class ViewColumns:
     focal: Array
     offset: Array
     sums: Any
+    by_intrinsics: Array
 
     @staticmethod
-    def of(observations: Observations, view: NDArray[np.intp], view_count: int) -> ViewColumns:
-        """From rows and the view (O,) of each."""
+    def of(observations: Observations, view: NDArray[np.intp], view_count: int, keypoint_motion: Array) -> ViewColumns:
+        """From rows and the view (O,) of each; `keypoint_motion` as in BundleProblem."""
         order = np.argsort(view, kind="stable")
         point, view = observations.point[order], view[order]
         ends = np.searchsorted(view, np.arange(view_count + 1))
@@ -198,6 +225,7 @@ class ViewColumns:
             columns(observations.focal_px[order] / sigma_px),
             columns((observations.principal_px - observations.pixel)[order] / sigma_px),
             csr_array((np.ones(count), (point, np.arange(count))), shape=(int(point.max(initial=-1)) + 1, count)),
+            np.ascontiguousarray(np.moveaxis(keypoint_motion, 0, 2)),
         )
 
     def in_camera(self, poses: Poses, x_in_world: Array) -> Array:
@@ -205,10 +233,16 @@ class ViewColumns:
         rotation = take(columns(poses.rotation), self.view)
         return np.asarray(apply_columns(rotation, take(x_in_world, self.point)) + take(poses.translation.T, self.view))
 
-    def residuals(self, x_in_camera: Array) -> Array:
+    def residuals(self, x_in_camera: Array, intrinsics: Array) -> Array:
         """(2, O), in standard deviations; NaN behind the camera."""
         depth = np.where(x_in_camera[2] > 0, x_in_camera[2], np.nan)
-        return np.asarray(x_in_camera[:2] / depth * self.focal + self.offset)
+        return self._with_intrinsics(np.asarray(x_in_camera[:2] / depth * self.focal + self.offset), intrinsics)
+
+    def _with_intrinsics(self, residual: Array, intrinsics: Array) -> Array:
+        """The residuals (2, O), changed in place, at errors (I,) of the query's intrinsics."""
+        if intrinsics.size:
+            residual[:, self.parts[-1]] += np.einsum("aio,i->ao", self.by_intrinsics, intrinsics)
+        return residual
 
     def linearized(self, bundle: Bundle) -> tuple[Array, Array, Array]:
         """Residuals (2, O) and their derivatives by the point (2, 3, O) and the pose (2, 6, O)."""
@@ -226,16 +260,22 @@ class ViewColumns:
                 np.stack([zero, slope[1], -slope[1] * v, -fy * (1 + v * v), fy * u * v, fy * u]),
             ]
         )
-        return ideal * self.focal + self.offset, by_point, by_pose
+        residual = self._with_intrinsics(ideal * self.focal + self.offset, bundle.intrinsics)
+        return residual, by_point, by_pose
 
     def equations(self, bundle: Bundle, loss_scale_sigma: float) -> NormalEquations:
         """The normal equations of the observations alone, weighted by a Cauchy loss of this scale."""
         residual, by_point, by_pose = self.linearized(bundle)
         weight = cauchy_weight((residual**2).sum(axis=0), loss_scale_sigma)
         weighted_point, weighted_pose = by_point * weight, by_pose * weight
+        last = self.parts[-1]
+        weighted_intrinsics = self.by_intrinsics * weight[last] if self.by_intrinsics.size else self.by_intrinsics
         blocks, gradients = [], []
         for part in self.parts:
             (x, y), (weighted_x, weighted_y) = by_pose[:, :, part], weighted_pose[:, :, part]
+            if part is last and self.by_intrinsics.size:
+                x, y = np.concatenate([by_pose[:, :, part], self.by_intrinsics], axis=1)
+                weighted_x, weighted_y = np.concatenate([weighted_pose[:, :, part], weighted_intrinsics], axis=1)
             blocks.append(weighted_x @ x.T + weighted_y @ y.T)
             gradients.append(weighted_x @ residual[0, part] + weighted_y @ residual[1, part])
         point_block = symmetric_products(weighted_point, by_point)
@@ -247,20 +287,24 @@ class ViewColumns:
             np.stack([self.sums @ row for row in point_block]),
             np.stack([self.sums @ row for row in point_gradient]),
             np.einsum("kao,kbo->abo", weighted_pose, by_point),
+            np.einsum("kao,kbo->abo", weighted_intrinsics, by_point[:, :, last])
+            if self.by_intrinsics.size
+            else np.zeros((0, 3, 0)),
         )
 
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """[B E; E^T C] [d_pose; d_point] = -[g; h], where C is block-diagonal.
+    """[B E; E^T C] [d_pose; d_point] = -[g; h], where C is block-diagonal and poses include the query's intrinsics.
 
     Attributes:
         columns: the observations.
-        pose_block: B, (6 V, 6 V).
-        pose_gradient: g, (6 V,).
+        pose_block: B, (6 V + I, 6 V + I).
+        pose_gradient: g, (6 V + I,).
         point_block: C, (6, P) as in `arrays.SYMMETRIC`.
         point_gradient: h, (3, P).
         cross: E, (6, 3, O), the block of each observation's view and point.
+        cross_intrinsics: E, (I, 3, O_q), that of the query's intrinsics.
     """
 
     columns: ViewColumns
@@ -269,9 +313,10 @@ class NormalEquations:
     point_block: Array
     point_gradient: Array
     cross: Array
+    cross_intrinsics: Array
 
     def reduced(self, damping: float) -> tuple[Array, Array, EliminatedPoints]:
-        """B - E C^-1 E^T (6 V, 6 V), g - E C^-1 h (6 V,) and the points, diagonals enlarged by `damping`.
+        """B - E C^-1 E^T (U, U), g - E C^-1 h (U,), U = 6 V + I, and the points, diagonals enlarged by `damping`.
 
         With Cholesky's C = L L^T the products are those of F = E L^-T with itself and with L^-1 h.
         """
@@ -284,7 +329,14 @@ class NormalEquations:
         by_view = np.zeros((len(self.columns.parts), 18, self.point_gradient.shape[1]))
         for cross, part in zip(by_view, self.columns.parts, strict=True):
             cross[:, self.columns.point[part]] = by_observation[:, part]  # one observation per point and view
-        wide = by_view.reshape(len(self.pose_gradient), -1)
+        wide = by_view.reshape(6 * len(by_view), -1)
+        count = len(self.cross_intrinsics)
+        if count:
+            last = self.columns.parts[-1]
+            forward = _forward(factors[:, last], np.swapaxes(self.cross_intrinsics, 0, 1))
+            by_point = np.zeros((count, 3, self.point_gradient.shape[1]))
+            by_point[:, :, self.columns.point[last]] = np.stack(forward, axis=1)
+            wide = np.concatenate([wide, by_point.reshape(count, -1)])
         matrix = self.pose_block + damping * np.diag(np.diag(self.pose_block)) - wide @ wide.T
         return matrix, self.pose_gradient - wide @ gradient.ravel(), EliminatedPoints(factor, gradient, wide)
 
@@ -296,7 +348,7 @@ class EliminatedPoints:
     Attributes:
         factor: L (6, P), as in `arrays.SYMMETRIC`.
         gradient: L^-1 h, (3, P).
-        cross: E L^-T, (6 V, 3 P).
+        cross: E L^-T, (U, 3 P).
     """
 
     factor: Array
@@ -304,7 +356,7 @@ class EliminatedPoints:
     cross: Array
 
     def steps(self, motion: Array) -> Array:
-        """Steps (P, 3) of the points after a motion (6 V,) of the cameras."""
+        """Steps (P, 3) of the points after a motion (U,) of the cameras."""
         xx, yy, zz, xy, xz, yz = self.factor
         x, y, z = -(self.gradient + (motion @ self.cross).reshape(3, -1))
         z = z / zz

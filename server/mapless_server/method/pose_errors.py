@@ -125,11 +125,11 @@ def _of_motions(covariance: Array, rotations: Array, unit: Array) -> Array:
 
 
 def most_probable(errors: PoseErrors, matrix: Array, gradient: Array, options: PoseErrorOptions) -> tuple[float, float]:
-    """A and b, from the normal equations (6 K + 6, 6 K + 6), (6 K + 6,) at the given poses, with the query last."""
+    """A and b, from normal equations of 6 K unknowns and the query's, which are last, at the given poses."""
     finite = bool(np.isfinite(matrix).all() and np.isfinite(gradient).all())
     if not finite:
         return options.own_inflation * options.usual_own, options.drift_inflation * options.usual_drift
-    project, data = _whitened(*_without_query(matrix, gradient), np.sqrt(np.diag(errors.own)))
+    project, data = _whitened(*_without_query(matrix, gradient, len(errors.own)), np.sqrt(np.diag(errors.own)))
     own, drift = project @ errors.own @ project.T, project @ errors.drift @ project.T
     sizes = np.array([(a, b) for a in options.own for b in options.drift])
     squares = sizes[:, :, None, None] ** 2
@@ -142,11 +142,11 @@ def most_probable(errors: PoseErrors, matrix: Array, gradient: Array, options: P
     return options.own_inflation * float(sizes[best, 0]), options.drift_inflation * float(sizes[best, 1])
 
 
-def _without_query(matrix: Array, gradient: Array) -> tuple[Array, Array]:
-    """The normal equations (6 K, 6 K), (6 K,) with the query's pose eliminated."""
-    coupling = matrix[:-6, -6:]
-    solved = np.linalg.lstsq(matrix[-6:, -6:], np.column_stack([coupling.T, gradient[-6:]]), rcond=None)[0]
-    return matrix[:-6, :-6] - coupling @ solved[:, :-1], gradient[:-6] - coupling @ solved[:, -1]
+def _without_query(matrix: Array, gradient: Array, n: int) -> tuple[Array, Array]:
+    """The normal equations (n, n), (n,) of the references, with the query's unknowns eliminated."""
+    coupling = matrix[:n, n:]
+    solved = np.linalg.lstsq(matrix[n:, n:], np.column_stack([coupling.T, gradient[n:]]), rcond=None)[0]
+    return matrix[:n, :n] - coupling @ solved[:, :-1], gradient[:n] - coupling @ solved[:, -1]
 
 
 def _whitened(matrix: Array, gradient: Array, unit: Array) -> tuple[Array, Array]:

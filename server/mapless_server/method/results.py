@@ -13,6 +13,7 @@ from mapless.geometry import Array, RigidTransform, Similarity
 from .arrays import (
     AnyArray,
 )
+from .intrinsics import IntrinsicsEvidence
 from .priors.known import PriorCheck
 from .tracks import Tracks
 from .views import PosedView, View
@@ -138,6 +139,8 @@ class PoseEstimate:
         uncertainty: the jackknife covariance without priors; None if the covariance is from the residuals alone and
             leaves out correlated errors (see `pose_covariance`).
         without_priors: the estimate before priors were used; None if none was used.
+        intrinsics: what the matches say of errors of the photograph's intrinsics, which the covariance contains; None
+            for poses that were not adjusted.
     """
 
     world_from_camera: RigidTransform
@@ -148,6 +151,7 @@ class PoseEstimate:
     prior_checks: tuple[PriorCheck, ...] = ()
     uncertainty: Uncertainty | None = None
     without_priors: PoseEstimate | None = None
+    intrinsics: IntrinsicsEvidence | None = None
 
 
 @dataclass(frozen=True, eq=False)

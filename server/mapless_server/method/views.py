@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Camera, RigidTransform
+from mapless.geometry import Camera, Distortion, RigidTransform
 
 Matches = NDArray[np.int32]
 """(M, 2): keypoint indices in the first and in the second of two views."""
@@ -62,11 +62,21 @@ class View:
         camera: pinhole, in pixels of the processed (reduced) image.
         features: in the same pixels.
         photograph: the image itself; None if no stage needs it.
+        distortion: of the lens, with which the keypoints were undistorted; None for a pinhole, and for stored
+            references, where it is not needed.
     """
 
     camera: Camera
     features: Features
     photograph: Photograph | None = None
+    distortion: Distortion | None = None
+
+    def has_camera_of(self, other: View) -> bool:
+        """Whether both have the same intrinsics, to a thousandth of its width, and so the same errors of them."""
+        ours, theirs = self.camera, other.camera
+        if (ours.width_px, ours.height_px) != (theirs.width_px, theirs.height_px):
+            return False
+        return bool(np.abs(ours.matrix() - theirs.matrix()).max() < 1e-3 * ours.width_px)
 
 
 @dataclass(frozen=True, eq=False)

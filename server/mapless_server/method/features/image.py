@@ -70,7 +70,9 @@ def view_of(camera: Camera, pixels: Array, descriptors: NDArray[np.float32], siz
         sizes_px: (N,), see Features.
     """
     if not len(pixels):
-        return View(camera.pinhole(), Features(np.empty((0, 2), np.float32), descriptors, sizes_px))
+        nothing = Features(np.empty((0, 2), np.float32), descriptors, sizes_px)
+        return View(camera.pinhole(), nothing, distortion=camera.distortion)
     ideal = undistort_pixels(pixels, camera)
     usable = np.isfinite(ideal).all(axis=1)
-    return View(camera.pinhole(), Features(ideal[usable].astype(np.float32), descriptors[usable], sizes_px[usable]))
+    features = Features(ideal[usable].astype(np.float32), descriptors[usable], sizes_px[usable])
+    return View(camera.pinhole(), features, distortion=camera.distortion)
