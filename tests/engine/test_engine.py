@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import hashlib
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -427,6 +429,19 @@ class TestPhotograph:
         for i, reference in enumerate(references):
             assert reference.view.photograph is not None
             np.testing.assert_array_equal(reference.view.photograph.read(), textured(seed=i))
+
+    def test_is_freed_with_the_answer(self, setting: Setting) -> None:
+        """By no cycle that waits for the garbage collector: its point maps and pixels are 15 MB."""
+        setting.replies["cheap"] = localized(SURE_INLIERS)
+        gc.collect()
+        gc.disable()
+        try:
+            setting.localize()
+            freed = threading.Event()
+            weakref.finalize(setting.seen.pop()[0], freed.set)
+            assert freed.wait(10)
+        finally:
+            gc.enable()
 
     def test_one_deleted_during_the_network_is_no_candidate(self, setting: Setting) -> None:
         """The server chose it, so the caller must not get an error."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import re
 import subprocess
@@ -96,3 +97,32 @@ def test_a_product_uses_one_thread_unless_set_otherwise(environment: dict[str, s
         env=inherited | environment,
     )
     assert (done.stdout.strip(), done.stderr) == (str(threads), "")
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_info"), reason="needs glibc")
+@pytest.mark.parametrize(("environment", "heaps"), [({}, range(1, 2)), ({"MALLOC_ARENA_MAX": "3"}, range(2, 4))])
+def test_threads_share_one_heap_unless_set_otherwise(environment: dict[str, str], heaps: range) -> None:
+    """Each heap keeps what its threads needed for a moment."""
+    program = """if True:
+        import ctypes, threading
+        from mapless_server.serve.libraries import configure_libraries
+        from mapless_server.settings import Settings
+        configure_libraries(Settings())
+        together = threading.Barrier(4)
+        threads = [threading.Thread(target=lambda: bytearray(100_000) and together.wait()) for _ in range(4)]
+        [it.start() for it in threads]
+        [it.join() for it in threads]
+        libc = ctypes.CDLL(None)
+        libc.malloc_info(0, ctypes.c_void_p.in_dll(libc, "stdout"))
+        libc.fflush(None)
+    """
+    inherited = {name: value for name, value in os.environ.items() if "MALLOC" not in name and "GLIBC" not in name}
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+        env=inherited | environment,
+    )
+    assert done.stdout.count("<heap ") in heaps

@@ -166,6 +166,24 @@ class StageRecord:
 
 
 @dataclass(eq=False)
+class _Life:
+    """What `Job.check` needs, apart from the job: payloads hold it, and would be freed late if it held them.
+
+    Attributes:
+        over: set at the job's end.
+        checked_s: see `Job.checked_s`.
+    """
+
+    over: threading.Event = field(default_factory=threading.Event)
+    checked_s: float = -math.inf
+
+    def check(self) -> None:
+        self.checked_s = time.monotonic()
+        if self.over.is_set():
+            raise Abandoned
+
+
+@dataclass(eq=False)
 class Job:
     """A call's work, from admission to its one and only ending.
 
@@ -185,7 +203,6 @@ class Job:
         charged_s: computing time charged to its tenant at admission.
         unusual_s: part of the current batch's computing time that says nothing about later jobs; set by its stage.
         is_computed: whether it is in a batch now.
-        checked_s: when a stage last called `check`, `time.monotonic`: a sign of life of the computing thread.
         timer_s: the `due_s` that the scheduler has set a timer for.
     """
 
@@ -203,30 +220,33 @@ class Job:
     charged_s: float = 0.0
     unusual_s: float = 0.0
     is_computed: bool = False
-    checked_s: float = -math.inf
     timer_s: float = -math.inf
-    _over: threading.Event = field(default_factory=threading.Event)
+    _life: _Life = field(default_factory=_Life)
 
     @property
     def is_over(self) -> bool:
         """Whether it has ended; a thread may still be computing it."""
-        return self._over.is_set()
+        return self._life.over.is_set()
+
+    @property
+    def checked_s(self) -> float:
+        """When a stage last called `check`, `time.monotonic`: a sign of life of the computing thread."""
+        return self._life.checked_s
 
     @property
     def due_s(self) -> float:
         """When it ends at the latest, by the queue's clock."""
         return self.deadline_s if self.fallback is None else min(self.fallback.at_s, self.deadline_s)
 
-    def check(self) -> None:
+    @property
+    def check(self) -> Callable[[], None]:
         """Raises Abandoned if the job has ended. Stages call it between their steps, from any thread."""
-        self.checked_s = time.monotonic()
-        if self._over.is_set():
-            raise Abandoned
+        return self._life.check
 
     def end(self, ending: Ending, value: Any) -> None:
         """Ends the job; called by the scheduler only."""
-        assert not self._over.is_set()
-        self._over.set()
+        assert not self.is_over
+        self._life.over.set()
         self.on_end(ending, value)
 
 
