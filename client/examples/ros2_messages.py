@@ -118,5 +118,5 @@ def fill_pose(message: Any, map_from_body: mapless.RigidTransform, covariance: A
     position, orientation = message.pose.pose.position, message.pose.pose.orientation
     position.x, position.y, position.z = map(float, map_from_body.translation)
     orientation.x, orientation.y, orientation.z, orientation.w = q.x, q.y, q.z, q.w
-    message.pose.covariance = [float(number) for number in covariance.ravel()]
+    message.pose.covariance = np.array(covariance, np.float64).ravel()  # serializers want an array
     return message

@@ -26,7 +26,8 @@ ProtoEnum = Any
 
 MIN_SIDE_PX, MAX_SIDE_PX = 32, 16384
 MAX_DISTORTION = 100.0
-MAX_FOCAL_PER_SIDE = 100.0
+MIN_FOCAL_PER_SIDE, MAX_FOCAL_PER_SIDE = 0.01, 100.0
+"""A focal length, by the image's longer side: fields of view of 178 and 0.6 degrees."""
 
 
 class FieldError(ValueError):
@@ -122,11 +123,12 @@ def camera_from_message(message: pb.CameraIntrinsics, field: str) -> Camera:
         value = getattr(message, side)
         if not MIN_SIDE_PX <= value <= MAX_SIDE_PX:
             raise FieldError(joined(field, side), f"must be {MIN_SIDE_PX} to {MAX_SIDE_PX}, is {value}")
-    max_focal_px = MAX_FOCAL_PER_SIDE * max(message.width_px, message.height_px)
+    side_px = max(message.width_px, message.height_px)
+    min_focal_px, max_focal_px = MIN_FOCAL_PER_SIDE * side_px, MAX_FOCAL_PER_SIDE * side_px
     for focal in ("focal_x_px", "focal_y_px"):
         value = getattr(message, focal)
-        if not 0 < value <= max_focal_px:
-            raise FieldError(joined(field, focal), f"must be above 0 and at most {max_focal_px:g}, is {value:g}")
+        if not min_focal_px <= value <= max_focal_px:
+            raise FieldError(joined(field, focal), f"must be {min_focal_px:g} to {max_focal_px:g}, is {value:g}")
     for principal, side_px in (("principal_x_px", message.width_px), ("principal_y_px", message.height_px)):
         value = getattr(message, principal)
         if not -side_px <= value <= 2 * side_px:

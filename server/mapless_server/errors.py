@@ -15,18 +15,26 @@ class RequestError(Exception):
         reason: UPPER_SNAKE_CASE, stable, for programs; the class's `default_reason`, or the code, if none is given.
         field: path of the wrong field in the request, "intrinsics.focal_x_px", or None.
         retry_after_s: when to try again, seconds, or None if a retry would change nothing.
+        resource: name of the scene or reference that does not exist or exists already; empty if it is about none.
     """
 
     code = "INTERNAL"
     default_reason = ""
 
     def __init__(
-        self, message: str, *, reason: str = "", field: str | None = None, retry_after_s: float | None = None
+        self,
+        message: str,
+        *,
+        reason: str = "",
+        field: str | None = None,
+        retry_after_s: float | None = None,
+        resource: str = "",
     ) -> None:
         super().__init__(message)
         self.reason = reason or self.default_reason or self.code
         self.field = field
         self.retry_after_s = retry_after_s
+        self.resource = resource
 
 
 class InvalidArgument(RequestError):

@@ -38,13 +38,13 @@ def test_four_numbers_take_the_size_of_the_photograph(tmp_path: Path) -> None:
         read_camera("-500,501,319,239", photo)
 
 
-GOOD = {"width_px": 640, "height_px": 480, "focal_x_px": 5, "focal_y_px": 5, "principal_x_px": 3, "principal_y_px": 2}
+GOOD = {"width_px": 640, "height_px": 480, "focal_x_px": 9, "focal_y_px": 9, "principal_x_px": 3, "principal_y_px": 2}
 
 
 @pytest.mark.parametrize(
     ("changes", "error_text"),
     [
-        ({"focal_x_px": -5}, "focal_x_px: must be above 0 and at most 64000, is -5"),
+        ({"focal_x_px": -5}, "focal_x_px: must be 6.4 to 64000, is -5"),
         ({"focal_x_px": None}, "focal_x_px is missing"),
         ({"focal_z_px": 5}, "focal_z_px is no field, perhaps focal_y_px; known: width_px, "),
         ({"spherical": {"k1": 1}}, "spherical is no field; known: .* fisheye"),
@@ -57,7 +57,7 @@ GOOD = {"width_px": 640, "height_px": 480, "focal_x_px": 5, "focal_y_px": 5, "pr
         ({"width_px": 640.5}, "width_px must be a whole number, is 640.5"),
         ({"width_px": True}, "width_px must be a whole number, is true"),
         ({"focal_y_px": [1]}, "focal_y_px must be a number, is [1]"),
-        ({"focal_y_px": math.nan}, "focal_y_px: must be above 0 and at most 64000, is nan"),
+        ({"focal_y_px": math.nan}, "focal_y_px: must be 6.4 to 64000, is nan"),
         ({"width_px": 10**400}, "width_px must be a whole number, is 1000"),
     ],
 )
@@ -124,7 +124,7 @@ def test_the_cameras_of_a_folder(tmp_path: Path) -> None:
     ("wrong", "error_text"),
     [
         ({"K": [[1]]}, "K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], is [[1]]"),
-        ({"K": [[-5, 0, 3], [0, 5, 2], [0, 0, 1]]}, "K[0][0]: must be above 0 and at most 64000, is -5"),
+        ({"K": [[-5, 0, 3], [0, 5, 2], [0, 0, 1]]}, "K[0][0]: must be 6.4 to 64000, is -5"),
         ({"width": 3}, "width: must be 32 to 16384, is 3"),
         ({"height": 480.5}, "height must be a whole number of pixels, above 0, is 480.5"),
         ({"K": [[5, 0, 0], [0, 5, 0], [3, 2, 1]]}, "K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], is [[5, 0, 0]"),

@@ -94,6 +94,8 @@ def test_a_quaternion_is_normalized() -> None:
         ({"height_px": 16385}, "height_px"),
         ({"width_px": -640}, "width_px"),
         ({"focal_x_px": 0.0}, "focal_x_px"),
+        ({"focal_x_px": 5e-324}, "focal_x_px"),
+        ({"focal_y_px": 6.39}, "focal_y_px"),
         ({"focal_y_px": -500.0}, "focal_y_px"),
         ({"focal_x_px": math.nan}, "focal_x_px"),
         ({"focal_y_px": math.inf}, "focal_y_px"),
@@ -118,7 +120,7 @@ def test_bad_cameras_are_refused_by_field(change: dict[str, Any], field: str) ->
 
 
 def test_camera_limits_are_inclusive() -> None:
-    camera = Camera(32, 16384, 100.0 * 16384, 1e-9, -32.0, 2.0 * 16384)
+    camera = Camera(32, 16384, 100.0 * 16384, 0.01 * 16384, -32.0, 2.0 * 16384)
     assert wire.camera_from_message(wire.camera_to_message(camera), "") == camera
 
 

@@ -19,6 +19,7 @@ from typing import Any
 import promql_parser
 import pytest
 import yaml  # type: ignore[import-untyped]
+from prometheus_client import generate_latest
 
 from mapless_server.method.coarse.token_cache import TokenCacheCounters
 from mapless_server.observability.metrics import LOCALIZED, STAGES, Metrics
@@ -190,6 +191,17 @@ def test_burn_rates_are_of_one_objective() -> None:
 def test_alerts_come_and_stay_away() -> None:
     tests = DEPLOY / "prometheus" / "alerts_test.yaml"
     subprocess.run(["promtool", "test", "rules", str(tests)], check=True, timeout=60)
+
+
+@pytest.mark.skipif(shutil.which("promtool") is None, reason="promtool, of Prometheus, is not here")
+def test_promtool_finds_no_fault_in_the_metrics() -> None:
+    done = subprocess.run(
+        ["promtool", "check", "metrics"],
+        input=generate_latest(Metrics().registry),
+        capture_output=True,
+        timeout=60,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
 
 
 def test_every_alert_is_tried_out() -> None:

@@ -150,8 +150,9 @@ def test_a_pose_is_filled_in_rosses_order(messages: Any) -> None:
     filled = messages.fill_pose(pose_message(), pose(1.5), covariance, "stamp", "map")
     assert (filled.header.stamp, filled.header.frame_id) == ("stamp", "map")
     assert (filled.pose.pose.position.x, filled.pose.pose.position.z) == (1.5, -1.0)
-    assert filled.pose.covariance == list(range(36))
-    assert all(isinstance(number, float) for number in filled.pose.covariance)
+    # An array: serializers other than ROS's own want one.
+    assert isinstance(filled.pose.covariance, np.ndarray)
+    assert (filled.pose.covariance.dtype, filled.pose.covariance.tolist()) == (np.float64, list(range(36)))
     q = filled.pose.pose.orientation
     assert [q.x, q.y, q.z, q.w] == pytest.approx(list(vars(pose(1.5).quaternion()).values()))
 

@@ -61,7 +61,7 @@ def poses(draw: st.DrawFn, most_m: float = 1e7) -> RigidTransform:
 def cameras(draw: st.DrawFn) -> Camera:
     """All that geometry.proto allows."""
     width, height = draw(st.tuples(*[st.integers(MIN_SIDE_PX, MAX_SIDE_PX)] * 2))
-    focals = draw(st.tuples(*[st.floats(1e-6, 100.0 * max(width, height))] * 2))
+    focals = draw(st.tuples(*[st.floats(0.01 * max(width, height), 100.0 * max(width, height))] * 2))
     centre = draw(st.floats(-width, 2 * width)), draw(st.floats(-height, 2 * height))
     lens: Distortion | None = draw(
         st.one_of(

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import resource
 import time
+from contextlib import suppress
 
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from support.images import cmyk_jpeg, encode, png_claiming, textured, with_exif_orientation
 
 from mapless_server.errors import InvalidArgument
@@ -42,6 +45,12 @@ def refusal(data: bytes, limits: ImageLimits = LIMITS, field: str = "image") -> 
     return caught.value
 
 
+def decoded_or_none(data: bytes) -> NDArray[np.uint8] | None:
+    with suppress(InvalidArgument):
+        return decode_image(data, LIMITS)
+    return None
+
+
 @pytest.mark.parametrize("name", FILES)
 def test_size_and_pixels_of_every_format(name: str) -> None:
     assert image_size(FILES[name], LIMITS) == (96, 64)
@@ -52,10 +61,40 @@ def test_size_and_pixels_of_every_format(name: str) -> None:
     assert np.abs(pixels.astype(int) - RGB).mean() <= (6 if lossy else 0)
 
 
+@pytest.mark.parametrize("interval", [0, 1, 4, 40])
+@pytest.mark.parametrize("image", ["textured", "grey", "white"])
+def test_a_jpeg_may_lack_its_end_marker_and_nothing_else(interval: int, image: str) -> None:
+    """As some cameras with MJPEG write it. Cut anywhere else, even between two restarts, it is refused."""
+    raster = {"textured": RGB, "grey": RGB[..., 0], "white": np.full_like(RGB, 255)}[image]
+    data = encode(".jpg", raster, int(cv2.IMWRITE_JPEG_RST_INTERVAL), interval)
+    pixels = decode_image(data, LIMITS)
+    start = data.index(b"\xff\xda")
+    cuts = {*range(len(data) - 60, len(data)), *range(start, len(data), 41)}
+    restarts = [found.start() for found in re.finditer(rb"\xff[\xd0-\xd7]", data[start:])]
+    for length in sorted(cuts | {start + it + moved for it in restarts[-30:] for moved in (0, 2)}):
+        decoded = decoded_or_none(data[:length])
+        if decoded is None:
+            assert length < len(data) - 2, length
+        else:
+            assert np.array_equal(decoded, pixels), length
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_12_bits_in_16_are_not_almost_black(channels: int) -> None:
+    """A channel of 16 bits keeps its high byte, but the high 8 of 12 where no value has more."""
+    deep = np.random.default_rng(3).integers(0, 2**12, (40, 50, channels)).astype(np.uint16)
+    shown = np.broadcast_to(deep[..., :3], (40, 50, 3))
+    deep = deep[..., 0] if channels == 1 else deep
+    assert np.array_equal(decode_image(encode(".png", deep), LIMITS), shown >> 4)
+    assert np.array_equal(decode_image(encode(".png", deep * 16), LIMITS), shown >> 4)
+    assert not decode_image(encode(".png", 0 * deep), LIMITS).any()
+
+
 @pytest.mark.parametrize("name", FILES)
 def test_truncation_at_every_length_is_refused(name: str) -> None:
     data = FILES[name]
-    for length in [*range(64), *range(64, len(data) - 64, 37), *range(len(data) - 64, len(data))]:
+    ends_early = len(data) - 2 if name in ("jpeg", "restarts jpeg") else len(data)
+    for length in [*range(64), *range(64, len(data) - 64, 37), *range(len(data) - 64, ends_early)]:
         assert refusal(data[:length]).reason.startswith("IMAGE_")
 
 

@@ -86,10 +86,19 @@ HISTOGRAMS = {
     "mapless_inlier_ratio": set(),
     "mapless_reprojection_error_px": set(),
     "mapless_scale_deviation": set(),
-    "mapless_accuracy_radius_m": set(),
+    "mapless_accuracy_radius_metres": set(),
     "mapless_event_loop_lag_seconds": set(),
     "mapless_store_op_seconds": {"op"},
 }
+
+ABBREVIATED = {"s", "ms", "us", "ns", "sec", "b", "kb", "mb", "gb", "tb", "m", "h", "d"}
+"""Units that `promtool check metrics` wants written out."""
+
+
+@pytest.mark.parametrize("name", [*COUNTERS, *GAUGES, *HISTOGRAMS])
+def test_no_name_abbreviates_its_unit(name: str) -> None:
+    assert not ABBREVIATED & {*name.split("_")}
+
 
 OUTCOMES = (LOCALIZED, *(reason.value for reason in RejectionReason))
 
@@ -265,7 +274,7 @@ def test_stages_of_stronger_features_are_a_tier_not_a_name(metrics: Metrics) -> 
         ("mapless_queue_wait_seconds", 1.0),
         ("mapless_event_loop_lag_seconds", 0.02),
         ("mapless_scale_deviation", 0.05),
-        ("mapless_accuracy_radius_m", 0.2),
+        ("mapless_accuracy_radius_metres", 0.2),
         ("mapless_inliers", 50.0),
     ],
 )

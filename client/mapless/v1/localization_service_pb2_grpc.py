@@ -39,8 +39,8 @@ class LocalizationServiceStub(object):
     * `x-mapless-scene`: "scenes/{scene}", the scene of the call, as in the request itself. For load balancers
     in front of several servers, which keep a scene's calls at one server by it; servers ignore it.
 
-    Every error is a google.rpc.Status with one ErrorInfo (domain "mapless") and, for INVALID_ARGUMENT, a BadRequest that
-    names the field. A message over the server's limit (32 MiB unless configured otherwise) is RESOURCE_EXHAUSTED, without
+    Every error is a google.rpc.Status with one ErrorInfo (domain "mapless"), a RequestInfo, for INVALID_ARGUMENT a BadRequest
+    that names the field, and for NOT_FOUND and ALREADY_EXISTS a ResourceInfo. A message over the server's limit (32 MiB unless configured otherwise) is RESOURCE_EXHAUSTED, without
     RetryInfo: sending it again does not help.
     """
 
@@ -91,8 +91,8 @@ class LocalizationServiceServicer(object):
     * `x-mapless-scene`: "scenes/{scene}", the scene of the call, as in the request itself. For load balancers
     in front of several servers, which keep a scene's calls at one server by it; servers ignore it.
 
-    Every error is a google.rpc.Status with one ErrorInfo (domain "mapless") and, for INVALID_ARGUMENT, a BadRequest that
-    names the field. A message over the server's limit (32 MiB unless configured otherwise) is RESOURCE_EXHAUSTED, without
+    Every error is a google.rpc.Status with one ErrorInfo (domain "mapless"), a RequestInfo, for INVALID_ARGUMENT a BadRequest
+    that names the field, and for NOT_FOUND and ALREADY_EXISTS a ResourceInfo. A message over the server's limit (32 MiB unless configured otherwise) is RESOURCE_EXHAUSTED, without
     RetryInfo: sending it again does not help.
     """
 
@@ -221,8 +221,8 @@ class LocalizationService(object):
     * `x-mapless-scene`: "scenes/{scene}", the scene of the call, as in the request itself. For load balancers
     in front of several servers, which keep a scene's calls at one server by it; servers ignore it.
 
-    Every error is a google.rpc.Status with one ErrorInfo (domain "mapless") and, for INVALID_ARGUMENT, a BadRequest that
-    names the field. A message over the server's limit (32 MiB unless configured otherwise) is RESOURCE_EXHAUSTED, without
+    Every error is a google.rpc.Status with one ErrorInfo (domain "mapless"), a RequestInfo, for INVALID_ARGUMENT a BadRequest
+    that names the field, and for NOT_FOUND and ALREADY_EXISTS a ResourceInfo. A message over the server's limit (32 MiB unless configured otherwise) is RESOURCE_EXHAUSTED, without
     RetryInfo: sending it again does not help.
     """
 

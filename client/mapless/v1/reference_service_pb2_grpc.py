@@ -36,8 +36,7 @@ class ReferenceServiceStub(object):
     its id is free. Request metadata is LocalizationService's: `authorization`, `x-request-id`, `x-client-id`,
     `x-mapless-scene`.
 
-    Errors are google.rpc.Status with one ErrorInfo (domain "mapless"); INVALID_ARGUMENT carries a BadRequest that names
-    the field. Beside what stands with each call, any of them may fail with
+    Errors are google.rpc.Status with details as LocalizationService's; a BadRequest names the field. Beside what stands with each call, any of them may fail with
 
     * UNAUTHENTICATED: the token is missing, unknown or expired. PERMISSION_DENIED: its role does not include the call;
     looking takes the role read, changing the role write.
@@ -133,8 +132,7 @@ class ReferenceServiceServicer(object):
     its id is free. Request metadata is LocalizationService's: `authorization`, `x-request-id`, `x-client-id`,
     `x-mapless-scene`.
 
-    Errors are google.rpc.Status with one ErrorInfo (domain "mapless"); INVALID_ARGUMENT carries a BadRequest that names
-    the field. Beside what stands with each call, any of them may fail with
+    Errors are google.rpc.Status with details as LocalizationService's; a BadRequest names the field. Beside what stands with each call, any of them may fail with
 
     * UNAUTHENTICATED: the token is missing, unknown or expired. PERMISSION_DENIED: its role does not include the call;
     looking takes the role read, changing the role write.
@@ -329,8 +327,7 @@ class ReferenceService(object):
     its id is free. Request metadata is LocalizationService's: `authorization`, `x-request-id`, `x-client-id`,
     `x-mapless-scene`.
 
-    Errors are google.rpc.Status with one ErrorInfo (domain "mapless"); INVALID_ARGUMENT carries a BadRequest that names
-    the field. Beside what stands with each call, any of them may fail with
+    Errors are google.rpc.Status with details as LocalizationService's; a BadRequest names the field. Beside what stands with each call, any of them may fail with
 
     * UNAUTHENTICATED: the token is missing, unknown or expired. PERMISSION_DENIED: its role does not include the call;
     looking takes the role read, changing the role write.

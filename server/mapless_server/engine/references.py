@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Protocol
 
+from mapless.names import reference_name
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.context import StageContext
@@ -147,8 +148,10 @@ class References:
                 if self._indexes.is_damaged(scene_key, reference_id):
                     message = f"reference {reference_id!r} is damaged in the store: delete it and add it again"
                     raise DataLoss(message, field=f"references[{index}]")
-                message = f"there is no reference {reference_id!r} in scene {scene_id_of(scene_key)!r}"
-                raise NotFound(message, field=f"references[{index}]")
+                scene_id = scene_id_of(scene_key)
+                message = f"there is no reference {reference_id!r} in scene {scene_id!r}"
+                name = reference_name(scene_id, reference_id)
+                raise NotFound(message, field=f"references[{index}]", resource=name)
         if not len(entries):
             return Choice((), self._descriptor.name, entries.generation)
         view = views.view(self._extractors[0], context)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,10 +25,19 @@ from .png_chunks import BadChunks, essential_png
 # IMREAD_UNCHANGED would also ignore the orientation, but keeps alpha and 16 bits. Asked for 8-bit colour, the decoder
 # keeps the high byte of 16, drops alpha, repeats grey and converts CMYK.
 _DECODE_FLAGS = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+# 12-bit data of cameras in 16-bit files: the high byte would be almost black.
+_DEEP_FLAGS = _DECODE_FLAGS | cv2.IMREAD_ANYDEPTH
+_PNG_DEPTH = 24  # position of the bits of a channel
 _PNG = b"\x89PNG\r\n\x1a\n"
 _MAX_JPEG_SEGMENTS = 2000  # 64 KiB each; bounds the walk through a file of nothing but empty ones
 _JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd9-\xfe]", re.DOTALL)
 _MAX_JPEG_SCANS = 100  # a progressive file has about ten; thousands make a small file decode for minutes
+
+_JPEG_END = b"\xff\xd9"
+_JPEG_RESTART = re.compile(rb"\xff[\xd0-\xd7]")
+# The data that could follow a scan that is cut off; several, since few bits may be missing.
+_JPEG_DATA = (b"\x5a\x96\x35\xc7" * 64, b"\xaa\x35\xe1" * 64, b"\xff\x00\xc7" * 64)
+_MAX_UNENDED_PIXELS = 16_000_000  # are decoded four times
 
 # Start-of-frame markers: C0 to CF without DHT (C4), JPG (C8) and DAC (CC).
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -102,10 +112,9 @@ def decode_image(data: bytes, limits: ImageLimits, field: str = "image") -> NDAr
         except BadChunks as error:
             reason = "IMAGE_TOO_COMPLEX" if error.is_too_much else "IMAGE_UNDECODABLE"
             raise InvalidArgument(str(error), reason=reason, field=field) from None
-    try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), _DECODE_FLAGS)
-    except cv2.error:
-        pixels = None
+    pixels = _decoded(data)
+    if pixels is None and width * height <= _MAX_UNENDED_PIXELS:
+        pixels = _decoded_without_end(data)
     if pixels is None:
         raise InvalidArgument(
             "the image cannot be decoded: truncated or damaged", reason="IMAGE_UNDECODABLE", field=field
@@ -116,7 +125,57 @@ def decode_image(data: bytes, limits: ImageLimits, field: str = "image") -> NDAr
             reason="IMAGE_UNDECODABLE",
             field=field,
         )
+    if data.startswith(_PNG) and data[_PNG_DEPTH] == 16 and 0 < pixels.max() < 16:
+        deep: NDArray[np.uint16] = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), _DEEP_FLAGS), np.uint16)
+        pixels = deep >> 4
     return np.asarray(pixels, np.uint8)
+
+
+def _decoded(data: bytes) -> NDArray[Any] | None:
+    """The decoder's pixels; None if it cannot read the file."""
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), _DECODE_FLAGS)
+    except cv2.error:
+        return None
+
+
+def _decoded_without_end(file: bytes) -> NDArray[Any] | None:
+    """Pixels of a JPEG that lacks nothing but its end marker; None for any other file.
+
+    Some cameras with MJPEG write such files. Whether anything else is missing shows in the pixels, which then depend on
+    what follows the data.
+    """
+    scan_start = _unended_scan(file)
+    kept = file.rstrip(b"\xff")
+    pixels = _decoded(kept + _JPEG_END) if scan_start else None
+    if pixels is None:
+        return None
+    # Each interval that may be missing begins with the next of eight markers. After a whole scan all of it is ignored.
+    restarts = _JPEG_RESTART.findall(kept, scan_start)
+    markers = [bytes([0xFF, 0xD0 + (len(restarts) + i) % 8]) for i in range(8)]
+    continued = (_decoded(kept + data.join([b"", *markers, b""]) + _JPEG_END) for data in _JPEG_DATA)
+    return pixels if all(it is not None and np.array_equal(it, pixels) for it in continued) else None
+
+
+def _unended_scan(data: bytes) -> int:
+    """Where the one sequential scan of a JPEG without an end marker begins; 0 for any other file."""
+    if not data.startswith(b"\xff\xd8"):
+        return 0
+    position, components, scan_start = 2, 0, 0
+    while marker := _JPEG_MARKER.search(data, position):
+        kind, start = marker[0][-1], marker.end()
+        if kind == 0xD9 or scan_start or start + 8 > len(data):
+            return 0
+        if kind in _JPEG_FRAMES:
+            if kind > 0xC1:  # progressive: later scans may be missing, too
+                return 0
+            components = data[start + 7]
+        if kind == 0xDA:
+            if data[start + 2] != components:
+                return 0
+            scan_start = start
+        position = start + int.from_bytes(data[start : start + 2], "big")
+    return scan_start
 
 
 def _has_many_scans(data: bytes) -> bool:

@@ -358,7 +358,7 @@ class Metrics(Observer, PairObserver):
             "mapless_scale_deviation", "Relative deviation of the scaled trajectory.", DEVIATION_BUCKETS
         )
         self._accuracy_radius = histogram(
-            "mapless_accuracy_radius_m", "Reported radius that holds 68 % of positions, metres.", RADIUS_BUCKETS
+            "mapless_accuracy_radius_metres", "Reported radius that holds 68 % of positions, metres.", RADIUS_BUCKETS
         )
 
     def _make_server_metrics(self) -> None:

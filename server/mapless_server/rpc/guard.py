@@ -21,7 +21,7 @@ from mapless_server.observability.tracing import CallSpan, Metadata, NoTracer, T
 from mapless_server.security import ENDLESS_METHODS, OPEN_METHODS, Principal
 
 from .call import REQUEST_ID_KEY, Call, Deadlines, begin_call, metadata_of
-from .receiving import Context, OpenMethods, Receiver
+from .receiving import Context, OpenMethods, Receiver, quiet_ended_calls
 from .sending import ENDLESS_SEND_LIMIT_S, SEND_LIMIT_S, Sender
 
 log = logging.getLogger(__name__)
@@ -95,6 +95,7 @@ class CallGuard:
         self._receiver = Receiver()
         self._sender = Sender()
         self._open = OpenMethods(self._receiver)
+        quiet_ended_calls()
 
     def guarded(self, method: str, handler: Any) -> Any:
         """The handler of "/package.Service/Method" as it is to be served."""

@@ -8,6 +8,7 @@ served as if their callers sent streams, of which the first message is read here
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Callable
 from typing import Any
 
@@ -126,7 +127,12 @@ class OpenMethods:
         try:
             return handler.request_deserializer(await self._receiver.message(context, OPEN_MESSAGE_LIMIT_S, evicted))
         except RequestError as error:
-            await context.abort(getattr(grpc.StatusCode, error.code), str(error))
+            try:
+                await context.abort(getattr(grpc.StatusCode, error.code), str(error))
+            except grpc.aio.BaseError as failure:
+                if has_ended(failure):
+                    raise asyncio.CancelledError("the call has ended") from None
+                raise
         finally:
             self._waiting.pop(evicted, None)
 
@@ -154,6 +160,26 @@ class _Latest:
         while self._message is not None:
             message, self._message = self._message, None
             await self._context.write(message)
+
+
+def has_ended(failure: BaseException | None) -> bool:
+    """Whether a status could not be sent because the call has ended: grpc rejected its message, or the caller left.
+
+    The handler that lets such an error pass to grpc has its stack trace in the log.
+    """
+    return isinstance(failure, grpc.aio.BaseError) and not isinstance(failure, grpc.aio.AbortError)
+
+
+def quiet_ended_calls() -> None:
+    """Keeps stack traces of calls that ended before their status was sent out of the log; grpc writes them itself.
+
+    They come from methods whose messages grpc reads, such as reflection, after a message that is too large.
+    """
+    logging.getLogger("grpc._cython.cygrpc").addFilter(_is_no_ended_call)
+
+
+def _is_no_ended_call(record: logging.LogRecord) -> bool:
+    return not has_ended(record.exc_info[1] if record.exc_info else None)
 
 
 def retrieve(task: asyncio.Future[Any]) -> None:

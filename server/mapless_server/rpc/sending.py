@@ -17,7 +17,7 @@ from grpc_status import rpc_status
 from mapless_server.errors import DeadlineExceeded, RequestError
 
 from .call import REQUEST_ID_KEY, Call
-from .receiving import Context, retrieve
+from .receiving import Context, has_ended, retrieve
 from .status import to_status
 
 SEND_LIMIT_S = 10.0
@@ -58,12 +58,14 @@ class Sender:
 
         Does not wait for a caller that does not read: it gets the status when it has read the earlier messages.
         """
-        status = rpc_status.to_status(to_status(error))
+        status = rpc_status.to_status(to_status(error, call.request_id))
         metadata = (*status.trailing_metadata, (REQUEST_ID_KEY, call.request_id))
         aborting = self._begin(context.abort(status.code, status.details, metadata))
         await asyncio.wait({aborting}, timeout=_STATUS_LIMIT_S)
         if not aborting.done():
             raise asyncio.CancelledError("the caller does not read")
+        if has_ended(aborting.exception()):
+            raise asyncio.CancelledError("the call has ended")
         aborting.result()
 
     async def _in_time(self, sending: Coroutine[Any, Any, None], limit_s: float) -> None:

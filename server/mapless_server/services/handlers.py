@@ -40,6 +40,24 @@ LOCALIZE_METHODS = frozenset(
 )
 
 
+class _Health(health.aio.HealthServicer):  # type: ignore[name-defined,misc]
+    """Health with the list of all services, which grpc's own lacks."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._states: dict[str, Any] = {}
+
+    async def set(self, service: str, status: Any) -> None:
+        """Sets the state of a service."""
+        self._states[service] = status
+        await super().set(service, status)
+
+    async def List(self, request: Any, context: Any) -> Any:  # noqa: N802  the RPC's name
+        """Implements Health.List."""
+        states = {name: health_pb2.HealthCheckResponse(status=it) for name, it in self._states.items()}
+        return health_pb2.HealthListResponse(statuses=states)
+
+
 class Services:
     """All services of a server: they answer UNAVAILABLE until `open` sets the engine, and `drain` ends them in order.
 
@@ -59,7 +77,7 @@ class Services:
     ) -> None:
         self._metrics = metrics
         self._engine: Engine | None = None
-        self._health = health.aio.HealthServicer()  # type: ignore[attr-defined]
+        self._health = _Health()
         self._is_serving = self._is_draining = False
         self._is_changeable = True
         self._guard = CallGuard(

@@ -151,7 +151,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         try:
             (record,), warnings = await self._add(scene_key, [draft], call)
         except AlreadyExists as error:
-            raise AlreadyExists(str(error), field="reference_id") from error
+            raise AlreadyExists(str(error), field="reference_id", resource=error.resource) from error
         return pb.CreateReferenceResponse(reference=reference_to_message(record), warnings=warnings)
 
     async def BatchCreateReferences(

@@ -8,6 +8,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, Row, Select, Table, delete, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 
+from mapless.names import reference_name, scene_name
 from mapless_server.errors import AlreadyExists, NotFound
 from mapless_server.security import DEFAULT_TENANT, KEY_SEPARATOR, SceneKey, end_of_keys, key_of, scene_id_of
 
@@ -129,6 +130,7 @@ def refuse_taken_ids(connection: Connection, scene_key: SceneKey, reference_ids:
             raise AlreadyExists(
                 f"reference {reference_id!r} exists already in scene {scene_id_of(scene_key)!r}",
                 field=f"requests[{index}].reference_id",
+                resource=reference_name(scene_id_of(scene_key), reference_id),
             )
         taken.add(reference_id)
 
@@ -193,7 +195,9 @@ def insert_new(connection: Connection, table: Table, row: Mapping[str, Any]) -> 
 
 def reference_not_found(scene_key: SceneKey, reference_id: str, field: str) -> NotFound:
     """The error for a reference that does not exist."""
-    return NotFound(f"there is no reference {reference_id!r} in scene {scene_id_of(scene_key)!r}", field=field)
+    scene_id = scene_id_of(scene_key)
+    message = f"there is no reference {reference_id!r} in scene {scene_id!r}"
+    return NotFound(message, field=field, resource=reference_name(scene_id, reference_id))
 
 
 def _reference_deleted() -> NotFound:
@@ -201,7 +205,8 @@ def _reference_deleted() -> NotFound:
 
 
 def _scene_not_found(scene_key: SceneKey) -> NotFound:
-    return NotFound(f"there is no scene {scene_id_of(scene_key)!r}", field="scene")
+    scene_id = scene_id_of(scene_key)
+    return NotFound(f"there is no scene {scene_id!r}", field="scene", resource=scene_name(scene_id))
 
 
 def _one(connection: Connection, statement: Select[Any], missing: NotFound) -> Row[Any]:

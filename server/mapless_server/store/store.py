@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, insert, select, update
 
 from mapless.geodesy import Datum
+from mapless.names import scene_name
 from mapless.scenes import UNCHANGED, Calibration, UnchangedType, Vector
 from mapless_server.errors import AlreadyExists, DataLoss, NotFound
 from mapless_server.method.views import View
@@ -126,7 +127,9 @@ class Store(StoreReader):
         with self._changing() as connection:
             generation = queries.raise_generation(connection, scene_key)
             if connection.scalar(select(scene.c.scene_id).where(scene.c.scene_id == scene_key)) is not None:
-                raise AlreadyExists(f"scene {scene_id_of(scene_key)!r} exists already", field="scene_id")
+                scene_id = scene_id_of(scene_key)
+                message = f"scene {scene_id!r} exists already"
+                raise AlreadyExists(message, field="scene_id", resource=scene_name(scene_id))
             row = {"scene_id": scene_key, "create_time_us": rows.time_us(now), "first_generation": generation}
             connection.execute(insert(scene).values(row | rows.attributes_row(scene_key, attributes)))
             return rows.scene_record(queries.find_scene(connection, scene_key))

@@ -16,7 +16,7 @@ from mapless.geometry import Camera
 
 from ..choices import EDGEPOINT2, FEATURES
 from ..views import View
-from .image import MAX_INCIDENCE_DEG, reduce_image, undistort_pixels
+from .image import MAX_INCIDENCE_DEG, reduce_image, seen_share, undistort_pixels
 from .sift import SiftExtractor, SiftOptions
 
 __all__ = [
@@ -27,6 +27,7 @@ __all__ = [
     "SiftOptions",
     "make_extractor",
     "reduce_image",
+    "seen_share",
     "undistort_pixels",
 ]
 

@@ -60,6 +60,15 @@ def undistort_pixels(pixels: Array, camera: Camera) -> Array:
     return np.where(good[:, None], ideal, np.nan)
 
 
+def seen_share(camera: Camera) -> float:
+    """Share of the image, 0 to 1, whose pixels have a ray through the lens; small for wrong coefficients."""
+    if camera.distortion is None:
+        return 1.0
+    across, down = (np.linspace(-0.5, side - 0.5, 17)[1::2] for side in (camera.width_px, camera.height_px))
+    pixels = np.stack(np.meshgrid(across, down), -1).reshape(-1, 2)
+    return float(np.isfinite(undistort_pixels(pixels, camera)).all(axis=1).mean())
+
+
 def view_of(camera: Camera, pixels: Array, descriptors: NDArray[np.float32], sizes_px: NDArray[np.float32]) -> View:
     """The view of keypoints found in an image: undistorted, without those that have no undistorted pixel.
 

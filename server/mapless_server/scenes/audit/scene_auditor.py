@@ -125,7 +125,8 @@ class SceneAuditor:
             if error.field == "scene":
                 raise
             if reference_id in self._named:
-                raise NotFound(str(error), field=f"references[{self._named.index(reference_id)}]") from error
+                field = f"references[{self._named.index(reference_id)}]"
+                raise NotFound(str(error), field=field, resource=error.resource) from error
             return None
         if reference_id not in entries:
             if self._tools.indexes.is_damaged(self._scene_key, reference_id):

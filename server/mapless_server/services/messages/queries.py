@@ -7,11 +7,13 @@ from enum import Enum
 from typing import Any, TypeVar
 
 from mapless import names, wire
+from mapless.geometry import lens_model_of
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError, camera_from_message, joined
 from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Photo, Query
 from mapless_server.images import ImageLimits, image_size
+from mapless_server.method.features import seen_share
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.security import SceneKey, key_of
 from mapless_server.store import SceneAttributes
@@ -83,8 +85,19 @@ def photo_from_message(message: Any, path: str, limits: ImageLimits) -> Photo:
             f"the intrinsics are for {camera.width_px}x{camera.height_px} pixels, the image has {width_px}x{height_px} "
             "(EXIF orientation is not applied)",
         )
+    if camera.distortion is not None and (share := seen_share(camera)) < MIN_SEEN_SHARE:
+        model = lens_model_of(camera.distortion)
+        coefficients = ", ".join(f"{name} = {value:g}" for name, value in vars(camera.distortion).items())
+        raise FieldError(
+            joined(path, f"intrinsics.{model}"),
+            f"must show the image: with {coefficients} only {100 * share:.0f} % of its pixels have a ray "
+            f"({100 * MIN_SEEN_SHARE:.0f} are needed)",
+        )
     return Photo(message.image, camera, joined(path, "image"))
 
+
+MIN_SEEN_SHARE = 0.1
+"""Of an image, which a lens must show: a fisheye's circle shows 0.3 at least; wrong coefficients may show nothing."""
 
 MAX_REFERENCES = 64
 MAX_CANDIDATES = 1000
