@@ -19,13 +19,31 @@ from .wire import optional
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Radii: errors not exceeded in 68 and 95 % of cases; `calibrated` if measured on photographs with known poses."""
+    """Radii: errors not exceeded in 68 and 95 % of cases.
+
+    Attributes:
+        position_68_m, position_95_m, rotation_68_deg, rotation_95_deg: the radii.
+        calibrated: whether they were measured in this scene on photographs with known poses.
+        calibration: "GENERIC", "SELF" (by the scene's references) or "MEASURED".
+        sample_size: of references that were localized against the others, or of photographs measured.
+    """
 
     position_68_m: float
     position_95_m: float
     rotation_68_deg: float
     rotation_95_deg: float
     calibrated: bool
+    calibration: str = "GENERIC"
+    sample_size: int = 0
+
+    @property
+    def calibrated_by(self) -> str:
+        """What the radii were calibrated by, in words."""
+        if self.calibration == "SELF":
+            return f"by {self.sample_size} references"
+        if self.calibrated:
+            return f"on {self.sample_size} photographs" if self.sample_size else "on photographs"
+        return ""
 
 
 @dataclass(frozen=True)
@@ -292,8 +310,11 @@ def covariance_from_message(message: Any) -> Array | None:
 
 
 def accuracy_from_message(message: pb.Accuracy) -> Accuracy:
-    """Radii of a message."""
-    return wire.filled(Accuracy, message)
+    """Radii of a message; of an older server, which says only whether they were measured."""
+    source = message.calibration or (
+        pb.CALIBRATION_SOURCE_MEASURED if message.calibrated else pb.CALIBRATION_SOURCE_GENERIC
+    )
+    return wire.filled(Accuracy, message, calibration=wire.value_name(pb.CalibrationSource, source))
 
 
 def geo_pose_from_message(message: pb.GeoPose) -> GeoPose:

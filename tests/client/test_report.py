@@ -226,8 +226,10 @@ def test_matches_that_were_not_asked_for_are_told_from_none() -> None:
 
 def test_an_uncalibrated_answer_is_marked_in_the_header() -> None:
     assert report_html(localized(), PHOTO, CAMERA).count("(uncalibrated)") == 2
-    calibrated = localized(accuracy=Accuracy(0.02, 0.04, 0.1, 0.2, True))
-    assert "uncalibrated" not in report_html(calibrated, PHOTO, CAMERA)
+    for source in ((True, "MEASURED", 40), (False, "SELF", 30), (True,)):  # the last of an older server
+        calibrated = localized(accuracy=Accuracy(0.02, 0.04, 0.1, 0.2, *source))
+        assert "uncalibrated" not in report_html(calibrated, PHOTO, CAMERA)
+    assert "by 30 references" in report_html(localized(accuracy=Accuracy(1, 2, 3, 4, False, "SELF", 30)), PHOTO, CAMERA)
 
 
 def test_an_arbitrary_unit_is_announced() -> None:

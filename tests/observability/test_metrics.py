@@ -34,6 +34,9 @@ COUNTERS = {
     "mapless_background_pairs_total": set(),
     "mapless_background_cpu_seconds_total": set(),
     "mapless_background_failures_total": set(),
+    "mapless_calibrations_total": set(),
+    "mapless_calibration_cpu_seconds_total": set(),
+    "mapless_calibration_failures_total": set(),
     "mapless_stored_pairs_total": {"result"},
     "mapless_stored_pairs_failures_total": set(),
     "mapless_captured_total": set(),
@@ -59,6 +62,7 @@ COUNTERS = {
 }
 GAUGES = {
     "mapless_background_waiting": set(),
+    "mapless_calibration_waiting": set(),
     "mapless_capture_bytes": set(),
     "mapless_capture_enabled": set(),
     "mapless_python_allocated_blocks": set(),

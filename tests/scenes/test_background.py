@@ -34,7 +34,8 @@ from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.scenes.pair_observer import PairObserver
 from mapless_server.scenes.stored_pairs import Matching, PairFinder
 from mapless_server.security import SceneKey
-from mapless_server.store import NewReference, PairStore, Store, matching_use, pairs
+from mapless_server.store import NewReference, Store, matching_use, pairs
+from mapless_server.store.pairs import PairStore
 
 SCENE = SceneKey("s")
 EXTRACTOR, DESCRIPTOR = StandInExtractor(), StandInDescriptor()

@@ -135,7 +135,7 @@ def test_planted_factors_are_stored_and_multiply_answers(
 def test_calibrating_again_finds_the_same_factors(
     server: RunningServer, client: Client, planted: str, folder: Path, tmp_path: Path
 ) -> None:
-    """What the server multiplies by now is divided out first."""
+    """It measures answers as they are without a calibration."""
     stored = []
     for _ in range(2):
         assert calibrate(server, tmp_path, folder, "--scene", planted).exit_code == 0

@@ -10,8 +10,9 @@ import pytest
 from support.stores import Place, make_reference
 
 from mapless_server.security import SceneKey
-from mapless_server.store import PairStore, Progress, Store, matching_use
+from mapless_server.store import Store, matching_use
 from mapless_server.store.matching_use import KEPT_S, delete_unused, record_use
+from mapless_server.store.pairs import PairStore, Progress
 
 SCENE = SceneKey("office")
 OURS, THEIRS = "aliked/strict", "sift/strict"

@@ -11,8 +11,9 @@ import pytest
 from support.stores import Place, assert_same_bits, faults_of, make_reference
 
 from mapless_server.security import SceneKey
-from mapless_server.store import Claim, PairStore, Progress, Store, pairs
+from mapless_server.store import Store, pairs
 from mapless_server.store.backup import back_up, restore
+from mapless_server.store.pairs import Claim, PairStore, Progress
 
 SCENE, OTHER = SceneKey("office"), SceneKey("acme/office")
 MATCHING = "sift/strict"

@@ -5,18 +5,17 @@ from __future__ import annotations
 import json
 import math
 import re
-from dataclasses import replace
+from dataclasses import astuple, replace
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.special import bdtr, bdtrc, gammainc, gammaincinv
 from support.scenes import random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless.scenes import Calibration
+from mapless_server.method.uncertainty.gap import USUAL_GAP
 from mapless_server.method.uncertainty.radii import Accuracy, accuracy_from_covariance
 from mapless_server.services.messages.radii import (
     Conditions,
@@ -25,6 +24,7 @@ from mapless_server.services.messages.radii import (
     scaled_accuracy,
     scaled_covariance,
 )
+from mapless_server.store import SceneAttributes, SelfCalibration, calibration_kind
 from mapless_tools.calibrate.claims import (
     MIN_QUERIES,
     Claim,
@@ -172,9 +172,37 @@ class TestApplying:
 
     def test_multiplies_radii(self) -> None:
         before = Accuracy(1.0, 2.0, 3.0, 4.0)
-        after = reported_radii(before, self.COVARIANCE, SIFT, self.calibration())
+        after = reported_radii(before, self.COVARIANCE, SIFT, SceneAttributes(calibration=self.calibration()), 0.1)
         assert after.accuracy == Accuracy(2.0, 6.0, 1.5, 3.0)
-        assert after.calibrated
+        assert (after.calibration, after.count) == ("MEASURED", 20)
+
+    def own(self, conditions: Conditions = SIFT, count: int = 30) -> SelfCalibration:
+        kind = calibration_kind(conditions.features, conditions.backend, conditions.server_version)
+        return SelfCalibration(kind, 7, count, *astuple(self.FACTORS))
+
+    def test_of_references_hold_at_the_usual_gap(self) -> None:
+        before, attributes = Accuracy(1.0, 2.0, 3.0, 4.0), SceneAttributes(self_calibrations=(self.own(),))
+        after = reported_radii(before, self.COVARIANCE, SIFT, attributes, USUAL_GAP)
+        assert after.accuracy == Accuracy(2.0, 6.0, 1.5, 3.0)
+        assert (after.calibration, after.count) == ("SELF", 30)
+        near, far = (reported_radii(before, self.COVARIANCE, SIFT, attributes, it).accuracy for it in (0.05, 0.2))
+        assert near.position_68_m < after.accuracy.position_68_m < far.position_68_m
+
+    def test_measured_ones_win_over_those_of_references(self) -> None:
+        both = SceneAttributes(calibration=self.calibration(), self_calibrations=(self.own(),))
+        after = reported_radii(Accuracy(1.0, 2.0, 3.0, 4.0), self.COVARIANCE, SIFT, both, 0.3)
+        assert (after.calibration, after.accuracy) == ("MEASURED", Accuracy(2.0, 6.0, 1.5, 3.0))
+
+    @pytest.mark.parametrize("field", ["features", "backend", "variant", "server_version"])
+    def test_those_of_references_hold_for_their_kind_only(self, field: str) -> None:
+        before, other = Accuracy(1.0, 2.0, 3.0, 4.0), replace(SIFT, **{field: "other"})
+        after = reported_radii(before, self.COVARIANCE, other, SceneAttributes(self_calibrations=(self.own(),)), 0.1)
+        assert (after.calibration, after.accuracy) == ("GENERIC", before)
+
+    def test_too_few_references_change_nothing(self) -> None:
+        before, none = Accuracy(1.0, 2.0, 3.0, 4.0), SceneAttributes(self_calibrations=(self.own(count=0),))
+        after = reported_radii(before, self.COVARIANCE, SIFT, none, 0.1)
+        assert (after.calibration, after.accuracy) == ("GENERIC", before)
 
     def test_the_covariance_has_the_calibrated_68_percent_radii(self) -> None:
         before = accuracy_from_covariance(self.COVARIANCE)
@@ -197,21 +225,14 @@ class TestApplying:
         before = Accuracy(1.0, 2.0, 3.0, 4.0)
         other = self.calibration(replace(SIFT, **{field: "other"}))
         for calibration in (None, other):
-            after = reported_radii(before, self.COVARIANCE, SIFT, calibration)
+            after = reported_radii(before, self.COVARIANCE, SIFT, SceneAttributes(calibration=calibration), 0.1)
             assert after.accuracy == before
-            assert not after.calibrated
+            assert after.calibration == "GENERIC"
             np.testing.assert_array_equal(after.covariance, self.COVARIANCE)
 
     def test_the_wider_radius_is_never_the_smaller_one(self) -> None:
         after = scaled_accuracy(Accuracy(1.0, 1.1, 1.0, 1.1), Factors(3.0, 1.0, 3.0, 1.0))
         assert after == Accuracy(3.0, 3.0, 3.0, 3.0)
-
-    @given(st.lists(st.floats(0.05, 20), min_size=4, max_size=4))
-    def test_are_undone_by_their_inverse(self, values: list[float]) -> None:
-        factors = Factors(*values)
-        np.testing.assert_allclose(
-            scaled_covariance(scaled_covariance(self.COVARIANCE, factors), factors.inverse), self.COVARIANCE, rtol=1e-9
-        )
 
 
 class TestShares:

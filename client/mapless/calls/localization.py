@@ -46,6 +46,7 @@ def localize(
     rerank_references: bool = False,
     allow_coarse: bool = False,
     coverage: float = 0.0,
+    ignore_calibration: bool = False,
     axes: Axes | str = "",
     include_debug: bool = False,
     capture_time: datetime | None = None,
@@ -67,6 +68,7 @@ def localize(
         allow_coarse: whether to return a pose that could not be refined before the deadline, with
             `LocalizationResult.pose_stage` "COARSE" and no covariance, instead of raising `DeadlineExceeded`.
         coverage: share of right answers to accept, above 0 and below 1; 0 for the server's default.
+        ignore_calibration: whether radii and trust are to be the generic ones, as if the scene had no calibration.
         axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: of `session_from_camera` and of
             `LocalizationResult.in_axes`.
         include_debug: whether the answer includes the matches that support it.
@@ -90,6 +92,7 @@ def localize(
             axes=wire.enum_value(pb.Axes, axes),
             include_debug=include_debug,
             coverage=coverage,
+            ignore_calibration=ignore_calibration,
         ),
     )
     set_priors(request, priors or Priors())

@@ -139,5 +139,5 @@ def _radius(accuracy: Accuracy | None, kind: str, unit: str) -> str:
     factor, shown = (100, "cm") if unit == "m" else (1, unit)
     suffix = "m" if kind == "position" else "deg"
     radii = [factor * getattr(accuracy, f"{kind}_{share}_{suffix}") for share in (68, 95)]
-    note = "" if accuracy.calibrated else ", uncalibrated"
-    return f"   within {radii[0]:.2g} {shown} (68 %), {radii[1]:.2g} {shown} (95 %{note})"
+    note = f"calibrated {accuracy.calibrated_by}" if accuracy.calibrated_by else "uncalibrated"
+    return f"   within {radii[0]:.2g} {shown} (68 %), {radii[1]:.2g} {shown} (95 %, {note})"

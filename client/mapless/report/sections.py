@@ -19,7 +19,7 @@ def cards(answer: LocalizationResult | Rejected) -> str:
     shown: list[tuple[str, str]] = []
     if isinstance(answer, LocalizationResult):
         if answer.accuracy is not None:
-            how = "in 95 % of cases" + ("" if answer.accuracy.calibrated else " (uncalibrated)")
+            how = "in 95 % of cases" + ("" if answer.accuracy.calibrated_by else " (uncalibrated)")
             shown.append((length(answer.accuracy.position_95_m), f"position is not further off, {how}"))
             shown.append((angle(answer.accuracy.rotation_95_deg), f"direction is not further off, {how}"))
         if answer.trust is not None:
@@ -99,8 +99,8 @@ def accuracy_section(answer: LocalizationResult) -> str:
         parts.append(
             '<p class="note">'
             + (
-                "Calibrated in this scene, on photographs with known poses."
-                if accuracy.calibrated
+                f"Calibrated in this scene, {accuracy.calibrated_by} with known poses."
+                if accuracy.calibrated_by
                 else "Not calibrated in this scene."
             )
             + "</p>"

@@ -48,6 +48,13 @@ class PoseStage(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     POSE_STAGE_INITIAL: _ClassVar[PoseStage]
     POSE_STAGE_COARSE: _ClassVar[PoseStage]
 
+class CalibrationSource(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    CALIBRATION_SOURCE_UNSPECIFIED: _ClassVar[CalibrationSource]
+    CALIBRATION_SOURCE_GENERIC: _ClassVar[CalibrationSource]
+    CALIBRATION_SOURCE_SELF: _ClassVar[CalibrationSource]
+    CALIBRATION_SOURCE_MEASURED: _ClassVar[CalibrationSource]
+
 class Advice(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     ADVICE_UNSPECIFIED: _ClassVar[Advice]
@@ -103,6 +110,10 @@ POSE_STAGE_UNSPECIFIED: PoseStage
 POSE_STAGE_REFINED: PoseStage
 POSE_STAGE_INITIAL: PoseStage
 POSE_STAGE_COARSE: PoseStage
+CALIBRATION_SOURCE_UNSPECIFIED: CalibrationSource
+CALIBRATION_SOURCE_GENERIC: CalibrationSource
+CALIBRATION_SOURCE_SELF: CalibrationSource
+CALIBRATION_SOURCE_MEASURED: CalibrationSource
 ADVICE_UNSPECIFIED: Advice
 ADVICE_ADD_REFERENCES: Advice
 ADVICE_SPREAD_REFERENCES: Advice
@@ -208,7 +219,7 @@ class PosePrior(_message.Message):
     def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ...) -> None: ...
 
 class LocalizeOptions(_message.Message):
-    __slots__ = ("variant", "scale_strategy", "reference_count", "allow_coarse", "rerank_references", "axes", "include_debug", "coverage")
+    __slots__ = ("variant", "scale_strategy", "reference_count", "allow_coarse", "rerank_references", "axes", "include_debug", "coverage", "ignore_calibration")
     VARIANT_FIELD_NUMBER: _ClassVar[int]
     SCALE_STRATEGY_FIELD_NUMBER: _ClassVar[int]
     REFERENCE_COUNT_FIELD_NUMBER: _ClassVar[int]
@@ -217,6 +228,7 @@ class LocalizeOptions(_message.Message):
     AXES_FIELD_NUMBER: _ClassVar[int]
     INCLUDE_DEBUG_FIELD_NUMBER: _ClassVar[int]
     COVERAGE_FIELD_NUMBER: _ClassVar[int]
+    IGNORE_CALIBRATION_FIELD_NUMBER: _ClassVar[int]
     variant: Variant
     scale_strategy: ScaleStrategy
     reference_count: int
@@ -225,7 +237,8 @@ class LocalizeOptions(_message.Message):
     axes: Axes
     include_debug: bool
     coverage: float
-    def __init__(self, variant: _Optional[_Union[Variant, str]] = ..., scale_strategy: _Optional[_Union[ScaleStrategy, str]] = ..., reference_count: _Optional[int] = ..., allow_coarse: bool = ..., rerank_references: bool = ..., axes: _Optional[_Union[Axes, str]] = ..., include_debug: bool = ..., coverage: _Optional[float] = ...) -> None: ...
+    ignore_calibration: bool
+    def __init__(self, variant: _Optional[_Union[Variant, str]] = ..., scale_strategy: _Optional[_Union[ScaleStrategy, str]] = ..., reference_count: _Optional[int] = ..., allow_coarse: bool = ..., rerank_references: bool = ..., axes: _Optional[_Union[Axes, str]] = ..., include_debug: bool = ..., coverage: _Optional[float] = ..., ignore_calibration: bool = ...) -> None: ...
 
 class LocalizeResponse(_message.Message):
     __slots__ = ("localization", "rejection", "diagnostics", "capture_time", "session_from_camera", "debug")
@@ -342,18 +355,22 @@ class PoseCovariance(_message.Message):
     def __init__(self, row_major: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class Accuracy(_message.Message):
-    __slots__ = ("position_68_m", "position_95_m", "rotation_68_deg", "rotation_95_deg", "calibrated")
+    __slots__ = ("position_68_m", "position_95_m", "rotation_68_deg", "rotation_95_deg", "calibrated", "calibration", "sample_size")
     POSITION_68_M_FIELD_NUMBER: _ClassVar[int]
     POSITION_95_M_FIELD_NUMBER: _ClassVar[int]
     ROTATION_68_DEG_FIELD_NUMBER: _ClassVar[int]
     ROTATION_95_DEG_FIELD_NUMBER: _ClassVar[int]
     CALIBRATED_FIELD_NUMBER: _ClassVar[int]
+    CALIBRATION_FIELD_NUMBER: _ClassVar[int]
+    SAMPLE_SIZE_FIELD_NUMBER: _ClassVar[int]
     position_68_m: float
     position_95_m: float
     rotation_68_deg: float
     rotation_95_deg: float
     calibrated: bool
-    def __init__(self, position_68_m: _Optional[float] = ..., position_95_m: _Optional[float] = ..., rotation_68_deg: _Optional[float] = ..., rotation_95_deg: _Optional[float] = ..., calibrated: bool = ...) -> None: ...
+    calibration: CalibrationSource
+    sample_size: int
+    def __init__(self, position_68_m: _Optional[float] = ..., position_95_m: _Optional[float] = ..., rotation_68_deg: _Optional[float] = ..., rotation_95_deg: _Optional[float] = ..., calibrated: bool = ..., calibration: _Optional[_Union[CalibrationSource, str]] = ..., sample_size: _Optional[int] = ...) -> None: ...
 
 class Rejection(_message.Message):
     __slots__ = ("reason", "message", "hint", "hypotheses")

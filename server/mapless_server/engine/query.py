@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from mapless_server import __version__
 from mapless_server.method.priors.known import NO_PRIORS, Priors
-from mapless_server.store import SceneAttributes
+from mapless_server.store import SceneAttributes, calibration_kind
 
 if TYPE_CHECKING:
     from mapless.geometry import Camera
@@ -49,6 +50,11 @@ class Tier:
     def backend(self) -> str:
         """Name of the coarse stage's backend."""
         return self.pipeline.reconstructor.name
+
+    @property
+    def kind(self) -> str:
+        """Of its answers, see `calibration_kind`."""
+        return calibration_kind(self.features, self.backend, __version__)
 
     @property
     def weights_sha256(self) -> str:
@@ -106,6 +112,7 @@ class Query:
     rerank: bool = False
     priors: Priors = NO_PRIORS
     is_part: bool = False
+    is_generic: bool = False
 
     @property
     def chooses(self) -> bool:

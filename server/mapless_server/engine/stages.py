@@ -25,6 +25,7 @@ from mapless_server.method.pipeline import Coarse, Prepared
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import Support
 from mapless_server.method.retrieve import spread_choice
+from mapless_server.method.trust.judge import trust_in_scene
 from mapless_server.method.views import Matches, PosedView, View
 from mapless_server.scenes import Choice, Narrowing, RankOptions, Selection
 from mapless_server.scenes.library import FeaturesMissing, Loaded, load_usable
@@ -179,7 +180,10 @@ class QueryStages:
             return self._matched_further(self._rematched(run) if self._has_time_to_rematch(run, tier) else run)
         run = replace(run, context=StageContext(job.check))
         try:
-            run = replace(run, attributes=run.source.attributes(query.scene_key))
+            attributes = run.source.attributes(query.scene_key)
+            if query.is_generic:
+                attributes = replace(attributes, calibration=None, self_calibrations=())
+            run = replace(run, attributes=attributes)
             run = self._with_chosen(run, tier) if query.chooses else self._with_named(run, tier)
         finally:
             # Described once and for all: the next queries find the features stored.
@@ -221,8 +225,10 @@ class QueryStages:
             pose = Step(PREPARE, f"{run.kind}, matched", f"{run.kind}, matched", replace(run, unmatched=()), run.kind)
             return self._next(run, again, pose)
         run = replace(run, unmatched=())
+        calibration = run.attributes.self_calibration(tier.kind)
+        pipeline = tier.pipeline.with_trust(calibration.trust_quantiles if calibration else ())
         part = self._method.prepare(
-            run.view, run.references, tier.pipeline, query.options, run.context, run.query_matches, query.priors
+            run.view, run.references, pipeline, query.options, run.context, run.query_matches, query.priors
         )
         if isinstance(part, Answer):
             return self._conclude(run, part)
@@ -306,13 +312,21 @@ class QueryStages:
         result = self._result(run, answer)
         if run.best is not None:
             result = replace(better_of(run.best, result, self._escalation), stage_seconds=result.stage_seconds)
-        if run.tier + 1 < len(self._tiers) and is_doubtful(result.answer, self._escalation):
+        if run.tier + 1 < len(self._tiers) and is_doubtful(result.answer, self._doubt_in(run)):
             now_s = time.monotonic()
             give_up_s = now_s + self._escalation.time_share * (run.deadline_s - now_s)
             asked = run.query, run.source, run.views, run.deadline_s, run.on_coarse
             stronger = QueryRun(*asked, run.tier + 1, result, now_s, give_up_s)
             return self._next(stronger, stronger.first_step)
         return Done(result, _ending(result))
+
+    def _doubt_in(self, run: QueryRun) -> EscalationOptions:
+        """The options for the trust of this scene's answers: those are tried again that would be in another scene."""
+        options, calibration = self._escalation, run.attributes.self_calibration(self._tiers[run.tier].kind)
+        if calibration is None:
+            return options
+        doubtful_trust = trust_in_scene(options.doubtful_trust, calibration.trust_quantiles)
+        return replace(options, doubtful_trust=doubtful_trust)
 
     def _next(self, run: QueryRun, step: Step, alternative: Step | None = None) -> Next:
         """Where there is an answer, it is given in time if neither step leads to a better one."""

@@ -92,6 +92,13 @@ class Pipeline:
     matcher: Matcher = field(default_factory=Matcher)
     options: StageOptions = field(default_factory=StageOptions)
 
+    def with_trust(self, quantiles: tuple[float, ...]) -> Pipeline:
+        """The pipeline for a scene whose right answers have these quantiles of trust; none: the usual ones."""
+        if not quantiles:
+            return self
+        options = replace(self.options, judge=self.options.judge.with_trust(quantiles))
+        return replace(self, options=options)
+
 
 @dataclass(frozen=True, eq=False)
 class Prepared:

@@ -258,6 +258,19 @@ class Metrics(Observer, PairObserver):
         """So many references wait to be matched in the background."""
         self._background_waiting.set(count)
 
+    def scene_calibrated(self, cpu_seconds: float) -> None:
+        """References of a scene were localized against the others, and what they say was stored."""
+        self._calibrations.inc()
+        self._calibration_seconds.inc(max(0.0, cpu_seconds))
+
+    def calibration_failed(self) -> None:
+        """Calibrating a scene from its references failed."""
+        self._calibration_failures.inc()
+
+    def scenes_wait(self, count: int) -> None:
+        """So many scenes have changed since they were calibrated from their references."""
+        self._calibration_waiting.set(count)
+
     def ran_out_of_memory(self) -> None:
         """The device had no memory left for a batch."""
         self._oom.inc()
@@ -384,6 +397,16 @@ class Metrics(Observer, PairObserver):
         )
         self._background_waiting = gauge(
             "mapless_background_waiting", "References that wait to be matched in the background, as last counted."
+        )
+        self._calibrations = counter("mapless_calibrations", "Scenes that were calibrated from their references.")
+        self._calibration_seconds = counter(
+            "mapless_calibration_cpu_seconds", "Processor time of that, counted as the background matching's."
+        )
+        self._calibration_failures = counter(
+            "mapless_calibration_failures", "Failures of calibrating a scene from its references; each is tried again."
+        )
+        self._calibration_waiting = gauge(
+            "mapless_calibration_waiting", "Scenes that changed since they were calibrated, as last counted."
         )
         self._oom = counter("mapless_gpu_oom", "Batches that the device had no memory for.")
         self._fatal = counter("mapless_fatal", "Faults that end the process.")

@@ -22,12 +22,13 @@ from mapless_server.method.context import StageContext
 from mapless_server.method.correspond import in_order
 from mapless_server.method.options import check_bounds
 from mapless_server.method.views import Matches, PosedView
-from mapless_server.store import Claim, Pair, PairStore, Progress, Store
+from mapless_server.store import Store
 from mapless_server.store.matching_use import delete_unused, record_use
-from mapless_server.store.pairs import CLAIM_S
+from mapless_server.store.pairs import CLAIM_S, Claim, Pair, PairStore, Progress
 
+from .calibration.calibrations import SceneCalibrations
 from .indexes import SceneIndexes
-from .library import ReferenceLibrary, load_usable
+from .library import Closed, ReferenceLibrary, load_usable
 from .pair_observer import PairObserver
 from .retrieval.ranking import RankOptions, Selection, rank_references
 from .stored_pairs import Matching, PairFinder
@@ -43,10 +44,6 @@ _CACHE_BYTES = 64 * 2**20
 _WAITING_IS_COUNTED_S = 30.0
 _USE_IS_RECORDED_S = 3600.0
 _LOOK_S = 0.01
-
-
-class _Closed(Exception):
-    """The server is being closed."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +89,7 @@ class BackgroundMatching:
         is_idle: Callable[[], bool],
         observer: PairObserver,
         options: BackgroundOptions | None = None,
+        calibrations: SceneCalibrations | None = None,
     ) -> None:
         """Nothing is matched before `start`, or `match_waiting`.
 
@@ -102,6 +100,7 @@ class BackgroundMatching:
             is_idle: whether the server computes nothing for a caller.
             observer: receives the events.
             options: see there.
+            calibrations: of scenes, made when all references are matched; None makes none.
         """
         self._store = store
         self._pairs = PairStore(store.database)
@@ -109,6 +108,7 @@ class BackgroundMatching:
         self._matchings = matchings
         self._is_idle = is_idle
         self._observer = observer
+        self._calibrations = calibrations
         self.options = options or BackgroundOptions()
         self._progress = {matching.name: Progress() for matching in matchings}
         self._closing = threading.Event()
@@ -127,7 +127,7 @@ class BackgroundMatching:
         if self._store.database.only_reads:
             log.warning("references are not matched in the background: the store can only be read")
             return
-        run = partial(self._run, self.match_waiting if makes_pairs else self.maintain)
+        run = partial(self._run, self._match_and_calibrate if makes_pairs else self.maintain)
         self._thread = threading.Thread(target=run, name="background matching", daemon=True)
         self._thread.start()
 
@@ -136,6 +136,12 @@ class BackgroundMatching:
         self._closing.set()
         if self._thread is not None:
             self._thread.join()
+
+    def _match_and_calibrate(self) -> None:
+        self.match_waiting()
+        if self._calibrations is not None:
+            self._step_begin_s = time.monotonic()
+            self._calibrations.calibrate_waiting(self._wait_for_callers)
 
     def match_waiting(self) -> None:
         """Matches the references that may be claimed now, until there are none; raises if the store fails."""
@@ -163,7 +169,11 @@ class BackgroundMatching:
                 self._pairs.discard(matching.name, damaged)
         if time.monotonic() < self._use_is_due_s:
             return
-        record_use(self._store.database, [matching.name for matching in self._matchings])
+        used = [matching.name for matching in self._matchings]
+        if self._calibrations is not None:
+            self._calibrations.maintain()
+            used.append(self._calibrations.kind)
+        record_use(self._store.database, used)
         delete_unused(self._store.database, self._pause)
         self._use_is_due_s = time.monotonic() + _USE_IS_RECORDED_S
 
@@ -177,7 +187,7 @@ class BackgroundMatching:
         """Does the work; whether the store failed."""
         try:
             work()
-        except _Closed:
+        except Closed:
             return False
         except Exception as error:
             self._observer.matching_failed()
@@ -204,7 +214,7 @@ class BackgroundMatching:
         begin_s = time.thread_time()
         try:
             made, is_complete = self._match(library, matching, claim, until_s)
-        except _Closed:
+        except Closed:
             made, is_complete = {}, False
         except NotFound:  # the reference was deleted
             self._pairs.postpone(matching.name, claim)
@@ -245,7 +255,7 @@ class BackgroundMatching:
                 for other in others:
                     self._let_callers_first()
                     made |= self._match_pair(matching, *in_order(subject, other))
-            except _Closed:
+            except Closed:
                 return made, False
         return made, True
 
@@ -298,7 +308,11 @@ class BackgroundMatching:
 
     def _check(self) -> None:
         if self._closing.is_set():
-            raise _Closed
+            raise Closed
+
+    def _wait_for_callers(self) -> None:
+        self._check()
+        self._let_callers_first()
 
     def _pause(self) -> None:
         """In the middle of a pair that takes long; a pair has some ten steps."""

@@ -41,6 +41,10 @@ class FeaturesMissing(Exception):
     """References lack the requested features, and the caller does not wait for them."""
 
 
+class Closed(Exception):
+    """The server is being closed: what is done in the background ends."""
+
+
 class KeyedLocks:
     """A lock for each key in use, so that threads do nothing twice."""
 

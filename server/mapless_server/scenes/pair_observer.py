@@ -1,4 +1,4 @@
-"""Events of matching references ahead of queries, for metrics."""
+"""Events of what is done in the background, ahead of queries, for metrics."""
 
 from __future__ import annotations
 
@@ -23,3 +23,12 @@ class PairObserver:
 
     def references_wait(self, count: int) -> None:
         """So many references wait to be matched in the background."""
+
+    def scene_calibrated(self, cpu_seconds: float) -> None:
+        """References of a scene were localized against the others, and what they say was stored."""
+
+    def calibration_failed(self) -> None:
+        """Calibrating a scene from its references failed; it is tried again."""
+
+    def scenes_wait(self, count: int) -> None:
+        """So many scenes have changed since they were calibrated from their references."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from mapless_server.method.correspond import Matcher
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.views import Matches, PosedView
-from mapless_server.store import Pair, PairStore
+from mapless_server.store.pairs import Pair, PairStore
 
 from .pair_observer import PairObserver
 

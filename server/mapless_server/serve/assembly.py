@@ -29,6 +29,8 @@ from mapless_server.scenes import GlobalDescriptor
 from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.audit.scene_auditor import AuditTools
 from mapless_server.scenes.background import BackgroundMatching
+from mapless_server.scenes.calibration.calibrations import SceneCalibrations
+from mapless_server.scenes.calibration.calibrator import Calibrator
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.scenes.pair_observer import PairObserver
@@ -37,7 +39,8 @@ from mapless_server.scenes.stored_pairs import Matching, PairFinder
 from mapless_server.scheduling import Observer, Quota, WorkQueueOptions
 from mapless_server.security import RateLimiter
 from mapless_server.settings import Settings, available_cores
-from mapless_server.store import PairStore, Store, StoreError
+from mapless_server.store import Store, StoreError
+from mapless_server.store.pairs import PairStore
 
 log = logging.getLogger(__name__)
 
@@ -167,7 +170,17 @@ def _background_matching(
         matchings |= {Matching(tier.extractor, matcher, wide): finder for wide in (False, True)}
         if matcher.pair_matching is not None:  # last, because it takes long
             strong |= {Matching(tier.extractor, matcher, wide, True): finder for wide in (False, True)}
-    return BackgroundMatching(store, indexes, matchings | strong, lambda: engine.queue.job_count == 0, observer)
+    first = engine.tiers[0]
+    # Answers of stronger tiers, some per cent, keep the generic radii: their references take too long to localize.
+    calibrator = Calibrator(indexes, first.extractor, first.pipeline, first.kind)
+    return BackgroundMatching(
+        store,
+        indexes,
+        matchings | strong,
+        lambda: engine.queue.job_count == 0,
+        observer,
+        calibrations=SceneCalibrations(store, calibrator, observer),
+    )
 
 
 def feature_names(settings: Settings, device: str) -> tuple[str, ...]:

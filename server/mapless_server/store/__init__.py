@@ -1,14 +1,13 @@
 """Persistence: scenes and references with their images and features, in one transactional database.
 
-May import security, method and images. Begin with `Store` (store.py), whose values are in `records`, and with
-`PairStore` (pairs.py) for the matches of pairs of references; `tables` is the schema. Rows become values in `rows` and
-`codec`, which check every byte. `sqlite` and `postgresql` are the databases; `backup` and `verify` are what the `store`
-commands do.
+May import security, method and images. Begin with `Store` (store.py), whose values are in `records`; `tables` is the
+schema. What is made in the background is in `pairs` (matches of pairs of references) and `calibrations`. Rows become
+values in `rows` and `codec`, which check every byte. `sqlite` and `postgresql` are the databases; `backup` and `verify`
+are what the `store` commands do.
 """
 
 from .cache import LruCache
 from .database import StoreError
-from .pairs import Claim, Pair, PairStore, Progress
 from .records import (
     ContradictingDown,
     DatumWithoutMetres,
@@ -20,27 +19,27 @@ from .records import (
     SceneChanges,
     SceneRecord,
     SceneSnapshot,
+    SelfCalibration,
+    calibration_kind,
 )
 from .rows import time_us
 from .store import Store
 
 __all__ = [
-    "Claim",
     "ContradictingDown",
     "DatumWithoutMetres",
     "DescribedReference",
     "IndexedReference",
     "LruCache",
     "NewReference",
-    "Pair",
-    "PairStore",
-    "Progress",
     "ReferenceRecord",
     "SceneAttributes",
     "SceneChanges",
     "SceneRecord",
     "SceneSnapshot",
+    "SelfCalibration",
     "Store",
     "StoreError",
+    "calibration_kind",
     "time_us",
 ]

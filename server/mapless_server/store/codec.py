@@ -33,7 +33,7 @@ from mapless.geometry import LENS_MODELS, Camera, Distortion, Quaternion, RigidT
 from mapless.scenes import Calibration
 from mapless_server.method.views import Features, Matches, View
 
-from .records import SceneAttributes
+from .records import SceneAttributes, SelfCalibration
 
 VIEW_FORMAT_VERSION = 1
 _PREFIX = struct.Struct("<B3xI")
@@ -85,6 +85,8 @@ def encode_attributes(attributes: SceneAttributes) -> bytes | None:
     if attributes == SceneAttributes():
         return None
     content = asdict(attributes)
+    if not attributes.self_calibrations:  # which are stored apart from these, and captured together
+        del content["self_calibrations"]
     if attributes.calibration is not None and attributes.calibration.create_time is not None:
         content["calibration"]["create_time"] = attributes.calibration.create_time.isoformat()
     return _to_json(content)
@@ -110,7 +112,28 @@ def decode_attributes(owner: str, data: bytes | None, sha256: str | None) -> Sce
             tuple(down) if down else None,
             Calibration(**calibration) if calibration else None,
             content.get("arbitrary_unit", False),  # which 0.2.0 did not write
+            tuple(_calibration_from_dict(it) for it in content.get("self_calibrations", ())),
         )
+
+
+def encode_calibration(calibration: SelfCalibration) -> bytes:
+    """A self-calibration as JSON.
+
+    Raises:
+        ValueError: a number is not finite.
+    """
+    return _to_json(asdict(calibration))
+
+
+def decode_calibration(owner: str, data: bytes, sha256: str) -> SelfCalibration:
+    """The self-calibration that `encode_calibration` was given.
+
+    Raises:
+        Damaged: the checksum or the form of the data is wrong.
+    """
+    check(owner, data, sha256, "calibration")
+    with _checked_form("calibration"):
+        return _calibration_from_dict(json.loads(data))
 
 
 def encode_view(view: View) -> bytes:
@@ -221,6 +244,10 @@ def _checked_form(what: str) -> Iterator[None]:
 
 def _to_json(content: dict[str, Any]) -> bytes:
     return json.dumps(content, allow_nan=False, separators=(",", ":")).encode()
+
+
+def _calibration_from_dict(content: dict[str, Any]) -> SelfCalibration:
+    return SelfCalibration(**{**content, "trust_quantiles": tuple(content["trust_quantiles"])})
 
 
 def _camera_to_dict(camera: Camera) -> dict[str, Any]:

@@ -13,7 +13,16 @@ from mapless_server.errors import AlreadyExists, NotFound
 from mapless_server.security import DEFAULT_TENANT, KEY_SEPARATOR, SceneKey, end_of_keys, key_of, scene_id_of
 
 from .deletion import is_detached
-from .tables import features, global_descriptor, image, reference, removed_reference, scene, scene_generation
+from .tables import (
+    features,
+    global_descriptor,
+    image,
+    reference,
+    removed_reference,
+    scene,
+    scene_calibration,
+    scene_generation,
+)
 
 _IDS_PER_STATEMENT = 500
 """Databases bound the number of parameters of a statement."""
@@ -45,6 +54,13 @@ def find_attributes(connection: Connection, scene_key: SceneKey) -> Row[Any]:
     """Columns `scene_id`, `attributes` and `attributes_sha256` of a scene. Raises NotFound."""
     statement: Select[Any] = select(scene.c.scene_id, scene.c.attributes, scene.c.attributes_sha256)
     return _one(connection, statement.where(scene.c.scene_id == scene_key), _scene_not_found(scene_key))
+
+
+def find_calibrations(connection: Connection, scene_key: SceneKey) -> Sequence[Row[Any]]:
+    """Columns of `scene_calibration` of a scene, where it has been calibrated."""
+    column = scene_calibration.c
+    stored: Select[Any] = select(column.scene_id, column.kind, column.data, column.sha256)
+    return connection.execute(stored.where(column.scene_id == scene_key, column.data.is_not(None))).all()
 
 
 def read_generation(connection: Connection, scene_key: SceneKey) -> int:

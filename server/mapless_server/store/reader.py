@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial, wraps
 from typing import Any, Concatenate, NamedTuple, NoReturn, ParamSpec, Protocol, TypeVar
 
@@ -106,7 +107,7 @@ class StoreReader:
         return self._described
 
     @contextmanager
-    def _changing(self) -> Iterator[Connection]:
+    def changing(self) -> Iterator[Connection]:
         """A transaction that writes; invalidates what is cached by `_state`, however it ends."""
         try:
             with self._database.write() as connection:
@@ -138,7 +139,9 @@ class StoreReader:
 
     @observed
     def get_attributes(self, scene_key: SceneKey) -> SceneAttributes:
-        """Attributes of a scene as a whole; cached where this process alone writes, since every query needs them.
+        """Attributes of a scene as a whole, with its self-calibrations.
+
+        They are cached where this process alone writes, since every query needs them.
 
         Raises:
             NotFound: there is no such scene.
@@ -150,7 +153,8 @@ class StoreReader:
             return cached[1]
         with self._database.read() as connection:
             row = queries.find_attributes(connection, scene_key)
-        attributes = rows.scene_attributes(row)
+            found = queries.find_calibrations(connection, scene_key)
+        attributes = replace(rows.scene_attributes(row), self_calibrations=rows.self_calibrations(found))
         if not self._database.is_shared:
             self._attributes.put(scene_key, (state, attributes), ATTRIBUTES_BYTES)
         return attributes

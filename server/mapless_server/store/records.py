@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mapless.geodesy import Datum
 from mapless.geometry import Array, Camera, RigidTransform
-from mapless.scenes import Calibration, Vector
+from mapless.scenes import FACTORS, MAX_FACTOR, MIN_FACTOR, Calibration, Vector
 from mapless_server.method.views import View
 from mapless_server.security import SceneKey, scene_id_of
 
@@ -28,6 +28,51 @@ class DatumWithoutMetres(ValueError):
     """A scene has a datum, although its unit of length is not the metre."""
 
 
+CALIBRATION_MODEL = 1
+"""Raised whenever the same references would give another `SelfCalibration`, or answers use it in another way."""
+
+
+@dataclass(frozen=True)
+class SelfCalibration:
+    """What the references of a scene say of its answers: some of them, each localized against the others.
+
+    Attributes:
+        kind: of the answers that it holds for, see `calibration_kind`.
+        generation: of the scene when its references were read.
+        answer_count: n, number of references whose answers it is from; 0: too few, and the rest is as without it.
+        position_factor_68, position_factor_95: of the position's radii at the usual gap (`method.uncertainty.gap`).
+        rotation_factor_68, rotation_factor_95: of the rotation's. All factors are 0.01 to 1000.
+        trust_quantiles: of the generic trust of right answers, at the levels of `method.trust.judge`; empty: unknown.
+        reference_noise_m, reference_noise_deg: size of the errors of the references' own poses; 0 if unknown.
+        focal_ratio, focal_sigma: the focal length that the references' matches give, by that of their intrinsics, and
+            its standard deviation; 1 and 0 if unknown.
+    """
+
+    kind: str
+    generation: int
+    answer_count: int
+    position_factor_68: float = 1.0
+    position_factor_95: float = 1.0
+    rotation_factor_68: float = 1.0
+    rotation_factor_95: float = 1.0
+    trust_quantiles: tuple[float, ...] = ()
+    reference_noise_m: float = 0.0
+    reference_noise_deg: float = 0.0
+    focal_ratio: float = 1.0
+    focal_sigma: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in FACTORS:
+            factor = getattr(self, name)
+            if not MIN_FACTOR <= factor <= MAX_FACTOR:
+                raise ValueError(f"{name} must be {MIN_FACTOR:g} to {MAX_FACTOR:g}, is {factor:g}")
+
+
+def calibration_kind(features: str, backend: str, server_version: str) -> str:
+    """Names what computes answers: a self-calibration holds for answers of its own kind only."""
+    return f"{features}/{backend}/{server_version}/{CALIBRATION_MODEL}"
+
+
 @dataclass(frozen=True)
 class SceneAttributes:
     """Attributes of a scene as a whole; None where unknown.
@@ -37,6 +82,7 @@ class SceneAttributes:
         down_in_world: unit vector in the direction of gravity; None for the datum's, if there is one.
         calibration: measured errors of answers.
         arbitrary_unit: whether the unit of length is arbitrary instead of the metre.
+        self_calibrations: from its own references, one for each kind of answers; only where answers need them.
 
     Raises:
         ContradictingDown: datum and down_in_world do not belong to the same world.
@@ -47,6 +93,7 @@ class SceneAttributes:
     down_in_world: Vector | None = None
     calibration: Calibration | None = None
     arbitrary_unit: bool = False
+    self_calibrations: tuple[SelfCalibration, ...] = ()
 
     def __post_init__(self) -> None:
         if self.datum is not None and self.arbitrary_unit:
@@ -60,6 +107,10 @@ class SceneAttributes:
                 f"is {angle_deg:.0f} degrees off the datum's down; its enu_from_world must turn the world's axes to "
                 "east, north and up"
             )
+
+    def self_calibration(self, kind: str) -> SelfCalibration | None:
+        """That of this kind of answers, if there is one."""
+        return next((it for it in self.self_calibrations if it.kind == kind), None)
 
     def down(self) -> Array | None:
         """Unit vector (3,) in the direction of gravity, world; None if unknown."""

@@ -17,7 +17,15 @@ from mapless_server.method.views import View
 from mapless_server.security import SceneKey, scene_id_of
 
 from . import codec
-from .records import DescribedReference, IndexedReference, NewReference, ReferenceRecord, SceneAttributes, SceneRecord
+from .records import (
+    DescribedReference,
+    IndexedReference,
+    NewReference,
+    ReferenceRecord,
+    SceneAttributes,
+    SceneRecord,
+    SelfCalibration,
+)
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 _MICROSECOND = timedelta(microseconds=1)
@@ -55,6 +63,24 @@ def scene_attributes(row: Row[Any]) -> SceneAttributes:
         raise DataLoss(
             f"scene {scene_id!r} is damaged in the store ({error}); set all three and the unit again"
         ) from error
+
+
+def self_calibration(row: Row[Any]) -> SelfCalibration | None:
+    """From a row of the table `scene_calibration`; None if it is damaged, since answers can do without."""
+    try:
+        return codec.decode_calibration(calibration_owner(row.scene_id, row.kind), row.data, row.sha256)
+    except codec.Damaged:
+        return None
+
+
+def self_calibrations(found: Sequence[Row[Any]]) -> tuple[SelfCalibration, ...]:
+    """From rows of that table, without damaged ones."""
+    return tuple(it for it in map(self_calibration, found) if it is not None)
+
+
+def calibration_owner(scene_key: str, kind: str) -> str:
+    """Owner of a self-calibration, for `codec.sha256_for`."""
+    return f"calibration {scene_key} {kind}"
 
 
 def attributes_owner(scene_key: str) -> str:

@@ -124,7 +124,7 @@ class Store(StoreReader):
             AlreadyExists: the id is taken.
         """
         now, scene = _now(), tables.scene
-        with self._changing() as connection:
+        with self.changing() as connection:
             generation = queries.raise_generation(connection, scene_key)
             if connection.scalar(select(scene.c.scene_id).where(scene.c.scene_id == scene_key)) is not None:
                 scene_id = scene_id_of(scene_key)
@@ -161,7 +161,7 @@ class Store(StoreReader):
         replaces_damaged = UNCHANGED not in given.values()
         given["arbitrary_unit"] = arbitrary_unit
         changes = {name: value for name, value in given.items() if value is not UNCHANGED}
-        with self._changing() as connection:
+        with self.changing() as connection:
             queries.begin_change(connection, scene_key)
             stored, found = queries.find_attributes(connection, scene_key), NO_ATTRIBUTES
             try:
@@ -188,7 +188,7 @@ class Store(StoreReader):
             Overloaded: the disk is full; the scene may be gone all the same, and some of its rows left.
         """
         try:
-            with self._changing() as connection:
+            with self.changing() as connection:
                 queries.begin_change(connection, scene_key)
                 self._database.lift_limits(connection)
                 deletion.detach_scene(connection, scene_key)
@@ -227,7 +227,7 @@ class Store(StoreReader):
             image_rows.append({"reference_key": record.key, "data": new.image})
             features_rows += [rows.features_row(record.key, *described) for described in new.views.items()]
             descriptor_rows += [rows.descriptor_row(record.key, *named) for named in new.descriptors.items()]
-        with self._changing() as connection:
+        with self.changing() as connection:
             generation = queries.begin_change(connection, scene_key, len(records))
             queries.refuse_taken_ids(connection, scene_key, [new.reference_id for new in references])
             connection.execute(insert(tables.reference), [row | {"generation": generation} for row in reference_rows])
@@ -252,7 +252,7 @@ class Store(StoreReader):
             ValueError: features are not float32, or a number of the camera is not finite.
         """
         row = rows.features_row(key, extractor, view)
-        with self._changing() as connection:
+        with self.changing() as connection:
             reference_id = queries.lock_reference(connection, key).reference_id
             if not queries.insert_new(connection, tables.features, row):
                 raise AlreadyExists(f"reference {reference_id!r} has features of {extractor!r} already")
@@ -278,7 +278,7 @@ class Store(StoreReader):
             scene_key = SceneKey(queries.find_by_key(connection, key, reference.c.scene_id).scene_id)
             if queries.has_descriptor(connection, key, name):
                 return
-        with self._changing() as connection:
+        with self.changing() as connection:
             generation = queries.begin_change(connection, scene_key)
             queries.lock_reference(connection, key)
             if queries.insert_new(connection, tables.global_descriptor, row):
@@ -305,7 +305,7 @@ class Store(StoreReader):
     def _delete_reference(
         self, scene_key: SceneKey, reference_id: str, delete: Callable[[Connection, str], None]
     ) -> str:
-        with self._changing() as connection:
+        with self.changing() as connection:
             generation = queries.begin_change(connection, scene_key, -1)
             key = queries.find_key(connection, scene_key, reference_id)
             delete(connection, key)
@@ -318,7 +318,7 @@ class Store(StoreReader):
     def try_writing(self) -> None:
         """Writes what changes nothing; raises as every change does if the store cannot be written."""
         version = tables.store_version
-        with self._changing() as connection:
+        with self.changing() as connection:
             connection.execute(update(version).values(schema_version=version.c.schema_version))
 
 

@@ -17,7 +17,7 @@ from sqlalchemy import (
     text,
 )
 
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 
 metadata = MetaData()
 
@@ -148,4 +148,19 @@ matching_use = Table(
     metadata,
     Column("matching", _Matching, primary_key=True),
     Column("used_time_us", BigInteger, nullable=False),
+)
+
+# What the references of a scene say of its answers, see calibrations.py; for each kind of answers.
+scene_calibration = Table(
+    "scene_calibration",
+    metadata,
+    Column("scene_id", _SceneKey, ForeignKey("scene.scene_id", ondelete="CASCADE"), primary_key=True),
+    Column("kind", _Matching, primary_key=True),
+    # Of the scene when its references were read; null until the first calibration is done.
+    Column("generation", BigInteger),
+    # When a server may claim the scene: the end of a claim, or of the wait after a calibration or a failure.
+    Column("due_time_us", BigInteger, nullable=False),
+    Column("failure_count", Integer, nullable=False, server_default=_NONE_YET),
+    Column("data", LargeBinary),  # see codec.py
+    Column("sha256", _Sha256),
 )

@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapless import Client, InvalidArgument, LocalizationResult, Reference, Rejected, RigidTransform
-from mapless_server.method.uncertainty.radii import Accuracy
-from mapless_server.services.messages.radii import Conditions, Factors, scaled_accuracy, scaled_covariance
+from mapless_server.services.messages.radii import Conditions
 from mapless_tools.child import CONNECT
 from mapless_tools.dataset import Frame
 from mapless_tools.evaluate.metrics import pose_error
@@ -111,10 +110,8 @@ def scene_queries(client: Client, scene: str, frames: Sequence[Frame], progress:
     return queries
 
 
-def localize(
-    client: Client, scene: str, query: Query, *, count: int, variant: str, scaled: Factors | None = None
-) -> Outcome:
-    """Localizes one photograph.
+def localize(client: Client, scene: str, query: Query, *, count: int, variant: str) -> Outcome:
+    """Localizes one photograph, as if the scene had no calibration.
 
     Args:
         client: of the server.
@@ -122,7 +119,6 @@ def localize(
         query: the photograph.
         count: references that the server chooses, where it does.
         variant: form of the method.
-        scaled: factors that the server multiplies claims by if they are calibrated; they are divided out again.
 
     Raises:
         MaplessError: the call failed, for another reason than the photograph.
@@ -137,6 +133,7 @@ def localize(
             variant=variant,
             reference_count=count if query.reranked or not query.references else 0,
             rerank_references=query.reranked,
+            ignore_calibration=True,
             timeout_s=CONNECT.timeout_s,
         )
     except InvalidArgument as error:
@@ -145,7 +142,7 @@ def localize(
     conditions = Conditions(used.features, used.backend, used.variant, used.server_version)
     if isinstance(answer, Rejected):
         return replace(_nothing(frame, answer.reason, answer.message), conditions=conditions)
-    return _outcome(frame, answer, conditions, scaled)
+    return _outcome(frame, answer, conditions)
 
 
 @dataclass(frozen=True)
@@ -189,20 +186,16 @@ def other_world(outcomes: Sequence[Outcome]) -> OtherWorld | None:
     return OtherWorld(moved_m, turned_deg, left[best])
 
 
-def _outcome(frame: Frame, answer: LocalizationResult, conditions: Conditions, scaled: Factors | None) -> Outcome:
+def _outcome(frame: Frame, answer: LocalizationResult, conditions: Conditions) -> Outcome:
     error_m, error_deg = pose_error(frame.world_from_camera, answer.world_from_camera)
     position = rotation = None
     if answer.accuracy is not None and answer.covariance is not None:
         claimed, covariance = answer.accuracy, answer.covariance
-        accuracy = Accuracy(
-            claimed.position_68_m, claimed.position_95_m, claimed.rotation_68_deg, claimed.rotation_95_deg
-        )
-        if claimed.calibrated and scaled is not None:
-            accuracy = scaled_accuracy(accuracy, scaled.inverse)
-            covariance = scaled_covariance(covariance, scaled.inverse)
-        position = Claim.of(error_m, accuracy.position_68_m, accuracy.position_95_m, covariance[:3, :3])
+        if claimed.calibrated_by:
+            raise UsageError("the server is older than this command and cannot answer without the scene's calibration")
+        position = Claim.of(error_m, claimed.position_68_m, claimed.position_95_m, covariance[:3, :3])
         in_degrees = np.degrees(np.degrees(covariance[3:, 3:]))
-        rotation = Claim.of(error_deg, accuracy.rotation_68_deg, accuracy.rotation_95_deg, in_degrees)
+        rotation = Claim.of(error_deg, claimed.rotation_68_deg, claimed.rotation_95_deg, in_degrees)
     return Outcome(
         name=frame.name,
         error_m=error_m,

@@ -14,7 +14,6 @@ from mapless.names import check_id
 from mapless.scenes import Calibration
 from mapless_server.serve.assembly import image_limits
 from mapless_server.serve.signals import terminable
-from mapless_server.services.messages.radii import Factors
 from mapless_server.settings import Settings, load_settings
 from mapless_tools.child import temporary_server
 from mapless_tools.connection import Connection, connected
@@ -118,7 +117,7 @@ def _measure_folder(
     plan = plan_for(dataset, options.evaluation, settings, progress)
     with temporary_server() as client:
         store_references(client, OWN_SCENE, plan.references, progress)
-        outcomes = _localize_all(client, OWN_SCENE, planned_queries(plan.queries), options.evaluation, None, progress)
+        outcomes = _localize_all(client, OWN_SCENE, planned_queries(plan.queries), options.evaluation, progress)
     stored = "not stored: no --scene was given"
     return CalibrationReport(
         dataset, "", len(plan.references), options.evaluation.k, options.right, stored, find(outcomes, options.right)
@@ -133,9 +132,8 @@ def _measure_scene(
     check_images(frames, image_limits(settings))
     with _connected(connection, settings) as client:
         scene = client.get_scene(options.scene)
-        before = Factors.of(scene.calibration) if scene.calibration else None
         queries = scene_queries(client, options.scene, frames, progress)
-        outcomes = _localize_all(client, options.scene, queries, options.evaluation, before, progress)
+        outcomes = _localize_all(client, options.scene, queries, options.evaluation, progress)
         other = other_world(outcomes)
         if other is not None:
             raise UsageError(str(other))
@@ -147,7 +145,7 @@ def _measure_scene(
 
 
 def _store(client: Client, options: CalibrateOptions, found: Findings, before: Calibration | None) -> str:
-    """What was done with the factors; `before` is what they were measured under."""
+    """What was done with the factors; `before` is the calibration that the scene had."""
     if found.factors is None or found.conditions is None:
         return f"not stored: {found.refusal}"
     if options.dry_run:
@@ -180,13 +178,12 @@ def _localize_all(
     scene: str,
     queries: Sequence[Query],
     options: EvaluationOptions,
-    scaled: Factors | None,
     progress: Progress,
 ) -> list[Outcome]:
     outcomes: list[Outcome] = []
     progress("localizing", 0, len(queries))
     for query in queries:
-        outcomes.append(localize(client, scene, query, count=options.k, variant=options.variant, scaled=scaled))
+        outcomes.append(localize(client, scene, query, count=options.k, variant=options.variant))
         progress("localizing", len(outcomes), len(queries))
     return outcomes
 

@@ -40,7 +40,8 @@ class Query:
                 lines.append(f"**What helps:** {_code(answer.hint.message)}")
         else:
             if answer.accuracy is not None:
-                of = "calibrated" if answer.accuracy.calibrated else "not calibrated in this scene"
+                by = answer.accuracy.calibrated_by
+                of = f"calibrated {by}" if by else "not calibrated in this scene"
                 radii = f"{_length(answer.accuracy.position_95_m)} and {answer.accuracy.rotation_95_deg:.2f}°"
                 lines.append(f"**95 % within** {radii} ({of})")
             if answer.trust is not None:

@@ -19,7 +19,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -67,6 +67,10 @@ class JudgeOptions:
             raise ValueError(f"JudgeOptions.scores must be {len(LEVELS)} numbers, is {self.scores}")
         if not all(a <= b for a, b in itertools.pairwise(self.scores)):
             raise ValueError(f"JudgeOptions.scores must be rising, is {self.scores}")
+
+    def with_trust(self, quantiles: tuple[float, ...]) -> JudgeOptions:
+        """For a scene whose right answers have these quantiles of the trust that these options give, at `LEVELS`."""
+        return replace(self, scores=tuple(np.interp(quantiles, LEVELS, self.scores).tolist()))
 
 
 @dataclass(frozen=True)
@@ -127,6 +131,11 @@ def trust_of(evidence: Evidence, options: JudgeOptions, log10_chance: float = 0.
     """Trust: share of right answers with at most this score, to which agreement with priors is added."""
     agreement = -options.agreement_weight * math.log(10) * log10_chance
     return float(np.interp(evidence.score + agreement, options.scores, LEVELS))
+
+
+def trust_in_scene(trust: float, quantiles: tuple[float, ...]) -> float:
+    """The trust that an answer has in a scene whose right answers have these quantiles of trust; none: the same."""
+    return float(np.interp(trust, quantiles, LEVELS)) if quantiles else trust
 
 
 def _low_trust(evidence: Evidence, trust: float, coverage: float) -> Rejection:

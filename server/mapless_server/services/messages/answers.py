@@ -16,6 +16,7 @@ from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.priors.known import PriorCheck
 from mapless_server.method.rejection import Hint, Rejection
 from mapless_server.method.results import MetricScale
+from mapless_server.method.uncertainty.gap import viewpoint_gap
 from mapless_server.method.uncertainty.radii import accuracy_from_covariance
 from mapless_server.store import SceneAttributes
 
@@ -50,7 +51,9 @@ def outcome_to_message(result: Result, options: LocalizeOptions, frames: AnswerF
     if outcome.covariance is not None:
         accuracy = accuracy_from_covariance(outcome.covariance)
         conditions = Conditions(result.tier.features, result.tier.backend, options.variant.name, __version__)
-        radii = reported_radii(accuracy, outcome.covariance, conditions, result.attributes.calibration)
+        support = result.answer.support
+        gap = viewpoint_gap(support)[0] if support is not None and support.estimate is not None else None
+        radii = reported_radii(accuracy, outcome.covariance, conditions, result.attributes, gap)
     return pb.LocalizeResponse(localization=_localization_to_message(outcome, radii, result.attributes, frames))
 
 
@@ -86,6 +89,13 @@ def covariance_to_message(covariance: Array) -> pb.PoseCovariance:
     return pb.PoseCovariance(row_major=covariance.ravel().tolist())
 
 
+CALIBRATIONS = {
+    "GENERIC": pb.CALIBRATION_SOURCE_GENERIC,
+    "SELF": pb.CALIBRATION_SOURCE_SELF,
+    "MEASURED": pb.CALIBRATION_SOURCE_MEASURED,
+}
+
+
 def accuracy_to_message(radii: ReportedRadii) -> pb.Accuracy:
     """Message of radii."""
     return pb.Accuracy(
@@ -93,7 +103,9 @@ def accuracy_to_message(radii: ReportedRadii) -> pb.Accuracy:
         position_95_m=radii.accuracy.position_95_m,
         rotation_68_deg=radii.accuracy.rotation_68_deg,
         rotation_95_deg=radii.accuracy.rotation_95_deg,
-        calibrated=radii.calibrated,
+        calibrated=radii.calibration == "MEASURED",
+        calibration=CALIBRATIONS[radii.calibration],
+        sample_size=radii.count,
     )
 
 

@@ -199,8 +199,8 @@ def _set_support(
     covariance: Array,
 ) -> None:
     """Sets the fields that both kinds of localizations have: covariance, radii and counts."""
-    # Not calibrated: a scene's calibration was measured with single photographs.
-    radii = ReportedRadii(accuracy_from_covariance(covariance), covariance, False)
+    # Not calibrated: a scene's calibrations are of single photographs.
+    radii = ReportedRadii(accuracy_from_covariance(covariance), covariance)
     message.covariance.CopyFrom(covariance_to_message(radii.covariance))
     message.accuracy.CopyFrom(accuracy_to_message(radii))
     message.inlier_count = sum(int(it.inliers.sum()) for it in matched)

@@ -124,6 +124,7 @@ def query_from_message(
         allow_coarse=request.options.allow_coarse,
         rerank=request.options.rerank_references and bool(request.references),
         priors=priors,
+        is_generic=request.options.ignore_calibration,
     )
 
 

@@ -9,7 +9,13 @@ import numpy as np
 
 from mapless.geometry import Array
 from mapless.scenes import MAX_FACTOR, MIN_FACTOR, Calibration
+from mapless_server.method.options import Variant
+from mapless_server.method.uncertainty.gap import growth
 from mapless_server.method.uncertainty.radii import Accuracy
+from mapless_server.store import SceneAttributes, SelfCalibration, calibration_kind
+
+_SELF_CALIBRATED = Variant.BEST.name
+"""The variant by which references are localized against the others."""
 
 
 @dataclass(frozen=True)
@@ -41,10 +47,17 @@ class Factors:
             calibration.rotation_factor_95,
         )
 
-    @property
-    def inverse(self) -> Factors:
-        """The factors that undo these, as far as the bounds allow."""
-        return Factors(*(min(max(1 / it, MIN_FACTOR), MAX_FACTOR) for it in astuple(self)))
+    @classmethod
+    def of_scene(cls, calibration: SelfCalibration, gap: float) -> Factors:
+        """The factors of a self-calibration for an answer at a gap, see `method.uncertainty.gap`."""
+        position, rotation = growth(gap)
+        factors = (
+            position * calibration.position_factor_68,
+            position * calibration.position_factor_95,
+            rotation * calibration.rotation_factor_68,
+            rotation * calibration.rotation_factor_95,
+        )
+        return cls(*(min(max(it, MIN_FACTOR), MAX_FACTOR) for it in factors))
 
 
 @dataclass(frozen=True)
@@ -71,29 +84,38 @@ class ReportedRadii:
     Attributes:
         accuracy: radii.
         covariance: (6, 6), order x y z rx ry rz, metres and radians.
-        calibrated: whether factors were applied.
+        calibration: what the factors come from: "GENERIC" for none, "SELF", "MEASURED".
+        count: of references that were localized against the others, or of photographs that were measured.
     """
 
     accuracy: Accuracy
     covariance: Array
-    calibrated: bool
+    calibration: str = "GENERIC"
+    count: int = 0
 
 
 def reported_radii(
-    accuracy: Accuracy, covariance: Array, conditions: Conditions, calibration: Calibration | None
+    accuracy: Accuracy, covariance: Array, conditions: Conditions, attributes: SceneAttributes, gap: float | None
 ) -> ReportedRadii:
-    """Calibrated radii, if the scene's calibration was measured under the same conditions.
+    """Radii by the scene's measured calibration, else by its references, if made under the same conditions.
 
     Args:
         accuracy: of the method.
         covariance: (6, 6) of the method.
         conditions: what computed the answer.
-        calibration: of the scene; None if it has none.
+        attributes: of the scene.
+        gap: of the answer, see `method.uncertainty.gap`; None if unknown.
     """
-    if calibration is None or not calibration.is_of(*astuple(conditions)):
-        return ReportedRadii(accuracy, covariance, False)
-    factors = Factors.of(calibration)
-    return ReportedRadii(scaled_accuracy(accuracy, factors), scaled_covariance(covariance, factors), True)
+    measured = attributes.calibration
+    if measured is not None and measured.is_of(*astuple(conditions)):
+        factors, calibration, count = Factors.of(measured), "MEASURED", measured.query_count
+    else:
+        kind = calibration_kind(conditions.features, conditions.backend, conditions.server_version)
+        own = attributes.self_calibration(kind)
+        if own is None or not own.answer_count or conditions.variant != _SELF_CALIBRATED or gap is None:
+            return ReportedRadii(accuracy, covariance)
+        factors, calibration, count = Factors.of_scene(own, gap), "SELF", own.answer_count
+    return ReportedRadii(scaled_accuracy(accuracy, factors), scaled_covariance(covariance, factors), calibration, count)
 
 
 def scaled_accuracy(accuracy: Accuracy, factors: Factors) -> Accuracy:

@@ -1,0 +1,186 @@
+"""Localizes references of a scene against the others, as queries are localized."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import chain, zip_longest
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from mapless.geometry import rotation_angle_deg
+from mapless_server.errors import DataLoss, NotFound, RequestError
+from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.context import StageContext
+from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.localize import prepare, refine
+from mapless_server.method.options import LocalizeOptions, check_bounds
+from mapless_server.method.pipeline import Pipeline, reconstruct
+from mapless_server.method.retrieve import spread_choice
+from mapless_server.method.uncertainty.gap import viewpoint_gap
+from mapless_server.method.uncertainty.radii import accuracy_from_covariance
+from mapless_server.method.views import PosedView
+from mapless_server.security import SceneKey
+from mapless_server.store import SelfCalibration
+
+from ..indexes import SceneIndexes
+from ..library import ReferenceLibrary, load_usable
+from ..retrieval.index import Entries
+from ..retrieval.ranking import RankOptions, Selection, rank_references
+from .fit import LeftOut, fit
+
+_AS_QUERIES_CHOOSE = RankOptions(nearby_weight=1.0)
+"""That of `engine.stages`."""
+
+
+@dataclass(frozen=True)
+class CalibratorOptions:
+    """Options of localizing references against the others.
+
+    Attributes:
+        sample: references that are localized, at most.
+        max_cpu_s: no further reference is begun after so much processor time, for each thousand references, begun or
+            whole, that the scene has.
+        reference_count: others that each is localized with, as queries are by default.
+        shortlist: so many times the others wanted are matched with it, as for queries.
+    """
+
+    sample: int = 40
+    max_cpu_s: float = 18.0
+    reference_count: int = 10
+    shortlist: int = 2
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "sample reference_count shortlist", at_least=1)
+        check_bounds(self, "max_cpu_s", above=0)
+
+
+class Calibrator:
+    """Calibrates scenes for the answers of one tier."""
+
+    def __init__(
+        self,
+        indexes: SceneIndexes,
+        extractor: FeatureExtractor,
+        pipeline: Pipeline,
+        kind: str,
+        options: CalibratorOptions | None = None,
+    ) -> None:
+        """`kind` is that of the tier's answers, see `store.calibration_kind`."""
+        self._indexes = indexes
+        self._extractor = extractor
+        self._pipeline = pipeline
+        self.kind = kind
+        self.options = options or CalibratorOptions()
+
+    def calibrate(
+        self, scene_key: SceneKey, library: ReferenceLibrary, newest: Sequence[str], pause: Callable[[], None]
+    ) -> SelfCalibration:
+        """Localizes references of a scene, and fits the model to the results.
+
+        Args:
+            scene_key: of the scene.
+            library: loads its references.
+            newest: ids of its latest references, the latest first.
+            pause: called between the stages of each; may raise, which ends it.
+
+        Raises:
+            NotFound: there is no such scene (field "scene").
+        """
+        begin_s = time.thread_time()
+        context = StageContext(pause)
+        entries = self._indexes.entries(scene_key, context)
+        results: list[LeftOut] = []
+        most_s = self.options.max_cpu_s * max(1, -(-len(entries) // 1000))
+        for reference_id in self._sample(entries, newest):
+            if time.thread_time() - begin_s > most_s:
+                break
+            result = self._leave_out(scene_key, entries, library, reference_id, context)
+            if result is not None:
+                results.append(result)
+            context.check()
+        return fit(results, self.kind, entries.generation)
+
+    def _sample(self, entries: Entries, newest: Sequence[str]) -> list[str]:
+        """Ids of references to leave out: the newest and the worst covered by turns."""
+        rows = entries.rows()
+        if len(rows) < 3:  # two others are needed
+            return []
+        centres = entries.centres(rows)
+        nearest_m = KDTree(centres).query(centres, k=2)[0][:, 1]
+        far = [entries.reference(rows[i])[0] for i in np.argsort(-nearest_m, kind="stable")[: self.options.sample]]
+        by_turns = chain.from_iterable(zip_longest([it for it in newest if it in entries], far))
+        return [it for it in dict.fromkeys(by_turns) if it is not None][: self.options.sample]
+
+    def _leave_out(
+        self,
+        scene_key: SceneKey,
+        entries: Entries,
+        library: ReferenceLibrary,
+        reference_id: str,
+        context: StageContext,
+    ) -> LeftOut | None:
+        """The result for one reference; None if it has too few others, or is deleted or damaged."""
+        loaded = self._load(scene_key, library, [reference_id], context)
+        if not loaded:
+            return None
+        (subject,), (row,) = loaded, entries.rows([reference_id])
+        count = self.options.reference_count
+        selection = Selection(self.options.shortlist * count + 1, options=_AS_QUERIES_CHOOSE)
+        ranked = rank_references(entries, entries.vector(row), selection)
+        wanted = [it.reference_id for it in ranked if it.key != subject.key]
+        others = [it for it in self._load(scene_key, library, wanted, context) if not _is_copy(it, subject)]
+        if len(others) < 2:
+            return None
+        context.check()
+        matches = self._pipeline.matcher.match_quickly(subject.view, others, context.check)
+        centres = [it.world_from_camera.translation for it in others]
+        chosen = spread_choice([len(it) for it in matches], centres, count)
+        references, chosen_matches = [others[i] for i in chosen], [matches[i] for i in chosen]
+        options = LocalizeOptions(coverage=1.0)
+        prepared = prepare(subject.view, references, self._pipeline, options, context, chosen_matches)
+        if isinstance(prepared, Answer):
+            return left_out(subject, prepared)
+        (coarse,) = reconstruct([prepared])
+        if isinstance(coarse, Exception):
+            raise coarse
+        return left_out(subject, coarse if isinstance(coarse, Answer) else refine(coarse))
+
+    def _load(
+        self, scene_key: SceneKey, library: ReferenceLibrary, reference_ids: Sequence[str], context: StageContext
+    ) -> tuple[PosedView, ...]:
+        """Those that exist and are not damaged."""
+
+        def report(damaged_id: str, error: RequestError) -> None:
+            if isinstance(error, DataLoss):
+                self._indexes.report_damaged(scene_key, damaged_id, error)
+
+        return load_usable(
+            lambda ids: library.load(scene_key, ids, self._extractor, context),
+            reference_ids,
+            (DataLoss, NotFound),
+            report,
+        )[1]
+
+
+def left_out(subject: PosedView, answer: Answer) -> LeftOut | None:
+    """The answer to a reference beside its pose; None if it was rejected."""
+    outcome, support = answer.outcome, answer.support
+    if not isinstance(outcome, Localization) or outcome.covariance is None or support is None:
+        return None
+    found, given = outcome.world_from_camera, subject.world_from_camera
+    return LeftOut(
+        float(np.linalg.norm(found.translation - given.translation)),
+        rotation_angle_deg(found.rotation.T @ given.rotation),
+        accuracy_from_covariance(outcome.covariance),
+        outcome.trust or 0.0,
+        *viewpoint_gap(support),
+    )
+
+
+def _is_copy(first: PosedView, second: PosedView) -> bool:
+    """Whether two references are the same photograph, which would answer with its own pose."""
+    one, other = first.view.photograph, second.view.photograph
+    return one is not None and other is not None and one.sha256 == other.sha256

@@ -1,0 +1,179 @@
+"""What the references of a scene say of its answers, and which scenes wait for that, by any of the servers.
+
+There is one calibration for each *kind* of answers: features, backend and server version, see `calibration_kind`. It
+belongs to a generation of its scene; a later one makes the scene due again, and until then the last calibration is
+used. A server claims a scene, localizes its references and stores what it finds; a claim ends by itself after `CLAIM_S`
+unless it is renewed, so a scene whose server is killed is calibrated by another one, or by the next. A server that lost
+its claim, because it was too slow or the scene was deleted, stores nothing.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+from sqlalchemy import ColumnElement, Connection, Select, delete, func, or_, select, update
+
+from mapless_server.errors import NotFound
+from mapless_server.security import SceneKey
+
+from . import codec, queries, rows
+from .database import Database
+from .deletion import is_detached
+from .pairs import FIRST_RETRY_S, LONGEST_RETRY_S
+from .records import SelfCalibration
+from .store import Store
+from .tables import reference, scene, scene_calibration, scene_generation
+
+CLAIM_S = 120.0
+"""Far longer than one reference takes, also on a busy server; it is renewed after each."""
+
+_CANDIDATES = 16
+_MICROSECONDS = 1_000_000
+
+
+@dataclass(frozen=True)
+class CalibrationClaim:
+    """A scene that one server calibrates.
+
+    Attributes:
+        scene_key: of the scene.
+        kind: of the answers.
+        until_us: when the claim ends; no other server's claim ends at the same microsecond.
+    """
+
+    scene_key: SceneKey
+    kind: str
+    until_us: int
+
+
+def claim_scene(database: Database, kind: str) -> CalibrationClaim | None:
+    """Claims a scene that has changed since its calibration; None if there is none that may be claimed now."""
+    with database.read() as connection:
+        due = connection.execute(_select_due(kind).limit(_CANDIDATES)).all()
+    for row in random.sample(due, len(due)):
+        claim = CalibrationClaim(SceneKey(row.scene_id), kind, _now_us() + _us(CLAIM_S))
+        with database.write() as connection:
+            if _try_claim(connection, claim):
+                return claim
+    return None
+
+
+def renew(database: Database, claim: CalibrationClaim) -> CalibrationClaim | None:
+    """The claim, which ends later now; None if it was lost."""
+    renewed = replace(claim, until_us=max(_now_us() + _us(CLAIM_S), claim.until_us + 1))
+    with database.write() as connection:
+        is_ours = connection.execute(_of(claim).values(due_time_us=renewed.until_us)).rowcount == 1
+    return renewed if is_ours else None
+
+
+def postpone(database: Database, claim: CalibrationClaim) -> float:
+    """Ends the claim of a scene that failed; returns after how long it may be claimed again, seconds."""
+    column = scene_calibration.c
+    count = select(column.failure_count).where(column.scene_id == claim.scene_key, column.kind == claim.kind)
+    with database.write() as connection:
+        failure_count = connection.scalar(count) or 0
+        wait_s = min(LONGEST_RETRY_S, FIRST_RETRY_S * 2.0 ** min(failure_count, 20))
+        values = {"due_time_us": _now_us() + _us(wait_s), "failure_count": failure_count + 1}
+        connection.execute(_of(claim).values(values))
+    return wait_s
+
+
+def release(database: Database, claim: CalibrationClaim) -> None:
+    """Ends the claim of a server that is closed, so that others may claim the scene at once."""
+    with database.write() as connection:
+        connection.execute(_of(claim).values(due_time_us=_now_us()))
+
+
+def add(store: Store, claim: CalibrationClaim, calibration: SelfCalibration, wait_s: float) -> bool:
+    """Stores the calibration of a claimed scene, and ends the claim; False if the claim was lost.
+
+    Args:
+        store: in which the scene is, so that what it caches of the scene is forgotten.
+        claim: of the scene.
+        calibration: to store; no change of the scene.
+        wait_s: the scene is not due again before, however often it changes.
+    """
+    data = codec.encode_calibration(calibration)
+    sha256 = codec.sha256_for(rows.calibration_owner(claim.scene_key, claim.kind), data)
+    due_us = _now_us() + _us(wait_s)
+    values = {"generation": calibration.generation, "data": data, "sha256": sha256, "due_time_us": due_us}
+    with store.changing() as connection:
+        return connection.execute(_of(claim).values(**values, failure_count=0)).rowcount == 1
+
+
+def list_newest(database: Database, scene_key: SceneKey, count: int) -> list[str]:
+    """Ids of the references that were added to a scene last, the latest first."""
+    column = reference.c
+    latest = select(column.reference_id).where(column.scene_id == scene_key)
+    with database.read() as connection:
+        return list(connection.scalars(latest.order_by(column.generation.desc(), column.key).limit(count)))
+
+
+def discard_damaged(database: Database, kind: str) -> int:
+    """Deletes damaged calibrations of a kind, so that they are made again; returns their number."""
+    column = scene_calibration.c
+    stored: Select[Any] = select(column.scene_id, column.kind, column.data, column.sha256)
+    with database.read() as connection:
+        found = connection.execute(stored.where(column.kind == kind, column.data.is_not(None))).all()
+    damaged = [row.scene_id for row in found if rows.self_calibration(row) is None]
+    for scene_id in damaged:
+        with database.write() as connection:
+            connection.execute(delete(scene_calibration).where(column.scene_id == scene_id, column.kind == kind))
+    return len(damaged)
+
+
+def count_waiting(database: Database, kind: str) -> int:
+    """Number of scenes that have changed since their calibration."""
+    with database.read() as connection:
+        changed = _select_changed(kind).subquery()
+        return connection.scalar(select(func.count()).select_from(changed)) or 0
+
+
+def _select_changed(kind: str) -> Select[Any]:
+    """Scenes with references that have changed since their calibration."""
+    column, generation = scene_calibration.c, scene_generation.c
+    of_kind = (column.scene_id == scene.c.scene_id) & (column.kind == kind)
+    is_current: ColumnElement[bool] = column.generation == generation.generation
+    return (
+        select(scene.c.scene_id)
+        .join(scene_generation, generation.scene_id == scene.c.scene_id)
+        .outerjoin(scene_calibration, of_kind)
+        .where(~is_detached(scene.c.scene_id), or_(column.generation.is_(None), ~is_current))
+        .where(or_(scene.c.reference_count > 0, column.scene_id.is_not(None)))
+    )
+
+
+def _select_due(kind: str) -> Select[Any]:
+    column = scene_calibration.c
+    return _select_changed(kind).where(or_(column.due_time_us.is_(None), column.due_time_us <= _now_us()))
+
+
+def _try_claim(connection: Connection, claim: CalibrationClaim) -> bool:
+    column = scene_calibration.c
+    try:
+        queries.read_generation(connection, claim.scene_key)
+    except NotFound:
+        return False
+    of_it = (column.scene_id == claim.scene_key) & (column.kind == claim.kind)
+    free = update(scene_calibration).where(of_it, column.due_time_us <= _now_us())
+    if connection.execute(free.values(due_time_us=claim.until_us)).rowcount == 1:
+        return True
+    row = {"scene_id": claim.scene_key, "kind": claim.kind, "due_time_us": claim.until_us}
+    return queries.insert_new(connection, scene_calibration, row)
+
+
+def _of(claim: CalibrationClaim) -> Any:
+    column = scene_calibration.c
+    of_it = (column.scene_id == claim.scene_key) & (column.kind == claim.kind)
+    return update(scene_calibration).where(of_it, column.due_time_us == claim.until_us)
+
+
+def _us(seconds: float) -> int:
+    return round(seconds * _MICROSECONDS)
+
+
+def _now_us() -> int:
+    return round(time.time() * _MICROSECONDS)

@@ -1,0 +1,305 @@
+"""Self-calibration on scenes with a planted truth: what references say of answers, and what wrong ones must not say."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.scenes import SceneOptions, make_scene, random_for
+from support.servers import StandInDescriptor, StandInExtractor
+from support.stores import Folder, Place
+
+from mapless.geometry import RigidTransform, rotation_from_vector
+from mapless_server.errors import Unavailable
+from mapless_server.method.pipeline import Pipeline
+from mapless_server.method.trust.judge import LEVELS, trust_in_scene
+from mapless_server.method.uncertainty.gap import USUAL_GAP, growth
+from mapless_server.method.uncertainty.radii import Accuracy
+from mapless_server.method.views import PosedView
+from mapless_server.scenes.calibration.calibrations import SceneCalibrations
+from mapless_server.scenes.calibration.calibrator import Calibrator, CalibratorOptions
+from mapless_server.scenes.calibration.fit import FitOptions, LeftOut, fit
+from mapless_server.scenes.indexes import SceneIndexes
+from mapless_server.scenes.library import Closed, ReferenceLibrary
+from mapless_server.scenes.pair_observer import PairObserver
+from mapless_server.security import SceneKey
+from mapless_server.store import NewReference, SelfCalibration, Store, calibration_kind, calibrations
+
+SCENE = SceneKey("s")
+EXTRACTOR, DESCRIPTOR = StandInExtractor(), StandInDescriptor()
+KIND = calibration_kind(EXTRACTOR.name, "geometric", "1")
+REFERENCES = make_scene(random_for("calibration"), SceneOptions(reference_count=8, baseline_m=0.3)).references
+Change = Callable[[RigidTransform], RigidTransform]
+
+
+def result(ratio: float, gap: float = USUAL_GAP, trust: float = 0.5) -> LeftOut:
+    """Errors that are so many times the radii of 68 %, whose double are those of 95 %."""
+    position, rotation = growth(gap)
+    return LeftOut(0.01 * ratio * position, 0.1 * ratio * rotation, Accuracy(0.01, 0.02, 0.1, 0.2), trust, gap, 5.0)
+
+
+def rayleigh(count: int, factor: float, gap: float = USUAL_GAP) -> list[LeftOut]:
+    """Results whose 68 % quantile is a factor."""
+    lengths = np.sqrt(-2 * np.log(1 - (np.arange(count) + 0.5) / count)) / np.sqrt(-2 * np.log(0.32))
+    return [result(factor * it, gap) for it in lengths]
+
+
+class TestFit:
+    def test_many_answers_give_the_planted_factor(self) -> None:
+        found = fit(rayleigh(2000, 2.5), KIND, 7)
+        assert (found.kind, found.generation, found.answer_count) == (KIND, 7, 2000)
+        assert found.position_factor_68 == pytest.approx(2.5, rel=0.05)
+        assert found.rotation_factor_68 == pytest.approx(2.5, rel=0.05)
+
+    @pytest.mark.parametrize("factor", [0.3, 3.0])
+    def test_few_answers_count_as_stated(self, factor: float) -> None:
+        n0 = FitOptions().radius_prior
+        found = [fit(rayleigh(n, factor), KIND, 1) for n in (6, 12, 24)]
+        for n, it in zip((6, 12, 24), found, strict=True):
+            assert np.log(it.position_factor_68) == pytest.approx(n / (n + n0) * np.log(factor), abs=0.1)
+
+    def test_a_larger_gap_explains_larger_errors(self) -> None:
+        near, far = (fit(rayleigh(30, 2.0, gap), KIND, 1) for gap in (0.05, 0.4))
+        assert near.position_factor_68 == pytest.approx(far.position_factor_68)
+
+    def test_one_wrong_answer_changes_nothing(self) -> None:
+        right = rayleigh(20, 1.5)
+        wrong = replace(result(1.0), error_m=4.0)
+        assert replace(fit([*right, wrong], KIND, 1), trust_quantiles=()) == replace(
+            fit(right, KIND, 1), trust_quantiles=()
+        )
+
+    def test_another_unit_changes_nothing(self) -> None:
+        def in_millimetres(it: LeftOut) -> LeftOut:
+            c = it.claimed
+            claimed = Accuracy(1e3 * c.position_68_m, 1e3 * c.position_95_m, c.rotation_68_deg, c.rotation_95_deg)
+            return replace(it, error_m=1e3 * it.error_m, claimed=claimed, depth_m=1e3 * it.depth_m)
+
+        results = rayleigh(20, 1.5)
+        ours, theirs = fit(results, KIND, 1), fit([in_millimetres(it) for it in results], KIND, 1)
+        assert theirs.position_factor_95 == pytest.approx(ours.position_factor_95)
+
+    def test_two_answers_say_nothing(self) -> None:
+        assert fit(rayleigh(2, 9.0), KIND, 3) == SelfCalibration(KIND, 3, 0)
+
+    def test_hard_scenes_lower_what_trust_is_usual(self) -> None:
+        hard = fit([replace(it, trust=0.02) for it in rayleigh(40, 1.0)], KIND, 1)
+        quantiles = np.array(hard.trust_quantiles)
+        assert (quantiles <= LEVELS).all()
+        assert (np.diff(quantiles) >= 0).all()
+        assert trust_in_scene(0.02, hard.trust_quantiles) > 0.5
+        easy = fit([replace(it, trust=0.9) for it in rayleigh(40, 1.0)], KIND, 1)
+        assert easy.trust_quantiles == pytest.approx(LEVELS)  # not stricter
+
+    def test_own_wrong_answers_stay_rejected(self) -> None:
+        hard = [replace(it, trust=0.03) for it in rayleigh(40, 1.0)]
+        wrong = replace(result(1.0), error_m=4.0, trust=0.04)
+        assert trust_in_scene(0.04, fit(hard, KIND, 1).trust_quantiles) > 0.05
+        assert trust_in_scene(0.0399, fit([*hard, wrong], KIND, 1).trust_quantiles) < 0.05
+
+
+@dataclass
+class Counts(PairObserver):
+    """What an observer was notified of."""
+
+    calibrated: int = 0
+    failures: int = 0
+    waiting: int | None = None
+
+    def scene_calibrated(self, cpu_seconds: float) -> None:
+        assert cpu_seconds >= 0
+        self.calibrated += 1
+
+    def calibration_failed(self) -> None:
+        self.failures += 1
+
+    def scenes_wait(self, count: int) -> None:
+        self.waiting = count
+
+
+class Server:
+    """What one server has of calibrating, without its queue."""
+
+    def __init__(self, store: Store, options: CalibratorOptions | None = None) -> None:
+        self.store, self.counts = store, Counts()
+        indexes = SceneIndexes(store, ReferenceLibrary(store), DESCRIPTOR, EXTRACTOR, 2**30)
+        self.calibrator = Calibrator(indexes, EXTRACTOR, Pipeline(), KIND, options)
+        self.calibrations = SceneCalibrations(store, self.calibrator, self.counts)
+
+    def run(self, pause: Callable[[], None] = lambda: None) -> SelfCalibration | None:
+        self.calibrations.calibrate_waiting(pause)
+        return self.store.get_attributes(SCENE).self_calibration(KIND)
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Folder:
+    return Folder(tmp_path / "data")
+
+
+@pytest.fixture
+def store(place: Folder) -> Iterator[Store]:
+    with place.open() as store:
+        store.create_scene(SCENE)
+        yield store
+
+
+def add(store: Store, references: Sequence[PosedView], change: Change = lambda it: it) -> None:
+    vector = np.zeros(16, np.float32)
+    new = []
+    for i, it in enumerate(references):
+        vector[:2] = np.cos(i / 5), np.sin(i / 5)
+        described = {EXTRACTOR.name: it.view}, {DESCRIPTOR.name: vector.copy()}
+        new.append(NewReference(f"r{i}", b"%d" % i, it.view.camera, change(it.world_from_camera), *described))
+    store.add_references(SCENE, new)
+
+
+def similar(scale: float) -> Change:
+    turn = rotation_from_vector([0.3, -1.0, 0.2])
+    return lambda it: RigidTransform(turn @ it.rotation, scale * turn @ it.translation + [100.0, -40.0, 7.0])
+
+
+def mirrored(it: RigidTransform) -> RigidTransform:
+    """In a world whose z has the other sign, with rotations of the right hand all the same."""
+    mirror = np.diag([1.0, 1.0, -1.0])
+    return RigidTransform(mirror @ it.rotation @ mirror, mirror @ it.translation)
+
+
+def found_in(store: Store, references: Sequence[PosedView], change: Change = lambda it: it) -> SelfCalibration:
+    add(store, references, change)
+    found = Server(store).run()
+    assert found is not None
+    return found
+
+
+class TestScenes:
+    def test_references_are_localized_against_the_others(self, store: Store) -> None:
+        found = found_in(store, REFERENCES)
+        assert found.answer_count == len(REFERENCES)
+        assert 0.3 < found.position_factor_68 < 3
+        assert 0.3 < found.rotation_factor_68 < 3
+
+    def test_all_wrong_by_a_similarity_say_the_same(self, store: Store, tmp_path: Path) -> None:
+        ours = found_in(store, REFERENCES)
+        with Folder(tmp_path / "other").open() as other:
+            other.create_scene(SCENE)
+            theirs = found_in(other, REFERENCES, similar(1000.0))  # in millimetres
+        assert theirs.answer_count == ours.answer_count
+        assert theirs.position_factor_68 == pytest.approx(ours.position_factor_68, rel=0.1)
+        assert theirs.rotation_factor_68 == pytest.approx(ours.rotation_factor_68, rel=0.1)
+
+    def test_mirrored_ones_say_nothing(self, store: Store) -> None:
+        assert found_in(store, REFERENCES, mirrored).answer_count == 0
+
+    def test_those_of_one_place_say_nothing(self, store: Store) -> None:
+        here = REFERENCES[0].world_from_camera.translation
+        found = found_in(store, REFERENCES, lambda it: RigidTransform(it.rotation, here))
+        assert replace(found, generation=0) == SelfCalibration(KIND, 0, 0)
+
+    @pytest.mark.parametrize("count", [0, 1, 2])
+    def test_too_few_say_nothing(self, store: Store, count: int) -> None:
+        if count:
+            add(store, REFERENCES[:count])
+            assert Server(store).run() == SelfCalibration(KIND, store.get_generation(SCENE), 0)
+        else:
+            assert Server(store).run() is None
+
+    def test_a_wrong_pose_among_good_ones_spoils_nothing(self, store: Store, tmp_path: Path) -> None:
+        ours = found_in(store, REFERENCES)
+        with Folder(tmp_path / "other").open() as other:
+            other.create_scene(SCENE)
+            wrong = replace(REFERENCES[3], world_from_camera=REFERENCES[3].world_from_camera.shifted([0.0, 0.0, 2.0]))
+            theirs = found_in(other, [*REFERENCES[:3], wrong, *REFERENCES[4:]])
+        assert theirs.answer_count in (len(REFERENCES) - 1, len(REFERENCES) - 2)
+        for name in ("position_factor_68", "position_factor_95", "rotation_factor_68", "rotation_factor_95"):
+            assert getattr(theirs, name) == pytest.approx(getattr(ours, name), rel=0.5)
+
+    def test_a_copy_does_not_answer_for_itself(self, store: Store) -> None:
+        add(store, [REFERENCES[0]] * 2)
+        store.update_scene(SCENE, down_in_world=None)
+        found = Server(store).run()
+        assert found is not None
+        assert found.answer_count == 0
+
+    def test_the_time_is_bounded(self, store: Store) -> None:
+        add(store, REFERENCES)
+        found = Server(store, CalibratorOptions(max_cpu_s=1e-9)).run()
+        assert found is not None
+        assert found.answer_count == 0
+
+
+class TestServers:
+    def test_calibrate_each_change_once(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+        add(store, REFERENCES[:4])
+        first, second = Server(store), Server(store)
+        with ThreadPoolExecutor(2) as pool:
+            list(pool.map(lambda it: it.run(), (first, second)))
+        assert first.counts.calibrated + second.counts.calibrated == 1
+        now_us = calibrations._now_us
+        monkeypatch.setattr(calibrations, "_now_us", lambda: now_us() + 10**12)
+        first.run()
+        assert first.counts.calibrated + second.counts.calibrated == 1
+        store.delete_reference(SCENE, "r0")
+        found = first.run()
+        assert first.counts.calibrated + second.counts.calibrated == 2
+        assert found is not None
+        assert found.generation == store.get_generation(SCENE)
+        assert first.counts.waiting == 0
+
+    def test_that_are_closed_leave_the_scene_to_others(self, store: Store) -> None:
+        add(store, REFERENCES[:4])
+        steps = iter(range(5))
+
+        def close() -> None:
+            if next(steps, None) is None:
+                raise Closed
+
+        with pytest.raises(Closed):
+            Server(store).run(close)
+        assert store.get_attributes(SCENE).self_calibrations == ()
+        assert Server(store).run() is not None
+
+    def test_that_lost_their_scene_store_nothing(self, store: Store) -> None:
+        add(store, REFERENCES[:4])
+        once = threading.Event()
+
+        def delete() -> None:
+            if not once.is_set():
+                once.set()
+                store.delete_scene(SCENE)
+                store.create_scene(SCENE)
+
+        server = Server(store)
+        server.run(delete)
+        assert (server.counts.calibrated, server.counts.failures) == (0, 0)
+        assert store.get_attributes(SCENE).self_calibrations == ()
+
+    def test_that_fail_try_again_later(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+        add(store, REFERENCES[:4])
+        server = Server(store)
+
+        def fail(*_: object) -> None:
+            raise Unavailable("the device is lost")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(server.calibrator, "calibrate", fail)
+            server.run()
+        assert (server.counts.failures, server.counts.calibrated, server.counts.waiting) == (1, 0, 1)
+        server.run()
+        assert server.counts.calibrated == 0  # not before 30 s
+        now_us = calibrations._now_us
+        monkeypatch.setattr(calibrations, "_now_us", lambda: now_us() + 31 * 10**6)
+        server.run()
+        assert server.counts.calibrated == 1
+
+    def test_ignore_damaged_references(self, store: Store, place: Place) -> None:
+        add(store, REFERENCES)
+        (key,) = store.find_keys(SCENE, ["r2"]).values()
+        place.execute("UPDATE features SET sha256 = ? WHERE reference_key = ?", "0" * 64, key)
+        found = Server(store).run()
+        assert found is not None
+        assert found.answer_count == len(REFERENCES) - 1
