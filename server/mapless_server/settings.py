@@ -81,6 +81,8 @@ class Settings(BaseModel):
     """Folder of the networks' weights."""
     compiled_views: int = Field(default=0, ge=0, le=65)
     """Photographs of a query, itself included, that a network is compiled for at the start, at least 3; 0: none."""
+    query_rays: bool = True
+    """Whether pi3x and mapanything get the photograph's own intrinsics; they always get those of the references."""
     workers: int = Field(default_factory=available_cores, ge=1)
     """Threads that compute."""
     max_batch: int = Field(default=4, ge=1, le=64)

@@ -73,6 +73,8 @@ class GreyRunner:
         most_scenes: more at a time are out of memory.
         failing_batches: so many first calls of `reconstruct` are out of memory.
         failing_encodings: so many first calls of `encode` are out of memory.
+        has_rays: whether each call of `encode` got intrinsics.
+        given: poses, posed and metric of each call of `reconstruct`.
         encoded: views of each call of `encode`.
         batches: scenes of each call of `reconstruct`.
     """
@@ -85,17 +87,21 @@ class GreyRunner:
     most_scenes: int = 100
     failing_batches: int = 0
     failing_encodings: int = 0
+    has_rays: list[bool] = field(default_factory=list)
+    given: list[tuple[torch.Tensor | None, ...]] = field(default_factory=list)
     encoded: list[int] = field(default_factory=list)
     batches: list[int] = field(default_factory=list)
 
     def encode(self, images: torch.Tensor, intrinsics: torch.Tensor | None = None) -> torch.Tensor:
         self.encoded.append(len(images))
+        self.has_rays.append(intrinsics is not None)
         if len(self.encoded) <= self.failing_encodings:
             raise torch.OutOfMemoryError("no room to encode")
         return images.mean((1, 2, 3))[:, None, None]
 
-    def reconstruct(self, tokens: torch.Tensor, grid: tuple[int, int], mapped: int, *_: Any) -> NetworkOutput:
+    def reconstruct(self, tokens: torch.Tensor, grid: tuple[int, int], mapped: int, *given: Any) -> NetworkOutput:
         scenes, views = tokens.shape[:2]
+        self.given.append(given)
         self.batches.append(scenes)
         if scenes > self.most_scenes or len(self.batches) <= self.failing_batches:
             raise torch.OutOfMemoryError("no room to reconstruct")
@@ -436,25 +442,31 @@ def test_errors_of_the_device_are_passed_on_unchanged(monkeypatch: pytest.Monkey
 # Not a number
 
 
-def test_output_that_is_not_finite_is_rejected(caplog: pytest.LogCaptureFixture) -> None:
-    network = small_network("pi3")
-    cast(Pi3, network).camera_head.fc_t.bias.data[:] = float("nan")
-    runner = NetworkRunner(network, "pi3", "sha", "cpu")
+@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("part", ["fc_t.bias", "2.bias"], ids=["poses", "maps"])
+def test_output_that_is_not_finite_is_rejected(name: str, part: str, caplog: pytest.LogCaptureFixture) -> None:
+    network = small_network(name)
+    layers = ("fc_t.bias",) if part == "fc_t.bias" else ("conf_head.proj.bias", "output_block.0.2.bias", "conv2.2.bias")
+    for key, parameter in network.named_parameters():
+        if key.endswith(layers):
+            parameter.data[:] = float("nan")
+    runner = NetworkRunner(network, name, "sha", "cpu")
     outcome = reconstruct_one(NetworkReconstructor(runner, OPTIONS), *small_request(2))
     assert isinstance(outcome, Rejection)
     assert outcome.reason is RejectionReason.SCALE_UNRELIABLE
-    assert "pi3" in outcome.message
-    assert [record.message for record in caplog.records] == ["pi3: the network's output is not finite"]
+    assert name in outcome.message
+    assert [record.message for record in caplog.records] == [f"{name}: the network's output is not finite"]
     kept = reconstruct_one(NetworkReconstructor(runner, replace(OPTIONS, keep_on_device=True)), *small_request(2))
     assert isinstance(kept, DeviceReconstruction)
-    assert kept.local_from_camera.isnan().any()
+    assert kept.local_from_camera.isnan().any() or kept.broken_pixels() > 0
 
 
-def test_a_reconstruction_on_the_device_equals_the_fetched_one() -> None:
-    runner, request = small_runner("pi3"), small_request(3)
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_reconstruction_on_the_device_equals_the_fetched_one(name: str) -> None:
+    runner, request = small_runner(name), small_request(3)
     kept = reconstruct_one(NetworkReconstructor(runner, replace(OPTIONS, keep_on_device=True)), *request)
     assert isinstance(kept, DeviceReconstruction)
-    assert kept.backend == "pi3"
+    assert kept.backend == name
     assert_same_bits(kept.fetch(), reconstruct_one(NetworkReconstructor(runner, OPTIONS), *request))
 
 
@@ -553,6 +565,106 @@ def test_pi3_gets_no_poses() -> None:
     backend = NetworkReconstructor(small_runner("pi3"), OPTIONS)
     moved = [replace(it, world_from_camera=pose) for it, pose in zip(references, random_poses(3), strict=True)]
     assert_same_bits(reconstruct_one(backend, query, references), reconstruct_one(backend, query, moved))
+
+
+# Known poses (MapAnything)
+
+
+def test_the_unit_of_poses_is_the_metre_as_the_scene_says() -> None:
+    """Not where all are at one place: they have no size then."""
+    runner = GreyRunner(conditioned=True)
+    backend = grey_backend(runner)
+    query, references = grey_request(1, 50, 60)
+    same_place = [replace(it, world_from_camera=references[0].world_from_camera) for it in references]
+    requests = [
+        Request(query, references),
+        Request(query, references, is_metric=False),
+        Request(query, same_place),
+    ]
+    backend.reconstruct_many(requests)
+    (given,) = runner.given
+    poses, posed, metric = given
+    assert poses is not None
+    assert metric is not None
+    assert metric.tolist() == [[True] * 3, [False] * 3, [False] * 3]
+    assert posed is not None
+    assert posed.tolist() == [[True, True, False]] * 3
+    assert torch.equal(poses[:, 0], torch.eye(4).expand(3, 4, 4))
+    reconstruct_one(backend, query, references[:1])
+    single = runner.given[-1][2]
+    assert single is not None
+    assert single.tolist() == [[False, False]]
+
+
+def test_the_querys_rays_are_left_out_by_option() -> None:
+    """Also where the photograph is that of a reference, whose tokens are others then."""
+    runner = GreyRunner(conditioned=True)
+    references = grey_request(1, 50, 60)[1]
+    query = references[0].view
+    for query_rays, expected in ((True, [True, True]), (False, [True, True, False])):
+        runner.has_rays.clear()
+        options = replace(OPTIONS, query_rays=query_rays)
+        assert greys_of(reconstruct_one(grey_backend(runner, options), query, references)) == [50, 50, 60]
+        assert runner.has_rays == expected
+
+
+@pytest.mark.parametrize("name", ["pi3x", "mapanything"])
+def test_poses_and_rays_of_a_conditioned_network_have_an_effect(name: str) -> None:
+    query, references = small_request(3)
+    runner = small_runner(name)
+    plain = reconstruct_one(NetworkReconstructor(runner, OPTIONS), query, references)
+    without_rays = reconstruct_one(NetworkReconstructor(runner, replace(OPTIONS, query_rays=False)), query, references)
+    turned = [replace(it, world_from_camera=pose) for it, pose in zip(references, random_poses(3), strict=True)]
+    other_poses = reconstruct_one(NetworkReconstructor(runner, OPTIONS), query, turned)
+    for other in (without_rays, other_poses):
+        assert np.abs(arrays_of(other)[0] - arrays_of(plain)[0]).max() > 1e-3
+
+
+@pytest.mark.parametrize("name", ["pi3x", "mapanything"])
+def test_a_rigid_motion_of_the_world_does_not_change_the_output(name: str) -> None:
+    query, references = small_request(3)
+    backend = NetworkReconstructor(small_runner(name), OPTIONS)
+    motion = random_poses(1, offset_m=1e4)[0]
+    moved = [replace(it, world_from_camera=motion.compose(it.world_from_camera)) for it in references]
+    plain, same = (reconstruct_one(backend, query, it) for it in (references, moved))
+    for one, other in zip(arrays_of(plain), arrays_of(same), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-4 * float(np.abs(other).max()))
+
+
+def test_metric_and_other_scenes_of_a_batch_equal_single_ones() -> None:
+    query, references = small_request(3)
+    runner = small_runner("mapanything")
+    requests = [Request(query, references, is_metric=is_metric) for is_metric in (True, False)]
+    together = NetworkReconstructor(runner, OPTIONS).reconstruct_many(requests)
+    assert np.abs(arrays_of(together[0])[0] - arrays_of(together[1])[0]).max() > 1e-3
+    for request, outcome in zip(requests, together, strict=True):
+        (alone,) = NetworkReconstructor(runner, OPTIONS).reconstruct_many([request])
+        for one, other in zip(arrays_of(outcome), arrays_of(alone), strict=True):
+            np.testing.assert_allclose(one, other, atol=2e-4 * float(np.abs(other).max()))
+
+
+def test_a_first_view_without_a_pose_is_an_error_of_the_caller() -> None:
+    runner = small_runner("mapanything")
+    tokens = runner.encode(torch.rand(3, 3, 56, 70))[None]
+    poses, nothing = torch.eye(4).repeat(1, 3, 1, 1), torch.zeros(1, 3, dtype=torch.bool)
+    with pytest.raises(ValueError, match="the first view must have a pose"):
+        runner.reconstruct(tokens, (4, 5), 2, poses, torch.tensor([[False, True, True]]))
+    none_posed = runner.reconstruct(tokens, (4, 5), 2, poses, nothing)
+    assert torch.equal(none_posed.camera_poses, runner.reconstruct(tokens, (4, 5), 2).camera_poses)
+
+
+# Odd input
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_photographs_of_odd_shapes_and_intrinsics_are_reconstructed(name: str) -> None:
+    """A panorama that fits no grid, references of mixed sizes, one whose focal length is thrice too long."""
+    query = view_of(photograph(textured(400, 40, seed=9)))
+    photos = [photograph(textured(*size, seed=i)) for i, size in enumerate([(96, 72), (72, 96), (640, 480)])]
+    wrong = replace(photos[2].camera, focal_x_px=3 * photos[2].camera.focal_x_px)
+    references = references_of([*photos[:2], replace(photos[2], camera=wrong)])
+    outcome = reconstruct_one(NetworkReconstructor(small_runner(name), OPTIONS), query, references)
+    assert all(np.isfinite(values).all() for values in arrays_of(outcome))
 
 
 # From a name to a backend

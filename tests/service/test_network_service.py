@@ -22,7 +22,7 @@ from support.servers import RunningServer, serving
 from support.small_networks import GRIDS, small_network
 from support.waiting import wait_until
 
-from mapless import Client, LocalizationResult, NewReference, Rejected
+from mapless import Client, DeadlineExceeded, LocalizationResult, NewReference, Rejected
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.engine.query import Tier
 from mapless_server.engine.stages import Method
@@ -88,24 +88,26 @@ def test_a_random_network_is_answered_for(tmp_path: Path, name: str) -> None:
         assert backend.cache.counters.device_hits >= 4
 
 
-def test_a_network_of_nans_gives_no_coarse_pose(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    network = small_network("pi3")
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_network_of_nans_gives_no_coarse_pose(tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture) -> None:
+    network = small_network(name)
     for parameter in network.parameters():
         parameter.data[:] = float("nan")
     photograph = encode(".png", photograph_at(0.7))
-    with on_network(tmp_path, network, "pi3") as (client, *_):
+    with on_network(tmp_path, network, name) as (client, *_):
         coarse = client.localize(photograph, CAMERA, "wall", ["r0", "r1", "r2"], variant="coarse")
         answer = client.localize(photograph, CAMERA, "wall", ["r0", "r1", "r2"])
     assert isinstance(coarse, Rejected)
     assert coarse.reason == "SCALE_UNRELIABLE"
-    assert "pi3" in coarse.message
+    assert name in coarse.message
     # The photograph's matches with the references need no network.
     assert isinstance(answer, LocalizationResult)
     assert answer.world_from_camera.translation == pytest.approx([0.7, 0, 0], abs=0.01)
-    assert "pi3: the network's output is not finite" in [record.message for record in caplog.records]
+    assert f"{name}: the network's output is not finite" in [record.message for record in caplog.records]
 
 
-def test_calls_waiting_for_a_network_become_one_batch(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", NETWORKS)
+def test_calls_waiting_for_a_network_become_one_batch(tmp_path: Path, name: str) -> None:
     sizes: list[int] = []
     entered, gate = threading.Semaphore(0), threading.Event()
 
@@ -118,7 +120,7 @@ def test_calls_waiting_for_a_network_become_one_batch(tmp_path: Path) -> None:
     options = {"workers": 2, "max_batch": 4, "max_queued_s": 60.0}
     with (
         ThreadPoolExecutor(5) as pool,
-        on_network(tmp_path, small_network("pi3"), "pi3", Method(reconstruct=reconstruct), **options) as running,
+        on_network(tmp_path, small_network(name), name, Method(reconstruct=reconstruct), **options) as running,
     ):
         client, backend, server = running
 
@@ -138,3 +140,43 @@ def test_calls_waiting_for_a_network_become_one_batch(tmp_path: Path) -> None:
         assert server.value("mapless_batch_size_count", stage="coarse") == 2
         # Each reference was encoded once: by the first query, for all of them.
         assert backend.cache.counters.misses == 4
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_a_call_whose_deadline_passes_in_the_network_fails_alone(tmp_path: Path, name: str) -> None:
+    entered, gate = threading.Semaphore(0), threading.Event()
+
+    def reconstruct(batch: Any) -> Any:
+        entered.release()
+        assert gate.wait(60)
+        return pipeline.reconstruct(batch)
+
+    photograph = encode(".png", photograph_at(0.7))
+    with (
+        ThreadPoolExecutor(1) as pool,
+        on_network(tmp_path, small_network(name), name, Method(reconstruct=reconstruct)) as (client, *_),
+    ):
+        late = pool.submit(client.localize, photograph, CAMERA, "wall", NAMES, timeout_s=1.0)
+        try:
+            assert entered.acquire(timeout=30)
+            assert isinstance(late.exception(30), DeadlineExceeded)
+        finally:
+            gate.set()
+        assert isinstance(client.localize(photograph, CAMERA, "wall", NAMES), LocalizationResult | Rejected)
+
+
+def test_a_scene_of_unknown_unit_has_no_metric_poses(tmp_path: Path) -> None:
+    units: list[bool] = []
+
+    def reconstruct(batch: Any) -> Any:
+        units.extend(prepared.is_metric for prepared in batch)
+        return pipeline.reconstruct(batch)
+
+    with on_network(tmp_path, small_network("mapanything"), "mapanything", Method(reconstruct=reconstruct)) as (
+        client,
+        *_,
+    ):
+        client.localize(encode(".png", photograph_at(0.7)), CAMERA, "wall", NAMES)
+        client.update_scene("wall", arbitrary_unit=True)
+        client.localize(encode(".png", photograph_at(0.7)), CAMERA, "wall", NAMES)
+    assert units == [True, False]

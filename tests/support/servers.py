@@ -163,7 +163,7 @@ def whole(localize: Callable[..., Answer]) -> Method:
     """A method whose work is all done in the last part, by `localize(query, references, pipeline, options, check)`."""
 
     def prepare(*arguments: Any) -> Any:
-        *asked, context, _, _ = arguments  # neither query matches nor priors matter
+        *asked, context, _, _, _ = arguments  # query matches, priors and unit do not matter
         return SimpleNamespace(asked=asked, context=context, bucket="stand-in", prepared=None)
 
     def refine(coarse: Any) -> Answer:

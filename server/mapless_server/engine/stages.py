@@ -227,9 +227,8 @@ class QueryStages:
         run = replace(run, unmatched=())
         calibration = run.attributes.self_calibration(tier.kind)
         pipeline = tier.pipeline.with_trust(calibration.trust_quantiles if calibration else ())
-        part = self._method.prepare(
-            run.view, run.references, pipeline, query.options, run.context, run.query_matches, query.priors
-        )
+        given = run.view, run.references, pipeline, query.options, run.context, run.query_matches, query.priors
+        part = self._method.prepare(*given, not run.attributes.arbitrary_unit)
         if isinstance(part, Answer):
             return self._conclude(run, part)
         return self._next(run, Step(COARSE, run.kind, str(part.bucket), replace(run, part=part)))

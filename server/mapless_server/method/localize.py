@@ -69,11 +69,13 @@ def prepare(
     context: StageContext,
     query_matches: Sequence[Matches] | None = None,
     priors: Priors = NO_PRIORS,
+    is_metric: bool = True,
 ) -> Prepared | Answer:
     """Matches the query with its references and these with one another; an answer if the query is rejected here.
 
-    `query_matches` with each reference, if given, are used as they are: the references were chosen by them. Raises
-    ValueError if a view lacks input of the coarse backend.
+    `query_matches` with each reference, if given, are used as they are: the references were chosen by them.
+    `is_metric` is whether the unit of the references' poses is the metre. Raises ValueError if a view lacks input of
+    the coarse backend.
     """
     if not references:
         return Answer(Rejection(RejectionReason.NO_USABLE_REFERENCES, "no references"))
@@ -96,6 +98,7 @@ def prepare(
         bucket,
         context,
         priors.shifted(-origin),
+        is_metric,
     )
 
 

@@ -117,6 +117,7 @@ class Prepared:
         bucket: prepared queries of the same bucket may be reconstructed together.
         context: cancels the computation and times its stages.
         priors: on the query's pose, in the same world.
+        is_metric: whether the unit of the references' poses is the metre.
     """
 
     query: View
@@ -129,6 +130,7 @@ class Prepared:
     bucket: Bucket
     context: StageContext
     priors: Priors = NO_PRIORS
+    is_metric: bool = True
 
     @property
     def structure_options(self) -> StructureOptions:
@@ -213,7 +215,7 @@ def reconstruct(batch: Sequence[Prepared]) -> list[Coarse | Answer | Exception]:
     outcomes: list[Any] = _each(lambda prepared: prepared.context.check(), batch)
     wanted = [prepared for prepared, outcome in zip(batch, outcomes, strict=True) if outcome is None]
     start_s = time.perf_counter()
-    requests = [Request(it.query, it.references, it.correspondences, it.priors) for it in wanted]
+    requests = [Request(it.query, it.references, it.correspondences, it.priors, it.is_metric) for it in wanted]
     made = iter(batch[0].pipeline.reconstructor.reconstruct_many(requests) if requests else [])
     outcomes = [next(made) if outcome is None else outcome for outcome in outcomes]
     spent_s = time.perf_counter() - start_s

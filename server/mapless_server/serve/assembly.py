@@ -217,7 +217,11 @@ def make_tiers(settings: Settings) -> tuple[Tier, ...]:
     }
     _log_missing(extractors, missing)
     reconstructor = make_reconstructor(
-        settings.backend, settings.weights_dir, device, compiled_views=settings.compiled_views
+        settings.backend,
+        settings.weights_dir,
+        device,
+        compiled_views=settings.compiled_views,
+        query_rays=settings.query_rays,
     )
     return tuple(Tier(extractor, Pipeline(reconstructor, matchers[name])) for name, extractor in extractors.items())
 

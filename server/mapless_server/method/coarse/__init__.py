@@ -51,12 +51,14 @@ class Request:
         references: with known poses.
         correspondences: between all views; networks use the images alone and need none.
         priors: on the query's pose, in the world of the references; networks ignore them.
+        is_metric: whether the unit of the references' poses is the metre.
     """
 
     query: View
     references: Sequence[PosedView]
     correspondences: Correspondences | None = None
     priors: Priors = NO_PRIORS
+    is_metric: bool = True
 
 
 class Reconstructor(Protocol):

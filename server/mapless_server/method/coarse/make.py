@@ -6,6 +6,7 @@ A further network needs its name in `choices.NETWORKS` and an entry, with its cl
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,6 +31,7 @@ def make_reconstructor(
     device: str = "cpu",
     options: NetworkOptions | None = None,
     compiled_views: int = 0,
+    query_rays: bool = True,
 ) -> Reconstructor:
     """The backend that a setting names.
 
@@ -43,6 +45,7 @@ def make_reconstructor(
         options: of a network's backend.
         compiled_views: number of views, the query included, for which a network is compiled, which takes minutes; for
             photographs of 4:3, landscape or portrait. 0 compiles nothing. Other queries are computed uncompiled.
+        query_rays: see NetworkOptions.
 
     Raises:
         ValueError: unknown name.
@@ -56,7 +59,7 @@ def make_reconstructor(
         backend = _choose(weights_dir, device)
     if backend == "geometric":
         return GeometricReconstructor()
-    return _load(backend, find_weights(backend, weights_dir), device, options, compiled_views)
+    return _load(backend, find_weights(backend, weights_dir), device, options, compiled_views, query_rays)
 
 
 def _choose(weights_dir: Path, device: str) -> str:
@@ -88,14 +91,17 @@ def _load(
     device: str,
     options: NetworkOptions | None,
     compiled_views: int,
+    query_rays: bool,
 ) -> Reconstructor:
     import torch
 
     from mapless_server.networks.checkpoint import load_strictly
     from mapless_server.networks.runner import CompiledShape, NetworkRunner, RunnerOptions
 
-    from .grids import GridOptions, fitted_grid
-    from .network import NetworkReconstructor
+    from .grids import fitted_grid
+    from .network import NetworkOptions, NetworkReconstructor
+
+    options = replace(options or NetworkOptions(), query_rays=query_rays)
 
     if device == "cpu":
         log.warning("backend %s on the CPU: minutes for a query, so calls need longer deadlines", backend)
@@ -110,7 +116,6 @@ def _load(
     runner = NetworkRunner(network, backend, weights_sha256, device, runner_options)
     if compiled_views:
         log.info("backend %s: compiling for %d views", backend, compiled_views)
-        limit = (options.grids if options else GridOptions()).pixel_limit
-        grids = (fitted_grid(width, height, limit) for width, height in COMPILED_ASPECTS)
+        grids = (fitted_grid(*aspect, options.grids.pixel_limit) for aspect in COMPILED_ASPECTS)
         runner.warm_up([CompiledShape((grid.rows, grid.columns), compiled_views) for grid in grids])
     return NetworkReconstructor(runner, options)

@@ -1,4 +1,4 @@
-"""The coarse stage by a network: pi^3, the paper's, or Pi3X, which also takes intrinsics and the references' poses.
+"""The coarse stage by a network: pi^3, the paper's, or Pi3X or MapAnything, which take intrinsics and known poses, too.
 
     photographs > pictures > tokens > network > DeviceReconstruction
       (views)    (grids)  (cached for           (on the device,
@@ -44,11 +44,15 @@ class NetworkOptions:
         grids: of the pictures.
         cache: of references' tokens.
         keep_on_device: whether a reconstruction stays on the network's device; None keeps it on CUDA.
+        query_rays: whether a network that takes intrinsics gets the query's. MapAnything saw hardly any view with
+            intrinsics and without a pose among posed ones when it was trained, and few views with neither: which is
+            better has to be measured with its weights.
     """
 
     grids: GridOptions = field(default_factory=GridOptions)
     cache: TokenCacheOptions = field(default_factory=TokenCacheOptions)
     keep_on_device: bool | None = None
+    query_rays: bool = True
 
 
 class NetworkReconstructor:
@@ -86,7 +90,7 @@ class NetworkReconstructor:
 
     def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
         """See Reconstructor.bucket."""
-        grid = _Scene.of(query, references, self._options.grids).grid
+        grid = _Scene.of(Request(query, references), self._options).grid
         return Bucket(self.name, len(references), (grid.rows, grid.columns))
 
     def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
@@ -120,7 +124,7 @@ class NetworkReconstructor:
                 outcomes[i] = Rejection(RejectionReason.NO_USABLE_REFERENCES, "no references")
                 continue
             try:
-                scene = _Scene.of(request.query, request.references, self._options.grids)
+                scene = _Scene.of(request, self._options)
                 tokens = self._with_room(partial(self._encode, scene, encoded))
             except torch.OutOfMemoryError:
                 raise
@@ -149,13 +153,16 @@ class NetworkReconstructor:
     def _run(self, scenes: Sequence[_EncodedScene]) -> list[Outcome]:
         """Outcomes of scenes of one grid and number of views."""
         grid, references = scenes[0].scene.grid, scenes[0].scene.references
-        poses = posed = None
+        poses = posed = metric = None
         if self._runner.conditioned:
             known = np.stack([condition_poses([r.world_from_camera for r in it.scene.references]) for it in scenes])
             poses = torch.from_numpy(known.astype(np.float32))
             posed = (torch.arange(len(references) + 1) < len(references)).repeat(len(scenes), 1)
+            # Poses at one place have no size that could be in metres.
+            metric = torch.tensor([it.scene.is_metric for it in scenes]) & poses[:, 1:-1, :3, 3].any(-1).any(-1)
+            metric = metric[:, None].expand_as(posed)
         tokens = torch.stack([of_view for it in scenes for of_view in it.tokens]).unflatten(0, (len(scenes), -1))
-        output = self._runner.reconstruct(tokens, (grid.rows, grid.columns), len(references), poses, posed)
+        output = self._runner.reconstruct(tokens, (grid.rows, grid.columns), len(references), poses, posed, metric)
         return [self._outcome(it.scene, output, index) for index, it in enumerate(scenes)]
 
     def _encode(self, scene: _Scene, encoded: dict[TokenKey, Tensor]) -> tuple[Tensor, ...]:
@@ -184,7 +191,7 @@ class NetworkReconstructor:
         """Tokens (T, C)."""
         picture = torch.from_numpy(view.layout.picture(view.photograph.read()))
         intrinsics = None
-        if self._runner.conditioned:
+        if self._runner.conditioned and view.given_rays:
             intrinsics = torch.from_numpy(view.layout.intrinsics.astype(np.float32))[None]
         return self._runner.encode(_on_device(picture[None], self._runner.device), intrinsics)[0]
 
@@ -197,7 +204,7 @@ class NetworkReconstructor:
             photograph.sha256,
             photograph.camera,
             layout.grid,
-            layout.camera,
+            layout.camera if view.given_rays else None,
         )
 
     def _outcome(self, scene: _Scene, output: NetworkOutput, index: int) -> Outcome:
@@ -219,30 +226,37 @@ class NetworkReconstructor:
 
 @dataclass(frozen=True, eq=False)
 class _LaidOut:
-    """A view's photograph, and its layout on the scene's grid."""
+    """A view's photograph, and its layout on the scene's grid.
+
+    `given_rays` is whether the network gets its intrinsics, if it takes any.
+    """
 
     photograph: Photograph
     layout: Layout
+    given_rays: bool
 
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """One request: its grid, its references and all its views, the query's last."""
+    """One request: its grid, its references and all its views, the query's last; and whether its unit is the metre."""
 
     grid: Grid
     references: Sequence[PosedView]
     views: tuple[_LaidOut, ...]
+    is_metric: bool
 
     @classmethod
-    def of(cls, query: View, references: Sequence[PosedView], options: GridOptions) -> _Scene:
+    def of(cls, request: Request, options: NetworkOptions) -> _Scene:
         """ValueError if a view has no photograph."""
-        photographs = [
-            *(_photograph(reference.view, reference.name) for reference in references),
-            _photograph(query, "the query"),
-        ]
-        grid = common_grid([photograph.camera for photograph in photographs[:-1]], options)
-        views = (_LaidOut(photograph, lay_out(photograph.camera, grid, options)) for photograph in photographs)
-        return cls(grid, references, tuple(views))
+        references = [_photograph(reference.view, reference.name) for reference in request.references]
+        query = _photograph(request.query, "the query")
+        grid = common_grid([photograph.camera for photograph in references], options.grids)
+        given_rays = [True] * len(references) + [options.query_rays]
+        views = (
+            _LaidOut(photograph, lay_out(photograph.camera, grid, options.grids), given)
+            for photograph, given in zip([*references, query], given_rays, strict=True)
+        )
+        return cls(grid, request.references, tuple(views), request.is_metric)
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,7 +290,7 @@ def _on_device(tensor: Tensor, device: torch.device) -> Tensor:
 def condition_poses(world_from_references: Sequence[RigidTransform]) -> Array:
     """Poses of the references and, last, a placeholder for the query's, relative to the first reference.
 
-    Networks normalize by the mean distance of all views from the first, whether their poses are used or not. The
+    Pi3X normalizes by the mean distance of all views from the first, whether their poses are used or not. The
     placeholder is at the mean distance of the other references, so that it does not change that mean; its direction is
     arbitrary, since nothing else is computed from it. With a single reference, whose pose is not used, it is there.
 
@@ -287,8 +301,12 @@ def condition_poses(world_from_references: Sequence[RigidTransform]) -> Array:
         (K + 1, 4, 4), the first the identity. Differences of world coordinates, which may be large, are taken here, in
         double precision.
     """
-    first_from_world = world_from_references[0].inverse()
-    relative = [first_from_world.compose(pose) for pose in world_from_references]
+    first = world_from_references[0]
+    # Differences first: references at one place are exactly there, which MapAnything's scale depends on.
+    relative = [
+        RigidTransform(first.rotation.T @ it.rotation, first.rotation.T @ (it.translation - first.translation))
+        for it in world_from_references
+    ]
     distances_m = [float(np.linalg.norm(pose.translation)) for pose in relative[1:]]
     neutral_m = float(np.mean(distances_m)) if distances_m else 0.0
     placeholder = RigidTransform(np.eye(3), np.array([neutral_m, 0.0, 0.0]))

@@ -28,7 +28,7 @@ class TokenKey:
         image_sha256: of the encoded photograph.
         source: the photograph's camera, from which its undistortion follows.
         grid: size of the picture.
-        camera: of the picture; a conditioned network takes it.
+        camera: of the picture; a conditioned network takes it. None if it is not given.
     """
 
     network: str
@@ -37,18 +37,19 @@ class TokenKey:
     image_sha256: str
     source: Camera
     grid: Grid
-    camera: Camera
+    camera: Camera | None
 
 
 @dataclass(frozen=True)
 class TokenCacheOptions:
-    """Options of the cache; tokens of one view are 2.1 MB at 518x392 in bfloat16, twice that in float32.
+    """Options of the cache; tokens of one view are 2.1 MB at 518x392 in bfloat16, MapAnything's 3.2; twice in float32.
 
     Attributes:
-        device_bytes: on the device; 1 GiB are 500 views in bfloat16, enough for a scene and little beside the weights.
+        device_bytes: on the device; 1 GiB are 500 views in bfloat16 (337 of MapAnything), enough for a scene and little
+            beside the weights.
         host_bytes: in the host's memory, for tokens that have no room on the device: another 1000 views. Copying those
-            of a view to the device moves 2.1 MB; computing them takes 0.8 TFLOP. For CUDA the memory is pinned, whose
-            blocks have sizes of powers of two: at 518x392 nearly twice as much is taken.
+            of a view to the device moves 2.1 MB; computing them takes 0.8 TFLOP, MapAnything's 1.6. For CUDA the memory
+            is pinned, whose blocks have sizes of powers of two: at 518x392 nearly twice as much is taken.
     """
 
     device_bytes: int = 2**30
