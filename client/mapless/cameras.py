@@ -57,14 +57,27 @@ def read_camera(source: str | Path, photo: str | Path | None = None) -> Camera:
 
 
 def read_pose(source: str | Path) -> RigidTransform:
-    """A pose: a JSON file or JSON text as the interface defines RigidTransform.
+    """A pose: a JSON file or JSON text as the interface defines RigidTransform, or a 4x4 or 3x4 matrix.
 
     Raises:
         OSError: the file cannot be read.
         ValueError: the source is no valid pose; names the file and the field.
     """
+    text = str(source)
+    is_inline = text.lstrip().startswith(("{", "["))
+    content = text if is_inline else Path(text).read_text("utf-8-sig", errors="replace")
+    if content.lstrip().startswith("["):
+        return _pose_from_matrix(content, "pose" if is_inline else text)
     required = ("rotation", "translation_m")
     return read_message(str(source), geometry_pb2.RigidTransform(), required, wire.transform_from_message, "pose")
+
+
+def _pose_from_matrix(content: str, name: str) -> RigidTransform:
+    try:
+        pose = RigidTransform.from_matrix(_numbers(read_json(content)))
+        return wire.transform_from_message(wire.transform_to_message(pose), "")
+    except ValueError as error:
+        raise ValueError(f"{name}: world_from_camera as a matrix: {error}") from None
 
 
 def read_cameras(file: str | Path) -> dict[Path, Camera]:

@@ -12,7 +12,7 @@ from google.rpc import error_details_pb2, status_pb2
 
 _DETAILS_KEY = "grpc-status-details-bin"
 _NO_TIME = "Deadline Exceeded"
-_NOT_CONNECTED = "connections to all backends failing"
+_NOT_CONNECTED = ("connections to all backends failing", "failed to connect to all addresses")
 _NOT_CONNECTED_BECAUSE = {
     "Socket closed": "the server closes the connection at once; if it uses TLS, give --tls or --ca FILE (Python: tls, "
     "root_certificates), and --cert if it requires a client certificate",

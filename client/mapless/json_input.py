@@ -34,7 +34,7 @@ def read_message(source: str, message: M, required: Sequence[str], convert: Call
         OSError: the file cannot be read.
         ValueError: it is not JSON, or a field is unknown, missing or wrong; names the file and the field.
     """
-    is_text = source.lstrip().startswith("{")
+    is_text = source.lstrip().startswith(("{", "["))
     name = what if is_text else source
     try:
         content = read_json(source if is_text else Path(source).read_bytes())

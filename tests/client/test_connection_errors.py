@@ -59,6 +59,38 @@ def test_a_failed_connection_is_explained(
     assert expected in caught.value.message
 
 
+def test_localhost_says_what_is_wrong_at_its_ipv4_address(addresses: dict[str, str]) -> None:
+    """Where it has an IPv6 address, too, and nothing listens there."""
+    for _ in range(3):
+        with Client(addresses["tls"].replace("127.0.0.1", "localhost"), ConnectOptions(max_attempts=1)) as client:
+            with pytest.raises(MaplessError) as caught:
+                client.is_serving()
+            assert caught.value.message.startswith(f"cannot connect to {addresses['tls']}: ")
+            assert "if it uses TLS" in caught.value.message
+
+
+@pytest.mark.parametrize(
+    ("address", "expected"),
+    [
+        ("http://localhost:50051", "host:port, without scheme and path: localhost:50051, is 'http://localhost:50051'"),
+        ("https://vps.example/", "without scheme and path: vps.example, and encrypt with --tls"),
+        ("grpc://[::1]:50051/mapless", r"without scheme and path: [::1]:50051, is"),
+        ("localhost:50051/", "without scheme and path: localhost:50051, is"),
+        ("", "without scheme and path: localhost:50051, is ''"),
+    ],
+)
+def test_an_address_that_is_a_url_is_corrected(address: str, expected: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(expected)):
+        Client(address)
+
+
+@pytest.mark.parametrize(
+    "address", ["localhost", "[::1]:50051", "dns:///mapless:50051", "unix:/run/mapless.sock", "a.b:1"]
+)
+def test_addresses_of_grpc_are_accepted(address: str) -> None:
+    Client(address).close()
+
+
 @pytest.mark.parametrize(
     ("address", "expected"),
     [

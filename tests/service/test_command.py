@@ -18,7 +18,7 @@ from google.protobuf import json_format
 from support.servers import BLACK, CAMERA, PHOTO, RunningServer, pose
 
 import mapless
-from mapless import Camera, wire
+from mapless import Camera, Client, NewReference, wire
 from mapless.__main__ import main
 from mapless.cli.arguments import make_parser
 from mapless.cli.output import plain
@@ -75,6 +75,73 @@ def test_from_an_empty_server_to_a_pose(run: Run, tmp_path: Path, camera_json: s
     assert run("scene", "get", "kitchen")[1]["reference_count"] == 0
     assert run("scene", "delete", "kitchen")[0] == 0
     assert run("scene", "list")[1] == []
+
+
+def test_a_reference_is_shown_and_its_photograph_downloaded(
+    run: Run, client: Client, scene: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    client.add_reference(scene, NewReference("view", PHOTO, CAMERA, pose(1.5)))
+    code, shown, _ = run("reference", "show", scene, "view")
+    assert (code, shown["reference_id"], shown["world_from_camera"]["translation_m"]["x"]) == (0, "view", 1.5)
+    assert run("reference", "download", scene, "view") == (0, "view.png\n", "")
+    assert (tmp_path / "view.png").read_bytes() == PHOTO
+    code, _, error = run("reference", "download", scene, "view")
+    assert (code, error) == (2, "mapless: view.png: File exists\n")
+    assert run("reference", "download", scene, "view", "--force")[0] == 0
+    assert run("reference", "download", scene, "lost")[0] == 1
+
+
+def test_lists_are_tables_on_a_terminal(run: Run, client: Client, scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+    head, *rows = run("reference", "list", scene)[1].splitlines()
+    assert head.split() == ["REFERENCE", "SIZE", "X", "Y", "Z", "FEATURES", "CREATED"]
+    assert [row.split()[:3] for row in rows] == [[f"r{i}", "96x64", f"{i}.000"] for i in range(3)]
+    assert len({len(row) for row in rows}) == 1
+    head, *rows = run("scene", "list")[1].splitlines()
+    assert [scene, "3", "m"] in [row.split()[:3] for row in rows]
+    assert run("reference", "list", scene, "--json")[1][0]["reference_id"] == "r0"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        (("localise", "s", "a.jpg"), "localize"),
+        (("scenes", "list"), "scene"),
+        (("scene", "lst"), "list"),
+        (("reference", "shwo", "s", "r"), "show"),
+        (("scene", "create", "s", "--unit", "meter"), "metre"),
+    ],
+)
+def test_a_wrong_command_gets_a_suggestion(run: Run, arguments: tuple[str, ...], meant: str) -> None:
+    code, _, error = run(*arguments)
+    assert code == 2
+    assert error.endswith(f"did you mean {meant!r}?\n")
+
+
+def test_a_pose_may_be_a_matrix(run: Run, scene: str, camera_json: str, tmp_path: Path) -> None:
+    photo = tmp_path / "view.png"
+    photo.write_bytes(PHOTO)
+    matrix = json.dumps(pose(1.25).matrix().tolist())
+    (tmp_path / "pose.json").write_text(matrix)
+    for reference_id, given in (("inline", matrix), ("file", tmp_path / "pose.json")):
+        arguments = ("--camera", camera_json, "--pose", given, "--id", reference_id)
+        code, stored, _ = run("reference", "add", scene, photo, *arguments)
+        assert (code, stored["world_from_camera"]["translation_m"]["x"]) == (0, 1.25)
+    code, _, error = run("reference", "add", scene, photo, "--camera", camera_json, "--pose", "[[1, 0], [0, 1]]")
+    assert (code, error) == (
+        2,
+        "mapless: pose: world_from_camera as a matrix: expected a 4x4 or 3x4 matrix, got shape (2, 2)\n",
+    )
+
+
+def test_more_references_than_are_used_say_how(run: Run, scene: str, camera_json: str, tmp_path: Path) -> None:
+    photo = tmp_path / "view.png"
+    photo.write_bytes(PHOTO)
+    named = [argument for i in range(65) for argument in ("--reference", f"r{i}")]
+    code, _, error = run("localize", scene, photo, "--camera", camera_json, *named)
+    assert code == 1
+    assert "at most 1000 with options.rerank_references (--rerank)" in error
 
 
 def test_errors_are_one_line_with_an_exit_code(run: Run, tmp_path: Path, camera_json: str) -> None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import os
+import re
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from ..options import ConnectOptions
 from ..shortcut import ADDRESS_VARIABLE, TOKEN_VARIABLE, default_address
@@ -15,9 +17,9 @@ from . import commands, localize
 DESCRIPTION = """\
 The command `mapless`: what the client can do, from a shell.
 
-`localize` prints a few lines on a terminal, and JSON with all fields where standard output is no terminal, or with
---json. All other commands print JSON. Exit codes: 0 success, 1 a call failed, 2 wrong usage, 3 a photograph was not
-localized (the answer has the reason).
+`localize` prints a few lines on a terminal, the lists a table, and both JSON with all fields where standard output is
+no terminal, or with --json. All other commands print JSON. Exit codes: 0 success, 1 a call failed, 2 wrong usage,
+3 a photograph was not localized (the answer has the reason).
 """
 
 FILE_FORMATS = """\
@@ -28,6 +30,8 @@ or focal lengths and principal point in pixels of the photograph, FX,FY,CX,CY,
 or a cameras.json that lists the photograph.
 POSE is a JSON file likewise, RigidTransform:
   {"rotation": {"x": 0, "y": 0, "z": 0, "w": 1}, "translation_m": {"x": 0, "y": 0, "z": 1.5}}
+or its matrix, 4x4 or 3x4:
+  [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1.5], [0, 0, 0, 1]]
 """
 
 
@@ -44,7 +48,18 @@ _CONNECTION_DEFAULTS: dict[str, Any] = {
 }
 
 
-class _Command(argparse.ArgumentParser):
+class _Parser(argparse.ArgumentParser):
+    """A parser that suggests what a wrong command or choice was meant to be."""
+
+    def error(self, message: str) -> NoReturn:
+        """Prints the message and exits."""
+        wrong = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
+        choices = re.findall(r"[\w-]+", wrong[2]) if wrong else []
+        nearest = difflib.get_close_matches(wrong[1], choices, 1) if wrong else []
+        super().error(f"{message}; did you mean {nearest[0]!r}?" if nearest else message)
+
+
+class _Command(_Parser):
     """A command, which accepts the flags of the connection too; they override those given before the command."""
 
     def __init__(self, **options: Any) -> None:
@@ -54,7 +69,7 @@ class _Command(argparse.ArgumentParser):
 
 def make_parser() -> argparse.ArgumentParser:
     """The parser of the command line; `run` of its result is the command's function."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="mapless",
         description=DESCRIPTION,
         epilog=FILE_FORMATS,
@@ -73,7 +88,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     health.set_defaults(run=commands.health)
     _add_scene(groups.add_parser("scene", help="create, update, get, list, delete"))
-    _add_reference(groups.add_parser("reference", help="add, list, delete"))
+    _add_reference(groups.add_parser("reference", help="add, show, download, list, delete"))
     _add_localize(groups.add_parser("localize", help="localize a photograph, or a folder of them"))
     _add_questions(groups)
     return parser
@@ -132,7 +147,9 @@ def _add_scene(scene: argparse.ArgumentParser) -> None:
         one = actions.add_parser(action)
         one.add_argument("scene")
         one.set_defaults(run=run)
-    actions.add_parser("list").set_defaults(run=commands.list_scenes)
+    listing = actions.add_parser("list", help="a table on a terminal, else JSON")
+    _add_json(listing)
+    listing.set_defaults(run=commands.list_scenes)
 
 
 def _add_place(command: argparse.ArgumentParser) -> None:
@@ -165,13 +182,26 @@ def _add_reference(reference: argparse.ArgumentParser) -> None:
     add.add_argument("--camera", required=True, help="its camera, see `mapless --help`")
     add.add_argument("--pose", required=True, help="its world_from_camera, likewise")
     add.set_defaults(run=commands.add_reference)
-    listing = actions.add_parser("list")
+    listing = actions.add_parser("list", help="a table on a terminal, else JSON")
     listing.add_argument("scene")
+    _add_json(listing)
     listing.set_defaults(run=commands.list_references)
-    delete = actions.add_parser("delete")
-    delete.add_argument("scene")
-    delete.add_argument("reference")
-    delete.set_defaults(run=commands.delete_reference)
+    for action, run, text in (
+        ("show", commands.show_reference, "its camera, pose, hash and number of features"),
+        ("download", commands.download_reference, "its photograph, the bytes that were stored"),
+        ("delete", commands.delete_reference, "delete it"),
+    ):
+        one = actions.add_parser(action, help=text)
+        one.add_argument("scene")
+        one.add_argument("reference")
+        one.set_defaults(run=run)
+        if action == "download":
+            one.add_argument("--output", type=Path, metavar="FILE", help="default: ID.jpg, .png or .webp; - for stdout")
+            one.add_argument("--force", action="store_true", help="overwrite the file")
+
+
+def _add_json(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--json", action="store_true", help="JSON on a terminal, too")
 
 
 def _add_localize(command: argparse.ArgumentParser) -> None:

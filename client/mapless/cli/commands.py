@@ -17,9 +17,10 @@ from ..geodesy import Datum
 from ..geometry import Quaternion
 from ..names import check_id
 from ..requests import NewReference
+from ..results import Reference, Scene
 from .folder import EXIT_FAILED, EXIT_REJECTED
 from .localize import priors
-from .output import print_json
+from .output import print_json, print_table
 
 _BLANK = "nothing can be matched with it; it is blank, dark or blurred"
 _STATE = {True: "SERVING", False: "NOT_SERVING"}
@@ -84,7 +85,22 @@ def get_scene(client: Client, arguments: argparse.Namespace) -> int:
 
 def list_scenes(client: Client, arguments: argparse.Namespace) -> int:
     """Lists all scenes."""
-    return print_json(list(client.list_scenes()))
+    scenes = list(client.list_scenes())
+    if arguments.json or not sys.stdout.isatty():
+        return print_json(scenes)
+    rows = [
+        (it.scene_id, it.reference_count, "arbitrary" if it.arbitrary_unit else "m", _place(it.datum), _minute(it))
+        for it in scenes
+    ]
+    return print_table(("SCENE", "REFERENCES", "UNIT", "LATITUDE, LONGITUDE", "CREATED"), rows)
+
+
+def _place(datum: Datum | None) -> str:
+    return "" if datum is None else f"{datum.latitude_deg:.5f}, {datum.longitude_deg:.5f}"
+
+
+def _minute(it: Scene | Reference) -> str:
+    return f"{it.create_time:%Y-%m-%d %H:%M}"
 
 
 def delete_scene(client: Client, arguments: argparse.Namespace) -> int:
@@ -120,7 +136,35 @@ def list_references(client: Client, arguments: argparse.Namespace) -> int:
     """Lists the references of a scene."""
     if client.get_scene(arguments.scene).arbitrary_unit:
         print("mapless: note: the scene's unit of length is arbitrary, not the metre", file=sys.stderr)
-    return print_json(list(client.list_references(arguments.scene)))
+    references = list(client.list_references(arguments.scene))
+    if arguments.json or not sys.stdout.isatty():
+        return print_json(references)
+    rows = []
+    for it in references:
+        position = [f"{coordinate:.3f}" for coordinate in it.world_from_camera.translation]
+        size = f"{it.camera.width_px}x{it.camera.height_px}"
+        rows.append((it.reference_id, size, *position, it.feature_count, _minute(it)))
+    return print_table(("REFERENCE", "SIZE", "X", "Y", "Z", "FEATURES", "CREATED"), rows)
+
+
+def show_reference(client: Client, arguments: argparse.Namespace) -> int:
+    """Prints a reference without its photograph."""
+    return print_json(client.get_reference(arguments.scene, arguments.reference))
+
+
+def download_reference(client: Client, arguments: argparse.Namespace) -> int:
+    """Writes the photograph of a reference to a file."""
+    found = client.get_reference(arguments.scene, arguments.reference, include_image=True)
+    image = found.image or b""
+    if str(arguments.output) == "-":
+        sys.stdout.buffer.write(image)
+        return 0
+    kind = {b"\xff\xd8": ".jpg", b"\x89P": ".png", b"RI": ".webp"}.get(image[:2], "")
+    file = arguments.output or Path(f"{found.reference_id}{kind}")
+    with file.open("wb" if arguments.force else "xb") as target:
+        target.write(image)
+    print(file)
+    return 0
 
 
 def delete_reference(client: Client, arguments: argparse.Namespace) -> int:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
+from collections.abc import Sequence
 from datetime import datetime
 from enum import Enum
 from typing import Any
@@ -20,12 +22,25 @@ from ..geometry import Camera, RigidTransform
 DOUBTFUL_TRUST = 0.05
 """Below it, an answer looks worse than 19 of 20 right ones: usually the intrinsics are wrong."""
 
+_NUMBER = re.compile(r"-?[\d.]+")
 _CAPTURED = "captured by the server"
 
 
 def print_json(value: object) -> int:
     """Prints a value as JSON; returns exit code 0."""
     print(json.dumps(plain(value), indent=2), flush=True)
+    return 0
+
+
+def print_table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> int:
+    """Prints rows below their head, numbers to the right; returns exit code 0."""
+    columns = [[name, *map(str, cells)] for name, *cells in zip(head, *rows, strict=True)]
+    for column in columns:
+        is_number = len(column) > 1 and all(map(_NUMBER.fullmatch, column[1:]))
+        width = max(map(len, column))
+        column[:] = [cell.rjust(width) if is_number else cell.ljust(width) for cell in column]
+    for line_cells in zip(*columns, strict=True):
+        print("  ".join(line_cells).rstrip())
     return 0
 
 

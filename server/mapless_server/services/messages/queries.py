@@ -55,7 +55,8 @@ def reference_ids_from_names(names_given: Sequence[str], scene_id: str, most: in
         FieldError: there are more than `most`, or one is no reference's name, of another scene, or repeated.
     """
     if len(names_given) > most:
-        raise FieldError("references", f"must be at most {most}, are {len(names_given)}")
+        more = f"; at most {MAX_CANDIDATES} with options.rerank_references (--rerank)" if most == MAX_REFERENCES else ""
+        raise FieldError("references", f"must be at most {most}, are {len(names_given)}{more}")
     reference_ids: dict[str, None] = {}
     for i, name in enumerate(names_given):
         field = f"references[{i}]"
