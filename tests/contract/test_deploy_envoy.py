@@ -165,10 +165,10 @@ def test_administration_is_for_the_pod_alone() -> None:
 
 def test_calls_with_a_scene_are_hashed_and_others_balanced() -> None:
     (host,) = manager("calls")["route_config"]["virtual_hosts"]
-    watching, by_scene, by_load, health = host["routes"]
+    _, watching, by_scene, by_load, health = host["routes"]
     method = localization_service_pb2.DESCRIPTOR.services_by_name["LocalizationService"].methods_by_name["WatchQueries"]
     assert watching["match"]["path"] == f"/{method.containing_service.full_name}/{method.name}"
-    assert by_scene["match"]["headers"] == [{"name": SCENE_KEY, "present_match": True}]
+    assert by_scene["match"]["headers"][1:] == [{"name": SCENE_KEY, "present_match": True}]
     for route in (watching, by_scene):
         assert route["route"]["hash_policy"] == [{"header": {"header_name": SCENE_KEY}}]
         assert CLUSTERS[route["route"]["cluster"]]["lb_policy"] == "RING_HASH"
@@ -186,3 +186,12 @@ def test_only_what_reached_no_server_is_repeated() -> None:
     assert set(host["retry_policy"]["retry_on"].split(",")) == {"connect-failure", "refused-stream"}
     assert "per_try_timeout" not in host["retry_policy"]
     assert not any("retry_policy" in route["route"] for route in host["routes"])
+
+
+def test_pages_of_no_origin_may_call_unless_listed() -> None:
+    (host,) = manager("calls")["route_config"]["virtual_hosts"]
+    policy = host["typed_per_filter_config"]["envoy.filters.http.cors"]
+    assert policy["allow_origin_string_match"] == []
+    assert policy["forward_not_matching_preflights"] is False
+    assert not policy.get("allow_credentials")
+    assert {SCENE_KEY, "authorization", "x-client-id", "x-request-id"} <= {*policy["allow_headers"].split(",")}

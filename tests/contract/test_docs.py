@@ -20,7 +20,7 @@ from support.images import encode, textured
 from support.servers import pose, serving
 from test_imports import LADDER
 
-from mapless import Client, NewReference, RigidTransform
+from mapless import Camera, Client, NewReference, RigidTransform
 from mapless import errors as client_errors
 from mapless.cli.arguments import make_parser
 from mapless.exchange import MALFORMED_ANSWER
@@ -28,11 +28,14 @@ from mapless.report.page import HEADLINES
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server import errors
 from mapless_server.errors import Unavailable
+from mapless_server.method.features import SiftOptions
 from mapless_server.method.options import Variant
 from mapless_server.method.rejection import RejectionReason
+from mapless_server.method.views import Features, View
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling import Refusal
 from mapless_server.settings import CLIENT_ADDRESS_VARIABLE, CLIENT_TOKEN_VARIABLE, Settings, load_settings
+from mapless_server.store.codec import encode_view
 from mapless_server.store.faults import RETRY_AFTER_S
 from mapless_server.store.postgresql import CONNECTION_WAIT_S, CONNECTIONS_AT_MOST, CONNECTIONS_KEPT
 from mapless_tools.cli.app import app
@@ -270,3 +273,15 @@ def test_figures_about_the_database_hold() -> None:
     assert "100 is enough for five" in text
     assert f"retry after {RETRY_AFTER_S:.0f} s" in text
     assert Unavailable.code in text
+
+
+def test_a_reference_takes_the_space_that_the_guide_says() -> None:
+    """The features of SIFT, and a JPEG of 640x480."""
+    (shown,) = re.findall(r"A reference takes about ([\d.]+) MB", (ROOT / "docs/guides/scenes.md").read_text())
+    count = SiftOptions().max_keypoints
+    features = Features(
+        np.zeros((count, 2), np.float32), np.zeros((count, 128), np.float32), np.zeros(count, np.float32)
+    )
+    view = View(Camera.from_fov(640, 480, 70.0), features)
+    photograph = encode(".jpg", textured(640, 480))
+    assert (len(encode_view(view)) + len(photograph)) / 1e6 == pytest.approx(float(shown), rel=0.1)

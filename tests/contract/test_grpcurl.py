@@ -59,14 +59,27 @@ def lines() -> list[Line]:
 
 
 def as_protobuf_json(body: str) -> str:
-    """JSON as protobuf defines it. grpcurl takes a field mask as a message alone, not as the string that is defined."""
+    """What grpcurl reads, as protobuf defines JSON.
 
-    def with_masks(message: dict[str, Any]) -> dict[str, Any]:
-        if "update_mask" in message:
-            message["update_mask"] = ",".join(message["update_mask"]["paths"])
+    grpcurl takes a field mask as a message alone, not as the string that is defined. Go's JSON, unlike Python's, has
+    neither NaN nor a field twice.
+    """
+
+    def with_masks(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        message = dict(pairs)
+        if len(message) < len(pairs):
+            raise ValueError(f"a field is given twice: {pairs}")
+        for name in {"update_mask", "updateMask"} & {*message}:
+            if not isinstance(message[name], dict) or set(message[name]) != {"paths"}:
+                raise ValueError(f'grpcurl wants {{"paths": [...]}}, not {message[name]!r}')
+            # Protobuf's string has JSON's names.
+            message[name] = ",".join(re.sub(r"_([a-z])", lambda it: it[1].upper(), it) for it in message[name]["paths"])
         return message
 
-    return json.dumps(json.loads(body, object_hook=with_masks))
+    def refuse(constant: str) -> Any:
+        raise ValueError(f"{constant} is no JSON")
+
+    return json.dumps(json.loads(body, object_pairs_hook=with_masks, parse_constant=refuse))
 
 
 class Described:
@@ -110,6 +123,34 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 def test_every_line_is_read() -> None:
     assert len(lines()) >= 7
     assert {line.address for line in lines()} == {"localhost:50051"}
+
+
+def test_no_line_is_overlooked() -> None:
+    """Wherever a page shows one: fenced, whatever the language, or indented."""
+    for page in PAGES:
+        assert len(re.findall(r"grpcurl -\w", page.read_text())) == shell(page).count("grpcurl -"), page
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        '{"update_mask": "datum"}',
+        '{"update_mask": ["datum"]}',
+        '{"scene": {"datum": {"latitude_deg": NaN}}}',
+        '{"scene": {}, "scene": {}}',
+        "{'scene': {}}",
+    ],
+)
+def test_what_grpcurl_does_not_read_is_noticed(body: str) -> None:
+    with pytest.raises(ValueError):  # noqa: PT011  each says it in its own words
+        as_protobuf_json(body)
+
+
+def test_a_mask_names_fields_as_the_protos_do(server: str) -> None:
+    request = Described(server).request(
+        "mapless.v1.ReferenceService/UpdateScene", '{"update_mask": {"paths": ["down_in_world", "datum"]}}'
+    )
+    assert list(request.update_mask.paths) == ["down_in_world", "datum"]
 
 
 def test_every_symbol_is_described(server: str) -> None:

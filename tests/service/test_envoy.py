@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import ssl
 import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent import futures
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
+from http.client import HTTPSConnection
 from pathlib import Path
 from typing import Any
 
@@ -263,6 +265,88 @@ def test_what_is_not_for_callers_does_not_pass(fleet: Fleet) -> None:
             with pytest.raises(grpc.RpcError) as caught:
                 channel.unary_unary(method)(b"", timeout=30)
             assert from_rpc_error(caught.value).code == "UNIMPLEMENTED"
+
+
+# Browsers
+
+
+ORIGIN = "https://app.example"
+
+
+@dataclass
+class Page:
+    """A page of an origin, whose browser speaks gRPC-Web over HTTP/1.1."""
+
+    running: Gateway
+    origin: str = ORIGIN
+
+    def asks(self, method: str, headers: dict[str, str], body: bytes = b"") -> tuple[int, dict[str, str], bytes]:
+        """Status, headers and body of a request to Localize."""
+        trusted = ssl.create_default_context(cadata=(self.running.options.root_certificates or b"").decode())
+        connection = HTTPSConnection("localhost", self.running.port, context=trusted, timeout=30)
+        with closing(connection):
+            path = "/mapless.v1.LocalizationService/Localize"
+            connection.request(method, path, body, {"origin": self.origin, **headers})
+            response = connection.getresponse()
+            return response.status, {name.lower(): it for name, it in response.getheaders()}, response.read()
+
+    def may_call(self) -> bool:
+        """What the answer to the browser's preflight says."""
+        wanted = {
+            "access-control-request-method": "POST",
+            "access-control-request-headers": "x-grpc-web,x-mapless-scene",
+        }
+        status, headers, _ = self.asks("OPTIONS", wanted)
+        return status == 200 and headers.get("access-control-allow-origin") == self.origin
+
+    def localizes(self) -> tuple[pb.LocalizeResponse, str, dict[str, str]]:
+        """The answer, the trailers and the headers of a call."""
+        request = localize_request(SCENES[0]).SerializeToString()
+        headers = {
+            "content-type": "application/grpc-web+proto",
+            "x-grpc-web": "1",
+            "x-mapless-scene": f"scenes/{SCENES[0]}",
+        }
+        status, answered, body = self.asks("POST", headers, b"\0" + len(request).to_bytes(4, "big") + request)
+        assert (status, answered["content-type"]) == (200, "application/grpc-web+proto")
+        size = int.from_bytes(body[1:5], "big")
+        return pb.LocalizeResponse.FromString(body[5 : 5 + size]), body[5 + size + 5 :].decode(), answered
+
+
+def test_a_page_of_a_listed_origin_localizes_by_grpc_web(
+    fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    configure = envoys.configured
+
+    def with_origin(*arguments: Any) -> Path:
+        path = configure(*arguments)
+        text = path.read_text().replace(
+            "allow_origin_string_match: []", f"allow_origin_string_match: [{{exact: {ORIGIN}}}]"
+        )
+        assert ORIGIN in text
+        path.write_text(text)
+        return path
+
+    monkeypatch.setattr(envoys, "configured", with_origin)
+    with gateway(tmp_path, [server.address for server in fleet.servers]) as running:
+        page = Page(running)
+        assert page.may_call()
+        answer, trailers, headers = page.localizes()
+        assert answer.localization.world_from_camera.translation_m.x == 1.0
+        assert "grpc-status:0" in trailers
+        assert headers["access-control-allow-origin"] == ORIGIN
+        assert "grpc-status" in headers["access-control-expose-headers"]
+        assert not Page(running, "https://other.example").may_call()
+
+
+def test_pages_are_refused_unless_their_origin_is_listed(fleet: Fleet) -> None:
+    page = Page(fleet.gateway)
+    assert not page.may_call()
+    assert page.asks("OPTIONS", {})[0] == 404
+    _, _, headers = page.localizes()  # as another program than a browser may, which has no origin to check
+    assert "access-control-allow-origin" not in headers
+    assert page.asks("POST", {"content-type": "application/json"}, b"{}")[0] == 404
+    assert page.asks("GET", {})[0] == 404
 
 
 def test_a_cancelled_call_ends_at_the_server(fleet: Fleet) -> None:
