@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from dataclasses import astuple, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -178,15 +178,22 @@ class TestApplying:
 
     def own(self, conditions: Conditions = SIFT, count: int = 30) -> SelfCalibration:
         kind = calibration_kind(conditions.features, conditions.backend, conditions.server_version)
-        return SelfCalibration(kind, 7, count, *astuple(self.FACTORS))
+        return SelfCalibration(kind, 7, count, 2.0, 0.5)
 
     def test_of_references_hold_at_the_usual_gap(self) -> None:
         before, attributes = Accuracy(1.0, 2.0, 3.0, 4.0), SceneAttributes(self_calibrations=(self.own(),))
         after = reported_radii(before, self.COVARIANCE, SIFT, attributes, USUAL_GAP)
-        assert after.accuracy == Accuracy(2.0, 6.0, 1.5, 3.0)
+        assert after.accuracy == Accuracy(2.0, 4.0, 1.5, 2.0)
         assert (after.calibration, after.count) == ("SELF", 30)
         near, far = (reported_radii(before, self.COVARIANCE, SIFT, attributes, it).accuracy for it in (0.05, 0.2))
         assert near.position_68_m < after.accuracy.position_68_m < far.position_68_m
+
+    def test_errors_of_references_are_below_no_radius(self) -> None:
+        noisy = SceneAttributes(self_calibrations=(replace(self.own(), reference_noise_m=0.01),))
+        for radius_m in (1e-4, 1e-2, 1.0):
+            before = Accuracy(radius_m, 2 * radius_m, 3.0, 4.0)
+            after = reported_radii(before, self.COVARIANCE, SIFT, noisy, USUAL_GAP).accuracy
+            assert after.position_68_m == pytest.approx(math.hypot(2 * radius_m, 0.01), rel=1e-2)
 
     def test_measured_ones_win_over_those_of_references(self) -> None:
         both = SceneAttributes(calibration=self.calibration(), self_calibrations=(self.own(),))

@@ -247,7 +247,8 @@ def _to_json(content: dict[str, Any]) -> bytes:
 
 
 def _calibration_from_dict(content: dict[str, Any]) -> SelfCalibration:
-    return SelfCalibration(**{**content, "trust_quantiles": tuple(content["trust_quantiles"])})
+    lists = {name: tuple(value) for name, value in content.items() if isinstance(value, list)}
+    return SelfCalibration(**(content | lists))
 
 
 def _camera_to_dict(camera: Camera) -> dict[str, Any]:

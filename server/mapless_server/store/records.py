@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mapless.geodesy import Datum
 from mapless.geometry import Array, Camera, RigidTransform
-from mapless.scenes import FACTORS, MAX_FACTOR, MIN_FACTOR, Calibration, Vector
+from mapless.scenes import MAX_FACTOR, MIN_FACTOR, Calibration, Vector
 from mapless_server.method.views import View
 from mapless_server.security import SceneKey, scene_id_of
 
@@ -40,32 +40,33 @@ class SelfCalibration:
         kind: of the answers that it holds for, see `calibration_kind`.
         generation: of the scene when its references were read.
         answer_count: n, number of references whose answers it is from; 0: too few, and the rest is as without it.
-        position_factor_68, position_factor_95: of the position's radii at the usual gap (`method.uncertainty.gap`).
-        rotation_factor_68, rotation_factor_95: of the rotation's. All factors are 0.01 to 1000.
+        position_factor, rotation_factor: of radii at the usual gap (`method.uncertainty.gap`), 0.01 to 1000.
+        reference_noise_m, reference_noise_deg: errors of the references' own poses, not exceeded in 68 % of cases: no
+            answer is free of them.
         trust_quantiles: of the generic trust of right answers, at the levels of `method.trust.judge`; empty: unknown.
-        reference_noise_m, reference_noise_deg: size of the errors of the references' own poses; 0 if unknown.
-        focal_ratio, focal_sigma: the focal length that the references' matches give, by that of their intrinsics, and
-            its standard deviation; 1 and 0 if unknown.
+        lens_error, lens_sigma: (4,) of the intrinsics of the references, as `method.intrinsics` orders them, and
+            standard deviations; empty: unknown.
     """
 
     kind: str
     generation: int
     answer_count: int
-    position_factor_68: float = 1.0
-    position_factor_95: float = 1.0
-    rotation_factor_68: float = 1.0
-    rotation_factor_95: float = 1.0
-    trust_quantiles: tuple[float, ...] = ()
+    position_factor: float = 1.0
+    rotation_factor: float = 1.0
     reference_noise_m: float = 0.0
     reference_noise_deg: float = 0.0
-    focal_ratio: float = 1.0
-    focal_sigma: float = 0.0
+    trust_quantiles: tuple[float, ...] = ()
+    lens_error: tuple[float, ...] = ()
+    lens_sigma: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in FACTORS:
+        for name in ("position_factor", "rotation_factor"):
             factor = getattr(self, name)
             if not MIN_FACTOR <= factor <= MAX_FACTOR:
                 raise ValueError(f"{name} must be {MIN_FACTOR:g} to {MAX_FACTOR:g}, is {factor:g}")
+        for name in ("reference_noise_m", "reference_noise_deg"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be at least 0, is {getattr(self, name):g}")
 
 
 def calibration_kind(features: str, backend: str, server_version: str) -> str:

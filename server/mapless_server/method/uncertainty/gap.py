@@ -6,7 +6,7 @@ import numpy as np
 
 from ..results import Support
 
-POSITION_GROWTH, ROTATION_GROWTH = 0.15, 0.05
+POSITION_GROWTH, ROTATION_GROWTH = 0.3, 0.3
 """Exponents of the gap in the ratio of errors to radii, from `research.self_calibration`."""
 
 USUAL_GAP = 0.1

@@ -177,6 +177,7 @@ def left_out(subject: PosedView, answer: Answer) -> LeftOut | None:
         accuracy_from_covariance(outcome.covariance),
         outcome.trust or 0.0,
         *viewpoint_gap(support),
+        support.estimate.intrinsics if support.estimate else None,
     )
 
 

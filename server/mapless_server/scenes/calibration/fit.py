@@ -1,17 +1,21 @@
 """The model: from references that were localized against the others to the radii and the trust of answers.
 
-A reference's result is its error by the radii that its answer claims, and the trust of the answer. Right answers only
-count: what judges the others is trust, and a reference whose own pose is wrong gives no right answer, so that it
+A reference's result is its error beside the radius that its answer claims, and the trust of the answer. Right answers
+only count: what judges the others is trust, and a reference whose own pose is wrong gives no right answer, so that it
 changes nothing here (the audit names it). What is right is a share of the distance and an angle, whatever the unit.
 
-Errors of answers grow faster with the distance to the references than radii do, and a reference that is left out is
-farther from the others than a query is. So ratios are compared at one gap g (distance to the nearest reference by the
-depth of what is seen): ln ratio = a + b ln g, with b from scenes with known poses, a of the scene. The factor of an
-answer is that at its own gap (`method.uncertainty.gap`).
+An error of position or angle is modelled as
 
-With n answers a factor is n / (n + n0) of what they say, in logarithms, as if n0 more answers had needed the factor 1
-of the generic radii. The quantiles of trust are those of the n answers and of n0 answers whose trust is distributed as
-it is elsewhere, uniformly. All n0 were chosen by leaving whole scenes out (`research.self_calibration`).
+    ln e = ln(median ratio x sqrt((f g^b r)^2 + s^2)) + normal noise,
+
+r the claimed radius, f the factor of the scene, s the errors of the references' own poses, which no answer is free of
+and which do not shrink with its radius, and g the gap: errors grow faster with the distance to the references than
+radii do, and a reference that is left out is farther from the others than a query is. b comes from scenes with known
+poses. f and s are means of the posterior on a grid. The prior of f is log-normal about 1, the generic radii, as if
+n0 = `mismatch` (`scatter` / `factor_log`)^2 = 1.3 more answers had needed it; that of s is half-normal.
+
+The quantiles of trust are those of the n answers and of n0 = `trust_prior` answers whose trust is distributed as it is
+elsewhere, uniformly. Priors were chosen by leaving whole scenes out (`research.self_calibration`).
 """
 
 from __future__ import annotations
@@ -22,7 +26,7 @@ from dataclasses import astuple, dataclass
 import numpy as np
 
 from mapless.geometry import Array
-from mapless.scenes import MAX_FACTOR, MIN_FACTOR
+from mapless_server.method.intrinsics import IntrinsicsEvidence
 from mapless_server.method.options import check_bounds
 from mapless_server.method.trust.judge import LEVELS
 from mapless_server.method.uncertainty.gap import growth
@@ -32,8 +36,12 @@ from mapless_server.store import SelfCalibration
 RIGHT_SHARE, RIGHT_DEG = 0.05, 5.0
 """A right answer is off by at most this share of the distance to what the photograph shows, and these degrees."""
 
-_MEDIAN_RATIO = 0.78
-"""Median of the length of a normal error in two or three directions, by its quantile at 68 %."""
+_FACTORS = np.exp(np.linspace(np.log(0.15), np.log(6.0), 57))
+_NOISES = np.array([0.0, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.7, 2.2])
+"""Values of f, and of s by the median radius, that are tried."""
+
+_FARTHEST_LOG = 3.0
+"""Standard deviations beyond which an error counts no more."""
 
 
 @dataclass(frozen=True)
@@ -41,19 +49,25 @@ class FitOptions:
     """Options of the model.
 
     Attributes:
-        radius_prior: n0 of the factors of 68 %.
-        tail_prior: n0 of what 95 % needs beyond 68 %.
+        median_ratio: median of errors by their radius of 68 %, if it is right.
+        scatter: standard deviation of the logarithm of errors by their radius; that of a normal error's length.
+        mismatch: so many answers count as one, because neighbours share errors, and left-out references are no queries.
+        factor_log: standard deviation of ln f between scenes.
+        noise_share: standard deviation of s, by the median radius.
         trust_prior: n0 of the quantiles of trust.
         least_answers: with fewer right answers, nothing is known of the scene.
     """
 
-    radius_prior: float = 12.0
-    tail_prior: float = 30.0
+    median_ratio: float = 0.72
+    scatter: float = 0.65
+    mismatch: float = 2.0
+    factor_log: float = 0.8
+    noise_share: float = 0.3
     trust_prior: float = 20.0
     least_answers: int = 3
 
     def __post_init__(self) -> None:
-        check_bounds(self, "radius_prior tail_prior trust_prior", above=0)
+        check_bounds(self, "median_ratio scatter mismatch factor_log noise_share trust_prior", above=0)
         check_bounds(self, "least_answers", at_least=1)
 
 
@@ -67,6 +81,7 @@ class LeftOut:
         trust: of the answer, generic.
         gap: distance of the answer to its nearest reference by the depth of what it sees.
         depth_m: that depth.
+        lens: what it says of the errors of the intrinsics; None if nothing.
     """
 
     error_m: float
@@ -75,6 +90,7 @@ class LeftOut:
     trust: float
     gap: float
     depth_m: float
+    lens: IntrinsicsEvidence | None = None
 
     @property
     def is_right(self) -> bool:
@@ -97,24 +113,37 @@ def fit(results: Sequence[LeftOut], kind: str, generation: int, options: FitOpti
         return SelfCalibration(kind, generation, 0)
     grown = np.array([growth(it.gap) for it in right])
     claimed = np.array([astuple(it.claimed) for it in right])
-    position = _factors(np.array([[it.error_m] for it in right]) / claimed[:, :2] / grown[:, :1], options)
-    rotation = _factors(np.array([[it.error_deg] for it in right]) / claimed[:, 2:] / grown[:, 1:], options)
+    position, noise_m = _factor_and_noise(np.array([it.error_m for it in right]), claimed[:, 0], grown[:, 0], options)
+    rotation, noise_deg = _factor_and_noise(
+        np.array([it.error_deg for it in right]), claimed[:, 2], grown[:, 1], options
+    )
     wrong = [it.trust for it in results if not it.is_right]
     quantiles = _trust_quantiles(np.array([it.trust for it in right]), max(wrong, default=0.0), options)
-    return SelfCalibration(kind, generation, len(right), *position, *rotation, tuple(quantiles.tolist()))
+    return SelfCalibration(
+        kind,
+        generation,
+        len(right),
+        position,
+        rotation,
+        noise_m,
+        noise_deg,
+        tuple(quantiles.tolist()),
+        *_lens([it.lens for it in right if it.lens is not None]),
+    )
 
 
-def _factors(ratios: Array, options: FitOptions) -> tuple[float, float]:
-    """Factors of the radii of 68 and 95 %, from the ratios (N, 2) of errors to both."""
-    count = len(ratios)
-    logs = np.log(np.clip(ratios, MIN_FACTOR, MAX_FACTOR))
-    # Two quantiles, because one of few is rough; of a distribution as claimed the median ratio is 0.78.
-    at_68 = float(np.mean(np.quantile(logs[:, 0], (0.5, 0.68)) - np.log((_MEDIAN_RATIO, 1.0))))
-    at_95 = float(np.quantile(logs[:, 1], 0.95)) - at_68
-    factor_68 = count / (count + options.radius_prior) * at_68
-    factor_95 = factor_68 + count / (count + options.tail_prior) * at_95
-    bounded = np.exp(np.clip((factor_68, factor_95), np.log(MIN_FACTOR), np.log(MAX_FACTOR)))
-    return float(bounded[0]), float(bounded[1])
+def _factor_and_noise(error: Array, radius: Array, grown: Array, options: FitOptions) -> tuple[float, float]:
+    """F and s of errors (N,) with claimed radii (N,) at gaps that make them grow (N,)."""
+    unit = max(float(np.median(radius)), np.finfo(float).tiny)
+    scaled = _FACTORS[:, None, None] * (radius * grown / unit)
+    expected = options.median_ratio * np.hypot(scaled, _NOISES[:, None])  # (F, S, N)
+    off = (np.log(np.maximum(error / unit, 1e-9)) - np.log(np.maximum(expected, 1e-9))) / options.scatter
+    likelihood = -0.5 * np.minimum(off**2, _FARTHEST_LOG**2).sum(axis=2) / options.mismatch
+    unusual = (np.log(_FACTORS)[:, None] / options.factor_log) ** 2 + (_NOISES / options.noise_share) ** 2
+    posterior = likelihood - 0.5 * unusual
+    weight = np.exp(posterior - posterior.max())
+    weight /= weight.sum()
+    return float(np.exp(weight.sum(axis=1) @ np.log(_FACTORS))), float(weight.sum(axis=0) @ _NOISES) * unit
 
 
 def _trust_quantiles(right: Array, highest_wrong: float, options: FitOptions) -> Array:
@@ -129,3 +158,19 @@ def _trust_quantiles(right: Array, highest_wrong: float, options: FitOptions) ->
     quantiles = trust[np.searchsorted(share, np.array(LEVELS) - 1e-12)]
     levels = np.array(LEVELS)
     return np.clip(quantiles, np.minimum(levels, highest_wrong), levels)
+
+
+def _lens(evidence: Sequence[IntrinsicsEvidence]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """What the references together say of the errors of their intrinsics, and its standard deviations; both (4,).
+
+    The median over the references, so that one wrong pose does not count, and the spread about it: references of one
+    lens that disagree do not become certain by their number alone.
+    """
+    if not evidence:
+        return (), ()
+    values = np.array([it.value for it in evidence])
+    middle = np.median(values, axis=0)
+    spread = 1.4826 * np.median(np.abs(values - middle), axis=0)
+    claimed = np.median([it.sigma for it in evidence], axis=0)
+    sigma = 1.2533 * np.maximum(spread, claimed) / np.sqrt(len(values))
+    return tuple(middle.tolist()), tuple(sigma.tolist())

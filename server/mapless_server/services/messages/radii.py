@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import asdict, astuple, dataclass, replace
 
 import numpy as np
@@ -48,16 +49,14 @@ class Factors:
         )
 
     @classmethod
-    def of_scene(cls, calibration: SelfCalibration, gap: float) -> Factors:
-        """The factors of a self-calibration for an answer at a gap, see `method.uncertainty.gap`."""
+    def of_references(cls, calibration: SelfCalibration, accuracy: Accuracy, gap: float) -> Factors:
+        """The factors of a self-calibration for an answer with these radii at a gap, see `scenes.calibration.fit`."""
         position, rotation = growth(gap)
         factors = (
-            position * calibration.position_factor_68,
-            position * calibration.position_factor_95,
-            rotation * calibration.rotation_factor_68,
-            rotation * calibration.rotation_factor_95,
+            _factor(position * calibration.position_factor, calibration.reference_noise_m, accuracy.position_68_m),
+            _factor(rotation * calibration.rotation_factor, calibration.reference_noise_deg, accuracy.rotation_68_deg),
         )
-        return cls(*(min(max(it, MIN_FACTOR), MAX_FACTOR) for it in factors))
+        return cls(*np.repeat(factors, 2).tolist())
 
 
 @dataclass(frozen=True)
@@ -114,8 +113,13 @@ def reported_radii(
         own = attributes.self_calibration(kind)
         if own is None or not own.answer_count or conditions.variant != _SELF_CALIBRATED or gap is None:
             return ReportedRadii(accuracy, covariance)
-        factors, calibration, count = Factors.of_scene(own, gap), "SELF", own.answer_count
+        factors, calibration, count = Factors.of_references(own, accuracy, gap), "SELF", own.answer_count
     return ReportedRadii(scaled_accuracy(accuracy, factors), scaled_covariance(covariance, factors), calibration, count)
+
+
+def _factor(factor: float, noise: float, radius: float) -> float:
+    """By which a radius grows that gets a factor, and noise that does not depend on it."""
+    return min(max(math.hypot(factor, noise / max(radius, sys.float_info.min)), MIN_FACTOR), MAX_FACTOR)
 
 
 def scaled_accuracy(accuracy: Accuracy, factors: Factors) -> Accuracy:
