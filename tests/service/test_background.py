@@ -16,7 +16,7 @@ from support.servers import listening
 from support.stores import Folder
 from support.waiting import wait_until
 
-from mapless import Client, NewReference, wire
+from mapless import Client, LocalizationResult, NewReference, wire
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.engine.queue_engine import QueueEngine
@@ -25,7 +25,7 @@ from mapless_server.scenes.background import BackgroundMatching
 from mapless_server.security import RateLimiter, SceneKey
 from mapless_server.serve.assembly import make_engine
 from mapless_server.settings import Settings
-from mapless_server.store import Store, pairs
+from mapless_server.store import Store, calibrations, pairs
 from mapless_tools.child import child_server
 from mapless_tools.demo import room
 
@@ -181,3 +181,31 @@ def test_what_a_killed_server_began_is_finished(
     assert count_pairs(data_dir) == 2 * PAIRS
     with serving(data_dir, **OFF) as served:
         assert served.answers() == expected
+
+
+def test_a_killed_servers_scene_is_calibrated_by_the_next(
+    matched: Path, expected: list[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def claims() -> int:
+        with closing(Folder(matched).open_as_is()) as database, database.read() as connection:
+            count = "SELECT count(*) FROM scene_calibration WHERE data IS NULL AND failure_count = 0"
+            return int(connection.exec_driver_sql(count).scalar_one())
+
+    Folder(matched).execute("DELETE FROM scene_calibration")
+    with child_server(matched) as child:
+        wait_until(lambda: claims() == 1)
+        os.kill(child.process_id, signal.SIGKILL)
+    assert claims() == 1
+    now_us = calibrations._now_us
+    monkeypatch.setattr(calibrations, "_now_us", lambda: now_us() + round(1e6 * calibrations.CLAIM_S))
+    with serving(matched) as served:
+        wait_until(lambda: served.value("mapless_calibrations_total") == 1)
+        assert served.value("mapless_calibration_failures_total") == 0
+        assert served.answers() == expected  # which ask for no calibration
+        photograph = room().queries[0]
+        with Client(served._address) as client:
+            answer = client.localize(photograph.data, photograph.camera, "room")
+    assert isinstance(answer, LocalizationResult)
+    assert answer.accuracy is not None
+    assert answer.accuracy.calibration == "SELF"
+    assert 3 <= answer.accuracy.sample_size <= REFERENCES
