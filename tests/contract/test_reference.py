@@ -78,6 +78,7 @@ def test_the_interface_is_complete_with_its_comments(generators: Any, stem: str)
     assert {word for word in words if word not in page} == set()
 
 
+@pytest.mark.nightly  # CI runs "make docs", which is as strict
 def test_the_site_builds_strictly(tmp_path: Path) -> None:
     pytest.importorskip("material", reason="mkdocs-material is not installed: make docs")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")]

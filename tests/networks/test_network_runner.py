@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from functools import partial
 
 import pytest
 import torch
@@ -20,6 +21,7 @@ from mapless_server.networks.pi3x import Pi3X
 from mapless_server.networks.runner import CompiledShape, NetworkRunner, RunnerOptions, UnsuitableDevice
 
 GRID = (2, 3)
+nightly = partial(pytest.param, marks=pytest.mark.nightly)
 
 
 def some_images(views: int, grid: tuple[int, int] = GRID) -> Tensor:
@@ -57,7 +59,7 @@ def shallow_network(name: str) -> Network:
     return network
 
 
-@pytest.fixture(params=["pi3", "pi3x", pytest.param("mapanything", marks=pytest.mark.nightly)])
+@pytest.fixture(params=["pi3", "pi3x", nightly("mapanything")])
 def name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
@@ -81,6 +83,7 @@ def test_the_runner_has_the_networks_output() -> None:
     runner.close()
 
 
+@pytest.mark.parametrize("name", [nightly("pi3"), "pi3x", nightly("mapanything")])
 def test_a_compiled_runner_does_not_compile_again(name: str) -> None:
     """That it compiles as a whole also shows that nothing in it waits for the device: that would break the graph."""
     plain = NetworkRunner(shallow_network(name), name, "sha")

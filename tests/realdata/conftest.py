@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 from mapless_tools.dataset import Dataset, read_folder
+from research.places import Place, read_place
 
 DATA = Path(os.environ.get("TEST_DATA") or Path(__file__).parents[3] / "shared" / "data")
+
+
+@cache
+def read_place_once(name: str) -> Place:
+    """A scene with the features of its photographs, for all tests."""
+    return read_place(DATA / name)
 
 
 @pytest.fixture(scope="session")

@@ -7,50 +7,46 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
-from pathlib import Path
+from functools import cache, partial
 
 import numpy as np
 import pytest
 from support.audits import audit_references, finder_of
 
 from mapless.geometry import RigidTransform, rotation_from_vector
-from mapless_server.images import ImageLimits, decode_image
-from mapless_server.method.features import make_extractor
 from mapless_server.method.views import PosedView
 from mapless_server.scenes import AuditVerdict, CoverageVerdict, ReferenceAudit
 from mapless_server.scenes.audit.coverage import check_coverage
 from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.audit.resection import with_focal
-from mapless_tools.dataset import Dataset, read_folder
+from mapless_tools.dataset import Dataset
+from research.places import Place, read_place
+
+from .conftest import DATA, read_place_once
 
 pytestmark = [pytest.mark.realdata, pytest.mark.timeout(300)]
 
 Photographs = Callable[[str], Dataset]
 KITCHEN = "7scenes-redkitchen-seq01-first600"
 FOUNTAIN = "fountain-P11"
-COUNTS = {KITCHEN: 30, FOUNTAIN: 11, "herz-jesus-P8": 8, "tum-fr3-office": 16, "kitti-drive-a": 26}
+nightly = partial(pytest.param, marks=pytest.mark.nightly)
 PAIRS = PairMatches()
 """Of all tests: matches depend on the photographs alone."""
 
 
 @cache
-def described(folder: Path) -> tuple[PosedView, ...]:
-    """References evenly spread over a dataset; keys and names are the photographs'."""
-    dataset = read_folder(folder)
-    chosen = np.linspace(0, len(dataset.frames) - 1, COUNTS[dataset.name]).round().astype(int)
-    extractor = make_extractor("sift")
-    views = []
-    for i in chosen:
-        frame = dataset.frames[i]
-        view = extractor.extract(decode_image(frame.image_path.read_bytes(), ImageLimits()), frame.camera)
-        key, name = f"{dataset.name}/{frame.name}", f"scenes/real/references/r{i}"
-        views.append(PosedView(key, name, view, frame.world_from_camera))
-    return tuple(views)
+def kitchen() -> Place:
+    """30 photographs, evenly spread."""
+    return read_place(DATA / KITCHEN, wanted=np.linspace(0, 599, 30).round().astype(int).tolist())
 
 
 def load(photographs: Photographs, name: str) -> list[PosedView]:
-    return list(described(photographs(name).frames[0].image_path.parents[1]))
+    photographs(name)
+    place = kitchen() if name == KITCHEN else read_place_once(name)
+    return [
+        PosedView(f"{name}/{i}", f"scenes/real/references/r{i}", view, place.poses[i])
+        for i, view in place.views.items()
+    ]
 
 
 def audit(references: list[PosedView], indices: list[int] | None = None) -> list[ReferenceAudit]:
@@ -85,7 +81,8 @@ def check_fault(found: ReferenceAudit, fault: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "scene", [FOUNTAIN, *(pytest.param(scene, marks=pytest.mark.nightly) for scene in COUNTS if scene != FOUNTAIN)]
+    "scene",
+    [FOUNTAIN, *map(nightly, (KITCHEN, "herz-jesus-P8", "tum-fr3-office", "kitti-drive-a"))],
 )
 def test_nothing_is_found_where_nothing_was_planted(photographs: Photographs, scene: str) -> None:
     """On the drive the first poses are off by 6 to 11 cm themselves: there may be doubt, but no fault."""

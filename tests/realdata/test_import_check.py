@@ -30,7 +30,7 @@ def check(frames: tuple[Frame, ...]) -> Verdict:
 @pytest.mark.parametrize(
     ("folder", "median_px"),
     [
-        (FOUNTAIN, 0.2),
+        nightly(FOUNTAIN, 0.2),
         nightly(KITCHEN, 0.5),
         nightly(OFFICE, 1.2),
         nightly("kitti-drive-a", 0.5),

@@ -9,9 +9,9 @@ import pytest
 from mapless_server.method.answer import Localization
 from mapless_tools.dataset import Dataset
 from research.gravity import SENSORS, error_of, is_right, sensed
-from research.places import Measured, Pair, Place, answered, read_place, right_pairs
+from research.places import Measured, Pair, Place, answered, right_pairs
 
-from .conftest import DATA
+from .conftest import read_place_once
 
 pytestmark = pytest.mark.realdata
 
@@ -31,7 +31,7 @@ def checks(it: Measured) -> tuple[bool, bool]:
 
 def test_gravity_neither_moves_nor_loses_a_good_answer(photographs: Callable[[str], Dataset]) -> None:
     photographs(FOUNTAIN)
-    place = read_place(DATA / FOUNTAIN)
+    place = read_place_once(FOUNTAIN)
     found = measured(list(right_pairs(place, None, (3,)))[::4], place, ("none", "1°", "upside down"))
     for none, right, upside_down in zip(*found.values(), strict=True):
         assert is_right(none)
@@ -43,6 +43,6 @@ def test_gravity_neither_moves_nor_loses_a_good_answer(photographs: Callable[[st
 def test_a_weak_answer_gains(photographs: Callable[[str], Dataset]) -> None:
     """No reference within three frames: with gravity more of these photographs are localized."""
     photographs(OFFICE)
-    place = read_place(DATA / OFFICE)
+    place = read_place_once(OFFICE)
     found = measured(list(right_pairs(place, None, (5,), frames_apart=3))[2:6], place, ("none", "1°"))
     assert sum(map(is_right, found["1°"])) > sum(map(is_right, found["none"]))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from itertools import chain, combinations
 
 import numpy as np
@@ -15,9 +14,9 @@ from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
 from mapless_server.method.trust.focal import FocalOptions, wrong_focal
 from mapless_tools.dataset import Dataset
-from research.places import METRIC, OTHERS, Measured, Place, answered, cross_pairs, read_places, right_pairs
+from research.places import METRIC, OTHERS, Measured, Place, answered, cross_pairs, right_pairs
 
-from .conftest import DATA
+from .conftest import read_place_once
 
 pytestmark = pytest.mark.realdata
 
@@ -28,16 +27,11 @@ ALL = LocalizeOptions(coverage=1.0)
 STRANGER_PARTS = 4
 
 
-@cache
-def fountain() -> Place:
-    """Described once."""
-    return read_places(DATA, [FOUNTAIN])[FOUNTAIN]
-
-
+@pytest.mark.nightly
 def test_right_answers_are_trusted_and_another_place_is_not(photographs: Photographs) -> None:
     """Two surveyed scenes, each photograph from two others of its own scene, and from those of the other one."""
     photographs(FOUNTAIN), photographs(HERZ)
-    places = {FOUNTAIN: fountain()} | read_places(DATA, [HERZ])
+    places = {name: read_place_once(name) for name in (FOUNTAIN, HERZ)}
     right = list(answered(chain.from_iterable(list(right_pairs(it, None, (2,)))[::2] for it in places.values()), ALL))
     assert all(it.right for it in right)
     assert min(trust_of(it) for it in right) >= 0.05
@@ -49,7 +43,7 @@ def test_right_answers_are_trusted_and_another_place_is_not(photographs: Photogr
 def test_a_wrong_focal_length_is_reported_with_the_right_one(photographs: Photographs) -> None:
     """A focal length 15 percent off would move the pose by as much of its distance: nearly all of it is estimated."""
     photographs(FOUNTAIN)
-    place = fountain()
+    place = read_place_once(FOUNTAIN)
     pair = list(right_pairs(place, None, (4,)))[5]
     given = pair.query.camera
     for factor in (0.85, 1.15):
@@ -67,7 +61,7 @@ def test_a_wrong_focal_length_is_reported_with_the_right_one(photographs: Photog
 def test_a_scene_with_half_its_references_moved_is_ambiguous(photographs: Photographs) -> None:
     """The known poses of every second reference are moved by five metres: both places are reported."""
     photographs(FOUNTAIN)
-    place = fountain()
+    place = read_place_once(FOUNTAIN)
     shift = np.array([5.0, 0.0, 0.0])
     poses = {i: pose.shifted(shift) if i % 2 else pose for i, pose in place.poses.items()}
     moved = type(place)(place.name, place.views, poses)
@@ -82,10 +76,9 @@ def test_a_scene_with_half_its_references_moved_is_ambiguous(photographs: Photog
     assert np.linalg.norm(centres[0] - centres[1]) == pytest.approx(5.0, abs=0.1)
 
 
-@cache
 def all_places() -> dict[str, Place]:
     """Of all metric scenes, and of the others."""
-    return read_places(DATA, [*dict.fromkeys(name for name, _ in METRIC), *OTHERS])
+    return {name: read_place_once(name) for name in dict.fromkeys([*(name for name, _ in METRIC), *OTHERS])}
 
 
 @pytest.mark.nightly

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +12,9 @@ from mapless_server.method.answer import Localization
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.uncertainty.radii import accuracy_from_covariance
 from mapless_tools.dataset import Dataset
-from research.places import answered, read_places, right_pairs
+from research.places import answered, right_pairs
+
+from .conftest import read_place_once
 
 pytestmark = pytest.mark.realdata
 
@@ -23,10 +24,9 @@ def fewest(probability: float, count: int, share: float) -> float:
     return float(np.ceil(bdtrik(probability, count, share)))
 
 
-def held(data: Path, scene: str, k: int) -> tuple[int, dict[str, int]]:
+def held(scene: str, k: int) -> tuple[int, dict[str, int]]:
     """Answers of a scene's photographs, each left out once and given K references, and how many radii held."""
-    place = read_places(data, [scene])[scene]
-    found = list(answered(right_pairs(place, None, (k,)), LocalizeOptions(coverage=1.0)))
+    found = list(answered(right_pairs(read_place_once(scene), None, (k,)), LocalizeOptions(coverage=1.0)))
     rows: list[Sequence[bool]] = []
     for it in found:
         assert isinstance(it.answer.outcome, Localization)
@@ -50,8 +50,8 @@ def held(data: Path, scene: str, k: int) -> tuple[int, dict[str, int]]:
 )
 def test_radii_contain_the_truth_as_often_as_stated(photographs: Callable[[str], Dataset], scene: str, k: int) -> None:
     """Within what chance allows one time in a thousand; photographs of one walk are not independent, besides."""
-    data = photographs(scene).frames[0].image_path.parents
-    count, shares = held(next(it.parent for it in data if it.name == scene), scene, k)
+    photographs(scene)
+    count, shares = held(scene, k)
     assert count >= 11
     low, high = fewest(0.0005, count, 0.68), fewest(0.9995, count, 0.68)
     for name in ("position 68", "rotation 68"):

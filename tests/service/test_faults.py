@@ -267,6 +267,7 @@ class TestMethods:
             with pytest.raises(grpc.RpcError, match="UNAVAILABLE"):
                 next(watch)
 
+    @pytest.mark.nightly
     def test_one_that_hangs_during_the_drain_is_a_failure_too(self, tmp_path: Path) -> None:
         with (
             gated(tmp_path / "server", "hangs", workers=1, stall_limit_s=2.5, drain_grace_s=50) as server,
@@ -357,7 +358,9 @@ class TestProcess:
                     stored = {it.reference_id for it in client.list_references("s")}
         assert {name for names in acknowledged for name in names} <= stored
 
-    @pytest.mark.parametrize("signals", [[signal.SIGTERM], [signal.SIGINT, signal.SIGTERM]])
+    @pytest.mark.parametrize(
+        "signals", [[signal.SIGTERM], pytest.param([signal.SIGINT, signal.SIGTERM], marks=pytest.mark.nightly)]
+    )
     def test_a_signal_drains_in_order(self, tmp_path: Path, signals: list[signal.Signals]) -> None:
         """Health first, while calls are still taken; then none; what runs and what waits is answered; exit code 0."""
         settings: dict[str, Any] = {

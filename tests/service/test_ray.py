@@ -258,6 +258,7 @@ FAILING: dict[str, tuple[type[MaplessError], Callable[[Client], Any]]] = {
 }
 
 
+@nightly
 def test_errors_are_those_of_the_plain_server_with_details(url: str, guarded: Guarded, tmp_path: Path) -> None:
     with (
         serving(tmp_path, store=Store.connect(url), tokens_file=guarded.tokens_file) as plain,
@@ -383,6 +384,7 @@ def test_calls_that_name_no_scene_come_to_both_by_turns(guarded: Guarded) -> Non
     assert min(counts.count(replica.process_id) for replica in guarded.cluster.replicas()) >= 8
 
 
+@nightly
 def test_additions_through_one_replica_are_used_by_the_other(guarded: Guarded) -> None:
     with ExitStack() as stack:
         one, other = (

@@ -303,7 +303,7 @@ def kill_and_check(database: str, folder: Path, rounds: int) -> None:
 
 @pytest.mark.parametrize("database", DATABASES)
 def test_killed_at_random_moments(database: str, tmp_path: Path) -> None:
-    kill_and_check(database, tmp_path, 10)
+    kill_and_check(database, tmp_path, DATABASE_IS_KILLED_EVERY)
 
 
 def check_scenes(place: Place) -> None:

@@ -194,7 +194,7 @@ time.sleep(60)
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.nightly)])
 def test_an_interrupted_fetch_leaves_nothing(folder: Path, tmp_path: Path, number: signal.Signals) -> None:
     """A package called pip stands for pip, before it on the path."""
     pytest.importorskip("torch")

@@ -64,7 +64,7 @@ def test_a_log_file_has_the_output_of_a_child_that_failed(tmp_path: Path, capfd:
     assert capfd.readouterr().err == ""
 
 
-@pytest.mark.parametrize("module", [None, "mapless_tools.load.no_op"])
+@pytest.mark.parametrize("module", [None, pytest.param("mapless_tools.load.no_op", marks=pytest.mark.nightly)])
 def test_a_child_on_a_folder_does_not_reach_for_a_database(
     module: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
