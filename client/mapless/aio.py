@@ -18,7 +18,8 @@ import grpc.aio
 
 from .calls import health, localization
 from .calls import references as reference_calls
-from .errors import from_rpc_error
+from .connecting import explained
+from .errors import REFUSED, from_rpc_error
 from .exchange import Attempt, Exchange, Methods, Pages, Pause, Reader, attempts
 from .options import ConnectOptions
 from .requests import NewReference
@@ -83,6 +84,7 @@ class Client:
         """
         asyncio.get_running_loop()
         self.options = options or ConnectOptions()
+        self._address = address
         self._channel = self.options.aio_channel(address)
         self._methods = Methods(self._channel, self.options.metadata())
 
@@ -175,4 +177,7 @@ class Client:
             finally:
                 response.cancel()
         except grpc.RpcError as error:
-            reader.fail(from_rpc_error(error))
+            failure = from_rpc_error(error)
+            if REFUSED in failure.message:
+                failure = await asyncio.to_thread(explained, failure, self._address, self.options)
+            reader.fail(failure)

@@ -12,6 +12,7 @@ import grpc
 
 from .calls import health, localization
 from .calls import references as reference_calls
+from .connecting import explained
 from .errors import from_rpc_error
 from .exchange import Attempt, Exchange, Methods, Pages, Pause, Reader, attempts
 from .options import ConnectOptions
@@ -73,6 +74,7 @@ class Client:
             options: how to connect.
         """
         self.options = options or ConnectOptions()
+        self._address = address
         self._channel = self.options.channel(address)
         self._methods = Methods(self._channel, self.options.metadata())
         self._closed = threading.Event()
@@ -178,4 +180,4 @@ class Client:
             finally:
                 response.cancel()
         except grpc.RpcError as error:
-            reader.fail(from_rpc_error(error))
+            reader.fail(explained(from_rpc_error(error), self._address, self.options))

@@ -12,7 +12,8 @@ from google.rpc import error_details_pb2, status_pb2
 
 _DETAILS_KEY = "grpc-status-details-bin"
 _NO_TIME = "Deadline Exceeded"
-_NOT_CONNECTED = ("connections to all backends failing", "failed to connect to all addresses")
+_NOT_CONNECTED = "connections to all backends failing"
+REFUSED = "no server listens there"
 _NOT_CONNECTED_BECAUSE = {
     "Socket closed": "the server closes the connection at once; if it uses TLS, give --tls or --ca FILE (Python: tls, "
     "root_certificates), and --cert if it requires a client certificate",
@@ -20,7 +21,7 @@ _NOT_CONNECTED_BECAUSE = {
     "unable to get local issuer certificate": "the server's certificate is not signed by a known authority; give its "
     "certificate with --ca FILE (Python: root_certificates)",
     "Failed to create security handshaker": "the given certificates are unusable; they must be PEM",
-    "Connection refused": "no server listens there (connection refused)",
+    "Connection refused": f"{REFUSED} (connection refused)",
 }
 _ADDRESS = re.compile(r"ipv[46]:(\S+): ")
 Detail = TypeVar("Detail", bound=Message)
@@ -120,6 +121,7 @@ def from_rpc_error(error: Any) -> MaplessError:
         status = status_pb2.Status()
     info = _detail(status, error_details_pb2.ErrorInfo())
     retry = _detail(status, error_details_pb2.RetryInfo())
+    request = _detail(status, error_details_pb2.RequestInfo())
     code: grpc.StatusCode = error.code()
     failure = _BY_CODE.get(code.name, MaplessError)(
         code.name,
@@ -127,7 +129,7 @@ def from_rpc_error(error: Any) -> MaplessError:
         reason=info.reason if info else "",
         field=(info.metadata.get("field") if info else None),
         retry_after_s=retry.retry_delay.ToNanoseconds() / 1e9 if retry else None,
-        request_id=metadata.get("x-request-id", ""),
+        request_id=metadata.get("x-request-id", "") or (request.request_id if request else ""),
     )
     failure.__cause__ = error
     return failure
@@ -145,8 +147,6 @@ def _message(details: str) -> str:
     where = unquote(address[1]) if address else ""
     if where.endswith(":443") and "Connection refused" in reason:
         known += "; an address without a port has port 443"
-    if where.startswith("["):  # the last of all that a name such as localhost has, and the only one that gRPC reports
-        known = f"{known or reason}; there may be another reason at the name's IPv4 address, such as 127.0.0.1"
     return f"cannot connect{f' to {where}' if where else ''}: {known or reason}"
 
 

@@ -16,7 +16,6 @@ _TOKEN = re.compile(r"[!-~]{1,4096}", re.ASCII)
 _FIRST_RECONNECT_MS = 200
 _TIMES = ("timeout_s", "upload_timeout_s", "max_reconnect_s", "keepalive_s", "keepalive_timeout_s")
 _CLIENT_ID = re.compile(r"[A-Za-z0-9_.-]{1,64}", re.ASCII)  # it enters the server's log
-_LOCAL = ("localhost", "localhost.")
 _SCHEMES = ("dns", "ipv4", "ipv6", "unix", "unix-abstract", "vsock", "xds")
 """Of grpc's own forms of an address."""
 
@@ -101,9 +100,15 @@ class ConnectOptions:
         if self.client_id and not _CLIENT_ID.fullmatch(self.client_id):
             raise ValueError(f"client_id must be 1 to 64 characters of A-Z a-z 0-9 _ . -, is {self.client_id!a}")
 
-    def channel(self, address: str) -> grpc.Channel:
-        """A channel to "host:port"; it does not connect yet. ValueError for a URL or an address without a host."""
-        credentials, options = self._credentials(), self.channel_options(_checked(address))
+    def channel(self, address: str, host: str = "") -> grpc.Channel:
+        """A channel to "host:port"; it does not connect yet. ValueError for a URL or an address without a host.
+
+        `host` is the name for which the server has its certificate, if it is not that of the address.
+        """
+        credentials, options = self._credentials(), self.channel_options()
+        if host:
+            options.append(("grpc.ssl_target_name_override", host))
+        address = _checked(address)
         channel: grpc.Channel = (
             grpc.secure_channel(address, credentials, options=options)
             if credentials is not None
@@ -113,7 +118,8 @@ class ConnectOptions:
 
     def aio_channel(self, address: str) -> grpc.aio.Channel:
         """An asynchronous channel of the running event loop; otherwise as `channel`."""
-        credentials, options = self._credentials(), self.channel_options(_checked(address))
+        credentials, options = self._credentials(), self.channel_options()
+        address = _checked(address)
         if credentials is not None:
             return grpc.aio.secure_channel(address, credentials, options=options)
         return grpc.aio.insecure_channel(address, options=options)
@@ -132,14 +138,12 @@ class ConnectOptions:
         client_id = ((CLIENT_ID_KEY, self.client_id),) if self.client_id else ()
         return token + client_id
 
-    def channel_options(self, address: str = "") -> list[tuple[str, int | str]]:
-        """The options in grpc's form, for a channel to an address."""
+    def channel_options(self) -> list[tuple[str, int | str]]:
+        """The options in grpc's form."""
         max_message_bytes = self.max_message_mib * 2**20
         max_reconnect_ms = round(1000 * self.max_reconnect_s)
-        # Several servers behind one name share the calls; a lost server is skipped. The addresses of localhost, first
-        # IPv6, are one server: tried in order, and the error is that of the last, where it usually listens.
-        policy = "pick_first" if address.rpartition(":")[0] in _LOCAL or address in _LOCAL else "round_robin"
-        config: dict[str, Any] = {"loadBalancingConfig": [{policy: {}}]}
+        # Several servers behind one name share the calls; a lost server is skipped.
+        config: dict[str, Any] = {"loadBalancingConfig": [{"round_robin": {}}]}
         return [
             ("grpc.max_send_message_length", max_message_bytes),
             ("grpc.max_receive_message_length", max_message_bytes),

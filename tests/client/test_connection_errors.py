@@ -13,7 +13,8 @@ import pytest
 from support.certificates import authority, signed
 
 from mapless import Client, ConnectOptions, MaplessError
-from mapless.errors import _message
+from mapless.connecting import explained
+from mapless.errors import REFUSED, _message
 
 OURS, ANOTHER = authority(), authority("another")
 CERTIFICATE = signed(OURS, "server")
@@ -59,14 +60,32 @@ def test_a_failed_connection_is_explained(
     assert expected in caught.value.message
 
 
-def test_localhost_says_what_is_wrong_at_its_ipv4_address(addresses: dict[str, str]) -> None:
-    """Where it has an IPv6 address, too, and nothing listens there."""
-    for _ in range(3):
-        with Client(addresses["tls"].replace("127.0.0.1", "localhost"), ConnectOptions(max_attempts=1)) as client:
-            with pytest.raises(MaplessError) as caught:
-                client.is_serving()
-            assert caught.value.message.startswith(f"cannot connect to {addresses['tls']}: ")
-            assert "if it uses TLS" in caught.value.message
+@pytest.mark.parametrize("certificates", [None, ANOTHER.certificate_pem])
+def test_localhost_says_what_is_wrong_where_the_server_is(
+    addresses: dict[str, str], certificates: bytes | None
+) -> None:
+    """Nothing listens at its IPv6 address, which gRPC reports as often as the other."""
+    address = addresses["tls"].replace("127.0.0.1", "localhost")
+    options = ConnectOptions(tls=certificates is not None, root_certificates=certificates, max_attempts=1)
+    expected = "is not signed by a known authority" if certificates else "if it uses TLS"
+    for _ in range(4):
+        with Client(address, options) as client, pytest.raises(MaplessError) as caught:
+            client.is_serving()
+        assert caught.value.message.startswith(f"cannot connect to {addresses['tls']}: ")
+        assert expected in caught.value.message
+
+
+def test_a_hidden_reason_is_found(addresses: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two addresses of a name, the one that is reported is the one where nothing listens."""
+    host, port = addresses["tls"].split(":")
+    found = [(socket.AF_INET6, 0, 0, "", ("::1", int(port), 0, 0)), (socket.AF_INET, 0, 0, "", (host, int(port)))]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+    reported = MaplessError("UNAVAILABLE", f"cannot connect to [::1]:{port}: {REFUSED} (connection refused)")
+    shown = explained(reported, f"localhost:{port}", ConnectOptions())
+    assert shown.message.startswith(f"cannot connect to {addresses['tls']}: the server closes the connection")
+    nowhere = addresses["nobody"].rpartition(":")[2]
+    assert explained(reported, f"localhost:{nowhere}", ConnectOptions()) is reported
+    assert explained(reported, f"[::1]:{port}", ConnectOptions()) is reported
 
 
 @pytest.mark.parametrize(
@@ -95,7 +114,7 @@ def test_addresses_of_grpc_are_accepted(address: str) -> None:
     ("address", "expected"),
     [
         ("ipv4:127.0.0.1:443", "cannot connect to 127.0.0.1:443: no server .*; an address without a port has port 443"),
-        ("ipv6:%5B::1%5D:50051", r"cannot connect to \[::1\]:50051: no server .*; there may be another reason at"),
+        ("ipv6:%5B::1%5D:50051", r"cannot connect to \[::1\]:50051: no server listens there"),
     ],
 )
 def test_an_address_that_was_not_meant_is_explained(address: str, expected: str) -> None:
