@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,15 @@ from mapless_server.engine.tiers import UNRECOVERABLE, EscalationOptions, better
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.results import PoseStage
+from mapless_server.method.results import (
+    KeypointNoise,
+    PointMatches,
+    PoseEstimate,
+    PoseStage,
+    Structure,
+    Support,
+)
+from mapless_server.method.tracks import Tracks
 from mapless_server.method.uncertainty.radii import accuracy_from_covariance, error_radii
 
 OPTIONS = EscalationOptions()
@@ -42,6 +51,20 @@ def localized(
     pose = RigidTransform(rotation_from_vector([0.0, np.radians(turn_deg), 0.0]), np.array([x_m, 0.0, 0.0]))
     covariance = np.diag([sigma_m**2] * 3 + [np.radians(0.1) ** 2] * 3)
     return Answer(Localization(pose, covariance, PoseStage.REFINED, inliers, 2 * inliers, 0.7, (), trust))
+
+
+DISTANCE_M = 10.0
+
+
+def found(answer: Answer, x_m: float, inliers: int) -> Answer:
+    """With the pose that was found, whether accepted or not, of points 10 m ahead."""
+    points, none = np.tile([x_m, 0.0, DISTANCE_M], (inliers, 1)), np.empty(0, np.intp)
+    matches = PointMatches(np.arange(inliers), np.arange(inliers), np.zeros(inliers, bool), 20.0)
+    pose = RigidTransform(np.eye(3), np.array([x_m, 0.0, 0.0]))
+    estimate = PoseEstimate(pose, PoseStage.REFINED, np.ones(inliers, bool), np.zeros(inliers), np.eye(6))
+    structure = Structure(points, Tracks(none, none, none), KeypointNoise(1.0, 0.0))
+    unused: Any = None
+    return replace(answer, support=Support(unused, (), structure, matches, estimate, np.zeros(3)))
 
 
 def rejected(reason: RejectionReason = RejectionReason.TOO_FEW_MATCHES) -> Answer:
@@ -107,6 +130,23 @@ class TestBetter:
             assert outcome.message == f"the features disagree: {expected}"
         else:
             assert isinstance(outcome, Localization)
+
+    @pytest.mark.parametrize("reason", [RejectionReason.GATE, RejectionReason.AMBIGUOUS])
+    @pytest.mark.parametrize(("inliers", "is_answered"), [(44, False), (45, True)])
+    def test_a_rejected_pose_elsewhere_contradicts_unless_clearly_weaker(
+        self, reason: RejectionReason, inliers: int, is_answered: bool
+    ) -> None:
+        for share, expected in ((0.9, True), (1.1, is_answered)):
+            x_m = share * OPTIONS.same_share * DISTANCE_M
+            first = found(rejected(reason), 0.0, 30)
+            second = found(localized(x_m, inliers=inliers), x_m, inliers)
+            chosen = better(first, second)
+            assert chosen.tier is STRONG
+            assert isinstance(chosen.answer.outcome, Localization) is expected
+
+    def test_a_pose_that_contradicted_a_prior_is_no_evidence(self) -> None:
+        first = found(rejected(RejectionReason.PRIOR_CONFLICT), 0.0, 300)
+        assert isinstance(better(first, found(localized(3.0), 3.0, 100)).answer.outcome, Localization)
 
     @given(apart_m=st.floats(0, 3), sigma_m=st.floats(1e-3, 0.5))
     def test_poses_agree_within_the_sum_of_95_radii_or_the_distance(self, apart_m: float, sigma_m: float) -> None:

@@ -199,6 +199,15 @@ class Support:
     origin: Array
     two_view: TwoViewSupport | None = None
 
+    def distance_m(self) -> float:
+        """Median depth of the inliers' points at the estimate; always positive."""
+        assert self.estimate is not None
+        x_in_world = self.structure.x_in_world[self.matches.point[self.estimate.inliers]]
+        if self.two_view is not None:
+            x_in_world = np.concatenate([x_in_world, self.two_view.x_in_world[self.two_view.inliers]])
+        depth_m = self.estimate.world_from_camera.inverse().apply(x_in_world)[:, 2]
+        return max(float(np.median(depth_m)), float(np.finfo(float).tiny))
+
     def inliers_by_reference(self) -> tuple[int, ...]:
         """Per reference, inliers on points that it observes, and inliers of two views."""
         count = len(self.references)
