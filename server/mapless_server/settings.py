@@ -115,7 +115,7 @@ class Settings(BaseModel):
     """Memory for references' features, MiB."""
     background_matching: bool = True
     """Whether references are matched with one another when the server is idle, so that queries need not."""
-    coverage: float = Field(default=0.97, gt=0, lt=1)
+    coverage: float = Field(default=0.95, gt=0, lt=1)
     """Share of right answers to accept where a request sets none; a larger one also accepts more wrong answers."""
     allow_watching: bool = False
     """Whether WatchQueries may show callers' photographs to callers with the role write; takes memory for 24 images."""

@@ -45,9 +45,9 @@ def test_an_arbitrary_unit_is_not_called_metres() -> None:
 
 
 def test_low_trust_is_warned_of() -> None:
-    warning = "  warning   fewer than 5 % of right answers look as doubtful: check the intrinsics"
-    assert lines(localized(trust=0.049))[-1] == warning
-    for trust in (0.05, 0.9, None):
+    warning = "  warning   fewer than 15 % of right answers look as doubtful: check the intrinsics"
+    assert lines(localized(trust=0.149))[-1] == warning
+    for trust in (0.15, 0.9, None):
         assert not [line for line in lines(localized(trust=trust)) if "warning" in line]
 
 

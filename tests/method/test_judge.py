@@ -18,7 +18,7 @@ from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import PoseEstimate, Support
 from mapless_server.method.trust.agreement import AgreementOptions
-from mapless_server.method.trust.evidence import Evidence, evidence_of, findable_count, hull_share
+from mapless_server.method.trust.evidence import Evidence, epipolar_share, evidence_of, findable_count, hull_share
 from mapless_server.method.trust.judge import LEVELS, JudgeOptions, judge, trust_of
 from mapless_server.method.trust.votes import votes_of
 from mapless_server.method.views import Matches, PosedView
@@ -31,10 +31,11 @@ GOOD = Evidence(
     found_share=0.5,
     expected_share=0.6,
     hull_share=0.6,
+    epipolar_share=0.7,
     matches_apart=0.0015,
     references_apart=0.002,
 )
-POOR = Evidence(22, 102, 0.1, 0.6, 0.04, 0.3, 0.2)
+POOR = Evidence(22, 102, 0.1, 0.6, 0.04, 0.1, 0.3, 0.2)
 """Such a pose was off by a tenth of the distance to the photograph's contents."""
 
 
@@ -77,6 +78,7 @@ def test_trust_is_high_with_good_support_and_low_without() -> None:
         replace(GOOD, found_share=0.6),
         replace(GOOD, expected_share=0.5),
         replace(GOOD, hull_share=0.9),
+        replace(GOOD, epipolar_share=0.8),
         replace(GOOD, matches_apart=0.001),
         replace(GOOD, references_apart=0.001),
     ],
@@ -87,7 +89,7 @@ def test_more_evidence_raises_the_score(better: Evidence) -> None:
 
 def test_the_score_is_the_formula() -> None:
     apart = np.hypot(GOOD.matches_apart, GOOD.references_apart)
-    assert pytest.approx(np.log(0.5 / 0.6 * 0.6 / apart)) == GOOD.score
+    assert pytest.approx(np.log(0.5 / 0.6 * 0.6 * 0.7 / apart)) == GOOD.score
 
 
 @pytest.mark.parametrize("shape", ["line", "one point"])
@@ -137,7 +139,8 @@ def test_worse_matches_and_fewer_points_lower_the_trust() -> None:
 
 
 def evidence(support: Support) -> Evidence:
-    return evidence_of(support, votes_of(support, query_matches_of(support)), AgreementOptions())
+    matches = query_matches_of(support)
+    return evidence_of(support, votes_of(support, matches), matches, AgreementOptions())
 
 
 def test_evidence_has_the_planted_counts() -> None:
@@ -152,6 +155,22 @@ def test_evidence_has_the_planted_counts() -> None:
     assert found.found_share == pytest.approx(expected)
     assert 0.5 < found.expected_share <= 1.0  # of what is inside a reference it sees nine tenths
     assert found.disagreement < 0.01
+
+
+def test_epipolar_share_is_the_planted_share_of_two_references() -> None:
+    """Wrong matches of the two best references count, those of others do not."""
+    support = support_of()
+    assert support.estimate is not None
+    strongest = np.argsort(-np.array(support.inliers_by_reference()), kind="stable")[:2].tolist()
+    for shares in ((0.0, 0.0), (0.5, 0.0), (0.5, 0.25)):
+        matches = query_matches_of(support)
+        for view, of_reference in enumerate(matches):
+            share = shares[strongest.index(view)] if view in strongest else 0.9
+            wrong = np.arange(len(of_reference)) < share * len(of_reference)
+            of_reference[wrong, 1] = np.roll(of_reference[wrong, 1], 7)
+        expected = (1 - shares[0]) * (1 - shares[1])
+        found = epipolar_share(support, matches, support.estimate.world_from_camera)
+        assert found == pytest.approx(expected, abs=0.05), "but for wrong ones that are on the line by chance"
 
 
 def test_the_unit_of_the_world_is_no_evidence() -> None:
@@ -173,7 +192,7 @@ def test_the_unit_of_the_world_is_no_evidence() -> None:
 
 def test_degenerate_evidence_has_a_finite_score() -> None:
     """No result of a solver may give a score of NaN, which no comparison rejects."""
-    worst = Evidence(4, 5000, 0.0, 0.0, 0.0, 1.0, 1.0)
+    worst = Evidence(4, 5000, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0)
     assert np.isfinite(worst.score)
     assert trust_of(worst, OPTIONS) < 1 - COVERAGE
 
@@ -197,7 +216,7 @@ def test_options_outside_their_bounds_are_refused(wrong: dict[str, tuple[float, 
 
 def test_agreement_with_gravity_only_adds_to_the_trust() -> None:
     """As much as its chance is small, and less than if nothing but chance made poses wrong."""
-    doubtful = Evidence(40, 60, 0.2, 0.5, 0.2, 0.02, 0.03)
+    doubtful = Evidence(40, 60, 0.2, 0.5, 0.2, 0.3, 0.02, 0.03)
     trusts = [trust_of(doubtful, OPTIONS, log10_chance) for log10_chance in (0.0, -1.0, -3.0)]
     assert trusts[0] == trust_of(doubtful, OPTIONS)
     assert trusts[0] < trusts[1] < trusts[2]

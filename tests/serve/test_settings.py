@@ -105,7 +105,7 @@ def test_features_that_can_be_made_are_those_of_the_setting(tmp_path: Path) -> N
     ("name", "bounds", "default"),
     [
         ("port", "0 to 65535", "50051"),
-        ("coverage", "above 0, below 1", "0.97"),
+        ("coverage", "above 0, below 1", "0.95"),
         ("max_queued_s", "above 0", "2"),
         ("workers", "at least 1", "all cores"),
         ("warm_up", "", "true"),

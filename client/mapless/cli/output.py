@@ -19,7 +19,7 @@ from .. import wire
 from ..answers import Accuracy, LocalizationResult, PriorCheck, Rejected
 from ..geometry import Camera, RigidTransform
 
-DOUBTFUL_TRUST = 0.05
+DOUBTFUL_TRUST = 0.15
 """Below it, an answer looks worse than 19 of 20 right ones: usually the intrinsics are wrong."""
 
 _NUMBER = re.compile(r"-?[\d.]+")

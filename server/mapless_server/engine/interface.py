@@ -44,7 +44,7 @@ class EngineOptions:
     image_limits: ImageLimits = field(default_factory=ImageLimits)
     index_cache_bytes: int = 1024 * 2**20
     escalation: EscalationOptions = field(default_factory=EscalationOptions)
-    coverage: float = 0.97
+    coverage: float = 0.95
     queue: WorkQueueOptions = field(default_factory=WorkQueueOptions)
 
     def __post_init__(self) -> None:

@@ -59,12 +59,13 @@ class LocalizeOptions:
     Attributes:
         variant: variant of the method.
         scale_strategy: how the metric scale is estimated.
-        coverage: share of right answers to accept; a larger share accepts more wrong answers too (see `trust.judge`).
+        coverage: share of right answers to accept, in a difficult place; a larger share accepts more wrong answers too
+            (see `trust.judge`).
     """
 
     variant: Variant = Variant.BEST
     scale_strategy: ScaleStrategy = ScaleStrategy.TWO_STAGE
-    coverage: float = 0.97
+    coverage: float = 0.95
 
     def __post_init__(self) -> None:
         check_bounds(self, "coverage", above=0, at_most=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,15 +13,19 @@ from scipy.spatial import ConvexHull
 from mapless.geometry import Array, RigidTransform
 
 from ..results import PointMatches, Support
-from ..views import View
+from ..two_view.matches import TwoViewMatches
+from ..views import Matches, View
 from .agreement import AgreementOptions, disagreement_of_matches, disagreement_of_references
 from .votes import Votes
 
 MOST_POINTS = 2000
 """The shares that references find are computed from so many points, evenly thinned."""
 
-LEAST_SHARE, LEAST_HULL_SHARE, LEAST_DISAGREEMENT = 0.01, 0.002, 0.001
+LEAST_SHARE, LEAST_HULL_SHARE, LEAST_EPIPOLAR_SHARE, LEAST_DISAGREEMENT = 0.01, 0.002, 0.0004, 0.001
 """Below these evidence is not better or worse. A right pose's halves are apart by a thousandth of the distance."""
+
+EPIPOLAR_PX = 2.0
+"""Largest Sampson distance of a match that agrees with a pose; keypoints are accurate to about a pixel."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +40,8 @@ class Evidence:
         expected_share: the same of the references, the median: in the dark, between distant references, or where much
             is hidden, a reference finds few of the points that it should see, too.
         hull_share: share of the image covered by the convex hull of the inliers.
+        epipolar_share: share of the matches with a reference that lie on their epipolar lines, for the two references
+            with the most inliers, multiplied. Most of these matches have no point, so they took no part in the pose.
         matches_apart: distance of the cameras that halves of the matches give, as a share of their distance from what
             they see.
         references_apart: the same for halves of the references.
@@ -45,6 +52,7 @@ class Evidence:
     found_share: float
     expected_share: float
     hull_share: float
+    epipolar_share: float
     matches_apart: float
     references_apart: float
 
@@ -60,20 +68,24 @@ class Evidence:
 
     @property
     def score(self) -> float:
-        """ln(found ratio x hull share / disagreement); larger for better evidence.
+        """ln(found ratio x hull share x epipolar share / disagreement); larger for better evidence.
 
-        Fitted weights of the three logarithms were 0.67, 0.72 and 0.67, so they have none.
+        Fitted weights of the logarithms were alike, so they have none.
         """
-        found = max(LEAST_SHARE, self.found_ratio)
-        return math.log(found * max(LEAST_HULL_SHARE, self.hull_share) / max(LEAST_DISAGREEMENT, self.disagreement))
+        found, hull = max(LEAST_SHARE, self.found_ratio), max(LEAST_HULL_SHARE, self.hull_share)
+        epipolar = max(LEAST_EPIPOLAR_SHARE, self.epipolar_share)
+        return math.log(found * hull * epipolar / max(LEAST_DISAGREEMENT, self.disagreement))
 
 
-def evidence_of(support: Support, votes: Votes, options: AgreementOptions) -> Evidence:
+def evidence_of(
+    support: Support, votes: Votes, query_matches: Sequence[Matches], options: AgreementOptions
+) -> Evidence:
     """The evidence for the estimate of a support.
 
     Args:
         support: with an estimate of four inliers or more.
         votes: of the query's matches.
+        query_matches: of the query with each reference.
         options: of the agreement of halves.
 
     Raises:
@@ -83,14 +95,14 @@ def evidence_of(support: Support, votes: Votes, options: AgreementOptions) -> Ev
     if estimate is None or estimate.inliers.sum() < 4:
         raise ValueError("support.estimate must have at least 4 inliers")
     inliers, pose = estimate.inliers, estimate.world_from_camera
-    x_in_camera = pose.inverse().apply(structure.x_in_world[matches.point[inliers]])
-    distance_m = max(float(np.median(x_in_camera[:, 2])), np.finfo(float).tiny)
+    distance_m = support.distance_m()
     return Evidence(
         int(inliers.sum()),
         len(matches),
         min(1.0, float(inliers.sum() / max(1, findable_count(query, structure.x_in_world, pose)))),
         _expected_share(support),
         hull_share(query, matches, inliers),
+        epipolar_share(support, query_matches, pose),
         disagreement_of_matches(support, distance_m, options),
         disagreement_of_references(support, votes, distance_m, options),
     )
@@ -105,6 +117,18 @@ def hull_share(query: View, matches: PointMatches, inliers: NDArray[np.bool_]) -
     """Share of the image covered by the convex hull of the inliers (M,), three or more."""
     pixels = query.features.keypoints[matches.keypoint[inliers]]
     return float(ConvexHull(pixels, qhull_options="QJ").volume) / (query.camera.width_px * query.camera.height_px)
+
+
+def epipolar_share(support: Support, query_matches: Sequence[Matches], world_from_query: RigidTransform) -> float:
+    """Share of the matches on their epipolar lines, of the two references with the most inliers, multiplied."""
+    strongest = np.argsort(-np.array(support.inliers_by_reference()), kind="stable")[:2]
+    chosen = [query_matches[i] for i in strongest]
+    if len(chosen) < 2 or not all(map(len, chosen)):
+        return 0.0
+    matches = TwoViewMatches.of(support.query, [support.references[i] for i in strongest], chosen)
+    # From the same place as a reference the photograph has no epipolar lines, and every match agrees.
+    agreeing = np.nan_to_num(matches.sampson_px(world_from_query)) < EPIPOLAR_PX
+    return float(np.prod([agreeing[matches.reference == i].mean() for i in (0, 1)]))
 
 
 def _inside(view: View, x_in_world: Array, world_from_camera: RigidTransform) -> NDArray[np.bool_]:
