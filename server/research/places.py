@@ -55,6 +55,21 @@ ALL = (
     "statue-of-liberty-internet",
 )
 KS = (10, 5, 3)
+"""References that each photograph of a place is given, the others of the place at choice."""
+SPARSE: dict[str, tuple[int, ...]] = {
+    KITCHEN: (30, 10, 5, 3),
+    "tum-fr3-office": (6,),
+    "kitti-drive-a": (8,),
+    "fountain-P11": (5,),
+    "herz-jesus-P8": (4,),
+    "euroc-v101-drone": (20, 10, 5),
+    "office-lockers": (20, 10),
+    "statue-of-liberty-internet": (20, 10),
+    "meeting-room": (10, 5),
+    "studio-flat": (10, 5),
+    "fox-portrait": (10, 5),
+}
+"""Few references, far apart, of which the queries in between are given ten or all."""
 QUERIES, FRAMES = 40, 150
 CROSS_REFERENCES = 30
 
@@ -187,6 +202,14 @@ def right_pairs(
         chosen = place.posed(place.most_matching(place.views[query], others, max(wanted), features))
         for k in wanted:
             yield Pair(title, k, place.views[query], chosen[:k], place.poses[query], metric=place.metric)
+
+
+def natural_pairs(place: Place, features: str = "sift") -> Iterator[Pair]:
+    """All queries of a place with many and few of its references, near and far apart."""
+    if place.name != KITCHEN:  # a film, where a photograph's neighbours are all but the same
+        yield from right_pairs(place, None, KS, features=features)
+    for count in SPARSE.get(place.name, ()):
+        yield from right_pairs(place, count, (min(10, count),), features=features)
 
 
 def cross_pairs(places: Sequence[Place], queries_each: int, k: int = 10, features: str = "sift") -> Iterator[Pair]:

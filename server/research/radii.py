@@ -1,4 +1,4 @@
-"""The factors of claimed radii, measured: `python -m research.radii FOLDER_OF_SCENES`.
+"""The factors of claimed radii: `python -m research.radii FOLDER_OF_SCENES [--weights FOLDER] [--samples FILE]`.
 
 The model of `method.uncertainty` has two factors on standard deviations and one on the tail, which no theory gives.
 They come from scenes with known poses, every scene counting alike however many photographs it has:
@@ -8,6 +8,7 @@ They come from scenes with known poses, every scene counting alike however many 
                           needs more: an unseen scene may be worse than these.
 
 They are tested by leaving out one scene at a time: fitted on the others, how many of its answers are within the radii.
+Answers that are wrong do not count: telling these is what trust is for (`research.trust`).
 """
 
 from __future__ import annotations
@@ -24,15 +25,14 @@ from scipy.special import bdtrik
 from mapless.geometry import Array
 from mapless_server.method.adjust import AdjustOptions
 from mapless_server.method.answer import Localization
+from mapless_server.method.features import FeatureExtractor, make_extractor
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import StageOptions
 from mapless_server.method.uncertainty.covariance import UncertaintyOptions
 from mapless_server.method.uncertainty.radii import error_radii
 
-from .places import METRIC, answered, read_places, right_pairs, weights_alike
+from .places import ALL, KS, answered, natural_pairs, read_places, weights_alike
 
-KS = (10, 5, 3)
-SETTINGS = tuple((name, count) for name, count in METRIC if count is None or count >= max(KS))
 TAIL_SHARE = 0.97
 """With 95 %, half of the unseen scenes would have fewer within."""
 UNFITTED = StageOptions(
@@ -47,11 +47,13 @@ class Answered:
 
     Attributes:
         scene: its folder.
+        features: their kind.
         k: references asked for, of `KS`; the photographs of a small scene have fewer.
         position_68, position_95, rotation_68, rotation_95: error by radius.
     """
 
     scene: str
+    features: str
     k: int
     position_68: float
     position_95: float
@@ -77,20 +79,19 @@ class Fit:
         )
 
 
-def collect(data: Path) -> Iterator[Answered]:
-    """Localizes the scenes' photographs; minutes."""
-    places = read_places(data, dict.fromkeys(name for name, _ in SETTINGS))
-    for name, count in SETTINGS:
-        for it in answered(right_pairs(places[name], count, KS), LocalizeOptions(coverage=1.0), stages=UNFITTED):
+def collect(data: Path, features: str, extractor: FeatureExtractor) -> Iterator[Answered]:
+    """Localizes everything in a folder of the scenes' folders; half an hour."""
+    for place in read_places(data, ALL, extractor).values():
+        for it in answered(natural_pairs(place, features), LocalizeOptions(coverage=1.0), features, UNFITTED):
             outcome = it.answer.outcome
-            if isinstance(outcome, Localization) and outcome.covariance is not None and it.off is not None:
+            if isinstance(outcome, Localization) and outcome.covariance is not None and it.off is not None and it.right:
                 position, rotation = outcome.covariance[:3, :3], np.degrees(np.degrees(outcome.covariance[3:, 3:]))
                 ratios = (
                     error / radius
                     for error, covariance in zip(it.off, (position, rotation), strict=True)
                     for radius in error_radii(covariance, [0.68, 0.95]).tolist()
                 )
-                yield Answered(name, min(k for k in KS if k >= it.pair.k), *ratios)
+                yield Answered(place.name, features, min(k for k in KS if k >= it.pair.k), *ratios)
 
 
 def fit(answers: Sequence[Answered]) -> Fit:
@@ -107,17 +108,20 @@ def fit(answers: Sequence[Answered]) -> Fit:
 
 def left_out(answers: Sequence[Answered]) -> Iterator[str]:
     """Lines of a table: each scene with the constants that the others give, and the range of a correct 68 %."""
-    yield "| scene left out | K | answers | position 68 % | 95 % | rotation 68 % | 95 % | a correct 68 % |"
-    yield "|---|---|---|---|---|---|---|---|"
+    yield "| scene left out | features | K | answers | position 68 % | 95 % | rotation 68 % | 95 % | a correct 68 % |"
+    yield "|---|---|---|---|---|---|---|---|---|"
+    kinds = tuple(dict.fromkeys(it.features for it in answers))
+    rows = [*(((kind,), KS) for kind in kinds), *((kinds, (k,)) for k in KS), (kinds, KS)]
     for scene in dict.fromkeys(it.scene for it in answers):
         constants = fit([it for it in answers if it.scene != scene])
-        for ks in (*((k,) for k in KS), KS):
-            own = [it for it in answers if it.scene == scene and it.k in ks]
+        for features, ks in rows:
+            own = [it for it in answers if it.scene == scene and it.features in features and it.k in ks]
             if own:
                 shares = np.mean([constants.held(it) for it in own], axis=0)
                 low, high = (100 * np.ceil(bdtrik(p, len(own), 0.68)) / len(own) for p in (0.025, 0.975))
                 cells = " | ".join(f"{100 * share:.0f} %" for share in shares)
-                label = ", ".join(map(str, ks))
+                label = features[0] if len(features) == 1 else "all"
+                label = f"{label} | {', '.join(map(str, ks))}"
                 yield f"| {scene} | {label} | {len(own)} | {cells} | {low:.0f} to {high:.0f} % |"
 
 
@@ -131,12 +135,17 @@ def main() -> None:
     """Measures, fits and prints."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("data", type=Path, help="folder of the scenes' folders")
+    parser.add_argument("--weights", type=Path, help="folder with edgepoint2-l64.safetensors, for these features too")
     parser.add_argument("--samples", type=Path, help="read from this file if it is there, else written to it")
     arguments = parser.parse_args()
     if arguments.samples and arguments.samples.is_file():
         answers = [Answered(**it) for it in json.loads(arguments.samples.read_text())]
     else:
-        answers = list(collect(arguments.data))
+        answers = list(collect(arguments.data, "sift", make_extractor("sift")))
+        if arguments.weights:
+            name = "edgepoint2-l64"
+            extractor = make_extractor(name, arguments.weights / f"{name}.safetensors")
+            answers += collect(arguments.data, name, extractor)
         if arguments.samples:
             arguments.samples.write_text(json.dumps([asdict(it) for it in answers]))
     constants = fit(answers)

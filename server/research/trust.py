@@ -37,24 +37,19 @@ from mapless_server.method.trust.votes import votes_of
 from mapless_server.method.views import Features
 from mapless_tools.dataset import read_folder
 
-from .places import ALL, KITCHEN, Pair, Place, answered, cross_pairs, read_places, right_pairs, weights_alike
+from .places import (
+    ALL,
+    SPARSE,
+    Pair,
+    Place,
+    answered,
+    cross_pairs,
+    natural_pairs,
+    read_places,
+    right_pairs,
+    weights_alike,
+)
 
-LEAVE_ONE_OUT = (10, 5, 3)
-"""References that each photograph of a place is given, the others of the place at choice."""
-SPARSE: dict[str, tuple[int, ...]] = {
-    KITCHEN: (30, 10, 5, 3),
-    "tum-fr3-office": (6,),
-    "kitti-drive-a": (8,),
-    "fountain-P11": (5,),
-    "herz-jesus-P8": (4,),
-    "euroc-v101-drone": (20, 10, 5),
-    "office-lockers": (20, 10),
-    "statue-of-liberty-internet": (20, 10),
-    "meeting-room": (10, 5),
-    "studio-flat": (10, 5),
-    "fox-portrait": (10, 5),
-}
-"""Few references, far apart, of which the queries in between are given ten or all."""
 LEARNED = {"edgepoint2-l64": "edgepoint2-l64.safetensors", "aliked": "aliked-n16.safetensors"}
 """Further kinds of features, and the files of their weights."""
 FEATURES_LEFT = (150, 300)
@@ -88,11 +83,8 @@ class Sample:
 def collect(data: Path, features: str, extractor: FeatureExtractor) -> Iterator[Sample]:
     """Localizes everything in a folder of the scenes' folders; half an hour, with ALIKED an hour."""
     places = read_places(data, ALL, extractor)
-    for name, place in places.items():
-        if name != KITCHEN:  # a film, where a photograph's neighbours are all but the same
-            yield from _samples("natural", right_pairs(place, None, LEAVE_ONE_OUT, features=features), features)
-        for count in SPARSE.get(name, ()):
-            yield from _samples("natural", right_pairs(place, count, (min(10, count),), features=features), features)
+    for place in places.values():
+        yield from _samples("natural", natural_pairs(place, features), features)
     yield from _samples("cross", cross_pairs(list(places.values()), CROSS_QUERIES, CROSS_K, features), features)
     for name, place in places.items():
         random = np.random.default_rng(11)

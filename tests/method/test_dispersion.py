@@ -1,4 +1,4 @@
-"""Dispersion by leaving out references: against the dense equations, and in undetermined cases."""
+"""Dispersion of a pose without parts of its data: against the dense equations, and in undetermined cases."""
 
 from __future__ import annotations
 
@@ -6,141 +6,128 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from support.scenes import random_for
+import scipy.linalg
+from support.planted import NOISE, true_structure
+from support.scenes import SceneOptions, make_scene, random_for
 
 from mapless.geometry import Array
-from mapless_server.method.uncertainty.dispersion import Dispersion, JackknifeInput, LinearizedObservations, disperse
+from mapless_server.method.adjust import AdjustOptions, pose_problem
+from mapless_server.method.bundle import Bundle, BundleProblem
+from mapless_server.method.tracks import Tracks
+from mapless_server.method.uncertainty.dispersion import LEAST_LEFT, Dispersion, disperse
 
 
-def random_input(case: str, points: int = 30, references: int = 4, unknowns: int = 6) -> JackknifeInput:
-    """Random derivatives; every point is seen once by the query and by two references or more."""
-    random = random_for("grounds", case)
-
-    def observations(point: NDArray[np.intp]) -> LinearizedObservations:
-        n = len(point)
-        return LinearizedObservations(
-            point, random.normal(size=(n, 2, 3)), random.normal(size=(n, 2)), random.uniform(0.3, 1, n)
-        )
-
-    seen = random.random((points, references)) < 0.6
-    seen[:, 0] = seen[:, 1] = True
-    point, reference = np.nonzero(seen)
-    query = observations(random.permutation(points))
-    return JackknifeInput(query, random.normal(size=(points, 2, unknowns)), observations(point), reference, references)
+def planted(case: str, references: int = 4, points: int = 40) -> tuple[BundleProblem, Bundle]:
+    """A problem off its optimum, the references off their given poses."""
+    scene = make_scene(random_for(case), SceneOptions(point_count=points, reference_count=references))
+    structure, matches = true_structure(scene, NOISE)
+    used = np.arange(len(matches))
+    pose = scene.world_from_query
+    problem, start = pose_problem(scene.query, scene.references, structure, matches, used, pose, AdjustOptions())
+    motion = random_for(case, "moved").normal(0, 1e-3, (references + 1, 6))
+    return problem, start.moved(motion, np.zeros_like(start.points))
 
 
-def whole(jackknife: JackknifeInput, left_out: int | None = None) -> tuple[Array, Array, Array]:
-    """Jacobian (2 R, U + 3 P), residuals (2 R,) and weights (2 R,) of all rows, the query's first."""
-    unknowns = jackknife.by_pose.shape[2]
-    rows, errors, weights = [], [], []
-    size = unknowns + 3 * (1 + int(jackknife.query.point.max()))
-    for observations, by_pose, reference in (
-        (jackknife.query, jackknife.by_pose, None),
-        (jackknife.references, None, jackknife.reference),
-    ):
-        for i, point in enumerate(observations.point):
-            if reference is not None and reference[i] == left_out:
-                continue
-            row = np.zeros((2, size))
-            row[:, unknowns + 3 * point : unknowns + 3 * point + 3] = observations.by_point[i]
-            if by_pose is not None:
-                row[:, :unknowns] = by_pose[i]
-            rows.append(row)
-            errors.append(observations.residual[i])
-            weights += [observations.weight[i]] * 2
-    return np.concatenate(rows), np.concatenate(errors), np.array(weights)
+def dense(problem: BundleProblem, state: Bundle, left_out: int | None = None) -> tuple[Array, Array]:
+    """Matrix and gradient of the cameras, from the whole system without the observations of one reference."""
+    seen = problem.by_view
+    residual, by_point, by_pose = seen.linearized(state)
+    weight = 1 / (1 + (residual**2).sum(axis=0) / problem.loss_scale_sigma**2)
+    cameras = 6 * len(state.poses.rotation)
+    jacobian = np.zeros((2, len(weight), cameras + 3 * len(state.points)))
+    for o, (view, point) in enumerate(zip(seen.view, seen.point, strict=True)):
+        if view != left_out:
+            jacobian[:, o, 6 * view : 6 * view + 6] = by_pose[:, :, o]
+            jacobian[:, o, cameras + 3 * point : cameras + 3 * point + 3] = by_point[:, :, o]
+    rows = jacobian.reshape(-1, jacobian.shape[2])
+    weights = np.tile(weight, 2)
+    matrix, gradient = rows.T @ (weights[:, None] * rows), rows.T @ (weights * residual.ravel())
+    matrix[cameras:, cameras:] += 1e-7 * np.diag(np.diag(matrix)[cameras:])
+    crossed = scipy.linalg.solve(matrix[cameras:, cameras:], matrix[cameras:, :cameras], assume_a="pos").T
+    matrix, gradient = (
+        matrix[:cameras, :cameras] - crossed @ matrix[cameras:, :cameras],
+        gradient[:cameras] - (crossed @ gradient[cameras:]),
+    )
+    return matrix, gradient
 
 
-def dense(jackknife: JackknifeInput, left_out: int | None = None) -> tuple[Array, Array]:
-    """Information (U, U) and gradient (U,) of the pose, by eliminating all points from the whole system."""
-    unknowns = jackknife.by_pose.shape[2]
-    jacobian, errors, weight = whole(jackknife, left_out)
-    matrix, gradient = jacobian.T @ (weight[:, None] * jacobian), jacobian.T @ (weight * errors)
-    coupling = np.linalg.solve(matrix[unknowns:, unknowns:], matrix[unknowns:, :unknowns]).T
-    information = matrix[:unknowns, :unknowns] - coupling @ matrix[unknowns:, :unknowns]
-    return information, gradient[:unknowns] - coupling @ gradient[unknowns:]
+def held(problem: BundleProblem, state: Bundle, matrix: Array, gradient: Array) -> tuple[Array, Array]:
+    """With the prior on the references."""
+    free = np.zeros((6, 6))
+    pull = problem.information @ problem.reference_motion(state).ravel()
+    return matrix + scipy.linalg.block_diag(problem.information, free), gradient + np.append(pull, np.zeros(6))
 
 
-@pytest.mark.parametrize("unknowns", [6, 8])
-def test_left_out_poses_equal_one_dense_gauss_newton_step(unknowns: int) -> None:
-    """With 8 unknowns, as a rig or a sequence may have them."""
-    jackknife = random_input("dense", unknowns=unknowns)
-    found = disperse(jackknife)
-    assert isinstance(found, Dispersion)
-    information, gradient = dense(jackknife)
-    np.testing.assert_allclose(found.information, information, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(found.offset, -np.linalg.solve(information, gradient), rtol=1e-7, atol=1e-9)
-    for i in range(4):
-        without, pull = dense(jackknife, i)
-        expected = -np.linalg.solve(without + 0.01 * information, pull) - found.offset
-        np.testing.assert_allclose(found.motions[i], expected, rtol=1e-6, atol=1e-9)
-
-
-def test_the_order_of_rows_does_not_matter() -> None:
-    jackknife = random_input("order")
-    order = random_for("order").permutation(len(jackknife.reference))
-    r = jackknife.references
-    shuffled = LinearizedObservations(r.point[order], r.by_point[order], r.residual[order], r.weight[order])
-    found = disperse(jackknife)
-    other = disperse(replace(jackknife, references=shuffled, reference=jackknife.reference[order]))
+@pytest.mark.parametrize("references", [3, 5])
+def test_steps_equal_those_of_the_dense_equations(references: int) -> None:
+    problem, state = planted("dense", references)
+    found = disperse(problem, state, 1000)
     assert found
-    assert other
-    np.testing.assert_allclose(other.motions, found.motions, rtol=1e-9, atol=1e-12)
+    data, gradient = dense(problem, state)
+    offset = -np.linalg.solve(*held(problem, state, data, gradient))[-6:]
+    np.testing.assert_allclose(found.offset, offset, atol=1e-4 * np.abs(offset).max())
+    for i in range(references):
+        matrix, pull = held(problem, state, *dense(problem, state, i))
+        matrix[-6:, -6:] += LEAST_LEFT * data[-6:, -6:]
+        expected = -np.linalg.solve(matrix, pull)[-6:] - offset
+        np.testing.assert_allclose(found.references[i], expected, atol=1e-3 * np.abs(found.references).max())
 
 
-def test_a_reference_without_observations_adds_no_dispersion() -> None:
-    jackknife = replace(random_input("idle"), reference_count=6)
-    found = disperse(jackknife)
+def test_the_regions_together_are_the_whole_gradient() -> None:
+    problem, state = planted("regions")
+    start = Bundle(problem.given.and_last(state.world_from_query.inverse()), state.points)
+    found = disperse(problem, start, 1000)
     assert found
-    np.testing.assert_allclose(found.motions[4:], 0, atol=1e-9 + 0.02 * np.abs(found.offset).max())
+    np.testing.assert_allclose(found.regions.sum(axis=0), found.offset, atol=1e-9)
 
 
-def test_the_photos_part_is_the_covariance_of_its_noise() -> None:
-    """Residuals at the optimum of noise of 0.7 everywhere; the pose's answer to the query's noise alone is linear."""
-    jackknife = random_input("photograph", points=150)
-    random, n = random_for("drawn residuals"), 150
-    unit = replace(jackknife.query, weight=np.ones(n))
-    references = replace(jackknife.references, weight=np.ones(len(jackknife.reference)))
-    plain = replace(jackknife, query=unit, references=references)
-    jacobian, _, _ = whole(plain)
-    answer = -np.linalg.pinv(jacobian)[:6, : 2 * n]
-    expected = 0.7**2 * answer @ answer.T
-    noise = random.normal(0, 0.7, len(jacobian))
-    left = (noise - jacobian @ (np.linalg.pinv(jacobian) @ noise))[: 2 * n].reshape(n, 2)
-    found = disperse(replace(plain, query=replace(unit, residual=left)))
+def test_a_reference_without_observations_changes_nothing() -> None:
+    problem, state = planted("idle")
+    count = len(problem.given.rotation)
+    idle = problem.view == 1
+    kept = np.flatnonzero(~idle)
+    names = ("pixel", "size_px", "sigma_px", "rotation", "translation", "focal_px", "principal_px")
+    rows = {name: getattr(problem.observations, name)[kept] for name in names}
+    tracks = problem.observations.tracks
+    assert isinstance(tracks, Tracks)
+    rest = replace(tracks, point=tracks.point[kept], view=tracks.view[kept], keypoint=tracks.keypoint[kept])
+    without = replace(problem, observations=replace(problem.observations, tracks=rest, **rows), view=problem.view[kept])
+    found = disperse(without, state, 1000)
     assert found
-    size = np.trace(found.photograph) / np.trace(expected)
-    assert size == pytest.approx(1, abs=0.35)  # the median of 150 squared lengths
-    np.testing.assert_allclose(found.photograph, size * expected, atol=1e-9 + 1e-6 * np.abs(expected).max())
+    assert found.references.shape == (count, 6)
+    np.testing.assert_allclose(found.references[1], 0, atol=0.02 * np.abs(found.offset).max())
 
 
 def test_covariance_of_three_poses_equals_the_jackknife() -> None:
-    motions = np.zeros((3, 6))
-    motions[:, 0] = [0.1, -0.1, 0.3]
-    found = Dispersion(np.eye(6), np.zeros(6), motions, np.zeros((6, 6)))
-    expected = 2 / 3 * (2 / 4) ** 2 * (0.0**2 + 0.2**2 + 0.2**2)
-    assert found.covariance[0, 0] == pytest.approx(expected)
-    assert found.inflation**2 == pytest.approx(expected / 6)
+    references, regions = np.zeros((3, 6)), np.zeros((4, 6))
+    references[:, 0], references[:, 4] = [1, 2, 6], [0, 3, 0]
+    regions[:, 0] = [1, -1, 2, -2]
+    covariance = Dispersion(references, regions, np.zeros(6)).covariance(3.0)
+    assert covariance[0, 0] == pytest.approx(2 / 3 * (4 + 1 + 9) + 9 * 10)
+    assert covariance[4, 4] == pytest.approx(2 / 3 * (1 + 4 + 1))
+    assert covariance[0, 4] == pytest.approx(2 / 3 * (2 - 2 - 3))
+
+
+def test_thinned_matches_have_a_similar_dispersion() -> None:
+    problem, state = planted("thinned", 6, 500)
+    every, some = (disperse(problem, state, count) for count in (1000, 150))
+    assert every
+    assert some
+    ratio = np.sqrt(np.diag(some.covariance(1.0)) / np.diag(every.covariance(1.0)))
+    assert 0.5 < np.median(ratio) < 2
 
 
 def test_undetermined_equations_have_no_dispersion() -> None:
-    jackknife = random_input("nothing")
-    nowhere = replace(jackknife.query, by_point=np.full_like(jackknife.query.by_point, np.nan))
-    assert disperse(replace(jackknife, query=nowhere)) is None
-    assert disperse(replace(jackknife, by_pose=np.zeros_like(jackknife.by_pose))) is None
+    problem, state = planted("nothing")
+    nowhere = Bundle(state.poses, np.zeros_like(state.points))
+    assert disperse(problem, nowhere, 1000) is None
+    behind = Bundle(state.poses, state.points.copy())
+    behind.points[0] = np.nan
+    assert disperse(problem, behind, 1000) is None
 
 
-@pytest.mark.parametrize("points", [1, 2, 3])
-def test_few_matches_raise_no_exception(points: int) -> None:
-    found = disperse(random_input("few", points=points))
-    assert found is None or np.isfinite(found.covariance).all()
-
-
-def test_thinning_divides_the_photographs_part_only() -> None:
-    jackknife = random_input("thinned")
-    every, thinned = disperse(jackknife), disperse(replace(jackknife, thinning=3))
-    assert every
-    assert thinned
-    np.testing.assert_allclose(thinned.photograph, every.photograph / 3)
-    np.testing.assert_array_equal(thinned.motions, every.motions)
+@pytest.mark.parametrize("points", [8, 12])
+def test_few_matches_have_a_dispersion(points: int) -> None:
+    found = disperse(*planted("few", 4, points), 1000)
+    assert found
+    assert np.isfinite(found.covariance(1.0)).all()

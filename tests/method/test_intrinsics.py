@@ -10,7 +10,7 @@ from support.planted import NOISE, stages, true_structure
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, Camera, Distortion, Fisheye, RadialTangential
-from mapless_server.method.adjust import AdjustOptions, adjust_pose, pose_problem, with_intrinsics
+from mapless_server.method.adjust import SHARED_CAMERA, AdjustOptions, adjust_pose, pose_problem, with_intrinsics
 from mapless_server.method.features import undistort_pixels
 from mapless_server.method.intrinsics import IntrinsicsSigma, corrected, keypoint_motion
 from mapless_server.method.results import PoseEstimate
@@ -101,7 +101,7 @@ def test_a_camera_shared_with_the_references_errs_less() -> None:
     usual = IntrinsicsSigma().of(scene.query.camera)
     found = adjusted(scene).intrinsics
     assert found
-    np.testing.assert_allclose(found.prior_sigma, 0.1 * usual)
+    np.testing.assert_allclose(found.prior_sigma, SHARED_CAMERA * usual)
     stated = adjusted(scene, IntrinsicsSigma()).intrinsics
     assert stated
     np.testing.assert_allclose(stated.prior_sigma, usual)
@@ -117,16 +117,17 @@ def test_reduced_equations_equal_those_of_plain_rows() -> None:
     )  # fmt: skip
     wide, there = with_intrinsics(problem, state, scene.query)
     there = replace(there, intrinsics=np.array([1e-3, 0.5, -0.5, 2e-3]))
-    rows, is_query = wide.rows(there), wide.view == 3
-    point, cameras, count = wide.observations.point, 24, len(state.points)
+    point, view = wide.by_view.point, wide.by_view.view
+    residual, by_point, by_pose = wide.by_view.linearized(there)
+    cameras, count = 24, len(state.points)
     jacobian = np.zeros((len(point), 2, cameras + 4 + 3 * count))
-    for o, (p, v) in enumerate(zip(point, wide.view, strict=True)):
-        jacobian[o, :, 6 * v : 6 * v + 6] = rows.by_pose[o]
-        jacobian[o, :, cameras + 4 + 3 * p : cameras + 7 + 3 * p] = rows.by_point[o]
-    jacobian[is_query, :, cameras : cameras + 4] = wide.keypoint_motion
-    weighted = jacobian * rows.weight[:, None, None]
+    for o, (p, v) in enumerate(zip(point, view, strict=True)):
+        jacobian[o, :, 6 * v : 6 * v + 6] = by_pose[:, :, o]
+        jacobian[o, :, cameras + 4 + 3 * p : cameras + 7 + 3 * p] = by_point[:, :, o]
+    jacobian[view == 3, :, cameras : cameras + 4] = wide.keypoint_motion
+    weighted = jacobian / (1 + (residual**2).sum(axis=0) / wide.loss_scale_sigma**2)[:, None, None]
     matrix = np.einsum("oka,okb->ab", weighted, jacobian)
-    gradient = np.einsum("oka,ok->a", weighted, rows.residual)
+    gradient = np.einsum("oka,ko->a", weighted, residual)
     split = cameras + 4
     crossed = matrix[:split, split:] @ np.linalg.inv(matrix[split:, split:])
     reduced, right, _ = wide.by_view.equations(there, wide.loss_scale_sigma).reduced(0.0)

@@ -36,7 +36,7 @@ from mapless_server.method.trust.two_view import (
 )
 from mapless_server.method.two_view.matches import TwoViewMatches
 from mapless_server.method.two_view.pose import RelativePoseOptions, band_chance, disc_chance
-from mapless_server.method.two_view.solve import TwoViewOptions, few_references_factor, solve_two_view
+from mapless_server.method.two_view.solve import TwoViewOptions, solve_two_view
 from mapless_server.method.views import Features, Matches, PosedView, View
 from mapless_tools.ingest.check.epipolar import sampson_px
 
@@ -175,7 +175,7 @@ def test_covariance_is_right_against_planted_noise(pose_noise_px: float) -> None
     """The mean squared errors of 30 poses, over the mean of what is stated."""
     errors, stated = [], []
     plain = replace(
-        AdjustOptions(), uncertainty=replace(AdjustOptions().uncertainty, shared_matches=1e9, rotation_factor=1.0)
+        AdjustOptions(), uncertainty=replace(AdjustOptions().uncertainty, position_factor=1.0, rotation_factor=1.0)
     )
     for seed in range(30):
         problem = planted((60, 60, 60), 0.5, 0.0, seed, pose_noise_px)
@@ -296,12 +296,6 @@ def test_trust_rises_with_the_second_references_share() -> None:
 def test_each_lack_of_evidence_is_named(evidence: TwoViewEvidence, part: str) -> None:
     assert part in (two_view_failure(evidence, GATE) or "")
     assert two_view_failure(TwoViewEvidence(-50.0, -20.0, 100, 200, 40, 0.5, 0.5), GATE) is None
-
-
-def test_few_references_widen_the_radii() -> None:
-    assert few_references_factor((30, 30, 30)) == pytest.approx(2.0)
-    assert few_references_factor((50, 50, 0, 0)) == pytest.approx(3.0)
-    assert few_references_factor((100, 0, 0)) == pytest.approx(11.0)
 
 
 def test_wrong_options_are_named() -> None:

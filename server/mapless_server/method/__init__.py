@@ -18,11 +18,12 @@ results                      scale, structure, matches, pose estimate and its su
 scale_equations, scale       metric scale, initial pose
 observations, structure      metric points
 match                        2D-3D matches of the query
-uncertainty/                 the covariance of a pose
 pnp                          pose and inliers
 resection                    pose and focal length from fixed points
 pose_errors                  (ours) errors of the references' given poses: how large, and how alike for neighbours
-bundle, adjust               (ours) everything adjusted together
+bundle                       (ours) everything adjusted together
+uncertainty/                 the covariance of a pose
+adjust                       (ours) the last refinement
 two_view/                    (ours) pose from matches with posed references, without points
 trust/                       whether a pose is accepted, and its trust
 answer, hints                the answer of the method; what would help after a rejection

@@ -25,7 +25,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import RigidTransform
+from mapless.geometry import Array, RigidTransform
 
 from .bundle import Bundle, BundleProblem, bundle_of
 from .intrinsics import IntrinsicsEvidence, IntrinsicsSigma, intrinsics_evidence, keypoint_motion
@@ -34,18 +34,18 @@ from .options import check_bounds
 from .perturbation import reprojection_errors_px, world_jacobian
 from .pose_errors import PoseErrorOptions, most_probable, pose_errors
 from .priors.known import NO_PRIORS, Priors
-from .results import PointMatches, PoseEstimate, PoseStage, Structure
+from .results import MetricScale, PointMatches, PoseEstimate, PoseStage, Structure, Support
 from .structure import tracks_with_query
-from .uncertainty.covariance import UncertaintyOptions, one_match_covariance, uncertainty_of
-from .uncertainty.dispersion import jackknife_input
+from .uncertainty.covariance import UncertaintyOptions, adjusted_covariance, scale_covariance
 from .views import PosedView, View
 
 LEAST_DAMPING = 1e-9
 """Keeps the points determined where they are eliminated at the given poses."""
 
-SHARED_CAMERA = 0.1
+SHARED_CAMERA = 0.03
 """Share of the intrinsics' usual errors that differ between photographs of one camera. What they share is in the
-references' points too, and moves the pose but little: focus and stabilization remain."""
+references' points too, and moves the pose but little: focus and stabilization remain. With 0.1 the covariance of these
+errors exceeds all others in scenes of one camera, where radii hold too often."""
 
 
 @dataclass(frozen=True)
@@ -166,16 +166,49 @@ def _conclude(
     inliers = errors_px < options.inlier_px
     if inliers.sum() < max(1, options.min_kept_share * estimate.inliers.sum()):
         return None
-    x_in_world = points[matches.point[inliers]]
-    one_match = one_match_covariance(query.camera, pose, x_in_world, structure.noise.level_px)
-    motions = np.concatenate([problem.reference_motion(bundle), np.zeros((1, 6))])
-    rows, point = problem.rows(bundle), problem.observations.point
-    jackknife = jackknife_input(rows, point, problem.view, options.uncertainty.max_matches, motions)
-    uncertainty = uncertainty_of(jackknife, pose, one_match, options.uncertainty)
-    if uncertainty is None:
+    covariance = adjusted_covariance(problem, bundle, options.uncertainty)
+    if covariance is None:
         return None
-    covariance = uncertainty.covariance
-    return PoseEstimate(pose, PoseStage.REFINED, inliers, errors_px, covariance, uncertainty=uncertainty)
+    return PoseEstimate(pose, PoseStage.REFINED, inliers, errors_px, covariance, is_adjusted=True)
+
+
+def pose_covariance(
+    support: Support,
+    scale: MetricScale,
+    options: AdjustOptions,
+    priors: Priors = NO_PRIORS,
+    points_are_predicted: bool = False,
+) -> Array:
+    """Covariance (6, 6) of a pose, order x y z rx ry rz, fixed world axes, metres and radians.
+
+    Args:
+        support: with an estimate, of any stage.
+        scale: its metric scale, whose deviation is used as its relative standard deviation.
+        options: see there.
+        priors: on the pose; those that were used reduce the covariance.
+        points_are_predicted: whether the structure's points are predicted by the reconstruction, rather than
+            triangulated from the references' poses.
+
+    Raises:
+        ValueError: there is no estimate.
+    """
+    estimate, references, matches = support.estimate, support.references, support.matches
+    if estimate is None:
+        raise ValueError("support.estimate must not be None")
+    if estimate.is_adjusted:
+        return estimate.covariance
+    used = np.flatnonzero(estimate.errors_px < options.max_error_px)
+    if len(used) < 3:
+        return estimate.covariance
+    pose, is_initial = estimate.world_from_camera, estimate.stage is PoseStage.INITIAL
+    problem, bundle = pose_problem(support.query, references, support.structure, matches, used, pose, options)
+    covariance = adjusted_covariance(problem, bundle, options.uncertainty, is_initial)
+    if covariance is None:
+        return estimate.covariance
+    if is_initial or points_are_predicted:
+        centroid = np.mean([it.world_from_camera.translation for it in references], axis=0)
+        covariance = covariance + scale_covariance(pose, centroid, scale.deviation)
+    return priors.consistent(estimate.prior_checks).sharpened(covariance, pose)
 
 
 def _evidence(

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -24,7 +24,7 @@ from scipy.sparse import csr_array
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 
 from .arrays import apply_columns, columns, symmetric_products, take
-from .observations import Linearization, Observations, linearize
+from .observations import Observations
 from .optimize import cauchy_cost, cauchy_weight, solve_step
 from .priors.known import NO_PRIORS, Priors
 from .results import Structure
@@ -128,10 +128,6 @@ class BundleProblem:
         count = 6 * len(self.given.rotation)
         return slice(count, count + 6)
 
-    def at(self, bundle: Bundle) -> Observations:
-        """The observations by cameras at these poses."""
-        return self.observations.moved(bundle.poses.rotation[self.view], bundle.poses.translation[self.view])
-
     def reference_motion(self, bundle: Bundle) -> Array:
         """(V - 1, 6): the motion of each reference away from its given pose."""
         return bundle.poses[:-1].motion_from(self.given)
@@ -145,16 +141,6 @@ class BundleProblem:
         if self.priors:
             prior += self.prior_weight * self.priors.cost(bundle.world_from_query)
         return cauchy_cost(squared, self.loss_scale_sigma) + prior
-
-    def rows(self, bundle: Bundle) -> Linearization:
-        """The observations linearized, at these intrinsics."""
-        found = self.at(bundle)
-        if bundle.intrinsics.size:
-            pixel = found.pixel.copy()
-            is_query = self.view == len(self.given.rotation)
-            pixel[is_query] -= (self.keypoint_motion @ bundle.intrinsics) * found.sigma_px[is_query, None]
-            found = replace(found, pixel=pixel)
-        return linearize(found, bundle.points, self.loss_scale_sigma)
 
     def linearize(self, bundle: Bundle) -> NormalEquations:
         """See optimize.Problem."""
@@ -214,19 +200,40 @@ class ViewColumns:
     def of(observations: Observations, view: NDArray[np.intp], view_count: int, keypoint_motion: Array) -> ViewColumns:
         """From rows and the view (O,) of each; `keypoint_motion` as in BundleProblem."""
         order = np.argsort(view, kind="stable")
-        point, view = observations.point[order], view[order]
-        ends = np.searchsorted(view, np.arange(view_count + 1))
         sigma_px = observations.sigma_px[order, None]
-        count = len(point)
-        return ViewColumns(
-            point,
-            view,
-            tuple(slice(*part) for part in itertools.pairwise(ends.tolist())),
+        return ViewColumns._sorted(
+            observations.point[order],
+            view[order],
             columns(observations.focal_px[order] / sigma_px),
             columns((observations.principal_px - observations.pixel)[order] / sigma_px),
-            csr_array((np.ones(count), (point, np.arange(count))), shape=(int(point.max(initial=-1)) + 1, count)),
             np.ascontiguousarray(np.moveaxis(keypoint_motion, 0, 2)),
+            view_count,
         )
+
+    @staticmethod
+    def _sorted(
+        point: NDArray[np.intp],
+        view: NDArray[np.intp],
+        focal: Array,
+        offset: Array,
+        by_intrinsics: Array,
+        view_count: int,
+    ) -> ViewColumns:
+        """From columns that are sorted by view."""
+        parts = itertools.pairwise(np.searchsorted(view, np.arange(view_count + 1)).tolist())
+        count = len(point)
+        sums = csr_array((np.ones(count), (point, np.arange(count))), shape=(int(point.max(initial=-1)) + 1, count))
+        return ViewColumns(point, view, tuple(slice(*part) for part in parts), focal, offset, sums, by_intrinsics)
+
+    def of_points(self, chosen: NDArray[np.bool_]) -> ViewColumns:
+        """The observations of some of the points (P,), which are numbered anew."""
+        kept = chosen[self.point]
+        point, view = (np.cumsum(chosen) - 1)[self.point[kept]], self.view[kept]
+        by_intrinsics = (
+            self.by_intrinsics[:, :, kept[self.parts[-1]]] if self.by_intrinsics.size else self.by_intrinsics
+        )
+        columns = self.focal[:, kept], self.offset[:, kept], by_intrinsics
+        return ViewColumns._sorted(point, view, *columns, len(self.parts))
 
     def in_camera(self, poses: Poses, x_in_world: Array) -> Array:
         """(3, O) in the cameras' frames, from points (3, P)."""
@@ -354,6 +361,10 @@ class EliminatedPoints:
     factor: Array
     gradient: Array
     cross: Array
+
+    def solved(self, vectors: Array, point: NDArray[np.intp]) -> Array:
+        """L^-1 b of vectors b (3, ..., O), each with the factor of its point (O,)."""
+        return np.stack(_forward(take(self.factor, point), vectors))
 
     def steps(self, motion: Array) -> Array:
         """Steps (P, 3) of the points after a motion (U,) of the cameras."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from .adjust import adjust_pose
+from .adjust import adjust_pose, pose_covariance
 from .answer import Answer, Localization, is_better
 from .context import StageContext
 from .match import match_points
@@ -33,7 +33,6 @@ from .trust.two_view import (
 )
 from .trust.votes import votes_of
 from .two_view.solve import solve_two_view
-from .uncertainty.covariance import pose_covariance
 from .views import Matches, PosedView, Reconstruction, View
 
 MIN_FEATURES = 12
@@ -147,7 +146,7 @@ def _solve(coarse: Coarse, counts_agreement: bool) -> Answer:
     support = replace(support, estimate=estimate)
     with stage("uncertainty"):
         predicted = not prepared.structure_options.optimize
-        covariance = pose_covariance(support, scale, options.adjust.uncertainty, priors, predicted)
+        covariance = pose_covariance(support, scale, options.adjust, priors, predicted)
     estimate = replace(estimate, covariance=covariance)
     support = replace(support, estimate=estimate)
     with stage("judge"):

@@ -1,6 +1,6 @@
 """Observations of points by cameras: residuals, derivatives, triangulation and adjustment of points.
 
-All but `linearize` works on NumPy arrays and on torch tensors (see `arrays`).
+Works on NumPy arrays and on torch tensors (see `arrays`).
 """
 
 from __future__ import annotations
@@ -9,8 +9,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-
-from mapless.geometry import Array
 
 from .arrays import (
     AnyArray,
@@ -28,8 +26,7 @@ from .arrays import (
     symmetric_products,
     take,
 )
-from .optimize import cauchy_weight, minimize_each, soft_l1, soft_l1_weight
-from .perturbation import motion_jacobian
+from .optimize import minimize_each, soft_l1, soft_l1_weight
 from .results import KeypointNoise
 from .tracks import Grouping
 
@@ -107,10 +104,6 @@ class Observations:
     def in_camera(self, x_in_world: AnyArray) -> AnyArray:
         """The point (O, 3) of each observation in its camera's frame, from points (P, 3) in the world."""
         return apply(self.rotation, x_in_world[self.point]) + self.translation
-
-    def moved(self, rotation: AnyArray, translation: AnyArray) -> Observations:
-        """The same observations by cameras at other poses (O, 3, 3), (O, 3)."""
-        return replace(self, rotation=rotation, translation=translation)
 
     def weighted(self, noise: KeypointNoise) -> Observations:
         """The same observations with another noise."""
@@ -259,30 +252,3 @@ def estimate_noise(observations: Observations, x_in_world: AnyArray, noise: Keyp
 
 def _cost(observations: Observations, residuals: AnyArray, loss_scale_sigma: float) -> AnyArray:
     return observations.sum_by_point(soft_l1((residuals**2).sum(-1), loss_scale_sigma))
-
-
-@dataclass(frozen=True, eq=False)
-class Linearization:
-    """Row o is one observation; residuals and derivatives in standard deviations.
-
-    Attributes:
-        residual: (O, 2).
-        weight: (O,) of its square, by the Cauchy loss.
-        by_point: (O, 2, 3) derivative by the point, per metre.
-        by_pose: (O, 2, 6) derivative by a left perturbation (v, w) of camera_from_world.
-    """
-
-    residual: Array
-    weight: Array
-    by_point: Array
-    by_pose: Array
-
-
-def linearize(observations: Observations, x_in_world: Array, loss_scale_sigma: float) -> Linearization:
-    """Linearizes the observations of points (P, 3), weighted by a Cauchy loss of this scale."""
-    x_in_camera = observations.in_camera(x_in_world)
-    residual = observations.camera_residuals(x_in_camera)
-    weight = cauchy_weight((residual**2).sum(axis=1), loss_scale_sigma)
-    by_camera_point = observations.camera_jacobians(x_in_camera)
-    by_point = by_camera_point @ observations.rotation
-    return Linearization(residual, weight, by_point, by_camera_point @ motion_jacobian(x_in_camera))

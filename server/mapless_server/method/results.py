@@ -111,21 +111,6 @@ class PoseStage(str, Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class Uncertainty:
-    """Covariance of a pose by the jackknife over its references.
-
-    Attributes:
-        covariance: (6, 6) of world_from_camera, order x y z rx ry rz, fixed world axes, metres and radians.
-        motions: (K, 6) change of the pose, in the same coordinates, when each reference is left out.
-        inflation: i, ratio of the references' errors to those of independent matches.
-    """
-
-    covariance: Array
-    motions: Array
-    inflation: float
-
-
-@dataclass(frozen=True, eq=False)
 class PoseEstimate:
     """A pose, before it is accepted or rejected.
 
@@ -136,8 +121,8 @@ class PoseEstimate:
         errors_px: (M,) reprojection errors; NaN for points behind the camera.
         covariance: (6, 6), order x y z rx ry rz, fixed world axes, metres and radians.
         prior_checks: comparison with each prior.
-        uncertainty: the jackknife covariance without priors; None if the covariance is from the residuals alone and
-            leaves out correlated errors (see `pose_covariance`).
+        is_adjusted: whether the pose is that of the adjustment. The covariance of another is from the residuals alone
+            and leaves out correlated errors (see `adjust.pose_covariance`).
         without_priors: the estimate before priors were used; None if none was used.
         intrinsics: what the matches say of errors of the photograph's intrinsics, which the covariance contains; None
             for poses that were not adjusted.
@@ -149,7 +134,7 @@ class PoseEstimate:
     errors_px: Array
     covariance: Array
     prior_checks: tuple[PriorCheck, ...] = ()
-    uncertainty: Uncertainty | None = None
+    is_adjusted: bool = False
     without_priors: PoseEstimate | None = None
     intrinsics: IntrinsicsEvidence | None = None
 

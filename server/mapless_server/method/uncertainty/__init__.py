@@ -1,1 +1,1 @@
-"""The covariance of a pose: `covariance` combines its parts, `dispersion` is the jackknife; `radii` follow from it."""
+"""The covariance of a pose (`covariance`), by what changes without parts of the data (`dispersion`); its `radii`."""

@@ -1,293 +1,179 @@
-"""Dispersion: change of a pose when one of its references is left out.
+"""Dispersion: how an adjusted pose changes without parts of its data.
 
-The errors of a reference, of its pose, its lens model and its shutter, are shared by all points that it observes. A sum
-over residuals treats them as independent, as if a thousand matches were a thousand measurements. The jackknife over
-references (Quenouille; Efron and Tibshirani 1993, chapter 11) does not: from the poses q_(i) without reference i,
-i = 1 ... K,
+A sum over residuals treats them as independent, as if a thousand matches were a thousand measurements. But errors are
+shared: by all points that a reference observes (its pose, its lens model, its shutter), and by neighbours in the
+photograph (lens model, shutter, surfaces, the way a keypoint moves with the viewpoint). The jackknife (Quenouille;
+Efron and Tibshirani 1993, chapter 11) finds what is shared within each part of the data by leaving it out. Two kinds of
+parts cross each other (Cameron, Gelbach and Miller, Robust inference with multiway clustering, 2011):
 
-    C = (K - 1) / K sum_i (q_(i) - mean) (q_(i) - mean)^T
+    references    from the poses q_(i) without the observations of reference i, i = 1 ... K,
+                  C_r = (K - 1) / K sum_i (q_(i) - mean) (q_(i) - mean)^T;
+    regions       of the photograph, with equally many matches each. One of them weighs little, so the change without it
+                  is the sum of its matches' influences s_c (the infinitesimal jackknife), and C_p = sum_c s_c s_c^T.
 
-is the covariance of the pose due to its references, with any correlation within each of them. This holds if leaving out
-one of K removes 1 / K of the information. Here it removes more: points come from pairs of photographs, and of the
-K (K + 1) / 2 pairs of K references and the query K (K - 1) / 2 remain. The steps are too long by the ratio of the two,
-(K + 1) / (K - 1), so C is divided by its square.
+Both are of the pose as it is estimated: by the normal equations of the adjustment at its optimum (see `bundle`), where
+the references may move and far ones are held less, and of which each q_(i) is one Gauss-Newton step.
 
-Solving K times would cost K times the adjustment, so each q_(i) is one Gauss-Newton step away. Let point p be observed
-by the query with weight w, derivatives A by the point and J by the pose, and residual r; and by the references with
-information C_p = sum_o w_o A_o^T A_o and gradient h_p = sum_o w_o A_o^T r_o. Eliminating the point gives, with
+Let F F^T be what eliminating the points subtracts from the normal equations, F_p = E_p L_p^-T of point p, whose
+information is L_p L_p^T; and l_p = L_p^-1 h_p, of its gradient. An observation with residual r, weight w and derivative
+A by the point, with a = L_p^-1 A^T, then fits its point up to
 
-    W = w - w^2 A T^-1 A^T,    u = w (r - A T^-1 (h_p + w A^T r)),    T = C_p + w A^T A,
+    e = r - a^T l_p,    with the covariance    S = I / w - a^T a,
 
-the information J^T W J and the gradient J^T u of the pose. Leaving out reference i subtracts its terms from C_p and
-h_p, which changes W and u only of the points that it observes; so each (point, reference) pair costs the inverse of one
-3 x 3 matrix, and the K steps one product of matrices.
-
-The noise of the photograph's own pixels does not depend on the references. It is independent between matches, so its
-part of the pose's covariance is
-
-    Q = s^2 H^-1 (sum J^T W w^-1 W J) H^-1,    H = sum J^T W J,
-
-with s^2 the ratio of the squared residuals to the expected ones: the median of |r|^2 is 2 ln 2 times the variance of a
-coordinate, and the point's own fit leaves only the share W / w of the noise in a residual.
-
-Residuals of the references are those with their poses as given: an adjustment that moves the references into agreement
-would otherwise hide their errors.
+and leaving it out subtracts F_p a S^-1 a^T F_p^T from the matrix and adds F_p a S^-1 e to the gradient. So K steps cost
+one product of matrices with two columns an observation, and no point is eliminated twice.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapless.geometry import Array
 
-from ..observations import Linearization
+from ..arrays import take
+from ..bundle import Bundle, BundleProblem, EliminatedPoints, ViewColumns
+from ..optimize import cauchy_weight
 
-MIN_DETERMINANT = 1e-10
-"""Least determinant of a point's information, over the cube of its largest diagonal element: below, the point is not
-determined and not used."""
+DAMPING = 1e-9
+"""Relative, of the points: one without enough observations is determined, and has no information to speak of."""
 
-LEAST_EIGENVALUE = 1e-10
-"""Least eigenvalue of the pose's information with unit diagonal: below, the pose is not determined."""
+LEAST_EIGENVALUE = 1e-7
+"""Least eigenvalue of the pose's information with unit diagonal: below, the pose is not determined. Above 1e-5 in
+photographs."""
+
+LEAST_VARIANCE = 1e-12
+"""Of S, as a share of I / w, where its point has no other observation but rounding."""
 
 LEAST_LEFT = 0.01
-"""Least share of the information assumed to remain without a reference."""
+"""Share of the pose's information added to what is left without a reference, which may not determine a pose."""
 
-
-@dataclass(frozen=True, eq=False)
-class LinearizedObservations:
-    """Observations of points, linearized; residuals and derivatives in standard deviations.
-
-    Attributes:
-        point: (N,) index of the point, common to query and references.
-        by_point: (N, 2, 3) derivative of the residual by the point, per metre.
-        residual: (N, 2).
-        weight: (N,) of the squared residual.
-    """
-
-    point: NDArray[np.intp]
-    by_point: Array
-    residual: Array
-    weight: Array
-
-
-@dataclass(frozen=True, eq=False)
-class JackknifeInput:
-    """The observations of one pose, or of several estimated jointly.
-
-    Attributes:
-        query: observations by the photographs to pose. A point observed twice counts as two points.
-        by_pose: (N, 2, U) derivative of their residuals by the U unknowns.
-        references: observations of the same points by the references, with their poses as given.
-        reference: (M,) index of the reference, from 0.
-        reference_count: K.
-        thinning: the query has so many times as many observations. The references' errors are the same in all of them;
-            the noise of the photograph's own pixels averages out.
-    """
-
-    query: LinearizedObservations
-    by_pose: Array
-    references: LinearizedObservations
-    reference: NDArray[np.intp]
-    reference_count: int
-    thinning: int = 1
+REGIONS = 3
+"""Columns of the photograph, and regions in each. With 2 or 4 radii hold about as well."""
 
 
 @dataclass(frozen=True, eq=False)
 class Dispersion:
-    """How poses without one reference differ.
+    """Changes of a pose, left perturbations (v, w) of camera_from_world.
 
     Attributes:
-        information: H, (U, U) of the pose, points eliminated and the references held at their given poses.
-        offset: (U,) the Gauss-Newton step from the pose to the optimum with all references.
-        motions: (K, U) from that optimum to the one without the i-th reference.
-        photograph: Q, (U, U) covariance by the errors of the photograph's own pixels.
+        references: (K, 6) from the optimum to the one without each reference's observations.
+        regions: (G, 6) influence of the matches in each region of the photograph.
+        offset: (6,) the Gauss-Newton step from the pose to the optimum.
     """
 
-    information: Array
+    references: Array
+    regions: Array
     offset: Array
-    motions: Array
-    photograph: Array
 
-    @property
-    def covariance(self) -> Array:
-        """C, (U, U), by the jackknife; zero with one reference, which has nothing to differ from."""
-        count = len(self.motions)
-        centred = self.motions - self.motions.mean(axis=0)
-        return np.asarray((count - 1) / count * ((count - 1) / (count + 1)) ** 2 * centred.T @ centred)
-
-    @property
-    def inflation(self) -> float:
-        """i, by how much errors exceed those of independent matches: i^2 = trace(H C) / U."""
-        return float(np.sqrt(np.trace(self.information @ self.covariance) / len(self.information)))
+    def covariance(self, region_factor: float) -> Array:
+        """C_r + f^2 C_p, (6, 6)."""
+        count = len(self.references)
+        references = self.references - self.references.mean(axis=0)
+        regions = region_factor * (self.regions - self.regions.mean(axis=0))
+        return np.asarray((count - 1) / count * references.T @ references + regions.T @ regions)
 
 
-def disperse(jackknife: JackknifeInput) -> Dispersion | None:
-    """Leaves out one reference at a time; None if all together do not determine a pose."""
-    seen, query = jackknife.references, jackknife.query
-    size = 1 + int(max(query.point.max(initial=0), seen.point.max(initial=0)))
-    of_seen, gradients = _information(seen), _gradient(seen)
-    of_point = np.stack([np.bincount(seen.point, row, size) for row in of_seen]).astype(np.float64)
-    gradient_of_point = np.stack([np.bincount(seen.point, row, size) for row in gradients]).astype(np.float64)
-
-    everything = _eliminate(query, of_point[:, query.point], gradient_of_point[:, query.point])
-    row, other = _pairs(query.point, seen.point, size)
-    point = query.point[row]
-    some = LinearizedObservations(point, query.by_point[row], query.residual[row], query.weight[row])
-    without = _eliminate(
-        some, of_point[:, point] - of_seen[:, other], gradient_of_point[:, point] - gradients[:, other]
-    )
-    change = np.zeros((jackknife.reference_count, 5, len(query.point)))
-    # A reference observes a point once, so the pairs are distinct.
-    change[jackknife.reference[other], :, row] = (without - everything[:, row]).T
-    found = _steps(query, jackknife.by_pose, everything, change)
-    return found and replace(found, photograph=found.photograph / jackknife.thinning)
-
-
-def _steps(query: LinearizedObservations, by_pose: Array, everything: Array, change: Array) -> Dispersion | None:
-    """From each observation's W and u (5, N), and their change (K, 5, N) without each reference."""
-    unknowns = by_pose.shape[2]
-    x, y = by_pose[:, 0], by_pose[:, 1]
-    mixed = x[:, :, None] * y[:, None, :]
-    squares = np.concatenate(
-        [x[:, :, None] * x[:, None, :], mixed + np.swapaxes(mixed, 1, 2), y[:, :, None] * y[:, None, :]]
-    )
-    squares = squares.reshape(-1, unknowns**2)
-    slopes = np.concatenate([x, y])
-    information = (everything[:3].reshape(1, -1) @ squares).reshape(unknowns, unknowns)
-    gradient = everything[3:].reshape(1, -1) @ slopes
-    if not _is_definite(information):
-        return None
-    count = len(change)
-    informations = information + (change[:, :3].reshape(count, -1) @ squares).reshape(count, unknowns, unknowns)
-    gradients = gradient + change[:, 3:].reshape(count, -1) @ slopes
-    offset = -np.linalg.solve(information, gradient[0])
-    # Without its only reference a point has no information, and the rest may not determine a pose.
-    without = -np.linalg.solve(informations + LEAST_LEFT * information, gradients[:, :, None])[..., 0]
-    if not (np.isfinite(offset).all() and np.isfinite(without).all()):
-        return None
-    inverse = np.linalg.inv(information)
-    spread = (_pixel_noise(query, everything[:3]).reshape(1, -1) @ squares).reshape(unknowns, unknowns)
-    return Dispersion(information, offset, without - offset, inverse @ spread @ inverse)
-
-
-def _is_definite(information: Array) -> bool:
-    """Whether a symmetric matrix is well-conditioned positive definite, independent of its units."""
-    unit = np.sqrt(np.diag(information).clip(min=0))
-    if not (np.isfinite(information).all() and unit.min() > 0):
-        return False
-    return bool(np.linalg.eigvalsh(information / np.outer(unit, unit))[0] > LEAST_EIGENVALUE)
-
-
-def _pixel_noise(query: LinearizedObservations, marginal: Array) -> Array:
-    """s^2 W w^-1 W of each observation, its elements xx, xy, yy (3, N), from those of W."""
-    xx, xy, yy = marginal
-    left = (xx + yy) / (2 * query.weight)
-    squared = (query.residual**2).sum(axis=1) / np.maximum(left, LEAST_LEFT)
-    size = np.median(squared) / (2 * np.log(2))
-    return np.asarray(size / query.weight * np.stack([xx**2 + xy**2, xy * (xx + yy), xy**2 + yy**2]))
-
-
-def _pairs(query_point: NDArray[np.intp], seen_point: NDArray[np.intp], size: int) -> tuple[NDArray[np.intp], ...]:
-    """Rows of the query and rows of the references with the same point."""
-    order = np.argsort(seen_point, kind="stable")
-    counts = np.bincount(seen_point, minlength=size)
-    starts = np.cumsum(counts) - counts
-    times = counts[query_point]
-    row = np.repeat(np.arange(len(query_point)), times)
-    first = np.repeat(starts[query_point] - (np.cumsum(times) - times), times)
-    return row, order[first + np.arange(len(row))]
-
-
-def _eliminate(query: LinearizedObservations, information: Array, gradient: Array) -> Array:
-    """W_xx, W_xy, W_yy, u_x, u_y (5, N) of observations whose points have this information (6, N) and gradient (3, N).
-
-    Zero where a point is not determined even with the query's own observation.
-    """
-    weight = query.weight
-    inverse = _inverse(information + _information(query))
-    both = gradient + _gradient(query)
-    a, b = query.by_point[:, 0].T, query.by_point[:, 1].T
-    inverse_a, inverse_b = _times(inverse, a), _times(inverse, b)
-    squared = weight**2
-    result = np.stack(
-        [
-            weight - squared * (a * inverse_a).sum(axis=0),
-            -squared * (b * inverse_a).sum(axis=0),
-            weight - squared * (b * inverse_b).sum(axis=0),
-            weight * (query.residual[:, 0] - (inverse_a * both).sum(axis=0)),
-            weight * (query.residual[:, 1] - (inverse_b * both).sum(axis=0)),
-        ]
-    )
-    return np.where(np.isfinite(result).all(axis=0), result, 0.0)
-
-
-def _information(observations: LinearizedObservations) -> Array:
-    """W A^T A of each, its elements xx, yy, zz, xy, xz, yz (6, N)."""
-    x, y, z = np.moveaxis(observations.by_point, 2, 0)  # (N, 2) each
-    pairs = ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))
-    return np.stack([observations.weight * (p[:, 0] * q[:, 0] + p[:, 1] * q[:, 1]) for p, q in pairs])
-
-
-def _gradient(observations: LinearizedObservations) -> Array:
-    """W A^T r of each, (3, N)."""
-    x, y = (observations.residual * observations.weight[:, None]).T
-    return np.asarray(observations.by_point[:, 0].T * x + observations.by_point[:, 1].T * y)
-
-
-def _inverse(matrices: Array) -> Array:
-    """Of symmetric matrices, elements as in `_information`; NaN where singular. One array an element: it is faster."""
-    xx, yy, zz, xy, xz, yz = matrices
-    adjugate = np.stack(
-        [yy * zz - yz**2, xx * zz - xz**2, xx * yy - xy**2, xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz]
-    )
-    determinant = xx * adjugate[0] + xy * adjugate[3] + xz * adjugate[4]
-    solvable = determinant > MIN_DETERMINANT * np.maximum(np.maximum(xx, yy), zz) ** 3
-    return np.asarray(adjugate / np.where(solvable, determinant, np.nan))
-
-
-def _times(matrices: Array, vectors: Array) -> Array:
-    """Symmetric matrices (6, N) by vectors (3, N)."""
-    xx, yy, zz, xy, xz, yz = matrices
-    x, y, z = vectors
-    return np.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z])
-
-
-def jackknife_input(
-    rows: Linearization,
-    point: NDArray[np.intp],
-    view: NDArray[np.intp],
-    max_matches: int,
-    motions: Array | None = None,
-) -> JackknifeInput:
-    """The jackknife input for the pose of the last view.
+def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Dispersion | None:
+    """How the query's pose changes without parts of the data; None if all together do not determine it.
 
     Args:
-        rows: of all observations.
-        point: (O,) of each.
-        view: (O,) of each; the references, in order, and last the photograph to pose.
-        max_matches: of its observations, evenly thinned.
-        motions: (V, 6) left perturbations from the given poses to those at which `rows` is linearized; None if both are
-            the same.
+        problem: of the adjustment, without priors on the query's pose.
+        bundle: its optimum, or values near it.
+        max_matches: of the query, evenly thinned. What a reference or a region shares is the same in all of them.
     """
-    asked = int(view.max())
-    is_asked = view == asked
-    thinning = -(-int(is_asked.sum()) // max_matches)
-    if thinning > 1:
-        taken = np.zeros(int(point.max()) + 1, bool)
-        taken[point[is_asked][::thinning]] = True
-        kept = taken[point]
-        rows = Linearization(rows.residual[kept], rows.weight[kept], rows.by_point[kept], rows.by_pose[kept])
-        point, view, is_asked = point[kept], view[kept], is_asked[kept]
-    residual = rows.residual
-    if motions is not None:
-        residual = residual - (rows.by_pose * motions[view][:, None, :]).sum(axis=2)
+    seen, bundle, thinning = _thinned(problem.by_view, bundle, max_matches)
+    equations = seen.equations(bundle, problem.loss_scale_sigma)
+    data, gradient, points = equations.reduced(DAMPING)
+    prior, prior_gradient = np.zeros_like(data), np.zeros_like(gradient)
+    prior[:-6, :-6] = problem.information / thinning
+    prior_gradient[:-6] = prior[:-6, :-6] @ problem.reference_motion(bundle).ravel()
+    to_pose = _rows_of_pose(data + prior)
+    if to_pose is None:
+        return None
+    residual, by_point, by_pose = seen.linearized(bundle)
+    weight = cauchy_weight((residual**2).sum(axis=0), problem.loss_scale_sigma)
+    slopes = (by_pose * (weight * residual)[:, None]).sum(axis=0)
+    regions = _influences(seen, to_pose, slopes, points)
 
-    def some(chosen: NDArray[np.bool_]) -> LinearizedObservations:
-        return LinearizedObservations(point[chosen], rows.by_point[chosen], residual[chosen], rows.weight[chosen])
+    gain, misfit = _whitened(seen, residual, by_point, weight, points)
+    cross = points.cross.reshape(len(data), 3, -1)
+    matrices, gradients = np.tile(prior, (len(seen.parts) - 1, 1, 1)), np.tile(prior_gradient, (len(seen.parts) - 1, 1))
+    for i, part in enumerate(seen.parts[:-1]):
+        lost = np.einsum("uan,abn->ubn", take(cross, seen.point[part]), gain[:, :, part]).reshape(len(data), -1)
+        others = np.ones(len(data), bool)
+        others[6 * i : 6 * i + 6] = False  # only the prior is left of its own pose
+        matrices[i] += np.where(np.outer(others, others), data - lost @ lost.T, 0)
+        gradients[i] += np.where(others, gradient + lost @ misfit[:, part].ravel(), 0)
+    matrices[:, -6:, -6:] += LEAST_LEFT * data[-6:, -6:]
+    offset = -to_pose @ (gradient + prior_gradient)
+    references = -np.linalg.solve(matrices, gradients[:, :, None])[:, -6:, 0] - offset
+    if not (np.isfinite(references).all() and np.isfinite(regions).all()):
+        return None
+    return Dispersion(references, regions, offset)
 
-    return JackknifeInput(
-        some(is_asked), rows.by_pose[is_asked], some(~is_asked), view[~is_asked], asked, max(thinning, 1)
+
+def _thinned(seen: ViewColumns, bundle: Bundle, max_matches: int) -> tuple[ViewColumns, Bundle, int]:
+    """Every so many-th match of the query, with the other observations of its point."""
+    of_query = seen.point[seen.parts[-1]]
+    thinning = -(-len(of_query) // max_matches)
+    if thinning <= 1:
+        return seen, bundle, 1
+    chosen = np.zeros(len(bundle.points), bool)
+    chosen[of_query[::thinning]] = True
+    return seen.of_points(chosen), Bundle(bundle.poses, bundle.points[chosen]), thinning
+
+
+def _rows_of_pose(matrix: Array) -> Array | None:
+    """Rows (6, U) of the inverse, those of the query's pose; None if it is not well-conditioned positive definite."""
+    if not np.isfinite(matrix).all():
+        return None
+    try:
+        rows = np.asarray(np.linalg.inv(matrix)[-6:])
+    except np.linalg.LinAlgError:
+        return None
+    return rows if _is_definite(rows[:, -6:]) else None
+
+
+def _is_definite(covariance: Array) -> bool:
+    """Whether a symmetric matrix (6, 6) is well-conditioned and positive definite, whatever its units."""
+    if not np.isfinite(covariance).all():
+        return False
+    information = np.linalg.pinv(covariance, hermitian=True)
+    unit = np.sqrt(np.diag(information).clip(min=0))
+    return bool(unit.min() > 0 and np.linalg.eigvalsh(information / np.outer(unit, unit))[0] > LEAST_EIGENVALUE)
+
+
+def _influences(seen: ViewColumns, to_pose: Array, slopes: Array, points: EliminatedPoints) -> Array:
+    """(G, 6) of the regions, from the gradients (6, O) of the observations by their cameras' poses."""
+    of_observation = np.concatenate(
+        [to_pose[:, 6 * i : 6 * i + 6] @ slopes[:, part] for i, part in enumerate(seen.parts)], axis=1
     )
+    of_match = np.stack([seen.sums @ row for row in of_observation])
+    of_match -= ((to_pose @ points.cross).reshape(6, 3, -1) * points.gradient).sum(axis=1)
+    query = seen.parts[-1]
+    ideal, match = -seen.offset[:, query] / seen.focal[:, query], seen.point[query]
+    regions = [
+        match[rows[np.argsort(ideal[1, rows], kind="stable")]]
+        for rows in np.array_split(np.argsort(ideal[0], kind="stable"), REGIONS)
+    ]
+    return -np.stack([of_match[:, it].sum(axis=1) for column in regions for it in np.array_split(column, REGIONS)])
+
+
+def _whitened(
+    seen: ViewColumns, residual: Array, by_point: Array, weight: Array, points: EliminatedPoints
+) -> tuple[Array, Array]:
+    """Of each observation a R^-T (3, 2, O) and R^-1 e (2, O), with S = R R^T."""
+    across = points.solved(np.moveaxis(by_point, 1, 0), seen.point)
+    misfit = residual - (across * take(points.gradient, seen.point)[:, None]).sum(axis=0)
+    least = LEAST_VARIANCE / weight
+    (xx, yy), xy = 1 / weight - (across**2).sum(axis=0), -(across[:, 0] * across[:, 1]).sum(axis=0)
+    first = np.sqrt(np.maximum(xx, least))
+    mixed = xy / first
+    second = np.sqrt(np.maximum(yy - mixed**2, least))
+
+    def whitened(x: Array, y: Array) -> list[Array]:
+        return [x / first, (y - mixed * x / first) / second]
+
+    return np.stack(whitened(across[:, 0], across[:, 1]), axis=1), np.stack(whitened(*misfit))
