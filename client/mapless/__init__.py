@@ -47,7 +47,15 @@ from .errors import (
 )
 from .geodesy import Datum, GeoPose
 from .geometry import Camera, Fisheye, Quaternion, RadialTangential, RigidTransform, Similarity
-from .groups import GroupRejected, ImageReport, RigImage, RigLocalization, SequenceFrame, SequenceLocalization
+from .groups import (
+    GroupRejected,
+    ImageReport,
+    RigImage,
+    RigLocalization,
+    SequenceFrame,
+    SequenceLocalization,
+    TrackingJump,
+)
 from .options import ConnectOptions
 from .priors import GeoPositionPrior, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
 from .requests import NewReference
@@ -107,6 +115,7 @@ __all__ = [
     "SequenceFrame",
     "SequenceLocalization",
     "Similarity",
+    "TrackingJump",
     "Unauthenticated",
     "Unavailable",
     "aio",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
@@ -287,10 +287,7 @@ def answer_from_message(message: pb.LocalizeResponse) -> LocalizationResult | Re
         trust=found.trust if found.HasField("trust") else None,
         in_axes=optional(found, "in_axes", _framed_from_message),
         geo_pose=optional(found, "geo_pose", geo_pose_from_message),
-        prior_checks=tuple(
-            wire.filled(PriorCheck, check, kind=wire.value_name(pb.PriorKind, check.kind))
-            for check in found.prior_checks
-        ),
+        prior_checks=prior_checks_from_messages(found.prior_checks),
         **common,
     )
 
@@ -379,3 +376,8 @@ def _scale_from_message(message: pb.ScaleEstimate) -> ScaleEstimate:
 
 def _seconds(duration: Any) -> float:
     return float(duration.ToNanoseconds() / 1e9)
+
+
+def prior_checks_from_messages(messages: Iterable[pb.PriorCheck]) -> tuple[PriorCheck, ...]:
+    """Checks of an answer's or a photograph's priors."""
+    return tuple(wire.filled(PriorCheck, check, kind=wire.value_name(pb.PriorKind, check.kind)) for check in messages)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
 
@@ -14,14 +14,17 @@ from .answers import (
     Diagnostics,
     Hint,
     Hypothesis,
+    PriorCheck,
     accuracy_from_message,
     covariance_from_message,
     diagnostics_from_message,
     geo_pose_from_message,
+    prior_checks_from_messages,
     rejection_fields,
 )
 from .geodesy import GeoPose
 from .geometry import Array, Camera, RigidTransform, Similarity
+from .priors import Priors
 from .requests import ImageSource
 from .v1 import localization_service_pb2 as pb
 from .wire import optional
@@ -36,12 +39,14 @@ class RigImage:
         camera: its camera, in pixels of the file as it is stored, before any EXIF rotation.
         rig_from_camera: pose of the camera in the rig, metres, OpenCV's axes; the rig's frame is arbitrary.
         references: the references to use, at most 64; empty: the server chooses.
+        priors: what is known of this camera's pose; soft ones are weighed in the joint pose.
     """
 
     image: ImageSource
     camera: Camera
     rig_from_camera: RigidTransform
     references: tuple[str, ...] = ()
+    priors: Priors = field(default_factory=Priors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +59,7 @@ class SequenceFrame:
         session_from_camera: the pose that the device tracked, in the axes of the call.
         capture_time: time of the photograph, with time zone.
         references: the references to use, at most 64; empty: the server chooses.
+        priors: what is known of this camera's pose; soft ones are weighed in the joint poses.
     """
 
     image: ImageSource
@@ -61,6 +67,7 @@ class SequenceFrame:
     session_from_camera: RigidTransform
     capture_time: datetime | None = None
     references: tuple[str, ...] = ()
+    priors: Priors = field(default_factory=Priors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,12 +79,32 @@ class ImageReport:
         match_count: all its 2D-3D matches.
         rejected_alone: reason of its rejection if localized alone, "LOW_OVERLAP"; None if it would be accepted.
         diagnostics: its inputs and times.
+        prior_checks: how the joint pose compares with each of its soft priors.
     """
 
     inlier_count: int
     match_count: int
     rejected_alone: str | None
     diagnostics: Diagnostics
+    prior_checks: tuple[PriorCheck, ...] = ()
+
+
+@dataclass(frozen=True)
+class TrackingJump:
+    """A jump of a device's tracking, as its own relocalization makes them.
+
+    Attributes:
+        before: index of the last photograph before it.
+        after: index of the first one after it. Photographs between the two show too little to say on which side they
+            are: their poses may be off by the jump.
+        shift_m: distance of the tracked position after it from that of the photographs.
+        rotation_deg: angle between the two orientations.
+    """
+
+    before: int
+    after: int
+    shift_m: float
+    rotation_deg: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +122,7 @@ class RigLocalization:
         geo_pose: the same pose on the Earth; None unless the scene has a datum.
         arbitrary_unit: as of `LocalizationResult`.
         capture_time: as it was sent.
+        trust: as of `LocalizationResult`, from the evidence of all photographs together.
     """
 
     world_from_rig: RigidTransform
@@ -108,6 +136,7 @@ class RigLocalization:
     geo_pose: GeoPose | None = None
     capture_time: datetime | None = None
     arbitrary_unit: bool = False
+    trust: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +147,7 @@ class SequenceLocalization:
         world_from_session: transform from the device's session, after the last photograph, to the world, in the axes
             of the call; its scale is 1 unless it was estimated.
         scale_sigma: standard deviation of that scale; 0 unless it was estimated.
-        world_from_camera: pose of each photograph, corrected for drift, OpenCV's axes.
+        world_from_camera: pose of each photograph, corrected for drift and jumps, OpenCV's axes.
         covariance: (6, 6) of the last of them, order x y z rx ry rz, metres and radians about fixed world axes.
         accuracy: radii of the same pose.
         inlier_count, match_count: number of 2D-3D matches of all photographs that agree with the poses, and of all.
@@ -126,6 +155,9 @@ class SequenceLocalization:
         images: contribution of each photograph, in order.
         axes: of `world_from_session`, "OPENCV".
         arbitrary_unit: as of `LocalizationResult`.
+        jumps: where the photographs contradict the tracking, in order. `world_from_session`, covariance, accuracy and
+            trust are of the photographs since the last one.
+        trust: as of `LocalizationResult`, from the evidence of the photographs since the last jump together.
     """
 
     world_from_session: Similarity
@@ -139,6 +171,8 @@ class SequenceLocalization:
     images: tuple[ImageReport, ...]
     axes: str
     arbitrary_unit: bool = False
+    jumps: tuple[TrackingJump, ...] = ()
+    trust: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,6 +209,7 @@ def rig_from_message(message: pb.LocalizeRigResponse) -> RigLocalization | Group
         world_from_session=optional(found, "world_from_session", wire.transform_from_message, path + "session"),
         geo_pose=optional(found, "geo_pose", geo_pose_from_message),
         capture_time=capture_time,
+        trust=found.trust if found.HasField("trust") else None,
         **_common(message),
     )
 
@@ -194,6 +229,8 @@ def sequence_from_message(message: pb.LocalizeSequenceResponse) -> SequenceLocal
             wire.transform_from_message(pose.world_from_camera, "localization.poses") for pose in found.poses
         ),
         axes=wire.value_name(pb.Axes, found.axes),
+        trust=found.trust if found.HasField("trust") else None,
+        jumps=tuple(wire.filled(TrackingJump, jump) for jump in found.jumps),
         **_common(message),
     )
 
@@ -224,6 +261,7 @@ def _reports(message: pb.LocalizeRigResponse | pb.LocalizeSequenceResponse) -> t
             image,
             rejected_alone=wire.value_name(pb.RejectionReason, image.alone.reason) if image.HasField("alone") else None,
             diagnostics=diagnostics_from_message(image.diagnostics),
+            prior_checks=prior_checks_from_messages(image.prior_checks),
         )
         for image in message.images
     )

@@ -77,7 +77,7 @@ def _check_localize(request: pb.LocalizeRequest) -> None:
 
 
 def _check_rig(request: pb.LocalizeRigRequest) -> None:
-    queries = queries_from_message(request, "images", (1, MAX_RIG_IMAGES), TENANT, ENGINE)
+    queries = queries_from_message(request, "images", (1, MAX_RIG_IMAGES), TENANT, ENGINE, KNOWN)
     poses = poses_from_message(request.images, "images", "rig_from_camera")
     session_from_rig = session_from_rig_from_message(request)
     assert 1 <= len(queries) == len(poses) <= MAX_RIG_IMAGES
@@ -88,7 +88,7 @@ def _check_rig(request: pb.LocalizeRigRequest) -> None:
 
 
 def _check_sequence(request: pb.LocalizeSequenceRequest) -> None:
-    queries = queries_from_message(request, "frames", (MIN_FRAMES, MAX_FRAMES), TENANT, ENGINE)
+    queries = queries_from_message(request, "frames", (MIN_FRAMES, MAX_FRAMES), TENANT, ENGINE, KNOWN)
     _, poses = session_poses_from_message(request)
     assert MIN_FRAMES <= len(queries) == len(poses) <= MAX_FRAMES
     for query in queries:

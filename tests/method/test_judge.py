@@ -169,7 +169,8 @@ def test_epipolar_share_is_the_planted_share_of_two_references() -> None:
             wrong = np.arange(len(of_reference)) < share * len(of_reference)
             of_reference[wrong, 1] = np.roll(of_reference[wrong, 1], 7)
         expected = (1 - shares[0]) * (1 - shares[1])
-        found = epipolar_share(support, matches, support.estimate.world_from_camera)
+        counts, pose = support.inliers_by_reference(), support.estimate.world_from_camera
+        found = epipolar_share(support.query, support.references, matches, counts, pose)
         assert found == pytest.approx(expected, abs=0.05), "but for wrong ones that are on the line by chance"
 
 

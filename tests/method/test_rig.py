@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.compare import assert_pose_close
@@ -12,6 +14,7 @@ from support.scenes import SceneOptions, random_for
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.groups.rig import RigEstimate, RigOptions, RigState, solve_rig
 from mapless_server.method.perturbation import perturbed, rotation_vector
+from mapless_server.method.priors.known import PositionPrior, Priors
 from mapless_server.method.rejection import Rejection, RejectionReason
 
 WORLD_FROM_RIG = RigidTransform(rotation_from_vector([0.1, 0.2, -0.1]), np.array([0.3, 0.1, -3.8]))
@@ -61,6 +64,24 @@ def test_one_wrong_own_pose_does_not_change_the_rigs() -> None:
     images = images_of(random_for("outvoted"), CAMERAS, alone=[True, False, False], own_noise_m=1.0)
     found = estimate(solve_rig(images, RIG_FROM_CAMERA, OPTIONS))
     assert_pose_close(found.world_from_rig, caller_pose(WORLD_FROM_RIG), metres=0.006, degrees=0.1)
+
+
+def test_a_rig_is_rejected_by_its_trust() -> None:
+    images = images_of(random_for("trust"), CAMERAS, keep=30)
+    found = estimate(solve_rig(images, RIG_FROM_CAMERA, OPTIONS))
+    assert 0.01 < found.trust < 1
+    outcome = rejection(solve_rig(images, RIG_FROM_CAMERA, RigOptions(coverage=(1 - found.trust) * 0.9)))
+    assert outcome.reason is RejectionReason.GATE
+    assert "its trust of" in outcome.message
+
+
+def test_a_prior_on_one_camera_is_used_for_the_rig() -> None:
+    images = images_of(random_for("prior"), CAMERAS, UNGUIDED, keep=8)
+    at = caller_pose(CAMERAS[1]).translation
+    prior = Priors(position=PositionPrior(at, 1e-8 * np.eye(3)))
+    found = estimate(solve_rig([images[0], replace(images[1], priors=prior), images[2]], RIG_FROM_CAMERA, OPTIONS))
+    assert [(it.used, it.conflict) for it in found.prior_checks[1]] == [(True, False)]
+    assert np.linalg.norm(found.world_from_rig.compose(RIG_FROM_CAMERA[1]).translation - at) < 1e-3
 
 
 def test_a_blank_image_has_no_effect() -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.compare import assert_pose_close, pose_error
@@ -11,8 +14,11 @@ from support.scenes import SceneOptions, look_at, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.groups.drift import DriftOptions, SequenceState, world_from_session_at
+from mapless_server.method.groups.jumps import find_jumps
 from mapless_server.method.groups.rig import RigOptions, solve_rig
-from mapless_server.method.groups.sequence import SequenceEstimate, SequenceOptions, solve_sequence
+from mapless_server.method.groups.sequence import SequenceEstimate, solve_sequence
+from mapless_server.method.groups.start import SequenceOptions
+from mapless_server.method.priors.known import PositionPrior, Priors
 from mapless_server.method.rejection import Rejection, RejectionReason
 
 OPTIONS = SequenceOptions()
@@ -83,18 +89,136 @@ def test_frames_without_matches_are_posed_by_tracking() -> None:
     assert [it.source.image for it in found.matched] == [0, 1, 2, 3]
 
 
-def test_a_jump_of_the_tracking_gets_little_weight() -> None:
-    random = random_for("jump")
+JUMP = RigidTransform(rotation_from_vector([0, 0.2, 0]), np.array([0.5, -0.2, 0.3]))
+
+
+def jumping(session: list[RigidTransform], at: int, jump: RigidTransform) -> list[RigidTransform]:
+    """The session, moved by a jump, about its camera there, from the frame `at` on."""
+    here = RigidTransform(np.eye(3), session[at].translation)
+    return session[:at] + [here.compose(jump).compose(here.inverse()).compose(it) for it in session[at:]]
+
+
+@pytest.mark.parametrize("at", [1, 3, 5])
+@pytest.mark.parametrize(("scale", "is_free"), [(1.0, False), (0.37, True)])
+def test_a_jump_is_found_with_its_size_and_cut(at: int, scale: float, is_free: bool) -> None:
+    random = random_for("jump", at, scale)
     truth = walk(random, 6)
-    session = drifting(random, truth, 0.01)
-    jump = RigidTransform(rotation_from_vector([0, 0.2, 0]), np.array([0.5, -0.2, 0.3]))
-    session = session[:3] + [jump.compose(pose) for pose in session[3:]]
+    session = rescaled(jumping(drifting(random, truth, 0.01), at, JUMP), 1 / scale)
+    images = images_of(random, truth, alone=True, own_noise_m=0.005)
+    found = estimate(solve_sequence(images, session, is_free, OPTIONS))
+    assert max(error_m(*it) for it in zip(found.world_from_camera, truth, strict=True)) < 0.008
+    (jump,) = found.jumps
+    assert (jump.before, jump.after) == (at - 1, at)
+    assert jump.shift_m == pytest.approx(np.linalg.norm(JUMP.translation), abs=0.05)
+    assert jump.rotation_deg == pytest.approx(np.degrees(0.2), abs=1.0)
+
+
+@pytest.mark.parametrize("apart_m", [0.3, 1e6])
+def test_of_two_frames_the_last_is_where_its_photograph_says(apart_m: float) -> None:
+    """Also the same photograph twice, 1,000 km apart in the session."""
+    random = random_for("two", apart_m)
+    truth = walk(random, 2) if apart_m < 1e6 else [walk(random, 2)[0]] * 2
+    jump = RigidTransform(np.eye(3), np.array([0, apart_m, 0]))
+    session = jumping(drifting(random, truth, 0.01), 1, jump)
     images = images_of(random, truth, alone=True, own_noise_m=0.005)
     found = estimate(solve_sequence(images, session, False, OPTIONS))
-    assert max(error_m(*it) for it in zip(found.world_from_camera, truth, strict=True)) < 0.008
-    weights = SequenceState.of(found.world_from_camera, session, 1.0, False, OPTIONS.drift).weights()
-    assert weights.argmin() == 2
-    assert weights[2] < 0.1 < np.delete(weights, 2).min()
+    assert error_m(found.world_from_camera[-1], truth[-1]) < 0.008
+    assert [(it.before, it.after) for it in found.jumps] == [(0, 1)]
+    assert found.jumps[0].shift_m == pytest.approx(apart_m, abs=0.05)
+    last = found.world_from_session.transform_pose(session[-1])
+    np.testing.assert_allclose(last.translation, found.world_from_camera[-1].translation, atol=1e-6)
+
+
+def test_a_jump_before_frames_without_matches_is_between_the_others() -> None:
+    random = random_for("gap")
+    truth = walk(random, 6)
+    images = images_of(random, truth, alone=True, own_noise_m=0.005)
+    images[2] = images[3] = NOTHING
+    found = estimate(solve_sequence(images, jumping(drifting(random, truth, 0.01), 3, JUMP), False, OPTIONS))
+    assert [(it.before, it.after) for it in found.jumps] == [(1, 4)]
+    assert error_m(found.world_from_camera[-1], truth[-1]) < 0.008
+
+
+def test_a_jump_is_found_at_a_frame_with_too_few_matches_alone() -> None:
+    """The frame is on the side of the jump that its few matches agree with."""
+    random = random_for("few")
+    truth = walk(random, 6)
+    posed = [True, True, False, True, True, True]
+    images = images_of(random, truth, keep=[200, 200, 12, 200, 200, 200], alone=posed, own_noise_m=0.005)
+    for at in (2, 3):
+        session = jumping(drifting(random, truth, 0.01), at, JUMP)
+        found = estimate(solve_sequence(images, session, False, OPTIONS))
+        assert [(it.before, it.after) for it in found.jumps] == [(at - 1, at)]
+        assert error_m(found.world_from_camera[2], truth[2]) < 0.02
+
+
+def test_a_last_frame_that_contradicts_its_tracked_pose_is_rejected() -> None:
+    """It has too few matches for a pose, and none is where the tracking says."""
+    random = random_for("lost")
+    truth = walk(random, 4)
+    images = images_of(random, truth, UNGUIDED, keep=[60, 60, 60, 40], alone=[True] * 3 + [False], own_noise_m=0.005)
+    wrong = images_of(random_for("lost"), truth, UNGUIDED, keep=40, wrong_share=1.0)[3]
+    right = drifting(random, truth, 0.01)
+    assert not estimate(solve_sequence(images, right, False, OPTIONS)).jumps
+    outcome = rejection(solve_sequence([*images[:3], wrong], jumping(right, 3, JUMP), False, OPTIONS))
+    assert outcome.reason is RejectionReason.GATE
+    assert "contradicts its tracked pose" in outcome.message
+
+
+def test_a_last_frame_not_localized_alone_is_cut_by_its_matches() -> None:
+    random = random_for("itself")
+    truth = walk(random, 4)
+    images = images_of(random, truth, alone=[True] * 3 + [False], own_noise_m=0.005)
+    session = jumping(drifting(random, truth, 0.01), 3, JUMP)
+    found = estimate(solve_sequence(images, session, False, OPTIONS))
+    assert [(it.before, it.after) for it in found.jumps] == [(2, 3)]
+    assert error_m(found.world_from_camera[-1], truth[-1]) < 0.01
+
+
+def test_steps_that_fit_no_unit_are_rejected() -> None:
+    random = random_for("no unit")
+    truth = walk(random, 3)
+    session = rescaled(jumping(drifting(random, truth, 0.01), 2, JUMP), 2.0)
+    images = images_of(random, truth, alone=True, own_noise_m=0.002)
+    outcome = rejection(solve_sequence(images, session, True, OPTIONS))
+    assert outcome.reason is RejectionReason.SCALE_UNRELIABLE
+    assert "in any unit" in outcome.message
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_drift_within_the_stated_noise_is_not_cut(seed: int) -> None:
+    """Steps with exactly the noise of the options."""
+    random = random_for("stated", seed)
+    truth = walk(random, 8)
+    session = [truth[0]]
+    for first, second in itertools.pairwise(truth):
+        step = first.inverse().compose(second)
+        error = random.normal(0, OPTIONS.drift.sigma(step))
+        turned = rotation_from_vector(error[3:]) @ step.rotation
+        session.append(session[-1].compose(RigidTransform(turned, step.translation + error[:3])))
+    own = {i: (pose, np.diag([1e-5] * 3 + [1e-6] * 3)) for i, pose in enumerate(truth)}
+    chain = find_jumps(own, session, 1.0, OPTIONS.drift, OPTIONS.jumps)
+    assert chain is not None
+    assert (chain.frames, chain.jumps) == (tuple(range(8)), ())
+
+
+def test_a_prior_on_a_frame_is_used_where_it_agrees() -> None:
+    random = random_for("prior")
+    truth = walk(random, 3)
+    images = images_of(random, truth, UNGUIDED, keep=20, alone=True, own_noise_m=0.005)
+    session = drifting(random, truth, 0.01)
+
+    def with_prior(off_m: float) -> SequenceEstimate:
+        at = caller_pose(truth[-1]).translation + np.array([off_m, 0, 0])
+        prior = Priors(position=PositionPrior(at, 1e-8 * np.eye(3)))
+        return estimate(solve_sequence([*images[:2], replace(images[2], priors=prior)], session, False, OPTIONS))
+
+    right, wrong, none = with_prior(0.0), with_prior(1.0), estimate(solve_sequence(images, session, False, OPTIONS))
+    assert error_m(right.world_from_camera[-1], truth[-1]) < 1e-3
+    assert np.trace(right.covariances[-1][:3, :3]) < 0.1 * np.trace(none.covariances[-1][:3, :3])
+    assert [(it.used, it.conflict) for it in right.prior_checks[2]] == [(True, False)]
+    assert [(it.used, it.conflict) for it in wrong.prior_checks[2]] == [(False, True)]
+    np.testing.assert_array_equal(wrong.world_from_camera[-1].matrix(), none.world_from_camera[-1].matrix())
 
 
 def test_one_wrong_own_pose_does_not_change_the_sequence() -> None:
@@ -104,6 +228,7 @@ def test_one_wrong_own_pose_does_not_change_the_sequence() -> None:
     wrong = images_of(random_for("outvoted"), truth, alone=True, own_noise_m=3.0)[4]
     found = estimate(solve_sequence([*images[:4], wrong], drifting(random, truth, 0.01), False, OPTIONS))
     assert error_m(found.world_from_camera[-1], truth[-1]) < 0.02
+    assert not found.jumps
 
 
 def test_a_session_without_motion_has_no_scale() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -22,9 +23,12 @@ from mapless import (
     Camera,
     Client,
     GroupRejected,
+    HeadingPrior,
     MaplessError,
     NewReference,
     NotFound,
+    PositionPrior,
+    Priors,
     RigidTransform,
     RigImage,
     RigLocalization,
@@ -80,6 +84,8 @@ def test_a_rig(corner: Client, queries: list[bytes]) -> None:
     assert (answer.geo_pose, answer.arbitrary_unit) == (None, False)
     assert 0 < answer.accuracy.position_68_m < answer.accuracy.position_95_m < 0.2
     assert (np.linalg.eigvalsh(answer.covariance) > 0).all()
+    assert answer.trust is not None
+    assert 0 < answer.trust <= 1
     assert [report.rejected_alone for report in answer.images] == [None, "LOW_TEXTURE", None, None]
     assert sum(report.inlier_count for report in answer.images) == answer.inlier_count <= answer.match_count
     assert answer.images[1].match_count == 0
@@ -128,6 +134,30 @@ def test_a_sequence(corner: Client, queries: list[bytes], axes: str) -> None:
     now = answer.world_from_session.transform_pose(tracked(WALK[-1]))
     assert_pose_close(now, pose_to(name, answer.world_from_camera[-1]), metres=1e-6, degrees=1e-4)
     assert [report.rejected_alone for report in answer.images] == [None] * 4
+
+
+def test_a_jump_of_the_tracking_is_reported(corner: Client, queries: list[bytes]) -> None:
+    """Between the two last photographs; one of them has priors."""
+    jump = RigidTransform(rotation_from_vector([0, 0.3, 0]), np.array([0.0, 2.0, 0.0]))
+    session = [*WALK[:3], jump.compose(WALK[3])]
+    known = Priors(heading=HeadingPrior(WALK[3].rotation[:, 2], sigma_deg=1.0))
+    frames = [SequenceFrame(image, CORNER, at) for image, at in zip(queries, session, strict=True)]
+    frames[3] = replace(frames[3], priors=known)
+    answer = corner.localize_sequence(frames, "corner")
+    assert isinstance(answer, SequenceLocalization), answer
+    (found,) = answer.jumps
+    assert (found.before, found.after) == (2, 3)
+    assert found.shift_m == pytest.approx(math.dist(session[3].translation, WALK[3].translation), abs=0.05)
+    assert found.rotation_deg == pytest.approx(math.degrees(0.3), abs=0.5)
+    for pose_found, truth in zip(answer.world_from_camera, WALK, strict=True):
+        assert_pose_close(pose_found, truth, metres=0.01, degrees=0.5)
+    assert answer.trust is not None
+    assert 0 < answer.trust <= 1
+    assert [(it.kind, it.conflict) for it in answer.images[3].prior_checks] == [("HEADING", False)]
+    frames[3] = replace(frames[3], priors=Priors(position=PositionPrior(WALK[3].translation + 5.0, radius_m=1.0)))
+    rejected = corner.localize_sequence(frames, "corner")
+    assert isinstance(rejected, GroupRejected)
+    assert rejected.reason == "PRIOR_CONFLICT"
 
 
 def test_what_shows_nothing_is_rejected_with_each_images_reason(corner: Client) -> None:
@@ -196,6 +226,8 @@ BAD_RIGS: dict[str, Case] = {
     "not an image": ("images[1].image", b"<svg/>"),
     "truncated": ("images[1].image", PHOTO[:-100]),
     "reference of another scene": ("images[1].references", ["scenes/other/references/r1"], "images[1].references[0]"),
+    "heading without a direction": ("images[1].heading_prior", pb.HeadingPrior(), "images[1].heading_prior.direction"),
+    "satellite without a datum": ("images[2].geo_position_prior", pb.GeoPositionPrior(horizontal_sigma_m=1.0)),
     "another variant": ("options.variant", pb.VARIANT_FULL),
     "65 chosen": ("options.reference_count", 65),
     "no scene": ("scene", None),

@@ -12,7 +12,8 @@ from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.groups.images import GroupImage
 from mapless_server.method.match import MatchOptions
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.results import KeypointNoise, PointMatches, PoseStage, Support
+from mapless_server.method.results import KeypointNoise, PointMatches, PoseStage, Structure, Support
+from mapless_server.method.views import Matches
 from support.planted import true_structure
 from support.scenes import SceneOptions, SyntheticScene, look_at, make_scene, observe
 
@@ -95,13 +96,23 @@ def images_of(
         wrong = random.permutation(len(chosen))[: round(wrong_share * len(chosen))]
         point[wrong] = np.roll(point[wrong], 1)
         matches = PointMatches(point, keypoint, np.zeros(len(point), bool), 6.0)
-        support = Support(view, scene.references, structure, matches, None, ORIGIN)
+        its_matches = matches_with_references(structure, matches, len(scene.references))
+        support = Support(view, scene.references, structure, matches, None, ORIGIN, query_matches=its_matches)
         outcome: Localization | Rejection = NOT_ALONE
         if is_posed:
             off = pose.shifted(ORIGIN + random.normal(0, own_noise_m, 3))
             outcome = Localization(off, np.eye(6) * 1e-4, PoseStage.REFINED, len(point), len(point), 0.5)
         images.append(GroupImage(Answer(outcome, support=support), MATCH))
     return images
+
+
+def matches_with_references(structure: Structure, matches: PointMatches, count: int) -> tuple[Matches, ...]:
+    """Of a photograph with each of the references that observe its points."""
+    keypoint_of = np.full(len(structure.x_in_world), -1)
+    keypoint_of[matches.point] = matches.keypoint
+    tracks = structure.tracks
+    pairs = np.stack([keypoint_of[tracks.point], tracks.keypoint], axis=1)
+    return tuple(pairs[(tracks.view == view) & (pairs[:, 0] >= 0)] for view in range(count))
 
 
 def caller_pose(world_from_camera: RigidTransform) -> RigidTransform:

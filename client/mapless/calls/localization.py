@@ -166,7 +166,7 @@ def localize_rig(
         images: the photographs, 1 to 8.
         scene: the scene to localize in.
         reference_count: number of references that the server chooses for each photograph; 0 for its default.
-        coverage: see `localize`; holds for each photograph alone.
+        coverage: see `localize`; holds for the joint pose, and for each photograph alone.
         capture_time: time of the photographs, with time zone; returned with the answer.
         session_from_rig: the device's own pose of the rig at that time, OpenCV's axes; used for
             `RigLocalization.world_from_session`.
@@ -174,15 +174,7 @@ def localize_rig(
     """
     request = pb.LocalizeRigRequest(
         scene=scene_name(scene),
-        images=[
-            pb.RigImage(
-                image=read_image(image.image),
-                intrinsics=wire.camera_to_message(image.camera),
-                rig_from_camera=wire.transform_to_message(image.rig_from_camera),
-                references=reference_names(scene, image.references),
-            )
-            for image in images
-        ],
+        images=[_rig_image_to_message(image, scene) for image in images],
         options=pb.LocalizeOptions(reference_count=reference_count, coverage=coverage),
     )
     if capture_time is not None:
@@ -203,14 +195,17 @@ def localize_sequence(
     axes: Axes | str = "",
     timeout_s: float | None = None,
 ) -> Exchange[SequenceLocalization | GroupRejected]:
-    """Localizes a device by a few photographs and the poses that it tracked meanwhile, which may drift.
+    """Localizes a device by a few photographs and the poses that it tracked meanwhile, which may drift or jump.
+
+    Where the photographs contradict the tracking, it is cut, and the photographs since then are localized without the
+    earlier ones (`SequenceLocalization.jumps`).
 
     Args:
         frames: 2 to 16 photographs with the device's poses, the oldest first.
         scene: the scene to localize in.
         estimate_session_scale: whether the scale of the device's poses is unknown; the device must have moved.
         reference_count: number of references that the server chooses for each photograph; 0 for its default.
-        coverage: see `localize`; holds for each photograph alone.
+        coverage: see `localize`; holds for the joint pose, and for each photograph alone.
         axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: of the device's poses and of
             `SequenceLocalization.world_from_session`.
         timeout_s: deadline of the call.
@@ -227,6 +222,17 @@ def localize_sequence(
     return sequence_from_message(response)
 
 
+def _rig_image_to_message(image: RigImage, scene: str) -> pb.RigImage:
+    message = pb.RigImage(
+        image=read_image(image.image),
+        intrinsics=wire.camera_to_message(image.camera),
+        rig_from_camera=wire.transform_to_message(image.rig_from_camera),
+        references=reference_names(scene, image.references),
+    )
+    set_priors(message, image.priors)
+    return message
+
+
 def _frame_to_message(frame: SequenceFrame, scene: str) -> pb.SequenceFrame:
     message = pb.SequenceFrame(
         image=read_image(frame.image),
@@ -234,6 +240,7 @@ def _frame_to_message(frame: SequenceFrame, scene: str) -> pb.SequenceFrame:
         session_from_camera=wire.transform_to_message(frame.session_from_camera),
         references=reference_names(scene, frame.references),
     )
+    set_priors(message, frame.priors)
     if frame.capture_time is not None:
         message.capture_time.FromDatetime(frame.capture_time)
     return message

@@ -511,16 +511,26 @@ class LocalizeRigRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., images: _Optional[_Iterable[_Union[RigImage, _Mapping]]] = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_rig: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ...) -> None: ...
 
 class RigImage(_message.Message):
-    __slots__ = ("image", "intrinsics", "rig_from_camera", "references")
+    __slots__ = ("image", "intrinsics", "rig_from_camera", "references", "position_prior", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior")
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     INTRINSICS_FIELD_NUMBER: _ClassVar[int]
     RIG_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
     REFERENCES_FIELD_NUMBER: _ClassVar[int]
+    POSITION_PRIOR_FIELD_NUMBER: _ClassVar[int]
+    HEADING_PRIOR_FIELD_NUMBER: _ClassVar[int]
+    GEO_POSITION_PRIOR_FIELD_NUMBER: _ClassVar[int]
+    GRAVITY_PRIOR_FIELD_NUMBER: _ClassVar[int]
+    POSE_PRIOR_FIELD_NUMBER: _ClassVar[int]
     image: bytes
     intrinsics: _geometry_pb2.CameraIntrinsics
     rig_from_camera: _geometry_pb2.RigidTransform
     references: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., rig_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., references: _Optional[_Iterable[str]] = ...) -> None: ...
+    position_prior: PositionPrior
+    heading_prior: HeadingPrior
+    geo_position_prior: GeoPositionPrior
+    gravity_prior: GravityPrior
+    pose_prior: PosePrior
+    def __init__(self, image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., rig_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., references: _Optional[_Iterable[str]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ...) -> None: ...
 
 class LocalizeRigResponse(_message.Message):
     __slots__ = ("localization", "rejection", "images", "capture_time", "session_from_rig")
@@ -537,7 +547,7 @@ class LocalizeRigResponse(_message.Message):
     def __init__(self, localization: _Optional[_Union[RigLocalization, _Mapping]] = ..., rejection: _Optional[_Union[Rejection, _Mapping]] = ..., images: _Optional[_Iterable[_Union[ImageReport, _Mapping]]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_rig: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ...) -> None: ...
 
 class RigLocalization(_message.Message):
-    __slots__ = ("world_from_rig", "covariance", "accuracy", "inlier_count", "match_count", "reprojection_error_px", "world_from_session", "geo_pose", "arbitrary_unit")
+    __slots__ = ("world_from_rig", "covariance", "accuracy", "inlier_count", "match_count", "reprojection_error_px", "world_from_session", "geo_pose", "arbitrary_unit", "trust")
     WORLD_FROM_RIG_FIELD_NUMBER: _ClassVar[int]
     COVARIANCE_FIELD_NUMBER: _ClassVar[int]
     ACCURACY_FIELD_NUMBER: _ClassVar[int]
@@ -547,6 +557,7 @@ class RigLocalization(_message.Message):
     WORLD_FROM_SESSION_FIELD_NUMBER: _ClassVar[int]
     GEO_POSE_FIELD_NUMBER: _ClassVar[int]
     ARBITRARY_UNIT_FIELD_NUMBER: _ClassVar[int]
+    TRUST_FIELD_NUMBER: _ClassVar[int]
     world_from_rig: _geometry_pb2.RigidTransform
     covariance: PoseCovariance
     accuracy: Accuracy
@@ -556,19 +567,22 @@ class RigLocalization(_message.Message):
     world_from_session: _geometry_pb2.RigidTransform
     geo_pose: GeoPose
     arbitrary_unit: bool
-    def __init__(self, world_from_rig: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., world_from_session: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., geo_pose: _Optional[_Union[GeoPose, _Mapping]] = ..., arbitrary_unit: bool = ...) -> None: ...
+    trust: float
+    def __init__(self, world_from_rig: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., world_from_session: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., geo_pose: _Optional[_Union[GeoPose, _Mapping]] = ..., arbitrary_unit: bool = ..., trust: _Optional[float] = ...) -> None: ...
 
 class ImageReport(_message.Message):
-    __slots__ = ("inlier_count", "match_count", "alone", "diagnostics")
+    __slots__ = ("inlier_count", "match_count", "alone", "diagnostics", "prior_checks")
     INLIER_COUNT_FIELD_NUMBER: _ClassVar[int]
     MATCH_COUNT_FIELD_NUMBER: _ClassVar[int]
     ALONE_FIELD_NUMBER: _ClassVar[int]
     DIAGNOSTICS_FIELD_NUMBER: _ClassVar[int]
+    PRIOR_CHECKS_FIELD_NUMBER: _ClassVar[int]
     inlier_count: int
     match_count: int
     alone: Rejection
     diagnostics: Diagnostics
-    def __init__(self, inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., alone: _Optional[_Union[Rejection, _Mapping]] = ..., diagnostics: _Optional[_Union[Diagnostics, _Mapping]] = ...) -> None: ...
+    prior_checks: _containers.RepeatedCompositeFieldContainer[PriorCheck]
+    def __init__(self, inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., alone: _Optional[_Union[Rejection, _Mapping]] = ..., diagnostics: _Optional[_Union[Diagnostics, _Mapping]] = ..., prior_checks: _Optional[_Iterable[_Union[PriorCheck, _Mapping]]] = ...) -> None: ...
 
 class LocalizeSequenceRequest(_message.Message):
     __slots__ = ("scene", "frames", "estimate_session_scale", "options")
@@ -583,18 +597,28 @@ class LocalizeSequenceRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., frames: _Optional[_Iterable[_Union[SequenceFrame, _Mapping]]] = ..., estimate_session_scale: bool = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ...) -> None: ...
 
 class SequenceFrame(_message.Message):
-    __slots__ = ("image", "intrinsics", "session_from_camera", "capture_time", "references")
+    __slots__ = ("image", "intrinsics", "session_from_camera", "capture_time", "references", "position_prior", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior")
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     INTRINSICS_FIELD_NUMBER: _ClassVar[int]
     SESSION_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
     CAPTURE_TIME_FIELD_NUMBER: _ClassVar[int]
     REFERENCES_FIELD_NUMBER: _ClassVar[int]
+    POSITION_PRIOR_FIELD_NUMBER: _ClassVar[int]
+    HEADING_PRIOR_FIELD_NUMBER: _ClassVar[int]
+    GEO_POSITION_PRIOR_FIELD_NUMBER: _ClassVar[int]
+    GRAVITY_PRIOR_FIELD_NUMBER: _ClassVar[int]
+    POSE_PRIOR_FIELD_NUMBER: _ClassVar[int]
     image: bytes
     intrinsics: _geometry_pb2.CameraIntrinsics
     session_from_camera: _geometry_pb2.RigidTransform
     capture_time: _timestamp_pb2.Timestamp
     references: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., references: _Optional[_Iterable[str]] = ...) -> None: ...
+    position_prior: PositionPrior
+    heading_prior: HeadingPrior
+    geo_position_prior: GeoPositionPrior
+    gravity_prior: GravityPrior
+    pose_prior: PosePrior
+    def __init__(self, image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., references: _Optional[_Iterable[str]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ...) -> None: ...
 
 class LocalizeSequenceResponse(_message.Message):
     __slots__ = ("localization", "rejection", "images")
@@ -607,7 +631,7 @@ class LocalizeSequenceResponse(_message.Message):
     def __init__(self, localization: _Optional[_Union[SequenceLocalization, _Mapping]] = ..., rejection: _Optional[_Union[Rejection, _Mapping]] = ..., images: _Optional[_Iterable[_Union[ImageReport, _Mapping]]] = ...) -> None: ...
 
 class SequenceLocalization(_message.Message):
-    __slots__ = ("world_from_session", "session_scale", "session_scale_sigma", "poses", "covariance", "accuracy", "inlier_count", "match_count", "reprojection_error_px", "axes", "arbitrary_unit")
+    __slots__ = ("world_from_session", "session_scale", "session_scale_sigma", "poses", "covariance", "accuracy", "inlier_count", "match_count", "reprojection_error_px", "axes", "arbitrary_unit", "jumps", "trust")
     WORLD_FROM_SESSION_FIELD_NUMBER: _ClassVar[int]
     SESSION_SCALE_FIELD_NUMBER: _ClassVar[int]
     SESSION_SCALE_SIGMA_FIELD_NUMBER: _ClassVar[int]
@@ -619,6 +643,8 @@ class SequenceLocalization(_message.Message):
     REPROJECTION_ERROR_PX_FIELD_NUMBER: _ClassVar[int]
     AXES_FIELD_NUMBER: _ClassVar[int]
     ARBITRARY_UNIT_FIELD_NUMBER: _ClassVar[int]
+    JUMPS_FIELD_NUMBER: _ClassVar[int]
+    TRUST_FIELD_NUMBER: _ClassVar[int]
     world_from_session: _geometry_pb2.RigidTransform
     session_scale: float
     session_scale_sigma: float
@@ -630,7 +656,21 @@ class SequenceLocalization(_message.Message):
     reprojection_error_px: float
     axes: Axes
     arbitrary_unit: bool
-    def __init__(self, world_from_session: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., session_scale: _Optional[float] = ..., session_scale_sigma: _Optional[float] = ..., poses: _Optional[_Iterable[_Union[CapturedPose, _Mapping]]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., axes: _Optional[_Union[Axes, str]] = ..., arbitrary_unit: bool = ...) -> None: ...
+    jumps: _containers.RepeatedCompositeFieldContainer[TrackingJump]
+    trust: float
+    def __init__(self, world_from_session: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., session_scale: _Optional[float] = ..., session_scale_sigma: _Optional[float] = ..., poses: _Optional[_Iterable[_Union[CapturedPose, _Mapping]]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., axes: _Optional[_Union[Axes, str]] = ..., arbitrary_unit: bool = ..., jumps: _Optional[_Iterable[_Union[TrackingJump, _Mapping]]] = ..., trust: _Optional[float] = ...) -> None: ...
+
+class TrackingJump(_message.Message):
+    __slots__ = ("before", "after", "shift_m", "rotation_deg")
+    BEFORE_FIELD_NUMBER: _ClassVar[int]
+    AFTER_FIELD_NUMBER: _ClassVar[int]
+    SHIFT_M_FIELD_NUMBER: _ClassVar[int]
+    ROTATION_DEG_FIELD_NUMBER: _ClassVar[int]
+    before: int
+    after: int
+    shift_m: float
+    rotation_deg: float
+    def __init__(self, before: _Optional[int] = ..., after: _Optional[int] = ..., shift_m: _Optional[float] = ..., rotation_deg: _Optional[float] = ...) -> None: ...
 
 class CapturedPose(_message.Message):
     __slots__ = ("capture_time", "world_from_camera")

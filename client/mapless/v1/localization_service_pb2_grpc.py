@@ -154,8 +154,8 @@ class LocalizationServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def LocalizeSequence(self, request, context):
-        """Localizes a device from a short sequence of photographs and the poses that it tracked meanwhile, which may drift, and
-        whose scale may be unknown. Errors are Localize's; those of a photograph name it ("frames[2].intrinsics").
+        """Localizes a device from a short sequence of photographs and the poses that it tracked meanwhile, which may drift or jump,
+        and whose scale may be unknown. Errors are Localize's; those of a photograph name it ("frames[2].intrinsics").
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -82,13 +82,18 @@ class Engine(Protocol):
         ...
 
     async def pose_rig(
-        self, results: Sequence[Result], rig_from_camera: Sequence[RigidTransform], caller: Caller
+        self,
+        queries: Sequence[Query],
+        results: Sequence[Result],
+        rig_from_camera: Sequence[RigidTransform],
+        caller: Caller,
     ) -> RigEstimate | Rejection:
         """The pose of the rig that took the photographs, however full the queue is."""
         ...
 
     async def pose_sequence(
         self,
+        queries: Sequence[Query],
         results: Sequence[Result],
         session_from_camera: Sequence[RigidTransform],
         estimate_scale: bool,

@@ -2,50 +2,68 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TypeVar
+from collections.abc import Mapping, Sequence
 
 from mapless.geometry import RigidTransform
 from mapless_server.method.groups.checks import check_mounting, check_unit, hinted_group
 from mapless_server.method.groups.images import GroupImage
 from mapless_server.method.groups.rig import RigEstimate, RigOptions, solve_rig
-from mapless_server.method.groups.sequence import SequenceEstimate, SequenceOptions, solve_sequence
+from mapless_server.method.groups.sequence import SequenceEstimate, solve_sequence
+from mapless_server.method.groups.start import SequenceOptions
 from mapless_server.method.options import Variant
-from mapless_server.method.rejection import Rejection
+from mapless_server.method.rejection import Rejection, RejectionReason
 
-from .query import Result
-
-Joint = TypeVar("Joint", RigEstimate, SequenceEstimate)
+from .query import Query, Result
 
 
-def pose_rig(results: Sequence[Result], rig_from_camera: Sequence[RigidTransform]) -> RigEstimate | Rejection:
+def pose_rig(
+    queries: Sequence[Query], results: Sequence[Result], rig_from_camera: Sequence[RigidTransform]
+) -> RigEstimate | Rejection:
     """The pose of the rig that took the photographs, in order."""
-    found = solve_rig(_images(results), rig_from_camera, RigOptions())
+    options = RigOptions(coverage=queries[0].options.coverage)
+    found = solve_rig(_images(queries, results), rig_from_camera, options)
     if not isinstance(found, Rejection):
         found = check_mounting(found, [result.answer for result in results])
-    return _hinted(found, results)
+    if isinstance(found, Rejection):
+        return _hinted(found, results)
+    poses = {i: found.world_from_rig.compose(it) for i, it in enumerate(rig_from_camera)}
+    return _beyond_limits(queries, poses, "images") or found
 
 
 def pose_sequence(
-    results: Sequence[Result], session_from_camera: Sequence[RigidTransform], estimate_scale: bool
+    queries: Sequence[Query],
+    results: Sequence[Result],
+    session_from_camera: Sequence[RigidTransform],
+    estimate_scale: bool,
 ) -> SequenceEstimate | Rejection:
     """The poses of the frames of a sequence, in order; OpenCV's axes."""
-    found = solve_sequence(_images(results), session_from_camera, estimate_scale, SequenceOptions())
+    options = SequenceOptions(coverage=queries[0].options.coverage)
+    found = solve_sequence(_images(queries, results), session_from_camera, estimate_scale, options)
     if not isinstance(found, Rejection) and not estimate_scale:
         found = check_unit(found, session_from_camera)
-    return _hinted(found, results)
+    if isinstance(found, Rejection):
+        return _hinted(found, results)
+    since = max((jump.after for jump in found.jumps), default=0)
+    poses = {i: pose for i, pose in enumerate(found.world_from_camera) if i >= since}
+    return _beyond_limits(queries, poses, "frames") or found
 
 
-def _images(results: Sequence[Result]) -> list[GroupImage]:
+def _beyond_limits(queries: Sequence[Query], poses: Mapping[int, RigidTransform], list_name: str) -> Rejection | None:
+    """A rejection if a photograph's joint pose is beyond a hard limit of its priors."""
+    for i, pose in poses.items():
+        if contradiction := queries[i].narrowing.contradiction(pose):
+            return Rejection(RejectionReason.PRIOR_CONFLICT, f"{list_name}[{i}]: {contradiction}")
+    return None
+
+
+def _images(queries: Sequence[Query], results: Sequence[Result]) -> list[GroupImage]:
     images = []
-    for result in results:
+    for query, result in zip(queries, results, strict=True):
         pipeline = result.tier.pipeline
         match = pipeline.options.match(Variant.BEST, pipeline.matcher.options.guided_similarity)
-        images.append(GroupImage(result.answer, match))
+        images.append(GroupImage(result.answer, match, query.priors))
     return images
 
 
-def _hinted(found: Joint | Rejection, results: Sequence[Result]) -> Joint | Rejection:
-    if not isinstance(found, Rejection):
-        return found
-    return hinted_group(found, [(result.answer, result.references) for result in results])
+def _hinted(rejection: Rejection, results: Sequence[Result]) -> Rejection:
+    return hinted_group(rejection, [(result.answer, result.references) for result in results])

@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import partial
 from typing import Any, TypeVar, cast
 
 from mapless.geometry import RigidTransform
@@ -220,20 +221,26 @@ class QueueEngine:
         return max(self.options.workers, self.options.max_batch)
 
     async def pose_rig(
-        self, results: Sequence[Result], rig_from_camera: Sequence[RigidTransform], caller: Caller
+        self,
+        queries: Sequence[Query],
+        results: Sequence[Result],
+        rig_from_camera: Sequence[RigidTransform],
+        caller: Caller,
     ) -> RigEstimate | Rejection:
         """The pose of the rig that took the photographs."""
-        return await self.join(lambda: joint.pose_rig(results, rig_from_camera), caller)
+        return await self.join(lambda: joint.pose_rig(queries, results, rig_from_camera), caller)
 
     async def pose_sequence(
         self,
+        queries: Sequence[Query],
         results: Sequence[Result],
         session_from_camera: Sequence[RigidTransform],
         estimate_scale: bool,
         caller: Caller,
     ) -> SequenceEstimate | Rejection:
         """The poses of the frames of a sequence, OpenCV's axes."""
-        return await self.join(lambda: joint.pose_sequence(results, session_from_camera, estimate_scale), caller)
+        work = partial(joint.pose_sequence, queries, results, session_from_camera, estimate_scale)
+        return await self.join(work, caller)
 
     async def join(self, compute: Callable[[], Joined], caller: Caller) -> Joined:
         """Computes from several photographs' answers, in its turn, however full the queue is.

@@ -51,6 +51,11 @@ class Poses:
     def __getitem__(self, chosen: NDArray[np.intp] | slice) -> Poses:
         return Poses(self.rotation[chosen], self.translation[chosen])
 
+    @property
+    def centres(self) -> Array:
+        """(V, 3) of the cameras, in the world."""
+        return np.asarray(-np.einsum("vji,vj->vi", self.rotation, self.translation))
+
     def and_last(self, camera_from_world: RigidTransform) -> Poses:
         """With another pose appended."""
         return Poses(

@@ -130,7 +130,8 @@ def _solve(coarse: Coarse, counts_agreement: bool) -> Answer:
         return coarse.answer(scale)
     query, references, options, priors = prepared.query, prepared.references, prepared.pipeline.options, prepared.priors
     structure, matches = _structure_and_matches(coarse, scale)
-    support = Support(query, references, structure, matches, None, prepared.origin)
+    query_matches = tuple(prepared.correspondences.query_matches)
+    support = Support(query, references, structure, matches, None, prepared.origin, query_matches=query_matches)
     with stage("pnp"):
         estimate = solve_pose(query, structure, matches, scale.world_from_query, options.pnp, priors)
     if isinstance(estimate, Rejection):
@@ -150,7 +151,6 @@ def _solve(coarse: Coarse, counts_agreement: bool) -> Answer:
     estimate = replace(estimate, covariance=covariance)
     support = replace(support, estimate=estimate)
     with stage("judge"):
-        query_matches = prepared.correspondences.query_matches
         judged = judge(support, query_matches, prepared.options.coverage, options.judge, chance)
     if judged.rejection:
         return coarse.answer(judged.rejection, support)

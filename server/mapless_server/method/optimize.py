@@ -11,10 +11,13 @@ Robust losses rho(s) of a squared residual s, with a scale c; both in standard d
     loss       rho(s)                           weight rho'(s)
     Cauchy     c^2 log(1 + s / c^2)             1 / (1 + s / c^2)
     soft L1    2 c^2 (sqrt(1 + s / c^2) - 1)    1 / sqrt(1 + s / c^2)
+    switched   s / (1 + s / c^2)                1 / (1 + s / c^2)^2
 
-Both are s for small s. For large s, soft L1 grows like the residual, and Cauchy's loss like its logarithm, so that the
-influence of outliers vanishes. The weights are those of iteratively reweighted least squares: the gradient of a sum of
-losses is 2 sum rho'(s) J^T r. (As in `scipy.optimize.least_squares`, with f_scale = c.)
+All are s for small s. For large s, soft L1 grows like the residual, and Cauchy's loss like its logarithm, so that the
+influence of outliers vanishes. The switched loss (Geman and McClure's) is that of a switch variable 0 <= t <= 1 for
+each residual, min_t t^2 s + (1 - t)^2 c^2 (Suenderhauf and Protzel 2012): an outlier costs c^2, however large it is.
+The weights are those of iteratively reweighted least squares: the gradient of a sum of losses is 2 sum rho'(s) J^T r.
+(As in `scipy.optimize.least_squares`, with f_scale = c.)
 """
 
 from __future__ import annotations
@@ -158,6 +161,16 @@ def cauchy_cost(squared: Array, scale: float) -> float:
 def cauchy_weight(squared: Array, scale: float) -> Array:
     """Weights rho' (N,)."""
     return np.asarray(1 / (1 + squared / scale**2))
+
+
+def switched_cost(squared: Array, scale: float) -> float:
+    """The sum of rho over squared residuals (N,) with a switch each."""
+    return float((squared / (1 + squared / scale**2)).sum())
+
+
+def switched_weight(squared: Array, scale: float) -> Array:
+    """Weights rho' (N,): the squares of the switches."""
+    return np.asarray((1 + squared / scale**2) ** -2.0)
 
 
 def soft_l1(squared: AnyArray, scale: float) -> AnyArray:

@@ -16,7 +16,7 @@ from .arrays import (
 from .intrinsics import IntrinsicsEvidence
 from .priors.known import PriorCheck
 from .tracks import Tracks
-from .views import PosedView, View
+from .views import Matches, PosedView, View
 
 
 class ScaleStage(str, Enum):
@@ -174,6 +174,7 @@ class Support:
         estimate: pose and inliers; None without a pose.
         origin: (3,) that origin in the caller's world, metres.
         two_view: matches with single references, where the pose rests on them too.
+        query_matches: of the query with each reference.
     """
 
     query: View
@@ -183,6 +184,7 @@ class Support:
     estimate: PoseEstimate | None
     origin: Array
     two_view: TwoViewSupport | None = None
+    query_matches: tuple[Matches, ...] = ()
 
     def distance_m(self) -> float:
         """Median depth of the inliers' points at the estimate; always positive."""

@@ -143,12 +143,12 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
     async def LocalizeRig(self, request: pb.LocalizeRigRequest, call: Call) -> pb.LocalizeRigResponse:
         """Implements LocalizationService.LocalizeRig."""
         engine = self._engine()
-        queries = queries_from_message(request, "images", (1, MAX_RIG_IMAGES), call.principal.tenant, engine.options)
+        queries = await self._queries(request, "images", (1, MAX_RIG_IMAGES), call)
         rig_from_camera = poses_from_message(request.images, "images", "rig_from_camera")
         session_from_rig = session_from_rig_from_message(request)
         with engine.hold(queries, call.caller):
             group = await localize_photographs(engine, queries, call, "images")
-            outcome = await engine.pose_rig(group.results, rig_from_camera, call.caller)
+            outcome = await engine.pose_rig(queries, group.results, rig_from_camera, call.caller)
         response = rig_to_message(outcome, group, queries, request, session_from_rig)
         self._finish_group(request, response, outcome, queries, group.results, call)
         return response
@@ -156,13 +156,14 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
     async def LocalizeSequence(self, request: pb.LocalizeSequenceRequest, call: Call) -> pb.LocalizeSequenceResponse:
         """Implements LocalizationService.LocalizeSequence."""
         engine = self._engine()
-        bounds = (MIN_FRAMES, MAX_FRAMES)
-        queries = queries_from_message(request, "frames", bounds, call.principal.tenant, engine.options)
+        queries = await self._queries(request, "frames", (MIN_FRAMES, MAX_FRAMES), call)
         axes, session_from_camera = session_poses_from_message(request)
         scale_is_free = request.estimate_session_scale
         with engine.hold(queries, call.caller):
             group = await localize_photographs(engine, queries, call, "frames")
-            outcome = await engine.pose_sequence(group.results, session_from_camera, scale_is_free, call.caller)
+            outcome = await engine.pose_sequence(
+                queries, group.results, session_from_camera, scale_is_free, call.caller
+            )
         response = sequence_to_message(outcome, group, queries, request, axes)
         self._finish_group(request, response, outcome, queries, group.results, call)
         return response
@@ -174,6 +175,20 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         self._watchers.check(call.principal.tenant)
         await asyncio.to_thread(self._store.get_scene, scene_key)
         return self._watchers.watch(scene_key)
+
+    async def _queries(
+        self,
+        request: pb.LocalizeRigRequest | pb.LocalizeSequenceRequest,
+        list_name: str,
+        bounds: tuple[int, int],
+        call: Call,
+    ) -> tuple[Query, ...]:
+        """The photographs of a request, each as a query; FieldError or RequestError names what is wrong with it."""
+        tenant, attributes = call.principal.tenant, SceneAttributes()
+        if any(map(needs_attributes, getattr(request, list_name))):
+            scene_key = scene_key_from_name(request.scene, "scene", tenant)
+            attributes = await asyncio.to_thread(self._store.get_attributes, scene_key)
+        return queries_from_message(request, list_name, bounds, tenant, self._engine().options, attributes)
 
     def _finish_group(
         self,

@@ -128,18 +128,23 @@ class _Recomputing:
         yield
 
     async def pose_rig(
-        self, results: Sequence[Result], rig_from_camera: Sequence[RigidTransform], caller: Caller
+        self,
+        queries: Sequence[Query],
+        results: Sequence[Result],
+        rig_from_camera: Sequence[RigidTransform],
+        caller: Caller,
     ) -> RigEstimate | Rejection:
-        return await asyncio.to_thread(pose_rig, results, rig_from_camera)
+        return await asyncio.to_thread(pose_rig, queries, results, rig_from_camera)
 
     async def pose_sequence(
         self,
+        queries: Sequence[Query],
         results: Sequence[Result],
         session_from_camera: Sequence[RigidTransform],
         estimate_scale: bool,
         caller: Caller,
     ) -> SequenceEstimate | Rejection:
-        return await asyncio.to_thread(pose_sequence, results, session_from_camera, estimate_scale)
+        return await asyncio.to_thread(pose_sequence, queries, results, session_from_camera, estimate_scale)
 
 
 def _compute(stages: QueryStages, job: Job) -> Result:

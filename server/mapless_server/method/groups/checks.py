@@ -62,16 +62,19 @@ def check_mounting(estimate: RigEstimate, alone: Sequence[Answer]) -> RigEstimat
 def check_unit(
     estimate: SequenceEstimate, session_from_camera: Sequence[RigidTransform]
 ) -> SequenceEstimate | Rejection:
-    """Checks the unit of a session that the request calls metric by the length of the photographs' path.
+    """Checks the unit of a session that the request calls metric by the length of the photographs' path, without jumps.
 
     Returns:
         The estimate; or a rejection SCALE_UNRELIABLE with the estimated unit, if the two lengths differ significantly.
     """
-    path_m = _length(estimate.world_from_camera)
-    tracked_m = _length(session_from_camera)
+    poses = estimate.world_from_camera
+    at_jump = {step for jump in estimate.jumps for step in range(jump.before, jump.after)}
+    steps = [(i, i + 1) for i in range(len(poses) - 1) if i not in at_jump]
+    path_m = sum(_distance(poses[i], poses[j]) for i, j in steps)
+    tracked_m = sum(_distance(session_from_camera[i], session_from_camera[j]) for i, j in steps)
     # The variance of a step is the sum of its ends'; an end that two steps share counts twice, which is conservative.
     variances = np.trace(estimate.covariances[:, :3, :3], axis1=1, axis2=2)
-    sigma_m = math.sqrt(float((variances[1:] + variances[:-1]).sum()))
+    sigma_m = math.sqrt(sum(float(variances[i] + variances[j]) for i, j in steps))
     if abs(path_m - tracked_m) <= SIGNIFICANT_SIGMAS * sigma_m or tracked_m * path_m == 0:
         return estimate
     unit_m = path_m / tracked_m
@@ -85,10 +88,9 @@ def check_unit(
     return Rejection(RejectionReason.SCALE_UNRELIABLE, message, Hint(STAGE, Advice.CHECK_CALIBRATION, advice))
 
 
-def _length(poses: Sequence[RigidTransform]) -> float:
-    """Length of the path along the poses' positions."""
-    positions = np.array([pose.translation for pose in poses])
-    return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+def _distance(first: RigidTransform, second: RigidTransform) -> float:
+    """Between two positions."""
+    return math.dist(first.translation, second.translation)
 
 
 STAGE = "join"

@@ -18,13 +18,14 @@ from ..match import MatchOptions, search, vote
 from ..observations import triangulate
 from ..options import check_bounds
 from ..pipeline import Prepared
+from ..priors.known import NO_PRIORS, Priors
 from ..rejection import Rejection, RejectionReason
 from ..results import PointMatches, Structure, Support
 from ..structure import StructureOptions, observe, refine_points, tracks_of
 from ..tracks import Tracks
 from ..trust.evidence import findable_count, hull_share
 from ..trust.gate import GateOptions, false_alarms, format_false_alarms
-from ..views import PosedView, View
+from ..views import Matches, PosedView, View
 from .generalized import CameraMatches
 
 
@@ -58,10 +59,12 @@ class GroupImage:
     Attributes:
         answer: its own; the group uses its `support`.
         match: options of the guided search.
+        priors: on its camera's pose.
     """
 
     answer: Answer
     match: MatchOptions
+    priors: Priors = NO_PRIORS
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +78,9 @@ class MatchedImage:
         structure: metric points.
         tracked: matches that do not depend on a pose of the photograph.
         own_pose: world_from_camera of its own answer; None if it is rejected.
+        own_covariance: (6, 6) of it, order x y z rx ry rz, fixed world axes, metres and radians.
         match: see GroupImage.
+        query_matches: of the photograph with each reference.
     """
 
     image: int
@@ -84,7 +89,9 @@ class MatchedImage:
     structure: Structure
     tracked: PointMatches
     own_pose: RigidTransform | None
+    own_covariance: Array | None
     match: MatchOptions
+    query_matches: tuple[Matches, ...] = ()
 
     def camera_matches(self, rig_from_camera: RigidTransform) -> CameraMatches:
         """The tracked matches as pixels and points of a camera with this mounting."""
@@ -153,8 +160,18 @@ def _matched_image(index: int, image: GroupImage, support: Support, origin: Arra
     tracked = PointMatches(
         support.matches.point[kept], support.matches.keypoint[kept], guided[kept], support.matches.radius_px
     )
-    own_pose = outcome.world_from_camera.shifted(-origin) if isinstance(outcome, Localization) else None
-    return MatchedImage(index, support.query, references, structure, tracked, own_pose, image.match)
+    own_pose, own_covariance = None, None
+    if isinstance(outcome, Localization):
+        own_pose, own_covariance = outcome.world_from_camera.shifted(-origin), outcome.covariance
+    query = support.query
+    return MatchedImage(
+        index, query, references, structure, tracked, own_pose, own_covariance, image.match, support.query_matches
+    )
+
+
+def priors_of(images: Sequence[GroupImage], origin: Array) -> dict[int, Priors]:
+    """The priors on the photographs that have some, by index, in a world with this origin (3,)."""
+    return {i: image.priors.shifted(-origin) for i, image in enumerate(images) if image.priors}
 
 
 def rejection_without_matches(images: Sequence[GroupImage]) -> Rejection:
@@ -236,4 +253,6 @@ def tracked_support(prepared: Prepared) -> Support | None:
     assert isinstance(left, Tracks)
     structure = Structure(refined.x_in_world[refined.trusted], left.select(refined.trusted), noise)
     matches = vote(structure, [len(r.view.features) for r in references], correspondences)
-    return Support(query, references, structure, matches, None, prepared.origin) if len(matches) else None
+    query_matches = tuple(correspondences.query_matches)
+    support = Support(query, references, structure, matches, None, prepared.origin, query_matches=query_matches)
+    return support if len(matches) else None

@@ -2,17 +2,18 @@
 
 What `adjust` minimizes for one photograph, summed over those of a group,
 
-    min  sum_f sum_obs rho(|r_o|^2 / sigma_o^2) + sum_i |xi_i|^2 / sigma_prior^2 + (cost of the group's parameters),
+    min  sum_f sum_obs rho(|r_o|^2 / sigma_o^2) + xi^T C^-1 xi + (cost of the group's parameters),
 
-where the references xi_i are common to the photographs that use them. Each photograph has its own points, which are
-eliminated photograph by photograph; the rest is a dense system of the references and the group's parameters, whose
-cost is zero for a rig and that of the tracked steps for a sequence (see `drift`).
+where the references xi are common to the photographs that use them, and C is that of `pose_errors`, relative to the
+place of the last photograph. Each photograph has its own points, which are eliminated photograph by photograph; the
+rest is a dense system of the references and the group's parameters, whose cost is zero for a rig and that of the
+tracked steps for a sequence (see `drift`). Soft priors that agree with the photographs add their terms.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Generic
 
 import numpy as np
@@ -21,6 +22,7 @@ from mapless.geometry import Array, RigidTransform
 
 from ..optimize import MinimizeOptions, minimize
 from ..perturbation import reprojection_errors_px
+from ..priors.known import PriorCheck, Priors
 from ..results import PointMatches
 from .images import MatchedImage, PosedImage
 from .problem import GroupProblem, GroupState, JointOptions, S
@@ -36,11 +38,13 @@ class JointEstimate(Generic[S]):
         state: the poses at the optimum.
         covariance: (N, N) of its parameters.
         matched: photographs with their matches, in the order of the matched images.
+        prior_checks: of the photographs with priors, by index.
     """
 
     state: S
     covariance: Array
     matched: tuple[PosedImage, ...]
+    prior_checks: Mapping[int, tuple[PriorCheck, ...]] = field(default_factory=dict)
 
     @property
     def inlier_count(self) -> int:
@@ -49,19 +53,47 @@ class JointEstimate(Generic[S]):
 
 
 def adjust_in_rounds(
-    matched_images: Sequence[MatchedImage], state: S, options: JointOptions, rounds: int
+    matched_images: Sequence[MatchedImage],
+    state: S,
+    options: JointOptions,
+    rounds: int,
+    priors: Mapping[int, Priors] | None = None,
 ) -> JointEstimate[S]:
-    """Alternates guided searches from the current poses with adjustments."""
+    """Alternates guided searches from the current poses with adjustments; then uses the priors that agree."""
     for _ in range(rounds):
         poses = [state.camera_from_world(it.image).inverse() for it in matched_images]
         matches = [it.matches_at(pose) for it, pose in zip(matched_images, poses, strict=True)]
         estimate = adjust_jointly(matched_images, matches, state, options)
         state = estimate.state.relaxed()
-    return estimate
+    return _with_priors(matched_images, estimate, priors, options) if priors else estimate
+
+
+def _with_priors(
+    matched_images: Sequence[MatchedImage],
+    estimate: JointEstimate[S],
+    priors: Mapping[int, Priors],
+    options: JointOptions,
+) -> JointEstimate[S]:
+    """Compares priors with the poses from the photographs alone, and adjusts with the consistent ones."""
+    checks, used = {}, {}
+    for image, its in priors.items():
+        pose, columns = estimate.state.camera_from_world(image).inverse(), estimate.state.jacobian(image)
+        covariance = covariance_in_world(columns @ estimate.covariance @ columns.T, pose)
+        checks[image] = its.check(pose, covariance)
+        if consistent := its.consistent(checks[image]):
+            used[image] = consistent
+    if used:
+        matches = [it.matches for it in estimate.matched]
+        estimate = adjust_jointly(matched_images, matches, estimate.state, options, used)
+    return replace(estimate, prior_checks=checks)
 
 
 def adjust_jointly(
-    matched_images: Sequence[MatchedImage], matches: Sequence[PointMatches], state: S, options: JointOptions
+    matched_images: Sequence[MatchedImage],
+    matches: Sequence[PointMatches],
+    state: S,
+    options: JointOptions,
+    priors: Mapping[int, Priors] | None = None,
 ) -> JointEstimate[S]:
     """Refines the poses of a group.
 
@@ -70,11 +102,12 @@ def adjust_jointly(
         matches: of each with its points; those with too large an error at the start are not used.
         state: the initial poses.
         options: of the adjustment.
+        priors: on the photographs' poses, by index; all are used.
 
     Returns:
         The refined poses; the initial ones if no match is used.
     """
-    problem = GroupProblem(matched_images, matches, state, options)
+    problem = GroupProblem(matched_images, matches, state, options, priors)
     steps = MinimizeOptions(options.iterations, options.adjust.min_decrease)
     point = minimize(problem, problem.start, steps) if problem.blocks else problem.start
     points = {block.image: (problem.chosen[i], point.points[i]) for i, block in enumerate(problem.blocks)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Generic, Protocol, TypeVar
 
@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
-from ..adjust import AdjustOptions
+from ..adjust import LEAST_DAMPING, AdjustOptions
 from ..bundle import Bundle, BundleProblem, NormalEquations, Poses, bundle_of
 from ..optimize import solve_step
 from ..options import check_bounds
-from ..perturbation import reprojection_errors_px
+from ..perturbation import reprojection_errors_px, world_jacobian
+from ..pose_errors import most_probable, pose_errors
+from ..priors.known import Priors
 from ..results import PointMatches
 from ..structure import tracks_with_query
 from ..tracks import Tracks
@@ -123,20 +125,15 @@ class JointOptions:
 
     Attributes:
         adjust: as for one photograph.
-        prior_share: standard deviation of the prior on reference poses, each on its own, in image pixels (a rotation by
-            1 / f, a shift by depth / f), as a share of the noise level of the structure. The residuals are an upper
-            bound of the effect of pose errors.
         max_matches: of a photograph, evenly thinned; several photographs have enough together.
         iterations: largest number of Levenberg-Marquardt steps; drift needs more than one photograph's pose.
     """
 
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
-    prior_share: float = 0.2
     max_matches: int = 300
     iterations: int = 15
 
     def __post_init__(self) -> None:
-        check_bounds(self, "prior_share", above=0)
         check_bounds(self, "max_matches", at_least=3)
         check_bounds(self, "iterations", at_least=1)
 
@@ -149,11 +146,15 @@ class ImageBlock:
         image: index of the photograph in the group.
         problem: the cost and its derivatives.
         references: (V - 1,) index of each of its references in the group; the last camera is the photograph.
+        level_px: noise of its structure.
+        depth_m: median depth of its points.
     """
 
     image: int
     problem: BundleProblem
     references: NDArray[np.intp]
+    level_px: float
+    depth_m: float
 
     def columns(self, reference_count: int, state: GroupState) -> Array:
         """(6 V, 6 R + N): derivative of its cameras' motions by the unknowns of the group."""
@@ -186,6 +187,7 @@ class GroupProblem(Generic[S]):
         start: the initial values.
         blocks: one for each photograph with matches.
         chosen: of each block, the indices (P_b,) of its points in the photograph's structure.
+        priors: on the photographs' poses, by index.
     """
 
     def __init__(
@@ -194,10 +196,11 @@ class GroupProblem(Generic[S]):
         matches: Sequence[PointMatches],
         state: S,
         options: JointOptions,
+        priors: Mapping[int, Priors] | None = None,
     ) -> None:
         self.options = options
+        self.priors = priors or {}
         self._references: dict[str, tuple[int, PosedView]] = {}
-        self._information: list[Array] = []
         self.blocks: list[ImageBlock] = []
         self.chosen: list[NDArray[np.intp]] = []
         points: list[Array] = []
@@ -211,9 +214,9 @@ class GroupProblem(Generic[S]):
             self.chosen.append(part.chosen)
             points.append(part.source.structure.x_in_world[part.chosen])
             self.blocks.append(self._block(part, shared))
-        self.information = np.array(self._information).ravel()
         references = Poses.of(reference.world_from_camera for _, reference in self._references.values())
         self.start = Point(references, tuple(points), state)
+        self.information = self._reference_information() if self.blocks else np.zeros((0, 0))
 
     @property
     def reference_count(self) -> int:
@@ -225,26 +228,51 @@ class GroupProblem(Generic[S]):
         views = [*source.references, PosedView("", "", source.query, part.world_from_camera)]
         observations, start, depth_m = bundle_of(part.tracks, views, structure, part.chosen)
         observations = replace(observations, sigma_px=observations.sigma_px * np.sqrt(shared.times(part)))
-        references = np.array([self._index(it, structure.noise.level_px, depth_m) for it in source.references])
+        references = np.array([self._index(it) for it in source.references])
         free = np.zeros((6 * len(references),) * 2)
         problem = BundleProblem(
             observations, part.tracks.view, start.poses[:-1], free, self.options.adjust.loss_scale_sigma
         )
-        return ImageBlock(source.image, problem, references)
+        return ImageBlock(source.image, problem, references, float(structure.noise.level_px), depth_m)
 
-    def _index(self, reference: PosedView, level_px: float, depth_m: float) -> int:
-        """Index of a reference in the group; a new one gets a prior on its pose."""
-        if reference.key not in self._references:
-            self._references[reference.key] = (len(self._references), reference)
-            noise_px = self.options.prior_share * level_px
-            angle = noise_px / reference.view.camera.focal_x_px
-            self._information.append(np.repeat([angle * depth_m, angle], 3) ** -2.0)
-        return self._references[reference.key][0]
+    def _index(self, reference: PosedView) -> int:
+        """Index of a reference in the group."""
+        return self._references.setdefault(reference.key, (len(self._references), reference))[0]
+
+    def _reference_information(self) -> Array:
+        """Of the priors on the references' poses, (6 R, 6 R): the inverse covariance of their errors (`pose_errors`).
+
+        The sizes are those that the photograph with the most observations finds, and the place to which the errors are
+        relative is that of the last photograph.
+        """
+        index = max(range(len(self.blocks)), key=lambda i: len(self.blocks[i].problem.view))
+        block, given = self.blocks[index], self.start.references
+        bundle = self.start.bundle(index, block)
+        observing = np.unique(block.problem.view)[:-1]  # the last is the photograph
+        views = [reference.view for _, reference in self._references.values()]
+        focal_px = float(np.median([views[i].camera.focal_x_px for i in block.references[observing]]))
+        size = block.level_px, focal_px, block.depth_m
+        centre = bundle.world_from_query.translation
+        its = given[block.references]
+        errors = pose_errors(its.centres, its.rotation, centre, *size, observing)
+        matrix, gradient, _ = block.problem.linearize(bundle).reduced(LEAST_DAMPING)
+        own, drift = most_probable(errors, matrix, gradient, self.options.adjust.pose_errors)
+        last = self.start.state.camera_from_world(self.blocks[-1].image).inverse().translation
+        errors = pose_errors(given.centres, given.rotation, last, *size, block.references[observing])
+        return np.asarray(np.linalg.inv(errors.covariance(own, drift)), np.float64)
 
     def cost(self, point: Point[S]) -> float:
         """NaN for a point behind a camera."""
         data = sum(block.problem.cost(point.bundle(i, block)) for i, block in enumerate(self.blocks))
-        return data + float((self._reference_motion(point) ** 2 * self.information).sum()) + point.state.cost()
+        poses = {image: point.state.camera_from_world(image).inverse() for image in self.priors}
+        prior = sum(self.priors[image].cost(pose) for image, pose in poses.items())
+        motion = self._reference_motion(point)
+        return (
+            data
+            + float(motion @ self.information @ motion)
+            + point.state.cost()
+            + self.options.adjust.error_inflation**2 * prior
+        )
 
     def _reference_motion(self, point: Point[S]) -> Array:
         """(6 R,): the motion of each reference away from its given pose."""
@@ -261,7 +289,7 @@ class GroupProblem(Generic[S]):
         """See optimize.Problem."""
         columns = self._columns(point)
         reduced = [it.reduced(damping) for it in equations]
-        matrix, gradient = self._prior_equations(point)
+        matrix, gradient = self._prior_equations(point, self.options.adjust.error_inflation**2)
         matrix += damping * np.diag(np.diag(matrix))
         for (its_matrix, its_gradient, _), its_columns in zip(reduced, columns, strict=True):
             matrix += its_columns.T @ its_matrix @ its_columns
@@ -277,24 +305,32 @@ class GroupProblem(Generic[S]):
         references = point.references.moved(step[: 6 * self.reference_count].reshape(-1, 6))
         return Point(references, tuple(points), point.state.moved(step[6 * self.reference_count :]))
 
-    def _prior_equations(self, point: Point[S], data_inflation: float = 1.0) -> tuple[Array, Array]:
-        """Matrix and gradient of the references' priors and the parameters' cost."""
+    def _prior_equations(
+        self, point: Point[S], prior_weight: float = 1.0, data_inflation: float = 1.0
+    ) -> tuple[Array, Array]:
+        """Matrix and gradient of the references' and the photographs' priors, and of the parameters' cost."""
         references = 6 * self.reference_count
         matrix = np.zeros((references + point.state.size,) * 2)
         gradient = np.zeros(len(matrix))
-        matrix[range(references), range(references)] = self.information / data_inflation**2
-        gradient[:references] = self.information * self._reference_motion(point) / data_inflation**2
+        matrix[:references, :references] = self.information / data_inflation**2
+        gradient[:references] = self.information @ self._reference_motion(point) / data_inflation**2
         matrix[references:, references:], gradient[references:] = point.state.equations()
+        for image, priors in self.priors.items():
+            pose, columns = point.state.camera_from_world(image).inverse(), point.state.jacobian(image)
+            slope, information = priors.gradient_and_information(pose)
+            by_state = world_jacobian(pose) @ columns
+            matrix[references:, references:] += prior_weight * by_state.T @ information @ by_state
+            gradient[references:] += prior_weight * by_state.T @ slope
         return matrix, gradient
 
     def covariance(self, point: Point[S]) -> Array:
         """(N, N) of the parameters; infinite on the diagonal of unobserved ones.
 
-        The parameters' cost counts as stated, the observations with inflated standard deviations (see
+        The parameters' cost and priors count as stated, the observations with inflated standard deviations (see
         AdjustOptions.error_inflation).
         """
         inflation = self.options.adjust.error_inflation
-        matrix, _ = self._prior_equations(point, inflation)
+        matrix, _ = self._prior_equations(point, data_inflation=inflation)
         for it, its_columns in zip(self.linearize(point), self._columns(point), strict=True):
             its_matrix, _, _ = it.reduced(0.0)
             matrix += its_columns.T @ its_matrix @ its_columns / inflation**2

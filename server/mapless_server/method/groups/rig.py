@@ -6,7 +6,7 @@ alone; then matches are searched near the projected points, and everything is ad
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,7 +16,9 @@ from mapless.geometry import Array, RigidTransform, cross_matrix
 from ..options import check_bounds
 from ..perturbation import perturbed
 from ..pnp import PnpOptions
+from ..priors.known import PriorCheck
 from ..rejection import Rejection, RejectionReason
+from ..trust.judge import JudgeOptions
 from .generalized import inlier_count, rig_ransac
 from .images import (
     GroupGateOptions,
@@ -25,9 +27,11 @@ from .images import (
     PosedImage,
     group_gate_failure,
     matched_images_of,
+    priors_of,
     rejection_without_matches,
 )
 from .joint import JointOptions, adjust_in_rounds, covariance_in_world
+from .trust import trust_of_group
 
 
 @dataclass(frozen=True)
@@ -38,16 +42,21 @@ class RigOptions:
         pnp: of the pose solver; `min_matches` of all cameras together.
         gate: of the gate, on the sums over the cameras.
         joint: of the adjustment.
+        judge: of the trust.
+        coverage: share of right answers that are accepted.
         rounds: of searching matches and adjusting; the second starts from a better pose.
     """
 
     pnp: PnpOptions = field(default_factory=PnpOptions)
     gate: GroupGateOptions = field(default_factory=GroupGateOptions)
     joint: JointOptions = field(default_factory=JointOptions)
+    judge: JudgeOptions = field(default_factory=JudgeOptions)
+    coverage: float = 0.97
     rounds: int = 2
 
     def __post_init__(self) -> None:
         check_bounds(self, "rounds", at_least=1)
+        check_bounds(self, "coverage", above=0, at_most=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +68,16 @@ class RigEstimate:
         covariance: (6, 6) of it, order x y z rx ry rz, fixed world axes, metres and radians.
         matched: the images that have matches, in order.
         origin: (3,) of the world in which these are, metres; the pose is in the caller's.
+        trust: 0 to 1, see `trust`.
+        prior_checks: of the photographs with priors, by index.
     """
 
     world_from_rig: RigidTransform
     covariance: Array
     matched: tuple[PosedImage, ...]
     origin: Array
+    trust: float = 1.0
+    prior_checks: Mapping[int, tuple[PriorCheck, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,15 +138,20 @@ def solve_rig(
     if isinstance(start, Rejection):
         return start
     state = RigState(start.inverse(), tuple(rig_from_camera))
-    estimate = adjust_in_rounds(matched_images, state, options.joint, options.rounds)
+    estimate = adjust_in_rounds(matched_images, state, options.joint, options.rounds, priors_of(images, origin))
     if estimate.inlier_count < 4:
         return Rejection(RejectionReason.PNP_FAILED, "no pose of the rig explains four matches")
     failure = group_gate_failure(estimate.matched, options.pnp.inlier_px, options.gate)
     if failure:
         return Rejection(RejectionReason.GATE, failure)
+    trust, doubt = trust_of_group(estimate.matched, options.judge, options.coverage)
+    if doubt:
+        return doubt
     world_from_rig = estimate.state.rig_from_world.inverse()
     covariance = covariance_in_world(estimate.covariance, world_from_rig)
-    return RigEstimate(world_from_rig.shifted(origin), covariance, estimate.matched, origin)
+    return RigEstimate(
+        world_from_rig.shifted(origin), covariance, estimate.matched, origin, trust, estimate.prior_checks
+    )
 
 
 def _start(

@@ -12,9 +12,9 @@ from scipy.spatial import ConvexHull
 
 from mapless.geometry import Array, RigidTransform
 
-from ..results import PointMatches, Support
+from ..results import PointMatches, Structure, Support
 from ..two_view.matches import TwoViewMatches
-from ..views import Matches, View
+from ..views import Matches, PosedView, View
 from .agreement import AgreementOptions, disagreement_of_matches, disagreement_of_references
 from .votes import Votes
 
@@ -100,9 +100,9 @@ def evidence_of(
         int(inliers.sum()),
         len(matches),
         min(1.0, float(inliers.sum() / max(1, findable_count(query, structure.x_in_world, pose)))),
-        _expected_share(support),
+        expected_share(structure, support.references),
         hull_share(query, matches, inliers),
-        epipolar_share(support, query_matches, pose),
+        epipolar_share(query, support.references, query_matches, support.inliers_by_reference(), pose),
         disagreement_of_matches(support, distance_m, options),
         disagreement_of_references(support, votes, distance_m, options),
     )
@@ -119,13 +119,19 @@ def hull_share(query: View, matches: PointMatches, inliers: NDArray[np.bool_]) -
     return float(ConvexHull(pixels, qhull_options="QJ").volume) / (query.camera.width_px * query.camera.height_px)
 
 
-def epipolar_share(support: Support, query_matches: Sequence[Matches], world_from_query: RigidTransform) -> float:
+def epipolar_share(
+    query: View,
+    references: Sequence[PosedView],
+    query_matches: Sequence[Matches],
+    inlier_counts: Sequence[int],
+    world_from_query: RigidTransform,
+) -> float:
     """Share of the matches on their epipolar lines, of the two references with the most inliers, multiplied."""
-    strongest = np.argsort(-np.array(support.inliers_by_reference()), kind="stable")[:2]
+    strongest = np.argsort(-np.array(inlier_counts), kind="stable")[:2]
     chosen = [query_matches[i] for i in strongest]
     if len(chosen) < 2 or not all(map(len, chosen)):
         return 0.0
-    matches = TwoViewMatches.of(support.query, [support.references[i] for i in strongest], chosen)
+    matches = TwoViewMatches.of(query, [references[i] for i in strongest], chosen)
     # From the same place as a reference the photograph has no epipolar lines, and every match agrees.
     agreeing = np.nan_to_num(matches.sampson_px(world_from_query)) < EPIPOLAR_PX
     return float(np.prod([agreeing[matches.reference == i].mean() for i in (0, 1)]))
@@ -138,12 +144,12 @@ def _inside(view: View, x_in_world: Array, world_from_camera: RigidTransform) ->
     return np.asarray(((projected >= -0.5) & (projected < size - 0.5)).all(axis=1))
 
 
-def _expected_share(support: Support) -> float:
+def expected_share(structure: Structure, references: Sequence[PosedView]) -> float:
     """Median over the references of the share that each observes of the points that it should see."""
-    structure, shares = support.structure, []
-    observed = np.bincount(structure.tracks.view, minlength=len(support.references))
+    shares = []
+    observed = np.bincount(structure.tracks.view, minlength=len(references))
     step = max(1, -(-len(structure.x_in_world) // MOST_POINTS))
-    for reference, count in zip(support.references, observed, strict=True):
+    for reference, count in zip(references, observed, strict=True):
         inside = step * _inside(reference.view, structure.x_in_world[::step], reference.world_from_camera).sum()
         shares.append(count / max(1, min(inside, len(reference.view.features))))
     return min(1.0, float(np.median(shares)))

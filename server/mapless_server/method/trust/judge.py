@@ -114,8 +114,8 @@ def judge(
     evidence = evidence_of(support, votes, query_matches, options.agreement)
     trust = trust_of(evidence, options, log10_chance)
     rejection = contradiction(support, votes, options)
-    if rejection is None and trust < 1 - coverage:
-        rejection = _low_trust(evidence, trust, coverage)
+    if rejection is None:
+        rejection = low_trust(evidence, trust, coverage)
     return Judgement(trust, evidence, rejection)
 
 
@@ -139,7 +139,10 @@ def trust_in_scene(trust: float, quantiles: tuple[float, ...]) -> float:
     return float(np.interp(trust, quantiles, LEVELS)) if quantiles else trust
 
 
-def _low_trust(evidence: Evidence, trust: float, coverage: float) -> Rejection:
+def low_trust(evidence: Evidence, trust: float, coverage: float) -> Rejection | None:
+    """A rejection if the trust is less than 1 - coverage."""
+    if trust >= 1 - coverage:
+        return None
     shown = math.floor(1000 * trust) / 1000  # rounded down, so that it never equals the bound
     message = (
         f"its trust of {shown:g} is below the {round(1 - coverage, 6):g} that a coverage of {coverage:g} requires: "

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, Camera, RigidTransform
 
 from ..perturbation import reprojection_errors_px
-from ..results import Support
-from ..views import Matches
+from ..results import Structure, Support
+from ..views import Matches, PosedView, View
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +45,15 @@ class Votes:
 
 def votes_of(support: Support, query_matches: Sequence[Matches]) -> Votes:
     """The matches with keypoints of triangulated points."""
-    tracks = support.structure.tracks
-    offsets = np.concatenate([[0], np.cumsum([len(r.view.features) for r in support.references])])
+    return votes_on(support.query, support.references, support.structure, query_matches)
+
+
+def votes_on(
+    query: View, references: Sequence[PosedView], structure: Structure, query_matches: Sequence[Matches]
+) -> Votes:
+    """The matches of a query with keypoints of a structure's points; `references` in the order of its tracks."""
+    tracks = structure.tracks
+    offsets = np.concatenate([[0], np.cumsum([len(r.view.features) for r in references])])
     point_of = np.full(offsets[-1], -1)
     point_of[offsets[tracks.view] + tracks.keypoint] = tracks.point
     reference = np.repeat(np.arange(len(query_matches)), [len(m) for m in query_matches])
@@ -54,5 +61,5 @@ def votes_of(support: Support, query_matches: Sequence[Matches]) -> Votes:
     point = point_of[offsets[reference] + pairs[:, 1]]
     known = point >= 0
     keypoint = pairs[known, 0]
-    pixels = support.query.features.keypoints[keypoint].astype(np.float64)
-    return Votes(reference[known], keypoint, support.structure.x_in_world[point[known]], pixels)
+    pixels = query.features.keypoints[keypoint].astype(np.float64)
+    return Votes(reference[known], keypoint, structure.x_in_world[point[known]], pixels)

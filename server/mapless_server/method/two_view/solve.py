@@ -93,7 +93,8 @@ def solve_two_view(
         best = adjusted
     if best.estimate is None or best.inlier_count < options.min_inliers:
         return None
-    return Support(query, tuple(references), structure, searched, best.estimate, origin, best.support)
+    query_matches = tuple(correspondences.query_matches)
+    return Support(query, tuple(references), structure, searched, best.estimate, origin, best.support, query_matches)
 
 
 @dataclass(frozen=True, eq=False)

@@ -67,7 +67,7 @@ def _localization_to_message(
         match_count=localization.match_count,
         reprojection_error_px=localization.reprojection_error_px,
         trust=localization.trust,
-        prior_checks=[_check_to_message(check) for check in localization.prior_checks],
+        prior_checks=[check_to_message(check) for check in localization.prior_checks],
     )
     if radii is not None:
         message.covariance.CopyFrom(covariance_to_message(radii.covariance))
@@ -109,7 +109,8 @@ def accuracy_to_message(radii: ReportedRadii) -> pb.Accuracy:
     )
 
 
-def _check_to_message(check: PriorCheck) -> pb.PriorCheck:
+def check_to_message(check: PriorCheck) -> pb.PriorCheck:
+    """Message of a prior's check."""
     return pb.PriorCheck(
         kind=enum_to_message(check.kind, pb.PriorKind),
         mahalanobis=check.mahalanobis,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,18 +18,20 @@ from mapless_server.engine.query import Query
 from mapless_server.method.options import Variant
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.uncertainty.radii import accuracy_from_covariance
-from mapless_server.scenes import Narrowing
 from mapless_server.security import key_of
+from mapless_server.store import SceneAttributes
 
 from .answers import (
     MAX_SESSION_COORDINATE_M,
     accuracy_to_message,
     axes_from_message,
+    check_to_message,
     covariance_to_message,
     diagnostics_to_message,
     geo_pose_to_message,
     rejection_to_message,
 )
+from .priors import priors_from_message
 from .queries import (
     MAX_CANDIDATES,
     MAX_REFERENCES,
@@ -53,6 +57,7 @@ def queries_from_message(
     bounds: tuple[int, int],
     tenant: str,
     engine: EngineOptions,
+    attributes: SceneAttributes,
 ) -> tuple[Query, ...]:
     """The photographs of a request, each as a query.
 
@@ -62,6 +67,7 @@ def queries_from_message(
         bounds: least and largest number of photographs.
         tenant: the scene's owner.
         engine: limits and defaults.
+        attributes: of the scene; they may be empty unless `needs_attributes` of a photograph.
 
     Raises:
         FieldError, InvalidArgument: it names the field that is wrong, "images[2].intrinsics".
@@ -80,26 +86,34 @@ def queries_from_message(
         raise FieldError("options.axes", "must be OPENCV, the default, for a rig")
     reranks = request.options.rerank_references
     count = reference_count_from_message(request.options)
-    return tuple(
-        Query(
-            scene_key=key_of(tenant, scene_id),
-            reference_ids=_reference_ids(
-                message.references, scene_id, MAX_CANDIDATES if reranks else MAX_REFERENCES, path
-            ),
-            photo=photo_from_message(message, path, engine.image_limits),
-            narrowing=Narrowing(),
-            reference_count=count,
-            options=options,
-            rerank=reranks and bool(message.references),
-            is_part=True,
+    most_references = MAX_CANDIDATES if reranks else MAX_REFERENCES
+    queries = []
+    for i, message in enumerate(messages):
+        path = f"{list_name}[{i}]"
+        with _within(path):
+            reference_ids = reference_ids_from_names(message.references, scene_id, most_references)
+            narrowing, priors = priors_from_message(message, attributes)
+        queries.append(
+            Query(
+                scene_key=key_of(tenant, scene_id),
+                reference_ids=reference_ids,
+                photo=photo_from_message(message, path, engine.image_limits),
+                narrowing=narrowing,
+                reference_count=count,
+                options=options,
+                rerank=reranks and bool(message.references),
+                priors=priors,
+                is_part=True,
+            )
         )
-        for path, message in ((f"{list_name}[{i}]", message) for i, message in enumerate(messages))
-    )
+    return tuple(queries)
 
 
-def _reference_ids(names: Sequence[str], scene_id: str, most: int, path: str) -> tuple[str, ...]:
+@contextmanager
+def _within(path: str) -> Iterator[None]:
+    """Names the field of an error within a message at this path."""
     try:
-        return reference_ids_from_names(names, scene_id, most)
+        yield
     except FieldError as error:
         message = str(error).removeprefix(f"{error.field}: ")
         raise FieldError(wire.joined(path, error.field), message) from None
@@ -141,7 +155,8 @@ def rig_to_message(
     if isinstance(outcome, Rejection):
         response = pb.LocalizeRigResponse(rejection=rejection_to_message(outcome))
     else:
-        message = pb.RigLocalization(world_from_rig=wire.transform_to_message(outcome.world_from_rig))
+        world_from_rig = wire.transform_to_message(outcome.world_from_rig)
+        message = pb.RigLocalization(world_from_rig=world_from_rig, trust=outcome.trust)
         _set_support(message, outcome.matched, outcome.covariance)
         if session_from_rig is not None:
             world_from_session = outcome.world_from_rig.compose(session_from_rig.inverse())
@@ -176,6 +191,8 @@ def sequence_to_message(
             session_scale_sigma=session.scale * outcome.scale_sigma,
             axes=enum_to_message(axes, pb.Axes),
             arbitrary_unit=group.results[0].attributes.arbitrary_unit,
+            jumps=[pb.TrackingJump(**asdict(jump)) for jump in outcome.jumps],
+            trust=outcome.trust,
         )
         for frame, pose in zip(request.frames, outcome.world_from_camera, strict=True):
             captured = message.poses.add(world_from_camera=wire.transform_to_message(pose))
@@ -212,6 +229,7 @@ def _reports(
     outcome: RigEstimate | SequenceEstimate | Rejection, group: GroupResult, queries: Sequence[Query]
 ) -> list[pb.ImageReport]:
     matched = {} if isinstance(outcome, Rejection) else {it.source.image: it for it in outcome.matched}
+    checks = {} if isinstance(outcome, Rejection) else outcome.prior_checks
     reports = []
     for i, (result, query) in enumerate(zip(group.results, queries, strict=True)):
         alone = result.answer
@@ -220,6 +238,7 @@ def _reports(
         report.diagnostics.total_duration.FromNanoseconds(round(1e9 * group.seconds[i]))
         if isinstance(alone.outcome, Rejection):
             report.alone.CopyFrom(rejection_to_message(alone.outcome))
+        report.prior_checks.extend(map(check_to_message, checks.get(i, ())))
         if i in matched:
             report.inlier_count = int(matched[i].inliers.sum())
             report.match_count = len(matched[i].matches)

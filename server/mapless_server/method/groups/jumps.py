@@ -1,0 +1,250 @@
+"""Jumps of a device's tracking: steps of its session that the photographs contradict.
+
+A device that relocalizes or loses its tracking moves its session at once, by centimetres or by kilometres. Where two
+photographs are localized alone, the step between their poses is compared with the tracked one: the difference e, of
+position and rotation, has a covariance from the poses' own and from the drift of the steps between. A pair with
+
+    m^2 = e^T C^-1 e > conflict_threshold(6)
+
+contradicts the tracking. Either it has jumped, or one of the two poses is wrong. So a chain of poses from the first to
+the last is found that has the least cost: m^2 for each link, at most the threshold, at which it is cut; and more than
+that for each pose left out. A pose that contradicts both its neighbours, which agree with each other, is left out; any
+other contradiction is a jump. The last pose is never left out: it is answered as its own photograph says.
+
+If the session's unit is unknown, the chain of least cost over the units that the pairs give is used.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, RigidTransform, cross_matrix
+
+from ..options import check_bounds
+from ..perturbation import rotation_vector
+from ..priors.known import conflict_threshold
+from .drift import DriftOptions
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A jump of the tracking.
+
+    Attributes:
+        before: index of the last photograph before it.
+        after: index of the first one after it. Photographs between them have too few matches: it is not known at which
+            of these the tracking has jumped, and their poses may be on the wrong side of it.
+        shift_m: how far the tracked position is from that of the photographs, after it, metres.
+        rotation_deg: the angle between the two orientations.
+    """
+
+    before: int
+    after: int
+    shift_m: float
+    rotation_deg: float
+
+    def __str__(self) -> str:
+        return (
+            f"the tracking jumps by {self.shift_m:.2f} m and {self.rotation_deg:.1f} degrees between "
+            f"frames[{self.before}] and frames[{self.after}]"
+        )
+
+
+@dataclass(frozen=True)
+class JumpOptions:
+    """Options of the search for jumps.
+
+    Attributes:
+        own_inflation: factor on the standard deviations of the photographs' own poses. In places that no constant was
+            fitted on, errors are up to so many times as large as they say.
+        left_out_cost: of leaving out a pose, in thresholds; more than one jump and less than two.
+        units: of an unknown unit, so many pairs at most are tried, those with the longest steps.
+    """
+
+    own_inflation: float = 2.0
+    left_out_cost: float = 1.5
+    units: int = 20
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "own_inflation", above=0)
+        check_bounds(self, "left_out_cost", above=1, below=2)
+        check_bounds(self, "units", at_least=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """Photographs whose own poses and the tracking are consistent, except at jumps.
+
+    Attributes:
+        frames: in order.
+        jumps: between successive ones of them.
+        scale: metres per unit of the session; where it is unknown, of the chain.
+    """
+
+    frames: tuple[int, ...]
+    jumps: tuple[Jump, ...]
+    scale: float
+
+    @property
+    def link_count(self) -> int:
+        """Pairs of successive frames without a jump."""
+        return len(self.frames) - 1 - len(self.jumps)
+
+
+def find_jumps(
+    own: Mapping[int, tuple[RigidTransform, Array]],
+    session_from_camera: Sequence[RigidTransform],
+    scale: float | None,
+    drift: DriftOptions,
+    options: JumpOptions,
+) -> Chain | None:
+    """The chain of least cost.
+
+    Args:
+        own: world_from_camera and its covariance (6, 6) of each photograph that is localized alone, by its index.
+        session_from_camera: of every photograph.
+        scale: metres per unit of the session; None if it is unknown.
+        drift: noise of the steps.
+        options: see there.
+
+    Returns:
+        The chain; None if there is no pose, or no unit of the session.
+    """
+    if not own:
+        return None
+    links = _Links.of(own, session_from_camera, drift, options)
+    scales = links.scales(options.units) if scale is None else [scale]
+    if not scales:
+        return None
+    threshold = conflict_threshold(6)
+    chains = [_cheapest(links.squared(it), threshold, options.left_out_cost * threshold) for it in scales]
+    best = min(range(len(scales)), key=lambda i: chains[i][0])
+    _, positions = chains[best]
+    squared = links.squared(scales[best])
+    jumps = [links.jump(i, j, scales[best]) for i, j in pairwise(positions) if squared[i, j] > threshold]
+    return Chain(tuple(int(links.frames[i]) for i in positions), tuple(jumps), scales[best])
+
+
+def _cheapest(squared: Array, threshold: float, left_out: float) -> tuple[float, list[int]]:
+    """Cost and positions of the chain from the first to the last of N poses; `squared` (N, N) of each pair."""
+    count = len(squared)
+    costs, previous = np.full(count, math.inf), np.full(count, -1)
+    costs[0] = 0.0
+    for j in range(1, count):
+        through = [costs[i] + min(squared[i, j], threshold) + left_out * (j - i - 1) for i in range(j)]
+        previous[j] = int(np.argmin(through))
+        costs[j] = through[previous[j]]
+    chain = [count - 1]
+    while chain[-1] > 0:
+        chain.append(int(previous[chain[-1]]))
+    return float(costs[-1]), chain[::-1]
+
+
+@dataclass(frozen=True, eq=False)
+class _Links:
+    """The pairs (i < j) of N own poses, differences in the world's axes.
+
+    Attributes:
+        frames: (N,) index of the photograph of each.
+        first, second: (P,) positions of each pair.
+        shift: (P, 3) from the first camera to the second.
+        tracked: (P, 3) the same as tracked, in units of the session.
+        turn: (P, 3) rotation from the tracked orientation to the photograph's.
+        own: (P, 6, 6) covariance of shift and turn by the poses' own.
+        steps: (F - 1, 2) of each step of the session its length, in its unit, and its angle in degrees.
+        levers: (P, F - 1) tracked distance from the end of each step to the second camera; NaN of steps outside.
+        drift: noise of the steps.
+    """
+
+    frames: NDArray[np.intp]
+    first: NDArray[np.intp]
+    second: NDArray[np.intp]
+    shift: Array
+    tracked: Array
+    turn: Array
+    own: Array
+    steps: Array
+    levers: Array
+    drift: DriftOptions
+
+    @staticmethod
+    def of(
+        own: Mapping[int, tuple[RigidTransform, Array]],
+        session: Sequence[RigidTransform],
+        drift: DriftOptions,
+        options: JumpOptions,
+    ) -> _Links:
+        frames = sorted(own)
+        pairs = list(combinations(range(len(frames)), 2))
+        shift, tracked, turn, covariances = [], [], [], []
+        levers = np.full((len(pairs), len(session) - 1), np.nan)
+        for row, (i, j) in enumerate(pairs):
+            a, b = frames[i], frames[j]
+            (pose, covariance), (other, other_covariance) = own[a], own[b]
+            step = session[a].inverse().compose(session[b])
+            shift.append(other.translation - pose.translation)
+            tracked.append(pose.rotation @ step.translation)
+            turn.append(rotation_vector(other.rotation @ (pose.rotation @ step.rotation).T))
+            by_first = -np.eye(6)
+            by_first[:3, 3:] = cross_matrix(shift[-1])
+            covariances.append(by_first @ covariance @ by_first.T + other_covariance)
+            for k in range(a, b):
+                levers[row, k] = np.linalg.norm(session[b].translation - session[k + 1].translation)
+        moves = [first.inverse().compose(second) for first, second in pairwise(session)]
+        lengths = [(np.linalg.norm(it.translation), _angle_deg(it.rotation)) for it in moves]
+        return _Links(
+            np.array(frames),
+            np.array([i for i, _ in pairs], np.intp),
+            np.array([j for _, j in pairs], np.intp),
+            np.array(shift).reshape(-1, 3),
+            np.array(tracked).reshape(-1, 3),
+            np.array(turn).reshape(-1, 3),
+            options.own_inflation**2 * np.array(covariances).reshape(-1, 6, 6),
+            np.array(lengths).reshape(-1, 2),
+            levers,
+            drift,
+        )
+
+    def scales(self, most: int) -> list[float]:
+        """Metres per unit by the pairs with the longest steps."""
+        travelled, moved_m = np.linalg.norm(self.tracked, axis=1), np.linalg.norm(self.shift, axis=1)
+        usable = np.flatnonzero((travelled > 0) & (moved_m > 0))
+        neighbours_first = np.argsort(self.second[usable] - self.first[usable], kind="stable")
+        order = usable[neighbours_first][np.argsort(-moved_m[usable[neighbours_first]], kind="stable")]
+        return [float(moved_m[i] / travelled[i]) for i in order[:most]]
+
+    def squared(self, scale: float) -> Array:
+        """m^2 of each pair (N, N), of those above the diagonal."""
+        result = np.zeros((len(self.frames),) * 2)
+        if not len(self.first):
+            return result
+        length_m, turn_deg = scale * self.steps[:, 0], self.steps[:, 1]
+        options = self.drift
+        angle = np.radians(options.floor_deg + options.deg_per_m * length_m + options.turn_share * turn_deg)
+        inside = np.isfinite(self.levers)
+        levers_m = scale * np.where(inside, self.levers, 0.0)
+        shift = inside @ (options.floor_m + options.share * length_m) ** 2 + levers_m**2 @ angle**2
+        covariance = self.own.copy()
+        covariance[:, range(3), range(3)] += shift[:, None]
+        covariance[:, range(3, 6), range(3, 6)] += (inside @ angle**2)[:, None]
+        error = np.concatenate([self.shift - scale * self.tracked, self.turn], axis=1)
+        whitened = np.linalg.solve(covariance, error[:, :, None])[:, :, 0]
+        result[self.first, self.second] = (error * whitened).sum(axis=1)
+        return result
+
+    def jump(self, i: int, j: int, scale: float) -> Jump:
+        """The difference between two poses, as a jump."""
+        row = int(np.flatnonzero((self.first == i) & (self.second == j))[0])
+        shift_m = float(np.linalg.norm(self.shift[row] - scale * self.tracked[row]))
+        turn_deg = math.degrees(float(np.linalg.norm(self.turn[row])))
+        return Jump(int(self.frames[i]), int(self.frames[j]), shift_m, turn_deg)
+
+
+def _angle_deg(rotation: Array) -> float:
+    return math.degrees(float(np.linalg.norm(rotation_vector(rotation))))

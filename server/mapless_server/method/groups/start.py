@@ -1,0 +1,207 @@
+"""Initial poses of a sequence: from the photographs localized alone and the tracking between them, cut at its jumps.
+
+If no photograph is localized alone, the initial world_from_session is found from the matches of all (generalized PnP,
+the whole sequence as one camera).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from mapless.geometry import Array, RigidTransform, Similarity
+
+from ..options import check_bounds
+from ..pnp import PnpOptions
+from ..priors.known import Priors
+from ..rejection import Rejection, RejectionReason
+from ..trust.judge import JudgeOptions
+from .drift import DriftOptions, world_from_session_at
+from .generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
+from .images import GroupGateOptions, MatchedImage
+from .joint import JointOptions
+from .jumps import Chain, Jump, JumpOptions, find_jumps
+
+
+@dataclass(frozen=True)
+class SequenceOptions:
+    """Options of posing a sequence.
+
+    Attributes:
+        pnp: of the pose solvers; `min_matches` of all frames together.
+        gate: of the gate, on the sums over the frames.
+        joint: of the adjustment.
+        judge: of the trust.
+        coverage: share of right answers that are accepted.
+        drift: of the session.
+        jumps: of the search for jumps of the tracking.
+        rounds: of searching matches and adjusting; the second starts from better poses.
+        loose_px: inlier bound for initial guesses, which drift.
+        should_show, least_near: the last photograph, not localized alone, contradicts the pose that it is tracked to if
+            so many points should be visible, or are matched, and fewer of its matches are near them, within `loose_px`
+            and three standard deviations of the pose. Of 14 such photographs 13 had three and more at their true poses;
+            by chance a hundred matches have 0.2.
+        min_motion: least extent of a session of unknown unit, as a share of its distance from its own origin; less is
+            rounding.
+        max_scale_sigma: largest relative standard deviation of an accepted scale.
+        scale_iterations: samples of the RANSAC for pose and scale.
+        scale_matches: matches on which they are scored.
+    """
+
+    pnp: PnpOptions = field(default_factory=PnpOptions)
+    gate: GroupGateOptions = field(default_factory=GroupGateOptions)
+    joint: JointOptions = field(default_factory=JointOptions)
+    judge: JudgeOptions = field(default_factory=JudgeOptions)
+    coverage: float = 0.97
+    drift: DriftOptions = field(default_factory=DriftOptions)
+    jumps: JumpOptions = field(default_factory=JumpOptions)
+    rounds: int = 2
+    loose_px: float = 12.0
+    should_show: int = 15
+    least_near: int = 3
+    min_motion: float = 1e-6
+    max_scale_sigma: float = 0.15
+    scale_iterations: int = 1000
+    scale_matches: int = 600
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "rounds should_show least_near scale_iterations scale_matches", at_least=1)
+        check_bounds(self, "loose_px", above=0)
+        check_bounds(self, "coverage", above=0, at_most=1)
+        check_bounds(self, "min_motion max_scale_sigma", above=0)
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Initial poses.
+
+    Attributes:
+        poses: world_from_camera of every frame.
+        scale: metres per unit of the session.
+        jumps: of the tracking.
+        cut: the step of each jump, from frame i to frame i + 1.
+    """
+
+    poses: tuple[RigidTransform, ...]
+    scale: float
+    jumps: tuple[Jump, ...] = ()
+    cut: tuple[int, ...] = ()
+
+    @property
+    def last_part(self) -> range:
+        """The frames since the last jump."""
+        return range(max(self.cut, default=-1) + 1, len(self.poses))
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """The tracked session, and initial poses from it.
+
+    Attributes:
+        frames: session_from_camera.
+        scale_is_free: whether its unit is unknown.
+        options: of the sequence.
+        priors: on the frames' poses, by index.
+    """
+
+    frames: tuple[RigidTransform, ...]
+    scale_is_free: bool
+    options: SequenceOptions
+    priors: Mapping[int, Priors]
+
+    @property
+    def moves(self) -> bool:
+        """Whether there is enough motion to determine the unit."""
+        centres = np.array([frame.translation for frame in self.frames])
+        extent = float(np.ptp(centres, axis=0).max())
+        return extent > self.options.min_motion * float(np.abs(centres).max())
+
+    def start(self, matched_images: Sequence[MatchedImage]) -> Start | Rejection:
+        """Initial poses of all frames: from their own ones and the tracking, or from the matches of all together."""
+        matched = {it.image: it for it in matched_images}
+        own = {
+            it.image: (it.own_pose, it.own_covariance)
+            for it in matched_images
+            if it.own_pose is not None and it.own_covariance is not None
+        }
+        while chain := self._chain(own):
+            outvoted = [i for i in own if any(self._is_outvoted(matched[i], jump, chain, own) for jump in chain.jumps)]
+            if not outvoted:
+                break
+            own = {i: own[i] for i in own if i not in outvoted}
+        if chain is None:
+            guess = self._of_all_matches([it.camera_matches(self.frames[it.image]) for it in matched_images])
+            if guess is None:
+                total = sum(len(it.tracked) for it in matched_images)
+                message = f"no poses of the sequence explain four of {total} matches"
+                return Rejection(RejectionReason.PNP_FAILED, message)
+            return Start(tuple(guess.transform_pose(frame) for frame in self.frames), guess.scale)
+        if self.scale_is_free and chain.jumps and chain.link_count < 2:
+            jumps = "; ".join(map(str, chain.jumps))
+            message = f"the session's steps contradict one another in any unit; in that of one of them, {jumps}"
+            return Rejection(RejectionReason.SCALE_UNRELIABLE, message)
+        return self._cut(matched, {i: own[i][0] for i in chain.frames}, chain)
+
+    def _chain(self, own: Mapping[int, tuple[RigidTransform, Array]]) -> Chain | None:
+        scale = None if self.scale_is_free else 1.0
+        return find_jumps(own, self.frames, scale, self.options.drift, self.options.jumps)
+
+    def _is_outvoted(
+        self, matched: MatchedImage, jump: Jump, chain: Chain, own: Mapping[int, tuple[RigidTransform, Array]]
+    ) -> bool:
+        """Whether a photograph beside a jump shows what it should if there were none, rather than at its own pose."""
+        if matched.image not in (jump.before, jump.after):
+            return False
+        other = jump.before if matched.image == jump.after else jump.after
+        tracked = self._tracked(matched.image, own[other][0], other, chain.scale)
+        return self._inliers(matched, tracked) > self._inliers(matched, own[matched.image][0])
+
+    def _tracked(self, image: int, pose: RigidTransform, frame: int, scale: float) -> RigidTransform:
+        """world_from_camera of an image, tracked from the pose of a frame."""
+        return world_from_session_at(pose, self.frames[frame], scale).transform_pose(self.frames[image])
+
+    def _inliers(self, matched: MatchedImage, pose: RigidTransform) -> int:
+        camera = matched.camera_matches(RigidTransform.identity())
+        return int(camera.inliers(pose, self.options.loose_px).sum())
+
+    def _of_all_matches(self, cameras: Sequence[CameraMatches]) -> Similarity | None:
+        """The world_from_session of the whole sequence as one camera; None if none explains four matches."""
+        options = self.options
+        if self.scale_is_free:
+            guess = scaled_ransac(cameras, options.pnp, options.scale_iterations, options.scale_matches)
+        else:
+            rigid = rig_ransac(cameras, options.pnp)
+            guess = None if rigid is None else Similarity(1.0, rigid.rotation, rigid.translation)
+        if guess is None or inlier_count(cameras, guess, options.loose_px) < 4:
+            return None
+        return guess
+
+    def _cut(self, matched: Mapping[int, MatchedImage], own: Mapping[int, RigidTransform], chain: Chain) -> Start:
+        """Initial poses, each from the nearest own one on its side of all jumps."""
+
+        def tracked(image: int, nearest: int) -> RigidTransform:
+            return self._tracked(image, own[nearest], nearest, chain.scale)
+
+        def inliers(image: int, nearest: int) -> int:
+            return self._inliers(matched[image], tracked(image, nearest)) if image in matched else 0
+
+        jumps, cut = [], []
+        for jump in chain.jumps:
+            between = range(jump.before + 1, jump.after)
+            earlier, later = ([inliers(i, end) for i in between] for end in (jump.before, jump.after))
+            # The frames up to the cut agree with the side before it, those after it with the other.
+            step = max(
+                range(jump.before, jump.after), key=lambda k: sum(earlier[: k - jump.before] + later[k - jump.before :])
+            )
+            before = max((i for i in between if i <= step and earlier[i - between[0]] >= 4), default=jump.before)
+            after = min((i for i in between if i > step and later[i - between[0]] >= 4), default=jump.after)
+            jumps.append(replace(jump, before=before, after=after))
+            cut.append(step)
+        part = np.searchsorted(cut, np.arange(len(self.frames)), side="left")
+        poses = [
+            tracked(i, min((j for j in own if part[j] == part[i]), key=lambda j: abs(i - j)))
+            for i in range(len(self.frames))
+        ]
+        return Start(tuple(poses), chain.scale, tuple(jumps), tuple(cut))

@@ -1,0 +1,153 @@
+"""Trust in the joint pose of a group: that of `judge`, from the evidence of all photographs together.
+
+The photographs count as one camera with several images, mounted as the joint pose says: shares are those of their sums
+(of the matches on epipolar lines the mean, by inliers), the covered parts of the images are added, and halves of all
+matches, or of all references, give poses by generalized PnP. With one photograph this is the evidence of `judge`, so
+that trust means the same for both.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, RigidTransform
+
+from ..rejection import Rejection
+from ..trust.agreement import NO_AGREEMENT, AgreementOptions
+from ..trust.evidence import Evidence, epipolar_share, expected_share, findable_count, hull_share
+from ..trust.judge import JudgeOptions, low_trust, trust_of
+from ..trust.votes import Votes, votes_on
+from .generalized import CameraMatches, rig_ransac
+from .images import PosedImage
+
+
+def trust_of_group(
+    matched: Sequence[PosedImage], options: JudgeOptions, coverage: float
+) -> tuple[float, Rejection | None]:
+    """Trust, 0 to 1, and a rejection GATE if it is less than 1 - coverage.
+
+    Args:
+        matched: photographs with their joint poses and, together, four inliers or more.
+        options: of the judge.
+        coverage: share of right answers to accept, above 0 and at most 1.
+    """
+    sources = [it.source for it in matched]
+    inliers = [int(it.inliers.sum()) for it in matched]
+    findable = [findable_count(it.source.query, it.source.structure.x_in_world, it.world_from_camera) for it in matched]
+    expected = [expected_share(it.structure, it.references) for it in sources]
+    hulls = [
+        hull_share(it.source.query, it.matches, it.inliers)
+        for it, count in zip(matched, inliers, strict=True)
+        if count >= 3
+    ]
+    distance_m = _distance_m(matched)
+    evidence = Evidence(
+        sum(inliers),
+        sum(len(it.matches) for it in matched),
+        min(1.0, sum(inliers) / max(1, sum(findable))),
+        float(np.average(expected, weights=np.maximum(findable, 1))),
+        min(1.0, sum(hulls)),
+        float(np.average([_epipolar_share(it) for it in matched], weights=np.maximum(inliers, 1))),
+        _matches_apart(matched, distance_m, options.agreement),
+        _references_apart(matched, distance_m, options.agreement),
+    )
+    trust = trust_of(evidence, options)
+    return trust, low_trust(evidence, trust, coverage)
+
+
+def _distance_m(matched: Sequence[PosedImage]) -> float:
+    """Median depth of the inliers in their photographs."""
+    depths = []
+    for it in matched:
+        points = it.source.structure.x_in_world[it.matches.point[it.inliers]]
+        depths.append(it.world_from_camera.inverse().apply(points)[:, 2])
+    return max(float(np.median(np.concatenate(depths))), np.finfo(float).tiny)
+
+
+def _matches_apart(matched: Sequence[PosedImage], distance_m: float, options: AgreementOptions) -> float:
+    """`agreement.disagreement_of_matches` of all photographs."""
+    cameras = []
+    for it, mounting in zip(matched, _mounting(matched), strict=True):
+        source, matches = it.source, it.matches
+        rows = np.flatnonzero(~matches.guided) if not matches.guided.all() else np.arange(len(matches))
+        pixels = source.query.features.keypoints[matches.keypoint[rows]].astype(np.float64)
+        x_in_world = source.structure.x_in_world[matches.point[rows]]
+        cameras.append(CameraMatches(source.query.camera, mounting, pixels, x_in_world))
+
+    def half(random: np.random.Generator) -> list[NDArray[np.bool_]]:
+        return [np.asarray(random.permutation(len(it.pixels)) % 2 == 0) for it in cameras]
+
+    return _median_disagreement(cameras, half, distance_m, options, None)
+
+
+def _references_apart(matched: Sequence[PosedImage], distance_m: float, options: AgreementOptions) -> float:
+    """`agreement.disagreement_of_references` of all photographs; a reference is in the same half for all."""
+    cameras, owners, keypoints = [], [], []
+    names: dict[str, int] = {}
+    for it, mounting in zip(matched, _mounting(matched), strict=True):
+        source = it.source
+        votes = _votes(it)
+        number = np.array([names.setdefault(r.key, len(names)) for r in source.references], np.intp)
+        cameras.append(CameraMatches(source.query.camera, mounting, votes.pixels, votes.x_in_world))
+        owners.append(number[votes.reference])
+        keypoints.append(votes.keypoint)
+    counts = np.bincount(np.concatenate(owners), minlength=len(names))
+
+    def half(random: np.random.Generator) -> list[NDArray[np.bool_]]:
+        order = np.argsort(-counts * (1 + options.shuffling * random.random(len(counts))), kind="stable")
+        in_first, totals = np.zeros(len(counts), bool), [0, 0]
+        for reference in order:
+            in_first[reference] = totals[0] <= totals[1]
+            totals[0 if in_first[reference] else 1] += counts[reference]
+        return [np.asarray(in_first[it]) for it in owners]
+
+    return _median_disagreement(cameras, half, distance_m, options, keypoints)
+
+
+def _epipolar_share(matched: PosedImage) -> float:
+    source = matched.source
+    counts, pose = matched.inliers_by_reference(), matched.world_from_camera
+    return epipolar_share(source.query, source.references, source.query_matches, counts, pose)
+
+
+def _votes(matched: PosedImage) -> Votes:
+    source = matched.source
+    return votes_on(source.query, source.references, source.structure, source.query_matches)
+
+
+def _mounting(matched: Sequence[PosedImage]) -> list[RigidTransform]:
+    """Pose of each camera in that of the last."""
+    last = matched[-1].world_from_camera.inverse()
+    return [last.compose(it.world_from_camera) for it in matched]
+
+
+def _median_disagreement(
+    cameras: Sequence[CameraMatches],
+    draw_half: Callable[[np.random.Generator], list[NDArray[np.bool_]]],
+    distance_m: float,
+    options: AgreementOptions,
+    keypoints: Sequence[NDArray[np.intp]] | None,
+) -> float:
+    """Median over the splits of the distance of the two halves' poses, as a share of `distance_m`; at most one."""
+    random, apart = np.random.default_rng(0), []
+    for _ in range(options.splits):
+        in_first = draw_half(random)
+        centres: list[Array | None] = []
+        for halves in (in_first, [~it for it in in_first]):
+            rows = [np.flatnonzero(it) for it in halves]
+            if keypoints is not None:
+                rows = [r[np.unique(k[r], return_index=True)[1]] for r, k in zip(rows, keypoints, strict=True)]
+            some = [
+                CameraMatches(it.camera, it.rig_from_camera, it.pixels[r], it.x_in_world[r])
+                for it, r in zip(cameras, rows, strict=True)
+                if len(r)
+            ]
+            pose = rig_ransac(some, options.pnp) if sum(map(len, rows)) >= 4 else None
+            centres.append(None if pose is None else pose.translation)
+        first, second = centres
+        apart.append(NO_AGREEMENT if first is None or second is None else math.dist(first, second) / distance_m)
+    return min(NO_AGREEMENT, float(np.median(apart)))
