@@ -528,4 +528,4 @@ class Events(RuleBasedStateMachine):
 
 
 TestEvents = Events.TestCase
-TestEvents.settings = hypothesis_settings(max_examples=150, stateful_step_count=60, deadline=None)
+TestEvents.settings = hypothesis_settings(max_examples=75, stateful_step_count=60, deadline=None)

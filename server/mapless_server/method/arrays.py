@@ -108,7 +108,7 @@ def symmetric_products(first: AnyArray, second: AnyArray) -> AnyArray:
 
 
 def solve_columns(matrices: AnyArray, vectors: AnyArray) -> AnyArray:
-    """`solve_symmetric` for columns: (6, P) as in `SYMMETRIC`, (3, P)."""
+    """Solves symmetric 3x3 systems in columns, (6, P) as in `SYMMETRIC`, (3, P); NaN where singular."""
     xp = namespace(matrices)
     xx, yy, zz, xy, xz, yz = matrices
     x, y, z = vectors
@@ -118,11 +118,6 @@ def solve_columns(matrices: AnyArray, vectors: AnyArray) -> AnyArray:
     solvable = abs(determinant) > 1e-14 * xp.amax(abs(matrices), 0) ** 3
     solution = xp.stack([ixx * x + ixy * y + ixz * z, ixy * x + iyy * y + iyz * z, ixz * x + iyz * y + izz * z])
     return solution / xp.where(solvable, determinant, np.nan)
-
-
-def solve_symmetric(matrices: AnyArray, vectors: AnyArray) -> AnyArray:
-    """Solves symmetric 3x3 systems (P, 3, 3), (P, 3); NaN where singular."""
-    return apply(invert_symmetric(matrices), vectors)
 
 
 def invert_symmetric(matrices: AnyArray) -> AnyArray:
