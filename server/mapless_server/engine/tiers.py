@@ -31,7 +31,7 @@ class EscalationOptions:
     Attributes:
         doubtful_trust: a pose that is trusted less is doubtful. Of 2,528 photographs, many with few references, SIFT
             and EdgePoint2 had 115 off by over 5 % of the distance, 5 degrees or 25 cm; trying again below this trust
-            tries 433, 114 of these among them; below 0.2 it tries 312, 106 of these among them.
+            tries 393, 114 of these among them; below 0.2 it tries 335, 109 of these among them.
         doubtful_radius_m: a pose whose claimed 68 % radius is larger is doubtful: what a robot needs to pass a door.
         same_position_m, same_rotation_deg: two poses closer than this never contradict each other, however small the
             claimed radii, which leave out the errors of the references' poses.
@@ -46,7 +46,7 @@ class EscalationOptions:
             `Matcher.rematch`): the rest is for the pose, which takes a second where matches are few.
     """
 
-    doubtful_trust: float = 0.3
+    doubtful_trust: float = 0.25
     doubtful_radius_m: float = 0.2
     same_position_m: float = 0.1
     same_rotation_deg: float = 2.0
