@@ -48,6 +48,14 @@ def test_a_wrong_focal_length_is_detected_and_estimated(factor: float) -> None:
     assert found.agreeing > found.agreeing_before
 
 
+@pytest.mark.parametrize(("least", "decides"), [(0.25, True), (0.9, False)])
+def test_the_first_step_decides_only_where_enough_matches_agree(least: float, decides: bool) -> None:
+    """About half of them do; the bound on the step is one that every step is below."""
+    support = solved(planted("first step", outlier_share=0.7, point_count=600), 1.15)
+    found = wrong_focal(support, replace(OPTIONS, first_share=100.0, first_agreeing=least))
+    assert (found is None) is decides
+
+
 def test_the_true_focal_length_is_never_reported() -> None:
     for case in range(16):
         few = {"point_count": 60, "noise_px": 1.5} if case % 2 else {}

@@ -44,6 +44,8 @@ class FocalOptions:
         error_inflation: factor on the standard deviation, which leaves out errors of the points.
         first_loss_sigma: loss scale of a first step, after which most photographs are accepted.
         first_share: of `max_log_ratio`, up to which s after that step is accepted: 13 of the 298 were above.
+        first_agreeing: least share of matches that agree with the answered pose for that; where fewer do, the step is
+            that of the others. Of 629 answers, most of them weak, the full estimation names one more, a wrong one.
         loss_scales_sigma: of the full estimation, from wide, so that matches of a wrong pose are used, to narrow.
         iterations: steps with each of them.
         max_step: largest change of s in one step.
@@ -58,6 +60,7 @@ class FocalOptions:
     error_inflation: float = 2.0
     first_loss_sigma: float = 10.0
     first_share: float = 0.25
+    first_agreeing: float = 0.25
     loss_scales_sigma: tuple[float, ...] = (40.0, 10.0, 3.0, 1.4)
     iterations: int = 8
     max_step: float = 0.5
@@ -71,6 +74,7 @@ class FocalOptions:
         check_bounds(self, "max_log_ratio error_inflation first_loss_sigma first_share max_step min_decrease", above=0)
         check_bounds(self, "loss_scales_sigma", above=0)
         check_bounds(self, "false_alarm", above=0, below=1)
+        check_bounds(self, "first_agreeing", at_least=0, at_most=1)
         if not self.loss_scales_sigma:
             raise ValueError("FocalOptions.loss_scales_sigma must be at least one number, is ()")
 
@@ -118,7 +122,10 @@ def wrong_focal(support: Support, options: FocalOptions) -> Focal | None:
     if len(problem.pixels) < options.min_agreeing:
         return None
     first = solve_step(*problem.linearize(start))
-    if first is None or abs(first[6]) < options.first_share * options.max_log_ratio:
+    if first is None:
+        return None
+    agreeing = (start.squared < (3 * options.loss_scales_sigma[-1]) ** 2).mean()
+    if agreeing >= options.first_agreeing and abs(first[6]) < options.first_share * options.max_log_ratio:
         return None
     found = focal_of(problem, start, seen_by, options)
     return found if found is not None and found.is_wrong(options) else None
