@@ -1,0 +1,215 @@
+"""Self-calibration tested: from the references alone, on photographs between them.
+
+    PYTHONPATH=client:server python -m research.self_calibration FOLDER_OF_SCENES [--weights FOLDER] [--samples FILE]
+
+Of each scene some evenly spread photographs are references, and photographs between them queries. Each reference is
+localized against the others, the model of `scenes.calibration.fit` fitted, and applied to the answers to the queries:
+how many are within their radii, and how many right ones are accepted, generic and self-calibrated. The model's few
+constants are tried on a grid, and chosen for each place by what the others say, so that none is tested on itself.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array
+from mapless_server.method.features import FeatureExtractor, make_extractor
+from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.trust.judge import trust_in_scene
+from mapless_server.method.uncertainty import gap
+from mapless_server.method.uncertainty.radii import Accuracy
+from mapless_server.scenes.calibration.calibrator import left_out
+from mapless_server.scenes.calibration.fit import FitOptions, LeftOut, fit
+from mapless_server.services.messages.radii import Factors, scaled_accuracy
+from mapless_server.store import SelfCalibration
+
+from .places import KITCHEN, QUERIES, Measured, Pair, Place, answered, read_places, spread
+
+SETTINGS: dict[str, tuple[int, ...]] = {
+    KITCHEN: (30, 10, 5),
+    "euroc-v101-drone": (20, 10, 5),
+    "tum-fr3-office": (6,),
+    "kitti-drive-a": (8,),
+    "office-lockers": (20, 10),
+    "statue-of-liberty-internet": (20, 10),
+    "meeting-room": (10, 5),
+    "studio-flat": (10, 5),
+    "fox-portrait": (10, 5),
+}
+"""Folders and numbers of references."""
+
+K, SAMPLE = 10, 40
+COVERAGE = 0.95
+GRID = tuple(
+    (growth, FitOptions(factor_log=factor, noise_share=noise))
+    for growth, factor, noise in product((0.0, 0.15, 0.3, 0.45), (0.4, 0.8), (0.05, 0.3, 0.6))
+)
+"""Exponents of the gap, and the priors of factor and noise."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """An answer to a photograph of a scene.
+
+    Attributes:
+        scene, features: what answered.
+        is_reference: whether the photograph is a reference that was left out; else a query.
+        is_right: by the scene's own scale (`Measured.right`); wrong answers are judged by trust, not by radii.
+        result: as the calibration sees it; None if it was rejected.
+    """
+
+    scene: str
+    features: str
+    is_reference: bool
+    is_right: bool
+    result: LeftOut | None
+
+
+def collect(data: Path, features: str, extractor: FeatureExtractor) -> Iterator[Sample]:
+    """Localizes references and queries of all scenes; half an hour."""
+    for name, counts in SETTINGS.items():
+        place = read_places(data, [name], extractor)[name]
+        indices = sorted(place.views)
+        for count in counts:
+            references = spread(indices, count)
+            queries = spread([i for i in indices[1:-1] if i not in references], QUERIES)
+            for is_reference, asked in ((True, spread(references, SAMPLE)), (False, queries)):
+                pairs = [_pair(place, f"{name}:{count}", i, references, features) for i in asked]
+                for i, it in zip(asked, answered(pairs, LocalizeOptions(coverage=1.0), features), strict=True):
+                    yield Sample(f"{name}:{count}", features, is_reference, it.right, _result(place, i, it))
+
+
+def _pair(place: Place, title: str, index: int, references: Sequence[int], features: str) -> Pair:
+    others = [i for i in references if i != index]
+    chosen = place.posed(place.most_matching(place.views[index], others, min(K, len(others)), features))
+    return Pair(title, K, place.views[index], chosen, place.poses[index], metric=place.metric)
+
+
+def _result(place: Place, index: int, it: Measured) -> LeftOut | None:
+    found = left_out(place.posed([index])[0], it.answer)
+    return None if found is None else replace(found, lens=None)
+
+
+@dataclass(frozen=True, eq=False)
+class Tested:
+    """What one way of calibrating a scene is worth: errors by radii of 68 and 95 %, of right answers, and acceptance.
+
+    Attributes:
+        scene, features: of the answers.
+        ratios: (N, 4) position and rotation at 68 %, then both at 95 %.
+        accepted: (N,) at `COVERAGE`.
+    """
+
+    scene: str
+    features: str
+    ratios: Array
+    accepted: NDArray[np.bool_]
+
+    @property
+    def loss(self) -> float:
+        """Mean pinball loss of the logarithms of ratios: lowest if the shares within are as stated, for each answer."""
+        off = np.log(np.clip(self.ratios, 0.02, 50))
+        share = np.repeat([0.68, 0.95], 2)
+        return float(np.maximum(share * off, (share - 1) * off).mean())
+
+
+def test(samples: Sequence[Sample], growth: float, options: FitOptions | None) -> list[Tested]:
+    """Each scene and kind of features, calibrated with these options; None for generic radii."""
+    gap.POSITION_GROWTH = gap.ROTATION_GROWTH = growth
+    found = []
+    for scene, features in dict.fromkeys((it.scene, it.features) for it in samples):
+        own = [it for it in samples if (it.scene, it.features) == (scene, features)]
+        calibration = SelfCalibration("", 0, 0)
+        if options is not None:
+            left = [it.result for it in own if it.is_reference and it.result is not None]
+            calibration = fit(left, "", 0, options)
+        right = [it.result for it in own if not it.is_reference and it.is_right and it.result is not None]
+        if right:
+            ratios = np.array([_ratios(it, calibration) for it in right])
+            trust = [trust_in_scene(it.trust, calibration.trust_quantiles) for it in right]
+            found.append(Tested(scene, features, ratios, np.array(trust) >= 1 - COVERAGE))
+    return found
+
+
+def _ratios(it: LeftOut, calibration: SelfCalibration) -> tuple[float, ...]:
+    radii = it.claimed
+    if calibration.answer_count:
+        radii = scaled_accuracy(radii, Factors.of_references(calibration, radii, it.gap))
+    return (
+        it.error_m / radii.position_68_m,
+        it.error_deg / radii.rotation_68_deg,
+        it.error_m / radii.position_95_m,
+        it.error_deg / radii.rotation_95_deg,
+    )
+
+
+def choose(samples: Sequence[Sample]) -> tuple[float, FitOptions]:
+    """The growth and options with the lowest loss, every place counting alike."""
+    return min(GRID, key=lambda it: loss(test(samples, *it)))
+
+
+def loss(tested: Sequence[Tested]) -> float:
+    """Mean loss, every place counting alike."""
+    places: dict[str, list[float]] = {}
+    for it in tested:
+        places.setdefault(it.scene.partition(":")[0], []).append(it.loss)
+    return float(np.mean([np.mean(it) for it in places.values()]))
+
+
+def left_out_places(samples: Sequence[Sample]) -> Iterator[str]:
+    """Lines of a table: each place with the options that the others choose, beside the generic radii."""
+    yield "| scene | features | answers | generic: position, rotation 68 %, 95 %, accepted | self | chosen |"
+    yield "|---|---|---|---|---|---|"
+    for place in dict.fromkeys(it.scene.partition(":")[0] for it in samples):
+        own = [it for it in samples if it.scene.partition(":")[0] == place]
+        growth, options = choose([it for it in samples if it not in own])
+        for generic, calibrated in zip(test(own, 0.0, None), test(own, growth, options), strict=True):
+            chosen = f"{growth:g}, {options.factor_log:g}, {options.noise_share:g}"
+            cells = " | ".join(map(_cells, (generic, calibrated)))
+            yield f"| {generic.scene} | {generic.features} | {len(generic.ratios)} | {cells} | {chosen} |"
+
+
+def _cells(it: Tested) -> str:
+    return ", ".join(f"{100 * share:.0f}" for share in (*(it.ratios <= 1).mean(axis=0), it.accepted.mean()))
+
+
+def _read(path: Path) -> list[Sample]:
+    def result(content: dict[str, object] | None) -> LeftOut | None:
+        if content is None:
+            return None
+        return LeftOut(**{**content, "claimed": Accuracy(**content["claimed"])})  # type: ignore[arg-type]
+
+    return [Sample(**{**it, "result": result(it["result"])}) for it in json.loads(path.read_text())]
+
+
+def main() -> None:
+    """Localizes, chooses and prints."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("data", type=Path, help="folder of the scenes' folders")
+    parser.add_argument("--weights", type=Path, help="folder with edgepoint2-l64.safetensors, for these features too")
+    parser.add_argument("--samples", type=Path, help="read from this file if it is there, else written to it")
+    arguments = parser.parse_args()
+    if arguments.samples and arguments.samples.is_file():
+        samples = _read(arguments.samples)
+    else:
+        samples = list(collect(arguments.data, "sift", make_extractor("sift")))
+        if arguments.weights:
+            name = "edgepoint2-l64"
+            samples += collect(arguments.data, name, make_extractor(name, arguments.weights / f"{name}.safetensors"))
+        if arguments.samples:
+            arguments.samples.write_text(json.dumps([asdict(it) for it in samples]))
+    growth, options = choose(samples)
+    print(f"growth = {growth:g}, factor_log = {options.factor_log:g}, noise_share = {options.noise_share:g}\n")
+    print("\n".join(left_out_places(samples)))
+
+
+if __name__ == "__main__":
+    main()
