@@ -17,6 +17,7 @@ from support.stores import Folder, Place
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.errors import Unavailable
+from mapless_server.method.intrinsics import IntrinsicsEvidence
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.trust.judge import LEVELS, trust_in_scene
 from mapless_server.method.uncertainty.gap import USUAL_GAP, growth
@@ -24,7 +25,7 @@ from mapless_server.method.uncertainty.radii import Accuracy
 from mapless_server.method.views import PosedView
 from mapless_server.scenes.calibration.calibrations import SceneCalibrations
 from mapless_server.scenes.calibration.calibrator import Calibrator, CalibratorOptions
-from mapless_server.scenes.calibration.fit import FitOptions, LeftOut, fit
+from mapless_server.scenes.calibration.fit import FitOptions, LeftOut, fit, lens_contradictions
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import Closed, ReferenceLibrary
 from mapless_server.scenes.pair_observer import PairObserver
@@ -97,6 +98,19 @@ class TestFit:
         ours, theirs = fit(results, KIND, 1), fit([in_millimetres(it) for it in results], KIND, 1)
         assert theirs.position_factor == pytest.approx(ours.position_factor)
         assert theirs.reference_noise_m == pytest.approx(1e3 * ours.reference_noise_m)
+
+    def test_a_wrong_lens_of_all_is_named(self) -> None:
+        random, prior = random_for("lens"), np.array([0.003, 3.0, 3.0, 0.01])
+
+        def with_lens(it: LeftOut, error: float) -> LeftOut:
+            value = np.array([error, 0.5, 0.0, 0.001]) + 0.3 * prior * random.normal(size=4)
+            return replace(it, lens=IntrinsicsEvidence(value, 0.3 * prior, prior, np.eye(4), np.zeros((6, 4))))
+
+        right, wrong = ([with_lens(it, error) for it in spread(20, 1.0)] for error in (0.0, 0.03))
+        assert lens_contradictions(right) == []
+        assert [it.partition(" off")[0] for it in lens_contradictions(wrong)] == ["focal length"]
+        assert fit(wrong, KIND, 1).lens_error[0] == pytest.approx(0.03, abs=0.002)
+        assert lens_contradictions(spread(20, 1.0)) == []
 
     def test_two_answers_say_nothing(self) -> None:
         assert fit(spread(2, 9.0), KIND, 3) == SelfCalibration(KIND, 3, 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,7 +30,9 @@ from ..indexes import SceneIndexes
 from ..library import ReferenceLibrary, load_usable
 from ..retrieval.index import Entries
 from ..retrieval.ranking import RankOptions, Selection, rank_references
-from .fit import LeftOut, fit
+from .fit import LeftOut, fit, lens_contradictions
+
+log = logging.getLogger(__name__)
 
 _AS_QUERIES_CHOOSE = RankOptions(nearby_weight=1.0)
 """That of `engine.stages`."""
@@ -101,6 +104,8 @@ class Calibrator:
             if result is not None:
                 results.append(result)
             context.check()
+        for phrase in lens_contradictions(results):
+            log.warning("scene %s: its references together contradict their intrinsics: %s", scene_key, phrase)
         return fit(results, self.kind, entries.generation)
 
     def _sample(self, entries: Entries, newest: Sequence[str]) -> list[str]:

@@ -26,7 +26,7 @@ from dataclasses import astuple, dataclass
 import numpy as np
 
 from mapless.geometry import Array
-from mapless_server.method.intrinsics import IntrinsicsEvidence
+from mapless_server.method.intrinsics import NAMES, IntrinsicsEvidence
 from mapless_server.method.options import check_bounds
 from mapless_server.method.trust.judge import LEVELS
 from mapless_server.method.uncertainty.gap import growth
@@ -158,6 +158,24 @@ def _trust_quantiles(right: Array, highest_wrong: float, options: FitOptions) ->
     quantiles = trust[np.searchsorted(share, np.array(LEVELS) - 1e-12)]
     levels = np.array(LEVELS)
     return np.clip(quantiles, np.minimum(levels, highest_wrong), levels)
+
+
+def lens_contradictions(results: Sequence[LeftOut]) -> list[str]:
+    """What the references together contradict in their intrinsics, a phrase for each parameter.
+
+    A parameter is named whose error is more than three standard deviations of it, both of what the references say and
+    of what calibrated lenses have.
+    """
+    evidence = [it.lens for it in results if it.is_right and it.lens is not None]
+    values, sigmas = _lens(evidence)
+    if not evidence:
+        return []
+    usual = np.median([it.prior_sigma for it in evidence], axis=0)
+    found = []
+    for name, value, sigma, limit in zip(NAMES, values, sigmas, 3 * usual, strict=True):
+        if abs(value) > max(3 * sigma, limit):
+            found.append(f"{name} off by {value:.3g} (standard deviation {sigma:.2g})")
+    return found
 
 
 def _lens(evidence: Sequence[IntrinsicsEvidence]) -> tuple[tuple[float, ...], tuple[float, ...]]:
