@@ -183,7 +183,7 @@ class TestApplying:
     def test_of_references_hold_at_the_usual_gap(self) -> None:
         before, attributes = Accuracy(1.0, 2.0, 3.0, 4.0), SceneAttributes(self_calibrations=(self.own(),))
         after = reported_radii(before, self.COVARIANCE, SIFT, attributes, USUAL_GAP)
-        assert after.accuracy == Accuracy(2.0, 4.0, 1.5, 2.0)
+        assert after.accuracy == Accuracy(2.0, 4.0, 1.5, pytest.approx(4.0 * math.sqrt(0.5)))  # type: ignore[arg-type]
         assert (after.calibration, after.count) == ("SELF", 30)
         near, far = (reported_radii(before, self.COVARIANCE, SIFT, attributes, it).accuracy for it in (0.05, 0.2))
         assert near.position_68_m < after.accuracy.position_68_m < far.position_68_m

@@ -12,7 +12,7 @@ r the claimed radius, f the factor of the scene, s the errors of the references'
 and which do not shrink with its radius, and g the gap: errors grow faster with the distance to the references than
 radii do, and a reference that is left out is farther from the others than a query is. b comes from scenes with known
 poses. f and s are means of the posterior on a grid. The prior of f is log-normal about 1, the generic radii, as if
-n0 = `mismatch` (`scatter` / `factor_log`)^2 = 1.3 more answers had needed it; that of s is half-normal.
+n0 = `mismatch` (`scatter` / `factor_log`)^2 = 5 more answers had needed it; that of s is half-normal.
 
 The quantiles of trust are those of the n answers and of n0 = `trust_prior` answers whose trust is distributed as it is
 elsewhere, uniformly. Priors were chosen by leaving whole scenes out (`research.self_calibration`).
@@ -61,7 +61,7 @@ class FitOptions:
     median_ratio: float = 0.72
     scatter: float = 0.65
     mismatch: float = 2.0
-    factor_log: float = 0.8
+    factor_log: float = 0.4
     noise_share: float = 0.3
     trust_prior: float = 20.0
     least_answers: int = 3

@@ -56,7 +56,8 @@ class Factors:
             _factor(position * calibration.position_factor, calibration.reference_noise_m, accuracy.position_68_m),
             _factor(rotation * calibration.rotation_factor, calibration.reference_noise_deg, accuracy.rotation_68_deg),
         )
-        return cls(*np.repeat(factors, 2).tolist())
+        # A radius of 95 % shrinks by the root only: what photographs from elsewhere may need, references do not show.
+        return cls(*(it for factor in factors for it in (factor, max(factor, min(1.0, math.sqrt(factor))))))
 
 
 @dataclass(frozen=True)
