@@ -54,8 +54,8 @@ class UncertaintyOptions:
     """
 
     region_factor: float = 1.5
-    position_factor: float = 0.99
-    rotation_factor: float = 1.08
+    position_factor: float = 1.0
+    rotation_factor: float = 1.09
     max_matches: int = 500
 
     def __post_init__(self) -> None:

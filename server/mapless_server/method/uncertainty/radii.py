@@ -11,7 +11,7 @@ from scipy.special import gammaincinv
 
 from mapless.geometry import Array
 
-TAIL_95 = 1.62
+TAIL_95 = 1.51
 """Factor on the radius of 95 %, for heavy tails; the covariance is right at 68 %. From `research.radii`."""
 
 
