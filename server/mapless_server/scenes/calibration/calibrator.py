@@ -44,14 +44,15 @@ class CalibratorOptions:
 
     Attributes:
         sample: references that are localized, at most.
-        max_cpu_s: no further reference is begun after so much processor time, for each thousand references, begun or
-            whole, that the scene has.
+        max_cpu_s: no further reference is begun after so much processor time of the calling thread, for each thousand
+            references, begun or whole, that the scene has. With the matcher's threads it is 2.4 times as much at most,
+            if the matches of the references are stored.
         reference_count: others that each is localized with, as queries are by default.
         shortlist: so many times the others wanted are matched with it, as for queries.
     """
 
     sample: int = 40
-    max_cpu_s: float = 18.0
+    max_cpu_s: float = 8.5
     reference_count: int = 10
     shortlist: int = 2
 
