@@ -204,6 +204,7 @@ class LocalizationResult:
         geo_pose: the same pose on the Earth; None unless the scene has a datum.
         prior_checks: how the answer compares with each soft prior.
         arbitrary_unit: whether its lengths are in the scene's own, arbitrary unit, where these names say metres.
+        scale_source: what its lengths rest on: "REFERENCES", or "NETWORK" for a single reference.
         pose_stage: "REFINED" or "INITIAL"; "COARSE" for an unverified pose, either of a call with `allow_coarse` that
             ran out of time, or the first of `localize_progressively`.
         inlier_count, match_count: number of 2D-3D matches that agree with the pose, and of all matches.
@@ -230,6 +231,7 @@ class LocalizationResult:
     debug: Debug | None = None
     is_final: bool = True
     arbitrary_unit: bool = False
+    scale_source: str = "REFERENCES"
 
     @property
     def world_from_session(self) -> RigidTransform | None:
@@ -285,6 +287,7 @@ def answer_from_message(message: pb.LocalizeResponse) -> LocalizationResult | Re
         accuracy=optional(found, "accuracy", accuracy_from_message),
         pose_stage=wire.value_name(pb.PoseStage, found.pose_stage),
         trust=found.trust if found.HasField("trust") else None,
+        scale_source=wire.value_name(pb.ScaleSource, found.scale_source or pb.SCALE_SOURCE_REFERENCES),
         in_axes=optional(found, "in_axes", _framed_from_message),
         geo_pose=optional(found, "geo_pose", geo_pose_from_message),
         prior_checks=prior_checks_from_messages(found.prior_checks),

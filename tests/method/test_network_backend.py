@@ -84,6 +84,7 @@ class GreyRunner:
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
     dtype: torch.dtype = torch.float32
     conditioned: bool = False
+    metre_sigma: float | None = None
     most_scenes: int = 100
     failing_batches: int = 0
     failing_encodings: int = 0
@@ -177,6 +178,17 @@ def test_maps_have_the_cameras_of_the_pictures(name: str) -> None:
             view.local_from_camera.rotation @ view.local_from_camera.rotation.T, np.eye(3), atol=1e-5
         )
     assert np.abs(outcome.references[0].point_map - outcome.references[1].point_map).max() > 0.01
+
+
+@pytest.mark.parametrize(("name", "sigma"), [("pi3", None), ("pi3x", 0.31), ("mapanything", 0.2)])
+def test_the_unit_of_the_output_is_about_the_metre(name: str, sigma: float | None) -> None:
+    """Where the network predicts metres and the scene is in metres; only then is one reference enough."""
+    backend = NetworkReconstructor(small_runner(name), OPTIONS)
+    request = Request(*small_request(1))
+    outcomes = backend.reconstruct_many([request, replace(request, is_metric=False)])
+    for outcome, expected in zip(outcomes, (sigma, None), strict=True):
+        assert isinstance(outcome, Reconstruction)
+        assert outcome.metre_sigma == expected
 
 
 def test_confidence_is_zero_where_a_picture_is_filled() -> None:

@@ -83,6 +83,8 @@ def test_a_random_network_is_answered_for(tmp_path: Path, name: str) -> None:
             used = answer.diagnostics
             assert (used.backend, used.weights_sha256) == (name, f"sha-of-{name}")
             assert "coarse" in used.stage_s
+        single = client.localize(encode(".png", photograph_at(0.7)), CAMERA, "wall", ["r1"])
+        assert isinstance(single, (LocalizationResult, Rejected)), "with its own metres or none"
         # The references' tokens were kept from the first query to the second.
         assert backend.cache.counters.misses == 4
         assert backend.cache.counters.device_hits >= 4

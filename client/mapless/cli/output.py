@@ -100,6 +100,8 @@ def lines(answer: LocalizationResult | Rejected) -> list[str]:
     text.append(f"  support   {_support(answer)}, {answer.diagnostics.total_s:.2f} s{captured}")
     if answer.arbitrary_unit:
         text.append("  warning   the scene's unit of length is arbitrary, not the metre")
+    if answer.scale_source == "NETWORK":
+        text.append("  warning   a single reference: its distance is a network's estimate, as the radius says")
     if answer.trust is not None and answer.trust < DOUBTFUL_TRUST:
         text.append(
             f"  warning   fewer than {100 * DOUBTFUL_TRUST:g} % of right answers look as doubtful: check the intrinsics"

@@ -33,6 +33,12 @@ class ScaleStrategy(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     SCALE_STRATEGY_TRAJECTORY: _ClassVar[ScaleStrategy]
     SCALE_STRATEGY_TWO_STAGE: _ClassVar[ScaleStrategy]
 
+class ScaleSource(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    SCALE_SOURCE_UNSPECIFIED: _ClassVar[ScaleSource]
+    SCALE_SOURCE_REFERENCES: _ClassVar[ScaleSource]
+    SCALE_SOURCE_NETWORK: _ClassVar[ScaleSource]
+
 class PriorKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     PRIOR_KIND_UNSPECIFIED: _ClassVar[PriorKind]
@@ -86,6 +92,7 @@ class ScaleStage(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     SCALE_STAGE_UNSPECIFIED: _ClassVar[ScaleStage]
     SCALE_STAGE_TRIANGULATION: _ClassVar[ScaleStage]
     SCALE_STAGE_TRAJECTORY: _ClassVar[ScaleStage]
+    SCALE_STAGE_NETWORK: _ClassVar[ScaleStage]
 AXES_UNSPECIFIED: Axes
 AXES_OPENCV: Axes
 AXES_ARKIT: Axes
@@ -101,6 +108,9 @@ SCALE_STRATEGY_UNSPECIFIED: ScaleStrategy
 SCALE_STRATEGY_TRIANGULATION: ScaleStrategy
 SCALE_STRATEGY_TRAJECTORY: ScaleStrategy
 SCALE_STRATEGY_TWO_STAGE: ScaleStrategy
+SCALE_SOURCE_UNSPECIFIED: ScaleSource
+SCALE_SOURCE_REFERENCES: ScaleSource
+SCALE_SOURCE_NETWORK: ScaleSource
 PRIOR_KIND_UNSPECIFIED: PriorKind
 PRIOR_KIND_POSITION: PriorKind
 PRIOR_KIND_HEADING: PriorKind
@@ -137,6 +147,7 @@ REJECTION_REASON_PRIOR_CONFLICT: RejectionReason
 SCALE_STAGE_UNSPECIFIED: ScaleStage
 SCALE_STAGE_TRIANGULATION: ScaleStage
 SCALE_STAGE_TRAJECTORY: ScaleStage
+SCALE_STAGE_NETWORK: ScaleStage
 
 class LocalizeRequest(_message.Message):
     __slots__ = ("scene", "references", "image", "intrinsics", "position_prior", "options", "capture_time", "session_from_camera", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior")
@@ -265,7 +276,7 @@ class LocalizeProgressivelyResponse(_message.Message):
     def __init__(self, answer: _Optional[_Union[LocalizeResponse, _Mapping]] = ..., is_final: bool = ...) -> None: ...
 
 class Localization(_message.Message):
-    __slots__ = ("world_from_camera", "covariance", "accuracy", "pose_stage", "inlier_count", "match_count", "reprojection_error_px", "trust", "in_axes", "geo_pose", "prior_checks", "arbitrary_unit")
+    __slots__ = ("world_from_camera", "covariance", "accuracy", "pose_stage", "inlier_count", "match_count", "reprojection_error_px", "trust", "in_axes", "geo_pose", "prior_checks", "arbitrary_unit", "scale_source")
     WORLD_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
     COVARIANCE_FIELD_NUMBER: _ClassVar[int]
     ACCURACY_FIELD_NUMBER: _ClassVar[int]
@@ -278,6 +289,7 @@ class Localization(_message.Message):
     GEO_POSE_FIELD_NUMBER: _ClassVar[int]
     PRIOR_CHECKS_FIELD_NUMBER: _ClassVar[int]
     ARBITRARY_UNIT_FIELD_NUMBER: _ClassVar[int]
+    SCALE_SOURCE_FIELD_NUMBER: _ClassVar[int]
     world_from_camera: _geometry_pb2.RigidTransform
     covariance: PoseCovariance
     accuracy: Accuracy
@@ -290,7 +302,8 @@ class Localization(_message.Message):
     geo_pose: GeoPose
     prior_checks: _containers.RepeatedCompositeFieldContainer[PriorCheck]
     arbitrary_unit: bool
-    def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., pose_stage: _Optional[_Union[PoseStage, str]] = ..., inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., trust: _Optional[float] = ..., in_axes: _Optional[_Union[FramedPose, _Mapping]] = ..., geo_pose: _Optional[_Union[GeoPose, _Mapping]] = ..., prior_checks: _Optional[_Iterable[_Union[PriorCheck, _Mapping]]] = ..., arbitrary_unit: bool = ...) -> None: ...
+    scale_source: ScaleSource
+    def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., pose_stage: _Optional[_Union[PoseStage, str]] = ..., inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., trust: _Optional[float] = ..., in_axes: _Optional[_Union[FramedPose, _Mapping]] = ..., geo_pose: _Optional[_Union[GeoPose, _Mapping]] = ..., prior_checks: _Optional[_Iterable[_Union[PriorCheck, _Mapping]]] = ..., arbitrary_unit: bool = ..., scale_source: _Optional[_Union[ScaleSource, str]] = ...) -> None: ...
 
 class FramedPose(_message.Message):
     __slots__ = ("axes", "world_from_camera", "covariance", "world_from_session")

@@ -26,6 +26,7 @@ uncertainty/                 the covariance of a pose
 adjust                       (ours) the last refinement
 two_view/                    (ours) pose from matches with posed references, without points
 trust/                       whether a pose is accepted, and its trust
+one_reference                (ours) pose from one reference, by a network's depths and metres
 answer, hints                the answer of the method; what would help after a rejection
 coarse/                      query and references reconstructed together, up to scale
 on_device/                   scale, structure and match where a network left its output

@@ -11,7 +11,7 @@ from mapless.geometry import Array, RigidTransform
 
 from .priors.known import PriorCheck
 from .rejection import Rejection
-from .results import MetricScale, PoseEstimate, PoseStage, Support, TwoViewSupport
+from .results import MetricScale, PoseEstimate, PoseStage, ScaleSource, Support, TwoViewSupport
 from .uncertainty.radii import accuracy_from_covariance
 
 
@@ -30,6 +30,7 @@ class Localization:
         prior_checks: comparison of the pose with each prior.
         trust: 0 to 1, share of right answers whose score is at most as high (see `judge`); None for a pose without
             refinement.
+        scale_source: what its lengths rest on.
     """
 
     world_from_camera: RigidTransform
@@ -40,6 +41,7 @@ class Localization:
     reprojection_error_px: float
     prior_checks: tuple[PriorCheck, ...] = ()
     trust: float | None = None
+    scale_source: ScaleSource = ScaleSource.REFERENCES
 
     @classmethod
     def of(cls, estimate: PoseEstimate, trust: float, two_view: TwoViewSupport | None = None) -> Localization:

@@ -15,12 +15,13 @@ from .adjust import adjust_pose, pose_covariance
 from .answer import Answer, Localization, is_better
 from .context import StageContext
 from .match import match_points
+from .one_reference import one_reference_failure, solve_one_reference, trust_of_score
 from .options import LocalizeOptions, Variant
 from .pipeline import Coarse, Pipeline, Prepared, reconstruct, with_wide_correspondences
 from .pnp import solve_pose
 from .priors.known import NO_PRIORS, Priors
 from .rejection import Rejection, RejectionReason
-from .results import MetricScale, PointMatches, Structure, Support
+from .results import MetricScale, PointMatches, ScaleStage, Structure, Support
 from .structure import build_structure
 from .trust.gate import gate_failure
 from .trust.judge import contradiction, judge
@@ -128,6 +129,8 @@ def _solve(coarse: Coarse, counts_agreement: bool) -> Answer:
     prepared, scale, stage = coarse.prepared, coarse.scale, coarse.prepared.context.stage
     if isinstance(scale, Rejection):
         return coarse.answer(scale)
+    if scale.stage is ScaleStage.NETWORK:
+        return _solve_one_reference(coarse, scale)
     query, references, options, priors = prepared.query, prepared.references, prepared.pipeline.options, prepared.priors
     structure, matches = _structure_and_matches(coarse, scale)
     query_matches = tuple(prepared.correspondences.query_matches)
@@ -155,6 +158,27 @@ def _solve(coarse: Coarse, counts_agreement: bool) -> Answer:
     if judged.rejection:
         return coarse.answer(judged.rejection, support)
     return coarse.answer(Localization.of(estimate, judged.trust), support)
+
+
+def _solve_one_reference(coarse: Coarse, scale: MetricScale) -> Answer:
+    """From a single reference, by the network's depths and metres; priors are compared with the pose, and not used."""
+    prepared, options = coarse.prepared, coarse.prepared.pipeline.options
+    assert isinstance(coarse.reconstruction, Reconstruction)
+    given = prepared.query, prepared.references, coarse.reconstruction, scale, prepared.correspondences.query_matches
+    with prepared.context.stage("pnp"):
+        found = solve_one_reference(*given, prepared.origin, options.one_reference)
+    if isinstance(found, Rejection):
+        return coarse.answer(found)
+    estimate = found.support.estimate
+    assert estimate is not None
+    checks = prepared.priors.check(estimate.world_from_camera, estimate.covariance)
+    estimate = replace(estimate, prior_checks=tuple(replace(it, used=False) for it in checks))
+    support = replace(found.support, estimate=estimate)
+    trust = trust_of_score(found.score, options.one_reference)
+    failure = one_reference_failure(found, trust, prepared.options.coverage, options.gate)
+    if failure:
+        return coarse.answer(Rejection(RejectionReason.GATE, failure), support)
+    return coarse.answer(replace(Localization.of(estimate, trust), scale_source=scale.source), support)
 
 
 def _solve_two_view(coarse: Coarse, answer: Answer) -> Answer:

@@ -21,12 +21,13 @@ from .coarse.geometric import GeometricReconstructor
 from .context import StageContext
 from .correspond import Correspondences, Matcher
 from .match import PAPER_MATCH, MatchOptions
+from .one_reference import OneReferenceOptions
 from .options import LocalizeOptions, Variant
 from .pnp import PnpOptions
 from .priors.known import NO_PRIORS, Priors
 from .rejection import Rejection, RejectionReason
 from .results import MetricScale, PointMatches, PoseStage, Structure, Support
-from .scale import estimate_scale
+from .scale import estimate_scale, network_scale
 from .scale_equations import ScaleOptions
 from .structure import PAPER_STRUCTURE, StructureOptions
 from .trust.gate import GateOptions
@@ -54,6 +55,7 @@ class StageOptions:
         judge: of the judge.
         two_view: of the pose from matches with the references themselves, for queries that fail otherwise.
         two_view_gate: of its acceptance.
+        one_reference: of the pose from a single reference, with a network that predicts metres.
     """
 
     weak_inliers: int = 100
@@ -64,6 +66,7 @@ class StageOptions:
     judge: JudgeOptions = field(default_factory=JudgeOptions)
     two_view: TwoViewOptions = field(default_factory=TwoViewOptions)
     two_view_gate: TwoViewGateOptions = field(default_factory=TwoViewGateOptions)
+    one_reference: OneReferenceOptions = field(default_factory=OneReferenceOptions)
 
     @staticmethod
     def structure(variant: Variant) -> StructureOptions:
@@ -230,7 +233,7 @@ def coarse_answer(coarse: Coarse) -> Answer | None:
     """The answer if there is no time to refine: the pose of `Variant.COARSE`; None if there is none yet."""
     if isinstance(coarse.scale, Rejection):
         return None
-    return coarse.answer(Localization(coarse.scale.world_from_query, None, PoseStage.COARSE, 0, 0, 0.0))
+    return coarse.answer(_unverified(coarse.scale, PoseStage.COARSE))
 
 
 def with_wide_correspondences(coarse: Coarse) -> Coarse:
@@ -268,6 +271,10 @@ def _launch_scale(prepared: Prepared, reconstruction: Outcome) -> Callable[[], C
     coarse = partial(Coarse, prepared, reconstruction)
     if isinstance(reconstruction, Rejection):
         return partial(coarse, reconstruction)
+    if len(references) == 1 and reconstruction.metre_sigma is not None:
+        with context.stage("scale"):
+            fetched = reconstruction if isinstance(reconstruction, Reconstruction) else reconstruction.fetch()
+            return partial(Coarse, prepared, fetched, network_scale(fetched, references[0]))
     if isinstance(reconstruction, Reconstruction):
         with context.stage("scale"):
             return partial(coarse, estimate_scale(reconstruction, references, correspondences, options))
@@ -294,5 +301,10 @@ def _answered_if_final(coarse: Coarse) -> Coarse | Answer:
         answer = coarse.answer(coarse.scale)
         return coarse if coarse.prepared.can_improve(answer) else answer
     if coarse.prepared.options.variant is Variant.COARSE:
-        return coarse.answer(Localization(coarse.scale.world_from_query, None, PoseStage.INITIAL, 0, 0, 0.0))
+        return coarse.answer(_unverified(coarse.scale, PoseStage.INITIAL))
     return coarse
+
+
+def _unverified(scale: MetricScale, stage: PoseStage) -> Localization:
+    """The initial pose, which nothing has checked."""
+    return Localization(scale.world_from_query, None, stage, 0, 0, 0.0, scale_source=scale.source)

@@ -24,6 +24,17 @@ class ScaleStage(str, Enum):
 
     TRIANGULATION = "triangulation"
     TRAJECTORY = "trajectory"
+    NETWORK = "network"
+    """The network's own metres, with a single reference."""
+
+
+class ScaleSource(str, Enum):
+    """What the lengths of an answer rest on."""
+
+    REFERENCES = "references"
+    """The references' given poses."""
+    NETWORK = "network"
+    """The metres that a network predicts, with a single reference."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +48,7 @@ class MetricScale:
         anchor: index of the reference whose pose ties the local frame to the world.
         world_from_local: the reconstruction's frame in the world, metres.
         world_from_query: the query camera's initial pose P_q^init, metres.
+        relative_sigma: standard deviation of the network's metre, if that gives the scale; otherwise 0.
     """
 
     metres_per_unit: float
@@ -45,6 +57,12 @@ class MetricScale:
     anchor: int
     world_from_local: Similarity
     world_from_query: RigidTransform
+    relative_sigma: float = 0.0
+
+    @property
+    def source(self) -> ScaleSource:
+        """What it rests on."""
+        return ScaleSource.NETWORK if self.stage is ScaleStage.NETWORK else ScaleSource.REFERENCES
 
 
 @dataclass(frozen=True)

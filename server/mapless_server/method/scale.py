@@ -57,6 +57,35 @@ def estimate_scale(
     return judge(candidates, len(references), options)
 
 
+def network_scale(reconstruction: Reconstruction, reference: PosedView) -> MetricScale | Rejection:
+    """The scale of a reconstruction whose unit is about the metre, with a single reference.
+
+    Returns:
+        One metre a unit, and the query's pose that follows; SCALE_UNRELIABLE if the reconstruction is not finite.
+
+    Raises:
+        ValueError: the reconstruction's unit is arbitrary, or it has several references.
+    """
+    (view,) = reconstruction.references
+    if reconstruction.metre_sigma is None:
+        raise ValueError("the reconstruction's unit is arbitrary")
+    local, of_query = view.local_from_camera, reconstruction.query.local_from_camera
+    if not np.isfinite(np.stack([local.matrix(), of_query.matrix()])).all():
+        return Rejection(RejectionReason.SCALE_UNRELIABLE, "predicted poses are not finite")
+    if not (np.isfinite(view.point_map).all(axis=-1) & (view.confidence > 0)).any():
+        return Rejection(RejectionReason.SCALE_UNRELIABLE, "no depth of the reference is known")
+    world_from_local = reference.world_from_camera.compose(local.inverse())
+    return MetricScale(
+        1.0,
+        ScaleStage.NETWORK,
+        0.0,
+        0,
+        Similarity(1.0, world_from_local.rotation, world_from_local.translation),
+        world_from_local.compose(of_query),
+        reconstruction.metre_sigma,
+    )
+
+
 def check_references(references: Sequence[PosedView], options: ScaleOptions) -> Rejection | None:
     """Rejects references at one place: their trajectory radius is 0, so the scale is not determined."""
     count = len(references)

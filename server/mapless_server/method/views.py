@@ -147,7 +147,9 @@ class Reconstruction:
     Attributes:
         query: the query.
         references: the references, in order.
+        metre_sigma: relative standard deviation of its unit, if that is about the metre; None if it is arbitrary.
     """
 
     query: ReconstructedView
     references: tuple[ReconstructedView, ...]
+    metre_sigma: float | None = None

@@ -137,6 +137,8 @@ class MapAnything(Network):
     """The network of `facebook/map-anything-apache`."""
 
     conditioned = True
+    metre_sigma = 0.2
+    """A third party found a mean error of the scale of 16 % on ETH3D, for a normal distribution 0.8 of this."""
     file_names = FileNames(canonical_name, describe_misfit=_describe_misfit)
     image_mean: Tensor
     image_std: Tensor

@@ -39,9 +39,12 @@ class Network(nn.Module, ABC):
 
     Attributes:
         conditioned: whether it takes intrinsics and poses.
+        metre_sigma: relative standard deviation of the unit of its output, if that is about the metre; None if it is
+            arbitrary.
     """
 
     conditioned: bool
+    metre_sigma: float | None = None
 
     def set_compute_type(self, dtype: torch.dtype) -> None:
         """Casts the parts that compute in low precision: linear layers of all transformer blocks, patch embeddings.

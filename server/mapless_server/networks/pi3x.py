@@ -25,6 +25,8 @@ class Pi3X(PiNetwork):
     """The network of Pi3X, without its part for depths."""
 
     conditioned = True
+    metre_sigma = 0.31
+    """A third party found a mean error of the scale of 25 % on ETH3D, for a normal distribution 0.8 of this."""
 
     def __init__(self, sizes: Sizes | None = None) -> None:
         sizes = sizes or Sizes()

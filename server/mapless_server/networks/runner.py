@@ -67,6 +67,7 @@ class NetworkRunner:
         device: on which it computes.
         dtype: of the computation in transformer blocks, and of tokens.
         conditioned: whether the network takes intrinsics and poses.
+        metre_sigma: see Network.
     """
 
     def __init__(
@@ -85,6 +86,7 @@ class NetworkRunner:
         cuda = self.device.type == "cuda"
         self.dtype = options.dtype or (torch.bfloat16 if cuda else torch.float32)
         self.conditioned = network.conditioned
+        self.metre_sigma = network.metre_sigma
         self.network = network.eval().requires_grad_(False)
         self.network.set_compute_type(self.dtype)
         self.network.to(self.device)

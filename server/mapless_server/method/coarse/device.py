@@ -26,6 +26,7 @@ class DeviceReconstruction:
         confidence: (K, H, W) float32, 0 to 1; 0 where the point is unknown.
         local_from_camera: (K + 1, 4, 4) float32, of the references in order, then of the query.
         backend: its name, for messages.
+        metre_sigma: see Reconstruction.
     """
 
     reference_cameras: tuple[Camera, ...]
@@ -34,6 +35,7 @@ class DeviceReconstruction:
     confidence: Tensor
     local_from_camera: Tensor
     backend: str
+    metre_sigma: float | None = None
 
     def __post_init__(self) -> None:
         count, camera = len(self.reference_cameras), self.query_camera
@@ -67,4 +69,4 @@ class DeviceReconstruction:
             local_from_camera[-1],
         )
         views = zip(self.reference_cameras, point_maps, confidence, local_from_camera[:-1], strict=True)
-        return Reconstruction(query, tuple(ReconstructedView(*view) for view in views))
+        return Reconstruction(query, tuple(ReconstructedView(*view) for view in views), self.metre_sigma)

@@ -220,6 +220,7 @@ class NetworkReconstructor:
             _without_filling(logits.sigmoid(), layouts),
             poses,
             self.name,
+            self._runner.metre_sigma if scene.is_metric else None,
         )
         return reconstruction if self._keeps else reconstruction.fetch()
 

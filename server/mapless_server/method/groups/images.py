@@ -20,7 +20,7 @@ from ..options import check_bounds
 from ..pipeline import Prepared
 from ..priors.known import NO_PRIORS, Priors
 from ..rejection import Rejection, RejectionReason
-from ..results import PointMatches, Structure, Support
+from ..results import PointMatches, ScaleSource, Structure, Support
 from ..structure import StructureOptions, observe, refine_points, tracks_of
 from ..tracks import Tracks
 from ..trust.evidence import findable_count, hull_share
@@ -141,7 +141,7 @@ def matched_images_of(images: Sequence[GroupImage]) -> tuple[Array, list[Matched
     with_matches = [
         (i, image, image.answer.support)
         for i, image in enumerate(images)
-        if image.answer.support is not None and len(image.answer.support.matches)
+        if image.answer.support is not None and len(image.answer.support.matches) and not _is_of_network(image.answer)
     ]
     if not with_matches:
         return np.zeros(3), []
@@ -256,3 +256,8 @@ def tracked_support(prepared: Prepared) -> Support | None:
     query_matches = tuple(correspondences.query_matches)
     support = Support(query, references, structure, matches, None, prepared.origin, query_matches=query_matches)
     return support if len(matches) else None
+
+
+def _is_of_network(answer: Answer) -> bool:
+    """Whether its points are at a network's depths, with a single reference; a group takes triangulated points only."""
+    return answer.scale is not None and answer.scale.source is ScaleSource.NETWORK

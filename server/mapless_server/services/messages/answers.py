@@ -68,6 +68,7 @@ def _localization_to_message(
         reprojection_error_px=localization.reprojection_error_px,
         trust=localization.trust,
         prior_checks=[check_to_message(check) for check in localization.prior_checks],
+        scale_source=enum_to_message(localization.scale_source, pb.ScaleSource),
     )
     if radii is not None:
         message.covariance.CopyFrom(covariance_to_message(radii.covariance))
