@@ -23,6 +23,7 @@ from .answers import (
     FramedPose,
     Hint,
     Hypothesis,
+    IntrinsicsCheck,
     LocalizationResult,
     PriorCheck,
     ReferenceUse,
@@ -58,7 +59,7 @@ from .groups import (
 )
 from .options import ConnectOptions
 from .priors import GeoPositionPrior, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
-from .requests import NewReference
+from .requests import IntrinsicsUncertainty, NewReference
 from .results import Coverage, Reference, ReferenceAudit, RetrievedReference, Scene
 from .scenes import UNCHANGED, Calibration
 from .shortcut import localize
@@ -89,6 +90,8 @@ __all__ = [
     "Hypothesis",
     "ImageReport",
     "Internal",
+    "IntrinsicsCheck",
+    "IntrinsicsUncertainty",
     "InvalidArgument",
     "LocalizationResult",
     "MaplessError",

@@ -145,6 +145,29 @@ class PriorCheck:
 
 
 @dataclass(frozen=True)
+class IntrinsicsCheck:
+    """What a photograph's matches say of one parameter of its intrinsics.
+
+    Attributes:
+        parameter: "FOCAL_LENGTH" (along x), "PRINCIPAL_X", "PRINCIPAL_Y" or "K1".
+        given: its value in the request, pixels of the photograph or the coefficient.
+        estimated: its value by the photograph alone.
+        estimated_sigma: standard deviation of the estimated value.
+        given_sigma: standard deviation of the given value.
+        conflict: whether they differ by more than both allow; the answer is then a rejection.
+        used: whether the pose was computed with the estimated value.
+    """
+
+    parameter: str
+    given: float
+    estimated: float
+    estimated_sigma: float
+    given_sigma: float
+    conflict: bool
+    used: bool
+
+
+@dataclass(frozen=True)
 class Hint:
     """Advice after a rejection.
 
@@ -203,6 +226,7 @@ class LocalizationResult:
         in_axes: the same pose in the requested axes, with `world_from_session`.
         geo_pose: the same pose on the Earth; None unless the scene has a datum.
         prior_checks: how the answer compares with each soft prior.
+        intrinsics_checks: what the photograph says of each parameter of its intrinsics; empty if it was not asked.
         arbitrary_unit: whether its lengths are in the scene's own, arbitrary unit, where these names say metres.
         scale_source: what its lengths rest on: "REFERENCES", or "NETWORK" for a single reference.
         pose_stage: "REFINED" or "INITIAL"; "COARSE" for an unverified pose, either of a call with `allow_coarse` that
@@ -232,6 +256,7 @@ class LocalizationResult:
     is_final: bool = True
     arbitrary_unit: bool = False
     scale_source: str = "REFERENCES"
+    intrinsics_checks: tuple[IntrinsicsCheck, ...] = ()
 
     @property
     def world_from_session(self) -> RigidTransform | None:
@@ -252,6 +277,7 @@ class Rejected:
         message: one sentence for a person, with the numbers that decided.
         hint: advice.
         hypotheses: contradictory poses, the best supported first, if the reason is "AMBIGUOUS".
+        intrinsics_checks: what the photograph says of its intrinsics, if a conflict with them is the reason.
         debug: the matches, if requested and found.
         capture_time, session_from_camera: as they were sent.
         is_final: always True.
@@ -264,6 +290,7 @@ class Rejected:
     session_from_camera: RigidTransform | None = None
     hint: Hint | None = None
     hypotheses: tuple[Hypothesis, ...] = ()
+    intrinsics_checks: tuple[IntrinsicsCheck, ...] = ()
     debug: Debug | None = None
     is_final: bool = field(default=True, init=False)
 
@@ -277,6 +304,7 @@ def answer_from_message(message: pb.LocalizeResponse) -> LocalizationResult | Re
         "debug": optional(message, "debug", _debug_from_message),
     }
     if message.WhichOneof("outcome") == "rejection":
+        common["intrinsics_checks"] = _intrinsics_checks_from(message.rejection)
         return wire.filled(Rejected, message.rejection, **rejection_fields(message.rejection), **common)
     found = message.localization
     return wire.filled(
@@ -291,6 +319,7 @@ def answer_from_message(message: pb.LocalizeResponse) -> LocalizationResult | Re
         in_axes=optional(found, "in_axes", _framed_from_message),
         geo_pose=optional(found, "geo_pose", geo_pose_from_message),
         prior_checks=prior_checks_from_messages(found.prior_checks),
+        intrinsics_checks=_intrinsics_checks_from(found),
         **common,
     )
 
@@ -302,6 +331,13 @@ def rejection_fields(message: pb.Rejection) -> dict[str, Any]:
         "hint": optional(message, "hint", _hint_from_message),
         "hypotheses": tuple(map(_hypothesis_from_message, message.hypotheses)),
     }
+
+
+def _intrinsics_checks_from(message: pb.Localization | pb.Rejection) -> tuple[IntrinsicsCheck, ...]:
+    return tuple(
+        wire.filled(IntrinsicsCheck, it, parameter=wire.value_name(pb.IntrinsicsParameter, it.parameter))
+        for it in message.intrinsics_checks
+    )
 
 
 def covariance_from_message(message: Any) -> Array | None:

@@ -1,4 +1,4 @@
-"""A new reference, and the bytes of a photograph."""
+"""A new reference, how far intrinsics may be off, and the bytes of a photograph."""
 
 from __future__ import annotations
 
@@ -23,6 +23,21 @@ class NewReference:
     image: ImageSource
     camera: Camera
     world_from_camera: RigidTransform
+
+
+@dataclass(frozen=True)
+class IntrinsicsUncertainty:
+    """Standard deviations of a photograph's intrinsics; 0 for the server's default.
+
+    Attributes:
+        focal_sigma_px: of both focal lengths together, pixels along x; by default 0.3 % of it.
+        principal_sigma_px: of each coordinate of the principal point; by default 0.3 % of the width.
+        k1_sigma: of the first distortion coefficient; by default 0.01.
+    """
+
+    focal_sigma_px: float = 0.0
+    principal_sigma_px: float = 0.0
+    k1_sigma: float = 0.0
 
 
 def create_request(scene_name: str, reference: NewReference) -> reference_pb.CreateReferenceRequest:

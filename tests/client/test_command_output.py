@@ -11,7 +11,7 @@ import pytest
 from support.planted_answers import diagnostics, localized, rejected
 
 from mapless import wire
-from mapless.answers import PriorCheck
+from mapless.answers import IntrinsicsCheck, PriorCheck
 from mapless.axes import Axes
 from mapless.cameras import read_camera
 from mapless.cli.folder import Tally
@@ -32,6 +32,17 @@ def test_each_prior_has_its_line() -> None:
         "prior     GRAVITY agrees, used",
         "prior     HEADING agrees, less certain than the photograph, not needed",
         "prior     POSITION contradicts the photograph: 8.0 standard deviations, not used",
+    ]
+
+
+def test_a_corrected_parameter_of_the_camera_has_its_line() -> None:
+    checks = (
+        IntrinsicsCheck("FOCAL_LENGTH", 525.0, 530.3, 0.8, 1.6, False, True),
+        IntrinsicsCheck("PRINCIPAL_X", 320.0, 320.9, 0.8, 1.9, False, True),
+        IntrinsicsCheck("K1", 0.0, 0.02, 0.05, 0.01, False, False),
+    )
+    assert [it.strip() for it in lines(localized(intrinsics_checks=checks)) if it.startswith("  camera")] == [
+        "camera    FOCAL_LENGTH is 525.0, the photograph says 530.3 +- 0.8: used"
     ]
 
 

@@ -15,7 +15,7 @@ from mapless_server.engine.query import Result, Tier
 from mapless_server.engine.tiers import UNRECOVERABLE, EscalationOptions, better_of, is_doubtful
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.rejection import IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason
 from mapless_server.method.results import (
     KeypointNoise,
     PointMatches,
@@ -82,7 +82,8 @@ class TestDoubt:
         assert {it.name for it in UNRECOVERABLE} == {"NO_USABLE_REFERENCES", "DEGENERATE_REFERENCES"}
 
     def test_a_wrong_focal_length_is_not_doubtful(self) -> None:
-        rejection = Rejection(RejectionReason.GATE, "planted", focal_ratio=1.2)
+        check = IntrinsicsCheck(IntrinsicsParameter.FOCAL_LENGTH, 525.0, 541.0, 2.0, 1.6, conflict=True, used=True)
+        rejection = Rejection(RejectionReason.GATE, "planted", intrinsics_checks=(check,))
         assert not is_doubtful(Answer(rejection), OPTIONS)
 
     @given(trust=st.floats(0, 1), sigma_m=st.floats(1e-4, 1.0))

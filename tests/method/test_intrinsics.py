@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.compare import assert_pose_close
 from support.planted import NOISE, stages, true_structure
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, Camera, Distortion, Fisheye, RadialTangential
-from mapless_server.method.adjust import SHARED_CAMERA, AdjustOptions, adjust_pose, pose_problem, with_intrinsics
+from mapless_server.method.adjust import AdjustOptions, adjust_pose, pose_problem, with_intrinsics
 from mapless_server.method.features import undistort_pixels
-from mapless_server.method.intrinsics import IntrinsicsSigma, corrected, keypoint_motion
+from mapless_server.method.intrinsics import IntrinsicsEvidence, corrected, keypoint_motion
+from mapless_server.method.options import IntrinsicsSigma
+from mapless_server.method.rejection import Advice, RejectionReason
 from mapless_server.method.results import PoseEstimate
+from mapless_server.method.trust.intrinsics import IntrinsicsOptions, intrinsics_checks, wrong_intrinsics
 
 LENSES = {
     "pinhole": None,
@@ -68,7 +73,7 @@ def test_planted_errors_are_found_within_their_sigma(parameter: str) -> None:
 
 
 def test_right_intrinsics_have_no_significant_errors() -> None:
-    found = [adjusted(make_scene(random_for("right", i))).intrinsics for i in range(10)]
+    found = [adjusted(make_scene(random_for("right", i))).intrinsics for i in range(5)]
     normalized = np.array([it.value / it.sigma for it in found if it])
     assert np.abs(normalized).max() < 1.5
 
@@ -92,19 +97,104 @@ def test_less_certain_intrinsics_make_the_covariance_larger() -> None:
 
 
 def test_a_camera_shared_with_the_references_errs_less() -> None:
-    """The same image from references of another camera has the usual errors."""
+    """The errors that photographs of one camera share are in the references' points too."""
     scene = make_scene(random_for("shared"))
     other = replace(scene.query.camera, focal_x_px=900.0, focal_y_px=900.0)
-    strangers = tuple(replace(it, view=replace(it.view, camera=other)) for it in scene.references)
     assert scene.query.has_camera_of(scene.references[0].view)
-    assert not scene.query.has_camera_of(strangers[0].view)
-    usual = IntrinsicsSigma().of(scene.query.camera)
-    found = adjusted(scene).intrinsics
-    assert found
-    np.testing.assert_allclose(found.prior_sigma, SHARED_CAMERA * usual)
-    stated = adjusted(scene, IntrinsicsSigma()).intrinsics
+    assert not replace(scene.query, camera=other).has_camera_of(scene.references[0].view)
+    shared, stated = adjusted(scene).intrinsics, adjusted(scene, IntrinsicsSigma()).intrinsics
+    assert shared
     assert stated
-    np.testing.assert_allclose(stated.prior_sigma, usual)
+    np.testing.assert_array_equal(shared.prior_sigma, stated.prior_sigma)
+    assert np.trace(shared.pose_covariance) < 0.2 * np.trace(stated.pose_covariance)
+
+
+LARGE = {
+    "focal length 3 %": (-0.03, 0, 0, 0),
+    "focal length 10 %": (0.1, 0, 0, 0),
+    "principal point": (0, 60.0, 0, 0),
+    "k1": (0, 0, 0, -0.3),
+}
+
+
+@pytest.mark.parametrize("case", LARGE)
+def test_a_contradicted_parameter_is_estimated_with_the_pose(case: str) -> None:
+    """Every tenth match is wrong. The value is within three of its standard deviations, the others stay as given."""
+    errors = np.array(LARGE[case], float)
+    scene = make_scene(random_for("large", case), SceneOptions(outlier_share=0.1))
+    found = adjusted(misread(scene, tuple(errors)))
+    assert found.intrinsics
+    assert found.view
+    wrong, sigma = errors != 0, found.intrinsics.sigma
+    assert (np.abs(found.intrinsics.value - errors) < 3 * sigma)[wrong].all()
+    assert (np.abs(found.intrinsics.removed - errors) < 1.5 * found.intrinsics.prior_sigma).all()
+    assert_pose_close(found.world_from_camera, scene.world_from_query, metres=0.012, degrees=0.2)
+    judged = wrong_intrinsics(found.intrinsics, "best", IntrinsicsOptions())
+    assert judged
+    assert [it.conflict for it in judged.intrinsics_checks] == wrong.tolist()
+
+
+def test_right_intrinsics_are_never_rejected() -> None:
+    for case in range(6):
+        few = SceneOptions(point_count=80, noise_px=1.5, outlier_share=0.2)
+        scene = make_scene(random_for("never", case), few if case % 2 else SceneOptions(outlier_share=0.2))
+        found = adjusted(scene)
+        assert found.intrinsics
+        assert found.view is None
+        assert wrong_intrinsics(found.intrinsics, "best", IntrinsicsOptions()) is None
+
+
+def test_a_flat_wall_contradicts_no_focal_length() -> None:
+    """A nearer camera with a wider lens has the same image."""
+    frontal = SceneOptions(box_m=(4.0, 2.4, 0.0), query_offset_m=(0.0, 0.0, 0.0), reference_count=2)
+    found = adjusted(misread(make_scene(random_for("wall"), frontal), (0.05, 0, 0, 0)))
+    assert found.view is None
+    assert found.intrinsics
+    assert wrong_intrinsics(found.intrinsics, "best", IntrinsicsOptions()) is None
+
+
+def evidence_of(lens: Distortion | None, value: tuple[float, ...]) -> IntrinsicsEvidence:
+    """Of a photograph that was reduced to half its size."""
+    sent = Camera(1280, 960, 1050.0, 1052.0, 641.0, 479.0, lens)
+    sigma, covariance = np.array([0.002, 1.0, 1.0, 0.01]), np.zeros((4, 4))
+    prior_sigma, motion = IntrinsicsSigma().of(sent.resized(640, 480)), np.zeros((6, 4))
+    given, values = sent.resized(640, 480), np.array(value)
+    return IntrinsicsEvidence(given, sent, values, sigma, prior_sigma, covariance, motion, values)
+
+
+@pytest.mark.parametrize(
+    ("lens", "value", "message", "advice"),
+    [
+        (None, (0.03, 0, 0, 0), "focal_x_px is 1050.0, the photograph says 1082.0 +- 2.1", "focal length"),
+        (None, (0, 20.0, 0, 0), "principal_x_px is 641.0, the photograph says 681.0 +- 2.0", "principal point"),
+        (None, (0, 0, 0, -0.21), "k1 is 0.000, the photograph says -0.210 +- 0.010", "without lens distortion"),
+        (Fisheye(), (0, 0, 0, 0.34), "k1 is 0.000, the photograph says 0.340", "fisheye without coefficients"),
+        (Fisheye(0.1), (0, 0, 0, 0.2), "k1 is 0.100, the photograph says 0.300", "the order of its coefficients"),
+        (None, (0.03, 0, 0, -0.3), "k1 is 0.000, .* +- 0.010; focal_x_px is", "without lens distortion"),
+    ],
+)
+def test_a_rejection_names_the_parameter_and_its_value(
+    lens: Distortion | None, value: tuple[float, ...], message: str, advice: str
+) -> None:
+    rejection = wrong_intrinsics(evidence_of(lens, value), "scenes/hall/references/a", IntrinsicsOptions())
+    assert rejection
+    assert rejection.reason is RejectionReason.GATE
+    assert re.search(message.replace("+-", r"\+-"), rejection.message), rejection.message
+    assert rejection.hint
+    assert rejection.hint.advice is Advice.CHECK_CALIBRATION
+    assert advice in rejection.hint.message
+
+
+def test_what_the_prior_allows_is_no_conflict() -> None:
+    """One percent of the focal length is significant, but three of both standard deviations together."""
+    (focal, *_) = intrinsics_checks(evidence_of(None, (0.0105, 0, 0, 0)), IntrinsicsOptions())
+    assert not focal.conflict
+    assert focal.used
+    assert focal.estimated == pytest.approx(1050 * np.exp(0.0105))
+    wider = replace(evidence_of(None, (0.03, 0, 0, 0)), prior_sigma=np.array([0.02, 2, 2, 0.01]))
+    assert wrong_intrinsics(wider, "best", IntrinsicsOptions()) is None
+    unsure = replace(evidence_of(None, (0.3, 0, 0, 0)), sigma=np.array([0.05, 1, 1, 0.01]))
+    assert wrong_intrinsics(unsure, "best", IntrinsicsOptions()) is None
 
 
 def test_reduced_equations_equal_those_of_plain_rows() -> None:

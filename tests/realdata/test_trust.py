@@ -12,7 +12,6 @@ import pytest
 from mapless_server.method.answer import Localization
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
-from mapless_server.method.trust.focal import FocalOptions, wrong_focal
 from mapless_tools.dataset import Dataset
 from research.places import METRIC, OTHERS, Measured, Place, answered, cross_pairs, right_pairs
 
@@ -49,11 +48,12 @@ def test_a_wrong_focal_length_is_reported_with_the_right_one(photographs: Photog
     for factor in (0.85, 1.15):
         camera = replace(given, focal_x_px=factor * given.focal_x_px, focal_y_px=factor * given.focal_y_px)
         (it,) = answered([replace(pair, query=replace(pair.query, camera=camera))], ALL)
-        assert it.answer.support is not None
-        estimate = wrong_focal(it.answer.support, FocalOptions())
-        assert estimate is not None
-        assert estimate.estimated_px == pytest.approx(given.focal_x_px, rel=0.01)
         assert isinstance(it.answer.outcome, Rejection)
+        focal, *others = it.answer.outcome.intrinsics_checks
+        assert focal.conflict
+        assert not any(other.conflict for other in others)
+        assert focal.estimated == pytest.approx(given.focal_x_px, abs=3 * focal.estimated_sigma)
+        assert focal.estimated_sigma < 0.01 * focal.given
         assert it.answer.outcome.hint is not None
         assert it.answer.outcome.hint.advice is Advice.CHECK_CALIBRATION
 

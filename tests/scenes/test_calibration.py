@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.special import ndtri
-from support.scenes import SceneOptions, make_scene, random_for
+from support.scenes import CAMERA, SceneOptions, make_scene, random_for
 from support.servers import StandInDescriptor, StandInExtractor
 from support.stores import Folder, Place
 
@@ -104,7 +104,9 @@ class TestFit:
 
         def with_lens(it: LeftOut, error: float) -> LeftOut:
             value = np.array([error, 0.5, 0.0, 0.001]) + 0.3 * prior * random.normal(size=4)
-            return replace(it, lens=IntrinsicsEvidence(value, 0.3 * prior, prior, np.eye(4), np.zeros((6, 4))))
+            zeros = np.zeros((6, 4))
+            lens = IntrinsicsEvidence(CAMERA, CAMERA, value, 0.3 * prior, prior, np.eye(4), zeros, np.zeros(4))
+            return replace(it, lens=lens)
 
         right, wrong = ([with_lens(it, error) for it in spread(20, 1.0)] for error in (0.0, 0.03))
         assert lens_contradictions(right) == []

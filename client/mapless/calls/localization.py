@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from datetime import datetime
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
@@ -24,7 +24,7 @@ from ..groups import (
 )
 from ..names import reference_names, scene_name
 from ..priors import Priors, set_priors
-from ..requests import ImageSource, read_image
+from ..requests import ImageSource, IntrinsicsUncertainty, read_image
 from ..v1 import localization_service_pb2 as pb
 
 SERVICE = "mapless.v1.LocalizationService"
@@ -40,6 +40,7 @@ def localize(
     references: Sequence[str] = (),
     *,
     priors: Priors | None = None,
+    intrinsics_uncertainty: IntrinsicsUncertainty | None = None,
     variant: str = "",
     scale_strategy: str = "",
     reference_count: int = 0,
@@ -61,6 +62,8 @@ def localize(
         scene: the scene to localize in.
         references: the references to use, most similar first, at most 64; empty: the server chooses.
         priors: what is known of the pose before the photograph is used.
+        intrinsics_uncertainty: how far the camera's intrinsics may be off; None for the defaults, and for less where
+            the references are of the same camera.
         variant: "best" (default), "full", "no_structure" or "coarse".
         scale_strategy: "two_stage" (default), "triangulation" or "trajectory".
         reference_count: number of references that the server chooses; 0 for its default.
@@ -96,6 +99,8 @@ def localize(
         ),
     )
     set_priors(request, priors or Priors())
+    if intrinsics_uncertainty is not None:
+        request.intrinsics_uncertainty.CopyFrom(pb.IntrinsicsUncertainty(**asdict(intrinsics_uncertainty)))
     if capture_time is not None:
         request.capture_time.FromDatetime(capture_time)
     if session_from_camera is not None:

@@ -226,6 +226,15 @@ def _add_localize(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--gravity-sigma", type=float, default=1.0, metavar="DEG", help="its standard deviation (default: %(default)s)"
     )
+    for name, unit, text in (
+        ("focal", "PX", "both focal lengths"),
+        ("principal", "PX", "the principal point"),
+        ("k1", "K1", "the distortion coefficient k1"),
+    ):
+        command.add_argument(
+            f"--{name}-sigma", type=float, default=0.0, metavar=unit,
+            help=f"standard deviation of {text} (default: the server's)",
+        )  # fmt: skip
     command.add_argument("--axes", default="", help="opencv, arkit, arcore, unity or ros: adds the pose in these axes")
     command.add_argument(
         "--coverage", type=float, default=0.0, help="share of right answers to accept (default: the server's)"

@@ -22,7 +22,7 @@ from ..errors import InvalidArgument, MaplessError, NotFound
 from ..geometry import Camera
 from ..priors import GravityPrior, HeadingPrior, PositionPrior, Priors
 from ..report import write_report
-from ..requests import ImageSource
+from ..requests import ImageSource, IntrinsicsUncertainty
 from ..results import Reference
 from . import output
 from .folder import EXIT_REJECTED, Concurrency, LimitedClient, Outcome, Tally
@@ -193,6 +193,7 @@ def _answers(
     """The answer; with --progressive, a coarse pose may come first."""
     options: dict[str, Any] = {
         "priors": priors(arguments),
+        "intrinsics_uncertainty": intrinsics_uncertainty(arguments),
         "variant": arguments.variant,
         "allow_coarse": arguments.allow_coarse,
         "scale_strategy": arguments.scale_strategy,
@@ -252,6 +253,12 @@ def priors(arguments: argparse.Namespace) -> Priors:
         heading=HeadingPrior(np.array(looking[:3]), looking[3]) if looking else None,
         gravity=GravityPrior(np.array(gravity), arguments.gravity_sigma) if gravity else None,
     )
+
+
+def intrinsics_uncertainty(arguments: argparse.Namespace) -> IntrinsicsUncertainty | None:
+    """The standard deviations that the command line gives; None without any."""
+    given = IntrinsicsUncertainty(arguments.focal_sigma, arguments.principal_sigma, arguments.k1_sigma)
+    return None if given == IntrinsicsUncertainty() else given
 
 
 @contextlib.contextmanager

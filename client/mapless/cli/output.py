@@ -16,7 +16,7 @@ from google.protobuf import json_format
 from google.protobuf.message import Message
 
 from .. import wire
-from ..answers import Accuracy, LocalizationResult, PriorCheck, Rejected
+from ..answers import Accuracy, IntrinsicsCheck, LocalizationResult, PriorCheck, Rejected
 from ..geometry import Camera, RigidTransform
 
 DOUBTFUL_TRUST = 0.15
@@ -96,6 +96,7 @@ def lines(answer: LocalizationResult | Rejected) -> list[str]:
         geo = answer.geo_pose
         text.append(f"  on earth  {geo.lat:.7f}, {geo.lon:.7f}, {geo.h:.2f} m")
     text += [f"  prior     {_checked(check)}" for check in answer.prior_checks]
+    text += [f"  camera    {_corrected(check)}" for check in answer.intrinsics_checks if _differs(check)]
     captured = f", {_CAPTURED}" if answer.diagnostics.captured else ""
     text.append(f"  support   {_support(answer)}, {answer.diagnostics.total_s:.2f} s{captured}")
     if answer.arbitrary_unit:
@@ -148,6 +149,20 @@ def _checked(check: PriorCheck) -> str:
         ignored = "" if check.used else ", not used"
         return f"{check.kind} contradicts the photograph: {check.mahalanobis:.1f} standard deviations{ignored}"
     return f"{check.kind} agrees, " + ("used" if check.used else "less certain than the photograph, not needed")
+
+
+def _differs(check: IntrinsicsCheck) -> bool:
+    """Whether the photograph's value was used because it differs from the given one by more than its usual error."""
+    return check.used and abs(check.estimated - check.given) > check.given_sigma
+
+
+def _corrected(check: IntrinsicsCheck) -> str:
+    """How a parameter of the camera differs from what the photograph says."""
+    digits = 3 if check.parameter == "K1" else 1
+    return (
+        f"{check.parameter} is {check.given:.{digits}f}, the photograph says {check.estimated:.{digits}f} +- "
+        f"{check.estimated_sigma:.{digits}f}: used"
+    )
 
 
 def _radius(accuracy: Accuracy | None, kind: str, unit: str) -> str:

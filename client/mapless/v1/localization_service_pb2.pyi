@@ -39,6 +39,14 @@ class ScaleSource(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     SCALE_SOURCE_REFERENCES: _ClassVar[ScaleSource]
     SCALE_SOURCE_NETWORK: _ClassVar[ScaleSource]
 
+class IntrinsicsParameter(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    INTRINSICS_PARAMETER_UNSPECIFIED: _ClassVar[IntrinsicsParameter]
+    INTRINSICS_PARAMETER_FOCAL_LENGTH: _ClassVar[IntrinsicsParameter]
+    INTRINSICS_PARAMETER_PRINCIPAL_X: _ClassVar[IntrinsicsParameter]
+    INTRINSICS_PARAMETER_PRINCIPAL_Y: _ClassVar[IntrinsicsParameter]
+    INTRINSICS_PARAMETER_K1: _ClassVar[IntrinsicsParameter]
+
 class PriorKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     PRIOR_KIND_UNSPECIFIED: _ClassVar[PriorKind]
@@ -111,6 +119,11 @@ SCALE_STRATEGY_TWO_STAGE: ScaleStrategy
 SCALE_SOURCE_UNSPECIFIED: ScaleSource
 SCALE_SOURCE_REFERENCES: ScaleSource
 SCALE_SOURCE_NETWORK: ScaleSource
+INTRINSICS_PARAMETER_UNSPECIFIED: IntrinsicsParameter
+INTRINSICS_PARAMETER_FOCAL_LENGTH: IntrinsicsParameter
+INTRINSICS_PARAMETER_PRINCIPAL_X: IntrinsicsParameter
+INTRINSICS_PARAMETER_PRINCIPAL_Y: IntrinsicsParameter
+INTRINSICS_PARAMETER_K1: IntrinsicsParameter
 PRIOR_KIND_UNSPECIFIED: PriorKind
 PRIOR_KIND_POSITION: PriorKind
 PRIOR_KIND_HEADING: PriorKind
@@ -150,7 +163,7 @@ SCALE_STAGE_TRAJECTORY: ScaleStage
 SCALE_STAGE_NETWORK: ScaleStage
 
 class LocalizeRequest(_message.Message):
-    __slots__ = ("scene", "references", "image", "intrinsics", "position_prior", "options", "capture_time", "session_from_camera", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior")
+    __slots__ = ("scene", "references", "image", "intrinsics", "position_prior", "options", "capture_time", "session_from_camera", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior", "intrinsics_uncertainty")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     REFERENCES_FIELD_NUMBER: _ClassVar[int]
     IMAGE_FIELD_NUMBER: _ClassVar[int]
@@ -163,6 +176,7 @@ class LocalizeRequest(_message.Message):
     GEO_POSITION_PRIOR_FIELD_NUMBER: _ClassVar[int]
     GRAVITY_PRIOR_FIELD_NUMBER: _ClassVar[int]
     POSE_PRIOR_FIELD_NUMBER: _ClassVar[int]
+    INTRINSICS_UNCERTAINTY_FIELD_NUMBER: _ClassVar[int]
     scene: str
     references: _containers.RepeatedScalarFieldContainer[str]
     image: bytes
@@ -175,7 +189,18 @@ class LocalizeRequest(_message.Message):
     geo_position_prior: GeoPositionPrior
     gravity_prior: GravityPrior
     pose_prior: PosePrior
-    def __init__(self, scene: _Optional[str] = ..., references: _Optional[_Iterable[str]] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ...) -> None: ...
+    intrinsics_uncertainty: IntrinsicsUncertainty
+    def __init__(self, scene: _Optional[str] = ..., references: _Optional[_Iterable[str]] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ..., intrinsics_uncertainty: _Optional[_Union[IntrinsicsUncertainty, _Mapping]] = ...) -> None: ...
+
+class IntrinsicsUncertainty(_message.Message):
+    __slots__ = ("focal_sigma_px", "principal_sigma_px", "k1_sigma")
+    FOCAL_SIGMA_PX_FIELD_NUMBER: _ClassVar[int]
+    PRINCIPAL_SIGMA_PX_FIELD_NUMBER: _ClassVar[int]
+    K1_SIGMA_FIELD_NUMBER: _ClassVar[int]
+    focal_sigma_px: float
+    principal_sigma_px: float
+    k1_sigma: float
+    def __init__(self, focal_sigma_px: _Optional[float] = ..., principal_sigma_px: _Optional[float] = ..., k1_sigma: _Optional[float] = ...) -> None: ...
 
 class PositionPrior(_message.Message):
     __slots__ = ("position_m", "radius_m", "covariance_m2")
@@ -276,7 +301,7 @@ class LocalizeProgressivelyResponse(_message.Message):
     def __init__(self, answer: _Optional[_Union[LocalizeResponse, _Mapping]] = ..., is_final: bool = ...) -> None: ...
 
 class Localization(_message.Message):
-    __slots__ = ("world_from_camera", "covariance", "accuracy", "pose_stage", "inlier_count", "match_count", "reprojection_error_px", "trust", "in_axes", "geo_pose", "prior_checks", "arbitrary_unit", "scale_source")
+    __slots__ = ("world_from_camera", "covariance", "accuracy", "pose_stage", "inlier_count", "match_count", "reprojection_error_px", "trust", "in_axes", "geo_pose", "prior_checks", "arbitrary_unit", "scale_source", "intrinsics_checks")
     WORLD_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
     COVARIANCE_FIELD_NUMBER: _ClassVar[int]
     ACCURACY_FIELD_NUMBER: _ClassVar[int]
@@ -290,6 +315,7 @@ class Localization(_message.Message):
     PRIOR_CHECKS_FIELD_NUMBER: _ClassVar[int]
     ARBITRARY_UNIT_FIELD_NUMBER: _ClassVar[int]
     SCALE_SOURCE_FIELD_NUMBER: _ClassVar[int]
+    INTRINSICS_CHECKS_FIELD_NUMBER: _ClassVar[int]
     world_from_camera: _geometry_pb2.RigidTransform
     covariance: PoseCovariance
     accuracy: Accuracy
@@ -303,7 +329,26 @@ class Localization(_message.Message):
     prior_checks: _containers.RepeatedCompositeFieldContainer[PriorCheck]
     arbitrary_unit: bool
     scale_source: ScaleSource
-    def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., pose_stage: _Optional[_Union[PoseStage, str]] = ..., inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., trust: _Optional[float] = ..., in_axes: _Optional[_Union[FramedPose, _Mapping]] = ..., geo_pose: _Optional[_Union[GeoPose, _Mapping]] = ..., prior_checks: _Optional[_Iterable[_Union[PriorCheck, _Mapping]]] = ..., arbitrary_unit: bool = ..., scale_source: _Optional[_Union[ScaleSource, str]] = ...) -> None: ...
+    intrinsics_checks: _containers.RepeatedCompositeFieldContainer[IntrinsicsCheck]
+    def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., pose_stage: _Optional[_Union[PoseStage, str]] = ..., inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., trust: _Optional[float] = ..., in_axes: _Optional[_Union[FramedPose, _Mapping]] = ..., geo_pose: _Optional[_Union[GeoPose, _Mapping]] = ..., prior_checks: _Optional[_Iterable[_Union[PriorCheck, _Mapping]]] = ..., arbitrary_unit: bool = ..., scale_source: _Optional[_Union[ScaleSource, str]] = ..., intrinsics_checks: _Optional[_Iterable[_Union[IntrinsicsCheck, _Mapping]]] = ...) -> None: ...
+
+class IntrinsicsCheck(_message.Message):
+    __slots__ = ("parameter", "given", "estimated", "estimated_sigma", "given_sigma", "conflict", "used")
+    PARAMETER_FIELD_NUMBER: _ClassVar[int]
+    GIVEN_FIELD_NUMBER: _ClassVar[int]
+    ESTIMATED_FIELD_NUMBER: _ClassVar[int]
+    ESTIMATED_SIGMA_FIELD_NUMBER: _ClassVar[int]
+    GIVEN_SIGMA_FIELD_NUMBER: _ClassVar[int]
+    CONFLICT_FIELD_NUMBER: _ClassVar[int]
+    USED_FIELD_NUMBER: _ClassVar[int]
+    parameter: IntrinsicsParameter
+    given: float
+    estimated: float
+    estimated_sigma: float
+    given_sigma: float
+    conflict: bool
+    used: bool
+    def __init__(self, parameter: _Optional[_Union[IntrinsicsParameter, str]] = ..., given: _Optional[float] = ..., estimated: _Optional[float] = ..., estimated_sigma: _Optional[float] = ..., given_sigma: _Optional[float] = ..., conflict: bool = ..., used: bool = ...) -> None: ...
 
 class FramedPose(_message.Message):
     __slots__ = ("axes", "world_from_camera", "covariance", "world_from_session")
@@ -386,16 +431,18 @@ class Accuracy(_message.Message):
     def __init__(self, position_68_m: _Optional[float] = ..., position_95_m: _Optional[float] = ..., rotation_68_deg: _Optional[float] = ..., rotation_95_deg: _Optional[float] = ..., calibrated: bool = ..., calibration: _Optional[_Union[CalibrationSource, str]] = ..., sample_size: _Optional[int] = ...) -> None: ...
 
 class Rejection(_message.Message):
-    __slots__ = ("reason", "message", "hint", "hypotheses")
+    __slots__ = ("reason", "message", "hint", "hypotheses", "intrinsics_checks")
     REASON_FIELD_NUMBER: _ClassVar[int]
     MESSAGE_FIELD_NUMBER: _ClassVar[int]
     HINT_FIELD_NUMBER: _ClassVar[int]
     HYPOTHESES_FIELD_NUMBER: _ClassVar[int]
+    INTRINSICS_CHECKS_FIELD_NUMBER: _ClassVar[int]
     reason: RejectionReason
     message: str
     hint: Hint
     hypotheses: _containers.RepeatedCompositeFieldContainer[Hypothesis]
-    def __init__(self, reason: _Optional[_Union[RejectionReason, str]] = ..., message: _Optional[str] = ..., hint: _Optional[_Union[Hint, _Mapping]] = ..., hypotheses: _Optional[_Iterable[_Union[Hypothesis, _Mapping]]] = ...) -> None: ...
+    intrinsics_checks: _containers.RepeatedCompositeFieldContainer[IntrinsicsCheck]
+    def __init__(self, reason: _Optional[_Union[RejectionReason, str]] = ..., message: _Optional[str] = ..., hint: _Optional[_Union[Hint, _Mapping]] = ..., hypotheses: _Optional[_Iterable[_Union[Hypothesis, _Mapping]]] = ..., intrinsics_checks: _Optional[_Iterable[_Union[IntrinsicsCheck, _Mapping]]] = ...) -> None: ...
 
 class Hint(_message.Message):
     __slots__ = ("stage", "advice", "message", "best_reference")

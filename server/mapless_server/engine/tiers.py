@@ -65,12 +65,12 @@ class EscalationOptions:
 def is_doubtful(answer: Answer, options: EscalationOptions) -> bool:
     """Whether stronger features could improve the answer.
 
-    Not if the focal length is wrong: other features do not correct it, but may determine it too little to notice. A
+    Not if the intrinsics are wrong: other features do not correct them, but may determine them too little to notice. A
     pose that nothing has checked (`Variant.COARSE`) has no trust and claims nothing, so there is nothing to doubt.
     """
     outcome = answer.outcome
     if isinstance(outcome, Rejection):
-        return outcome.reason not in UNRECOVERABLE and outcome.focal_ratio is None
+        return outcome.reason not in UNRECOVERABLE and not outcome.intrinsics_checks
     if outcome.covariance is None or outcome.trust is None:
         return False
     radius_m = accuracy_from_covariance(outcome.covariance).position_68_m

@@ -12,7 +12,8 @@ references' observations (see `pose_errors`).
 
 The query's intrinsics stay as given: where they are right, poses are twice as accurate without these four unknowns.
 What the photograph says of their errors follows from the same normal equations, and the pose's covariance contains them
-(see `intrinsics`).
+(see `intrinsics`). A parameter that the photograph contradicts is estimated with the pose, the most significant one
+first, and the photograph is read again with its value.
 Priors on the query's pose add their terms, unless the photograph alone contradicts them. The points are eliminated (see
 `bundle`).
 """
@@ -28,9 +29,15 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform
 
 from .bundle import Bundle, BundleProblem, bundle_of
-from .intrinsics import IntrinsicsEvidence, IntrinsicsSigma, intrinsics_evidence, keypoint_motion
+from .intrinsics import (
+    PRINCIPAL,
+    ContradictionOptions,
+    corrected_view,
+    intrinsics_evidence,
+    keypoint_motion,
+)
 from .optimize import MinimizeOptions, minimize
-from .options import check_bounds
+from .options import IntrinsicsSigma, check_bounds
 from .perturbation import reprojection_errors_px, world_jacobian
 from .pose_errors import PoseErrorOptions, most_probable, pose_errors
 from .priors.known import NO_PRIORS, Priors
@@ -47,6 +54,13 @@ SHARED_CAMERA = 0.03
 references' points too, and moves the pose but little: focus and stabilization remain. With 0.1 the covariance of these
 errors exceeds all others in scenes of one camera, where radii hold too often."""
 
+WIDE_SIGMA = np.array([0.3, 0.3, 0.3, 1.0])
+"""Of an estimated parameter: focal length and k1, and principal point as a share of the width."""
+MAX_HELD = 3.0
+"""An estimate that leaves the prior by more standard deviations has diverged."""
+LEAST_MATCHES = 20
+"""For a pose and intrinsics."""
+
 
 @dataclass(frozen=True)
 class AdjustOptions:
@@ -61,6 +75,10 @@ class AdjustOptions:
         max_error_px: matches with a larger error under the initial pose are not used.
         iterations: at most so many Levenberg-Marquardt steps.
         min_decrease: stop when a step lowers the cost by a smaller share.
+        suspicion: when a parameter of the intrinsics is estimated with the pose. A large error leaves few inliers, of
+            which those with other errors are missing.
+        contradiction: when this estimate is used.
+        rounds: at most so many times an estimated parameter's photograph is read again.
         pose_errors: of the errors of the references' poses.
         uncertainty: of the answer's covariance.
     """
@@ -72,12 +90,15 @@ class AdjustOptions:
     max_error_px: float = 8.0
     iterations: int = 8
     min_decrease: float = 1e-5
+    suspicion: ContradictionOptions = field(default_factory=lambda: ContradictionOptions(2.0, 0.06, 0.06, 0.15))
+    contradiction: ContradictionOptions = field(default_factory=ContradictionOptions)
+    rounds: int = 4
     pose_errors: PoseErrorOptions = field(default_factory=PoseErrorOptions)
     uncertainty: UncertaintyOptions = field(default_factory=UncertaintyOptions)
 
     def __post_init__(self) -> None:
         check_bounds(self, "inlier_px min_kept_share loss_scale_sigma max_error_px", above=0)
-        check_bounds(self, "iterations min_decrease", above=0)
+        check_bounds(self, "iterations min_decrease rounds", above=0)
 
 
 def adjust_pose(
@@ -138,13 +159,93 @@ def _adjusted(
     problem, start = pose_problem(query, references, structure, matches, used, estimate.world_from_camera, options)
     with_priors = replace(problem, priors=priors, prior_weight=options.error_inflation**2)
     bundle = minimize(with_priors, start, MinimizeOptions(options.iterations, options.min_decrease))
-    found = _conclude(query, structure, matches, used, estimate, problem, bundle, options)
-    if found is None:
+    usual = (intrinsics or IntrinsicsSigma()).of(query.camera)
+    is_shared = 2 * sum(query.has_camera_of(it.view) for it in references) > len(references)
+    held = SHARED_CAMERA * usual if intrinsics is None and is_shared else usual
+    terms = (query, np.zeros(4), usual, held)
+    found = _conclude(query, structure, matches, used, estimate, problem, bundle, options, terms)
+    if found is not None and found.intrinsics is not None:
+        found = _recalibrated(query, references, structure, matches, found, options, priors, usual)
+    return found and replace(found, covariance=priors.sharpened(found.covariance, found.world_from_camera))
+
+
+def _recalibrated(
+    query: View,
+    references: Sequence[PosedView],
+    structure: Structure,
+    matches: PointMatches,
+    found: PoseEstimate,
+    options: AdjustOptions,
+    priors: Priors,
+    usual: Array,
+) -> PoseEstimate:
+    """The estimate with the parameters that the photograph contradicts; the one found if it contradicts none."""
+    held = usual.copy()
+    wide = WIDE_SIGMA * np.array([1, query.camera.width_px, query.camera.width_px, 1])
+    while (worst := _contradicted(found, options.suspicion, held < usual * 2)) is not None:
+        held[list(worst)] = wide[list(worst)]
+        better = _with_errors(query, references, structure, matches, found, options, priors, usual, held)
+        if better is None or better.intrinsics is None:
+            break
+        if not better.intrinsics.contradicted(options.contradiction)[list(worst)].any():
+            break
+        found = better
+    return found
+
+
+def _contradicted(
+    found: PoseEstimate, options: ContradictionOptions, is_held: NDArray[np.bool_]
+) -> tuple[int, ...] | None:
+    """The parameter, or both of the principal point, that the photograph contradicts most; of those that are held."""
+    evidence = found.intrinsics
+    if evidence is None:
         return None
-    evidence = _evidence(query, references, problem, bundle, options, intrinsics)
-    if evidence is not None:
-        found = replace(found, covariance=found.covariance + evidence.pose_covariance, intrinsics=evidence)
-    return replace(found, covariance=priors.sharpened(found.covariance, found.world_from_camera))
+    wrong = evidence.contradicted(options) & is_held
+    worst = int(np.argmax(np.where(wrong, np.abs(evidence.value) / evidence.sigma, 0.0)))
+    if not wrong[worst]:
+        return None
+    return PRINCIPAL if worst in PRINCIPAL else (worst,)
+
+
+def _with_errors(
+    query: View,
+    references: Sequence[PosedView],
+    structure: Structure,
+    matches: PointMatches,
+    found: PoseEstimate,
+    options: AdjustOptions,
+    priors: Priors,
+    usual: Array,
+    held: Array,
+) -> PoseEstimate | None:
+    """The estimate with errors of the intrinsics as unknowns, of prior standard deviations `held`; None if it fails."""
+    assert found.intrinsics is not None
+    errors, pose, view = found.intrinsics.removed, found.world_from_camera, found.view or query
+    steps = MinimizeOptions(options.iterations, options.min_decrease)
+    change: Array | None = None
+    for left in reversed(range(options.rounds)):
+        pixels = view.features.keypoints[matches.keypoint].astype(np.float64)
+        errors_px = reprojection_errors_px(view.camera, pose, structure.x_in_world[matches.point], pixels)
+        used = np.flatnonzero(errors_px < options.max_error_px)
+        if len(used) < LEAST_MATCHES:
+            return None
+        problem, start = pose_problem(view, references, structure, matches, used, pose, options)
+        problem = replace(problem, priors=priors, prior_weight=options.error_inflation**2)
+        if not left or (change is not None and (np.abs(change) < usual / 10).all()):
+            break
+        wider, there = with_intrinsics(problem, start, view)
+        wider = replace(wider, intrinsics_information=held**-2.0, intrinsics_offset=errors)
+        bundle = minimize(wider, there, steps)
+        pose, change = bundle.world_from_query, bundle.intrinsics
+        errors = errors + change
+        if np.abs(errors / held).max() > MAX_HELD:
+            return None
+        view = corrected_view(query, errors)
+    terms = (query, errors, usual, held)
+    before = replace(found, inliers=errors_px < options.inlier_px)
+    bundle = minimize(problem, start, steps)
+    better = _conclude(view, structure, matches, used, before, problem, bundle, options, terms)
+    return better and replace(better, view=view)
 
 
 def _conclude(
@@ -156,8 +257,13 @@ def _conclude(
     problem: BundleProblem,
     bundle: Bundle,
     options: AdjustOptions,
+    intrinsics: tuple[View, Array, Array, Array],
 ) -> PoseEstimate | None:
-    """The estimate at the optimum, its covariance without priors; None if it has diverged."""
+    """The estimate at the optimum, its covariance without priors; None if it has diverged.
+
+    `intrinsics`: the query with its intrinsics as given, the errors that are removed from them, and the standard
+    deviations `prior_sigma` and `held_sigma` of `intrinsics_evidence`.
+    """
     pose = bundle.world_from_query
     pixels = query.features.keypoints[matches.keypoint].astype(np.float64)
     points = structure.x_in_world.copy()
@@ -169,7 +275,12 @@ def _conclude(
     covariance = adjusted_covariance(problem, bundle, options.uncertainty)
     if covariance is None:
         return None
-    return PoseEstimate(pose, PoseStage.REFINED, inliers, errors_px, covariance, is_adjusted=True)
+    wider, there = with_intrinsics(problem, bundle, query)
+    matrix, gradient, _ = wider.linearize(there).reduced(LEAST_DAMPING)
+    evidence = intrinsics_evidence(matrix, gradient, *intrinsics, options.error_inflation, world_jacobian(pose))
+    if evidence is not None:
+        covariance = covariance + evidence.pose_covariance
+    return PoseEstimate(pose, PoseStage.REFINED, inliers, errors_px, covariance, is_adjusted=True, intrinsics=evidence)
 
 
 def pose_covariance(
@@ -211,31 +322,13 @@ def pose_covariance(
     return priors.consistent(estimate.prior_checks).sharpened(covariance, pose)
 
 
-def _evidence(
-    query: View,
-    references: Sequence[PosedView],
-    problem: BundleProblem,
-    bundle: Bundle,
-    options: AdjustOptions,
-    intrinsics: IntrinsicsSigma | None,
-) -> IntrinsicsEvidence | None:
-    """What the photograph's matches say of its intrinsics, at the optimum."""
-    wider, there = with_intrinsics(problem, bundle, query)
-    matrix, gradient, _ = wider.linearize(there).reduced(LEAST_DAMPING)
-    sigma = (intrinsics or IntrinsicsSigma()).of(query.camera)
-    if intrinsics is None and 2 * sum(query.has_camera_of(it.view) for it in references) > len(references):
-        sigma = SHARED_CAMERA * sigma
-    to_world = world_jacobian(bundle.world_from_query)
-    return intrinsics_evidence(matrix, gradient, there.intrinsics, sigma, options.error_inflation, to_world)
-
-
 def with_intrinsics(problem: BundleProblem, bundle: Bundle, query: View) -> tuple[BundleProblem, Bundle]:
     """The same problem and values with errors of the query's intrinsics as unknowns, without a prior on them."""
     is_query = problem.view == len(problem.given.rotation)
     observations = problem.observations
     motion = keypoint_motion(query.camera, query.distortion, observations.pixel[is_query])
     motion = motion / observations.sigma_px[is_query, None, None]
-    wider = replace(problem, keypoint_motion=motion, intrinsics_information=np.zeros(4))
+    wider = replace(problem, keypoint_motion=motion, intrinsics_information=np.zeros(4), intrinsics_offset=np.zeros(4))
     return wider, replace(bundle, intrinsics=np.zeros(4))
 
 

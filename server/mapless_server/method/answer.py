@@ -10,7 +10,7 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform
 
 from .priors.known import PriorCheck
-from .rejection import Rejection
+from .rejection import IntrinsicsCheck, Rejection
 from .results import MetricScale, PoseEstimate, PoseStage, ScaleSource, Support, TwoViewSupport
 from .uncertainty.radii import accuracy_from_covariance
 
@@ -31,6 +31,8 @@ class Localization:
         trust: 0 to 1, share of right answers whose score is at most as high (see `judge`); None for a pose without
             refinement.
         scale_source: what its lengths rest on.
+        intrinsics_checks: what the matches say of each parameter of the intrinsics; empty for a pose without an
+            adjustment.
     """
 
     world_from_camera: RigidTransform
@@ -42,9 +44,16 @@ class Localization:
     prior_checks: tuple[PriorCheck, ...] = ()
     trust: float | None = None
     scale_source: ScaleSource = ScaleSource.REFERENCES
+    intrinsics_checks: tuple[IntrinsicsCheck, ...] = ()
 
     @classmethod
-    def of(cls, estimate: PoseEstimate, trust: float, two_view: TwoViewSupport | None = None) -> Localization:
+    def of(
+        cls,
+        estimate: PoseEstimate,
+        trust: float,
+        two_view: TwoViewSupport | None = None,
+        intrinsics_checks: tuple[IntrinsicsCheck, ...] = (),
+    ) -> Localization:
         """The localization of an accepted estimate, and the two-view matches that it rests on, if any."""
         errors_px, inliers = estimate.errors_px, estimate.inliers
         if two_view is not None:
@@ -59,6 +68,7 @@ class Localization:
             float(np.median(errors_px[inliers])),
             estimate.prior_checks,
             trust,
+            intrinsics_checks=intrinsics_checks,
         )
 
 

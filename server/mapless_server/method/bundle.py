@@ -110,6 +110,7 @@ class BundleProblem:
         keypoint_motion: (O_q, 2, I) of the query's observations, in their order, by errors of its intrinsics, in
             standard deviations; I = 0 if they are no unknowns.
         intrinsics_information: (I,) inverse variances of the prior on these errors.
+        intrinsics_offset: (I,) errors of the intrinsics that are removed already; the prior's mean is minus these.
     """
 
     observations: Observations
@@ -121,6 +122,7 @@ class BundleProblem:
     prior_weight: float = 1.0
     keypoint_motion: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))
     intrinsics_information: Array = field(default_factory=lambda: np.zeros(0))
+    intrinsics_offset: Array = field(default_factory=lambda: np.zeros(0))
 
     @cached_property
     def by_view(self) -> ViewColumns:
@@ -142,7 +144,9 @@ class BundleProblem:
         x_in_camera = self.by_view.in_camera(bundle.poses, np.ascontiguousarray(bundle.points.T))
         squared = (self.by_view.residuals(x_in_camera, bundle.intrinsics) ** 2).sum(axis=0)
         motion = self.reference_motion(bundle).ravel()
-        prior = float(motion @ self.information @ motion + self.intrinsics_information @ bundle.intrinsics**2)
+        prior = float(motion @ self.information @ motion)
+        if bundle.intrinsics.size:
+            prior += float(self.intrinsics_information @ (bundle.intrinsics + self.intrinsics_offset) ** 2)
         if self.priors:
             prior += self.prior_weight * self.priors.cost(bundle.world_from_query)
         return cauchy_cost(squared, self.loss_scale_sigma) + prior
@@ -154,8 +158,10 @@ class BundleProblem:
         references, intrinsics = slice(query.start), slice(query.stop, None)
         equations.pose_block[references, references] += self.information
         equations.pose_gradient[references] += self.information @ self.reference_motion(bundle).ravel()
-        equations.pose_block[intrinsics, intrinsics] += np.diag(self.intrinsics_information)
-        equations.pose_gradient[intrinsics] += self.intrinsics_information * bundle.intrinsics
+        if bundle.intrinsics.size:
+            errors = bundle.intrinsics + self.intrinsics_offset
+            equations.pose_block[intrinsics, intrinsics] += np.diag(self.intrinsics_information)
+            equations.pose_gradient[intrinsics] += self.intrinsics_information * errors
         if self.priors:
             gradient, information = self._query_terms(bundle.world_from_query)
             equations.pose_gradient[query] += gradient

@@ -24,6 +24,7 @@ from .rejection import Rejection, RejectionReason
 from .results import MetricScale, PointMatches, ScaleStage, Structure, Support
 from .structure import build_structure
 from .trust.gate import gate_failure
+from .trust.intrinsics import intrinsics_checks
 from .trust.judge import contradiction, judge
 from .trust.two_view import (
     lacks_distance,
@@ -146,8 +147,9 @@ def _solve(coarse: Coarse, counts_agreement: bool) -> Answer:
         return coarse.answer(Rejection(RejectionReason.GATE, failure), replace(support, estimate=estimate))
     if prepared.options.variant is Variant.BEST:
         with stage("adjust"):
-            estimate = adjust_pose(query, references, structure, matches, estimate, options.adjust, priors)
-    support = replace(support, estimate=estimate)
+            sigma = prepared.options.intrinsics
+            estimate = adjust_pose(query, references, structure, matches, estimate, options.adjust, priors, sigma)
+    support = replace(support, estimate=estimate, query=estimate.view or query)
     with stage("uncertainty"):
         predicted = not prepared.structure_options.optimize
         covariance = pose_covariance(support, scale, options.adjust, priors, predicted)
@@ -157,7 +159,8 @@ def _solve(coarse: Coarse, counts_agreement: bool) -> Answer:
         judged = judge(support, query_matches, prepared.options.coverage, options.judge, chance)
     if judged.rejection:
         return coarse.answer(judged.rejection, support)
-    return coarse.answer(Localization.of(estimate, judged.trust), support)
+    checks = intrinsics_checks(estimate.intrinsics, options.judge.intrinsics) if estimate.intrinsics else ()
+    return coarse.answer(Localization.of(estimate, judged.trust, None, checks), support)
 
 
 def _solve_one_reference(coarse: Coarse, scale: MetricScale) -> Answer:

@@ -9,6 +9,10 @@ import operator
 from dataclasses import dataclass
 from enum import Enum
 
+import numpy as np
+
+from mapless.geometry import Array, Camera
+
 _HOLDS = {"above": operator.gt, "at_least": operator.ge, "below": operator.lt, "at_most": operator.le}
 
 
@@ -53,6 +57,30 @@ class ScaleStrategy(str, Enum):
 
 
 @dataclass(frozen=True)
+class IntrinsicsSigma:
+    """Standard deviations of a photograph's intrinsics.
+
+    Attributes:
+        focal_share: of both focal lengths together, as a share of them. Lenses change by so much with focus and
+            temperature, and calibrations repeat no better.
+        principal_share: of each coordinate of the principal point, as a share of the image's width.
+        k1: of the first radial coefficient.
+    """
+
+    focal_share: float = 0.003
+    principal_share: float = 0.003
+    k1: float = 0.01
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "focal_share principal_share k1", above=0, at_most=1)
+
+    def of(self, camera: Camera) -> Array:
+        """(4,): of s, of the principal point in pixels of this camera, and of k1."""
+        principal_px = self.principal_share * camera.width_px
+        return np.array([self.focal_share, principal_px, principal_px, self.k1])
+
+
+@dataclass(frozen=True)
 class LocalizeOptions:
     """Options of a request; the defaults are the most accurate ones measured.
 
@@ -61,11 +89,14 @@ class LocalizeOptions:
         scale_strategy: how the metric scale is estimated.
         coverage: share of right answers to accept, in a difficult place; a larger share accepts more wrong answers too
             (see `trust.judge`).
+        intrinsics: standard deviations of the photograph's intrinsics; None for the defaults, and less where the
+            references share its camera.
     """
 
     variant: Variant = Variant.BEST
     scale_strategy: ScaleStrategy = ScaleStrategy.TWO_STAGE
     coverage: float = 0.95
+    intrinsics: IntrinsicsSigma | None = None
 
     def __post_init__(self) -> None:
         check_bounds(self, "coverage", above=0, at_most=1)

@@ -151,13 +151,14 @@ class Prepared:
         if self.options.variant is not Variant.BEST or len(self.references) < 2:
             return False
         if isinstance(answer.outcome, Rejection):
-            return answer.outcome.reason not in (RejectionReason.DEGENERATE_REFERENCES, RejectionReason.AMBIGUOUS)
+            found = (RejectionReason.DEGENERATE_REFERENCES, RejectionReason.AMBIGUOUS)
+            return answer.outcome.reason not in found and not answer.outcome.intrinsics_checks
         return answer.outcome.inlier_count < self.pipeline.options.weak_inliers
 
     def can_use_two_views(self, answer: Answer) -> bool:
         """Whether a pose may be found from matches with the references themselves, after this answer.
 
-        Not where a stage has found what is wrong: a second place, the focal length, or references at one place. Nor
+        Not where a stage has found what is wrong: a second place, the intrinsics, or references at one place. Nor
         where matches with points gave a pose that was not accepted: the same matches without points are no better
         evidence. Of four photographs that they rescued in `office-lockers`, two were wrong.
         """

@@ -47,6 +47,44 @@ class Advice(str, Enum):
     """The prior contradicts the photograph, or leaves no reference."""
 
 
+class IntrinsicsParameter(str, Enum):
+    """Parameters of a photograph's intrinsics that its matches are compared with."""
+
+    FOCAL_LENGTH = "focal_length"
+    """Along x; that along y in proportion."""
+    PRINCIPAL_X = "principal_x"
+    PRINCIPAL_Y = "principal_y"
+    K1 = "k1"
+
+    @property
+    def field(self) -> str:
+        """Its name in requests; the focal length's is that along x."""
+        return {"focal_length": "focal_x_px", "k1": "k1"}.get(self.value, f"{self.value}_px")
+
+
+@dataclass(frozen=True)
+class IntrinsicsCheck:
+    """What a photograph's matches say of one parameter of its intrinsics, in pixels of the photograph as it was sent.
+
+    Attributes:
+        parameter: which.
+        given: its value in the request.
+        estimated: its value by the photograph alone, the other parameters held by their priors.
+        estimated_sigma: standard deviation of the estimated value.
+        given_sigma: standard deviation of the given one.
+        conflict: whether they differ by more than both allow.
+        used: whether the pose was computed with the estimated value.
+    """
+
+    parameter: IntrinsicsParameter
+    given: float
+    estimated: float
+    estimated_sigma: float
+    given_sigma: float
+    conflict: bool
+    used: bool
+
+
 @dataclass(frozen=True)
 class Hint:
     """What would help after a rejection.
@@ -88,7 +126,7 @@ class Rejection:
         message: one sentence for a person, with the numbers that decided.
         hint: what would help; None until `hints` has added it.
         tried: number of 2D-3D matches that were used; None if there are none yet.
-        focal_ratio: the focal length that the matches give over that of the intrinsics; None unless it is the reason.
+        intrinsics_checks: what the matches say of the intrinsics; empty unless a conflict with them is the reason.
         hypotheses: the poses that explain it, the better supported first; empty unless AMBIGUOUS.
     """
 
@@ -97,4 +135,4 @@ class Rejection:
     hint: Hint | None = None
     hypotheses: tuple[Hypothesis, ...] = ()
     tried: int | None = None
-    focal_ratio: float | None = None
+    intrinsics_checks: tuple[IntrinsicsCheck, ...] = ()

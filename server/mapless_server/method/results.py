@@ -142,8 +142,9 @@ class PoseEstimate:
         is_adjusted: whether the pose is that of the adjustment. The covariance of another is from the residuals alone
             and leaves out correlated errors (see `adjust.pose_covariance`).
         without_priors: the estimate before priors were used; None if none was used.
-        intrinsics: what the matches say of errors of the photograph's intrinsics, which the covariance contains; None
-            for poses that were not adjusted.
+        intrinsics: what the matches with points say of errors of the photograph's intrinsics, which the covariance of
+            an adjusted pose contains; None without an adjustment.
+        view: the photograph read with the intrinsics of the estimate, where it contradicts those given; None else.
     """
 
     world_from_camera: RigidTransform
@@ -155,6 +156,7 @@ class PoseEstimate:
     is_adjusted: bool = False
     without_priors: PoseEstimate | None = None
     intrinsics: IntrinsicsEvidence | None = None
+    view: View | None = None
 
 
 @dataclass(frozen=True, eq=False)

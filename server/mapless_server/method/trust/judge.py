@@ -6,8 +6,8 @@ least 1 - c accepts the share c of right answers, independent of the scale of th
 is a right answer", as in conformal prediction (Vovk, Gammerman and Shafer 2005). It is not the probability of being
 right, which depends on how many of a caller's photographs show the place at all.
 
-A wrong focal length is checked separately (`focal`), because the evidence of its answers is as good as that of right
-ones.
+Wrong intrinsics are checked separately (`intrinsics`), because the evidence of their answers is as good as that of
+right ones.
 
 The quantiles come from `research.trust`: answers to photographs with many and few references, of the third of twelve
 places where right answers have the least evidence, so that the coverage holds in a place like these; elsewhere more are
@@ -25,13 +25,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..options import check_bounds
-from ..rejection import Advice, Hint, Hypothesis, Rejection, RejectionReason
+from ..rejection import Hypothesis, Rejection, RejectionReason
 from ..results import Support
 from ..views import Matches
 from .agreement import AgreementOptions
 from .ambiguity import AmbiguityOptions, find_rival
 from .evidence import Evidence, evidence_of
-from .focal import Focal, FocalOptions, wrong_focal
+from .intrinsics import IntrinsicsOptions, wrong_intrinsics
 from .votes import Votes, votes_of
 
 _RARE = (0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075)
@@ -50,7 +50,7 @@ class JudgeOptions:
             ones.
         agreement: of the comparison of halves.
         ambiguity: of the search for a second pose.
-        focal: of the check of the photograph's focal length.
+        intrinsics: of the check of the photograph's intrinsics.
     """
 
     scores: tuple[float, ...] = (
@@ -60,7 +60,7 @@ class JudgeOptions:
     agreement_weight: float = 0.3
     agreement: AgreementOptions = field(default_factory=AgreementOptions)
     ambiguity: AmbiguityOptions = field(default_factory=AmbiguityOptions)
-    focal: FocalOptions = field(default_factory=FocalOptions)
+    intrinsics: IntrinsicsOptions = field(default_factory=IntrinsicsOptions)
 
     def __post_init__(self) -> None:
         check_bounds(self, "agreement_weight", at_least=0)
@@ -106,9 +106,9 @@ def judge(
         log10_chance: see `Priors.log10_chance`.
 
     Returns:
-        The judgement. Rejections, in the support's world: GATE, with a hint, if the photograph contradicts its focal
-        length; AMBIGUOUS with both hypotheses if a second pose is supported about as well; GATE if the trust is less
-        than 1 - coverage.
+        The judgement. Rejections, in the support's world: GATE, with a hint, if the photograph contradicts its
+        intrinsics; AMBIGUOUS with both hypotheses if a second pose is supported about as well; GATE if the trust is
+        less than 1 - coverage.
     """
     votes = votes_of(support, query_matches)
     evidence = evidence_of(support, votes, query_matches, options.agreement)
@@ -120,10 +120,12 @@ def judge(
 
 
 def contradiction(support: Support, votes: Votes, options: JudgeOptions) -> Rejection | None:
-    """A rejection if the matches with points contradict the focal length, or support a second pose about as well."""
-    focal = wrong_focal(support, options.focal)
-    if focal:
-        return _miscalibrated(support, focal)
+    """A rejection if the matches with points contradict the intrinsics, or support a second pose about as well."""
+    if support.estimate is not None and support.estimate.intrinsics is not None:
+        best = support.references[int(np.argmax(support.inliers_by_reference()))].name
+        wrong = wrong_intrinsics(support.estimate.intrinsics, best, options.intrinsics)
+        if wrong:
+            return wrong
     hypotheses = find_rival(support, votes, options.ambiguity)
     return _ambiguous(hypotheses) if hypotheses else None
 
@@ -149,21 +151,6 @@ def low_trust(evidence: Evidence, trust: float, coverage: float) -> Rejection | 
         f"{format_evidence(evidence)}"
     )
     return Rejection(RejectionReason.GATE, message)
-
-
-def _miscalibrated(support: Support, focal: Focal) -> Rejection:
-    message = (
-        f"the matches give {focal.estimated_px / focal.given_px:.3f} times the focal length of the intrinsics "
-        f"(standard deviation {focal.sigma:.2g}): {focal.agreeing} of the matches considered agree with the former, "
-        f"{focal.agreeing_before} with the latter"
-    )
-    advice = (
-        "Check the photograph's focal length: intrinsics belong to one image size, change with it when a photograph is "
-        "resized, and have another principal point when it is cropped."
-    )
-    best = support.references[int(np.argmax(support.inliers_by_reference()))].name
-    hint = Hint("judge", Advice.CHECK_CALIBRATION, advice, best)
-    return Rejection(RejectionReason.GATE, message, hint, focal_ratio=focal.estimated_px / focal.given_px)
 
 
 def format_evidence(evidence: Evidence) -> str:

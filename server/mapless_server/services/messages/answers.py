@@ -14,7 +14,7 @@ from mapless_server.engine.query import Result
 from mapless_server.method.answer import Localization
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.priors.known import PriorCheck
-from mapless_server.method.rejection import Hint, Rejection
+from mapless_server.method.rejection import Hint, IntrinsicsCheck, Rejection
 from mapless_server.method.results import MetricScale
 from mapless_server.method.uncertainty.gap import viewpoint_gap
 from mapless_server.method.uncertainty.radii import accuracy_from_covariance
@@ -69,6 +69,7 @@ def _localization_to_message(
         trust=localization.trust,
         prior_checks=[check_to_message(check) for check in localization.prior_checks],
         scale_source=enum_to_message(localization.scale_source, pb.ScaleSource),
+        intrinsics_checks=[_intrinsics_check_to_message(check) for check in localization.intrinsics_checks],
     )
     if radii is not None:
         message.covariance.CopyFrom(covariance_to_message(radii.covariance))
@@ -135,6 +136,19 @@ def rejection_to_message(rejection: Rejection) -> pb.Rejection:
             )
             for it in rejection.hypotheses
         ],
+        intrinsics_checks=[_intrinsics_check_to_message(check) for check in rejection.intrinsics_checks],
+    )
+
+
+def _intrinsics_check_to_message(check: IntrinsicsCheck) -> pb.IntrinsicsCheck:
+    return pb.IntrinsicsCheck(
+        parameter=enum_to_message(check.parameter, pb.IntrinsicsParameter),
+        given=check.given,
+        estimated=check.estimated,
+        estimated_sigma=check.estimated_sigma,
+        given_sigma=check.given_sigma,
+        conflict=check.conflict,
+        used=check.used,
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from enum import Enum
 from typing import Any, TypeVar
 
@@ -14,7 +15,7 @@ from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Photo, Query
 from mapless_server.images import ImageLimits, image_size
 from mapless_server.method.features import seen_share
-from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.options import IntrinsicsSigma, LocalizeOptions
 from mapless_server.security import SceneKey, key_of
 from mapless_server.store import SceneAttributes
 
@@ -100,6 +101,9 @@ def photo_from_message(message: Any, path: str, limits: ImageLimits) -> Photo:
 MIN_SEEN_SHARE = 0.1
 """Of an image, which a lens must show: a fisheye's circle shows 0.3 at least; wrong coefficients may show nothing."""
 
+LEAST_SIGMA = 1e-6
+"""Of intrinsics, as a share: they are exact, and their inverse squares are finite."""
+
 MAX_REFERENCES = 64
 MAX_CANDIDATES = 1000
 """References that a request may name where the server chooses among them."""
@@ -115,17 +119,39 @@ def query_from_message(
     scene_id = wire.scene_id_from_name(request.scene, "scene")
     most = MAX_CANDIDATES if request.options.rerank_references else MAX_REFERENCES
     narrowing, priors = priors_from_message(request, attributes)
+    photo = photo_from_message(request, "", engine.image_limits)
+    options = replace(options_from_message(request.options, engine.coverage), intrinsics=_sigma_from(request, photo))
     return Query(
         scene_key=key_of(tenant, scene_id),
         reference_ids=reference_ids_from_names(request.references, scene_id, most),
-        photo=photo_from_message(request, "", engine.image_limits),
+        photo=photo,
         narrowing=narrowing,
         reference_count=reference_count_from_message(request.options),
-        options=options_from_message(request.options, engine.coverage),
+        options=options,
         allow_coarse=request.options.allow_coarse,
         rerank=request.options.rerank_references and bool(request.references),
         priors=priors,
         is_generic=request.options.ignore_calibration,
+    )
+
+
+def _sigma_from(request: pb.LocalizeRequest, photo: Photo) -> IntrinsicsSigma | None:
+    """Standard deviations of the intrinsics; None for the defaults. FieldError names the one that is wrong."""
+    if not request.HasField("intrinsics_uncertainty"):
+        return None
+    message, camera, defaults = request.intrinsics_uncertainty, photo.camera, IntrinsicsSigma()
+
+    def share(name: str, default: float, whole: float) -> float:
+        value = getattr(message, name)
+        if not 0 <= value <= whole:
+            field = f"intrinsics_uncertainty.{name}"
+            raise FieldError(field, f"must be above 0 and at most {whole:g}, or 0 for the default, is {value:g}")
+        return max(value / whole, LEAST_SIGMA) if value else default
+
+    return IntrinsicsSigma(
+        share("focal_sigma_px", defaults.focal_share, camera.focal_x_px),
+        share("principal_sigma_px", defaults.principal_share, camera.width_px),
+        share("k1_sigma", defaults.k1, 1.0),
     )
 
 
