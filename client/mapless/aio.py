@@ -18,8 +18,8 @@ import grpc.aio
 
 from .calls import health, localization
 from .calls import references as reference_calls
-from .connecting import explained
-from .errors import REFUSED, from_rpc_error
+from .connecting import explained, is_unreached
+from .errors import from_rpc_error
 from .exchange import Attempt, Exchange, Methods, Pages, Pause, Reader, attempts
 from .options import ConnectOptions
 from .requests import NewReference
@@ -178,6 +178,6 @@ class Client:
                 response.cancel()
         except grpc.RpcError as error:
             failure = from_rpc_error(error)
-            if REFUSED in failure.message:
+            if is_unreached(failure):
                 failure = await asyncio.to_thread(explained, failure, self._address, self.options)
             reader.fail(failure)

@@ -74,7 +74,11 @@ def read_pose(source: str | Path) -> RigidTransform:
 
 def _pose_from_matrix(content: str, name: str) -> RigidTransform:
     try:
-        pose = RigidTransform.from_matrix(_numbers(read_json(content)))
+        value = read_json(content)
+        matrix = _numbers(value)
+        if matrix.shape not in ((4, 4), (3, 4)):
+            raise ValueError(f"must be 3 or 4 rows of 4 finite numbers, is {shown(value)}")
+        pose = RigidTransform.from_matrix(matrix)
         return wire.transform_from_message(wire.transform_to_message(pose), "")
     except ValueError as error:
         raise ValueError(f"{name}: world_from_camera as a matrix: {error}") from None

@@ -11,40 +11,67 @@ import socket
 
 import grpc
 
-from .errors import REFUSED, MaplessError, from_rpc_error
+from .errors import REFUSED, DeadlineExceeded, MaplessError, Unavailable, from_rpc_error
 from .options import ConnectOptions
 
+_UNREACHED = re.compile(
+    f"{REFUSED}|Cannot assign requested address|Network is unreachable|No route to host|Address family not supported"
+)
+"""In errors of an address at which no server was reached, as IPv6's in a container without IPv6."""
 _NAMED = re.compile(r"([A-Za-z][A-Za-z0-9.-]*)(?::(\d+))?")
 _DEFAULT_PORT = "443"  # gRPC's
-_LIMIT_S = 2.0
+_CONNECT_LIMIT_S = 2.0
+_ANSWER_LIMIT_S = 10.0  # a server with much to do, or a busy machine, may need seconds for a handshake
+
+
+def is_unreached(error: MaplessError) -> bool:
+    """Whether it is of an address at which no server was reached, so that `explained` may say more."""
+    return error.message.startswith("cannot connect") and _UNREACHED.search(error.message) is not None
 
 
 def explained(error: MaplessError, address: str, options: ConnectOptions) -> MaplessError:
-    """The error; if it is a refused connection, rather that of another address of the name that says more.
+    """The error; if no server was reached at its address, rather that of another one of the name that says more.
 
-    Connects to the other addresses, which takes milliseconds and 2 seconds at most each.
+    Connects to the other addresses, which takes milliseconds. An address that does not answer takes 2 seconds; one that
+    accepts connections and sends nothing, 10 seconds, or the options' timeout if that is less.
     """
     named = _NAMED.fullmatch(address)
-    if named is None or REFUSED not in error.message:
+    if named is None or not is_unreached(error):
         return error
     host, port = named[1], named[2] or _DEFAULT_PORT
     try:
-        found = {it[4][0]: it[0] for it in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)}
+        found = {it[4][0]: it for it in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)}
     except OSError:
         return error
-    for ip, family in found.items():
+    refused = error if REFUSED in error.message else None
+    for ip, (family, *_, endpoint) in found.items():
         one = f"[{ip}]:{port}" if family == socket.AF_INET6 else f"{ip}:{port}"
-        if f" {one}: " not in error.message:
-            other = _failure(one, host, options)
-            if other is not None and other.message.startswith("cannot connect") and REFUSED not in other.message:
-                return other
-    return error
+        if f" {one}: " in error.message:
+            continue
+        try:
+            with socket.socket(family, socket.SOCK_STREAM) as probe:
+                probe.settimeout(_CONNECT_LIMIT_S)
+                probe.connect(endpoint)
+        except ConnectionRefusedError:
+            refused = refused or Unavailable("UNAVAILABLE", f"cannot connect to {one}: {REFUSED} (connection refused)")
+            continue
+        except OSError:
+            continue
+        other = _failure(one, host, options)
+        if other is not None and other.message.startswith("cannot connect") and not is_unreached(other):
+            return other
+    return refused or error
 
 
 def _failure(address: str, host: str, options: ConnectOptions) -> MaplessError | None:
+    limit_s = min(options.timeout_s, _ANSWER_LIMIT_S)
     with options.channel(address, host) as channel:
         try:
-            channel.unary_unary("/grpc.health.v1.Health/Check")(b"", timeout=_LIMIT_S)
+            channel.unary_unary("/grpc.health.v1.Health/Check")(b"", timeout=limit_s)
         except grpc.RpcError as error:
-            return from_rpc_error(error)
+            failure = from_rpc_error(error)
+            if not isinstance(failure, DeadlineExceeded):
+                return failure
+            text = f"cannot connect to {address}: a connection is accepted, but nothing answers within {limit_s:g} s"
+            return Unavailable("UNAVAILABLE", text)
     return None

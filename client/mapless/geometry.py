@@ -96,8 +96,13 @@ def nearest_rotation(matrix: ArrayLike) -> Array:
         ValueError: not finite, further than ROTATION_TOLERANCE from orthonormal, or a reflection.
     """
     m = np.asarray(matrix, float)
-    if m.shape != (3, 3) or not np.abs(m @ m.T - np.eye(3)).max() <= 2 * ROTATION_TOLERANCE:
-        raise ValueError("rotation is not an orthonormal 3x3 matrix")
+    if m.shape != (3, 3):
+        raise ValueError(f"rotation is not an orthonormal 3x3 matrix: its shape is {m.shape}")
+    if not (deviation := np.abs(m @ m.T - np.eye(3)).max()) <= 2 * ROTATION_TOLERANCE:
+        raise ValueError(
+            f"rotation is not an orthonormal 3x3 matrix: products of its rows are off by {deviation:.3g}, "
+            f"at most {2 * ROTATION_TOLERANCE:g} is allowed"
+        )
     if np.linalg.det(m) < 0:
         raise ValueError("rotation is a reflection (determinant -1)")
     u, _, vt = np.linalg.svd(m)

@@ -88,6 +88,33 @@ def test_a_hidden_reason_is_found(addresses: dict[str, str], monkeypatch: pytest
     assert explained(reported, f"[::1]:{port}", ConnectOptions()) is reported
 
 
+@pytest.mark.parametrize(("kind", "expected"), [("tls", "the server closes the connection"), ("nobody", REFUSED)])
+def test_an_address_without_a_route_hides_nothing(
+    addresses: dict[str, str], monkeypatch: pytest.MonkeyPatch, kind: str, expected: str
+) -> None:
+    """As ::1 in a container without IPv6, which gRPC tries last and reports."""
+    host, port = addresses[kind].split(":")
+    found = [(socket.AF_INET6, 0, 0, "", ("::1", int(port), 0, 0)), (socket.AF_INET, 0, 0, "", (host, int(port)))]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+    details = (
+        f"connections to all backends failing; last error: UNKNOWN: ipv6:%5B::1%5D:{port}: Failed to connect to remote "
+        "host: connect: Cannot assign requested address (99)"
+    )
+    shown = explained(MaplessError("UNAVAILABLE", _message(details)), f"localhost:{port}", ConnectOptions())
+    assert shown.message.startswith(f"cannot connect to {addresses[kind]}: {expected}")
+
+
+def test_an_address_that_accepts_and_is_silent_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a busy server is, whose handshake takes long: that nothing listens is true of the other address only."""
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        host, port = silent.getsockname()
+        found = [(socket.AF_INET6, 0, 0, "", ("::1", port, 0, 0)), (socket.AF_INET, 0, 0, "", (host, port))]
+        monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+        reported = MaplessError("UNAVAILABLE", f"cannot connect to [::1]:{port}: {REFUSED} (connection refused)")
+        shown = explained(reported, f"localhost:{port}", ConnectOptions(timeout_s=0.2))
+    assert shown.message.startswith(f"cannot connect to {host}:{port}: a connection is accepted, but nothing answers")
+
+
 @pytest.mark.parametrize(
     ("address", "expected"),
     [

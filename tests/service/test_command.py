@@ -131,7 +131,7 @@ def test_a_pose_may_be_a_matrix(run: Run, scene: str, camera_json: str, tmp_path
     code, _, error = run("reference", "add", scene, photo, "--camera", camera_json, "--pose", "[[1, 0], [0, 1]]")
     assert (code, error) == (
         2,
-        "mapless: pose: world_from_camera as a matrix: expected a 4x4 or 3x4 matrix, got shape (2, 2)\n",
+        "mapless: pose: world_from_camera as a matrix: must be 3 or 4 rows of 4 finite numbers, is [[1, 0], [0, 1]]\n",
     )
 
 

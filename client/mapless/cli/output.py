@@ -20,7 +20,7 @@ from ..answers import Accuracy, IntrinsicsCheck, LocalizationResult, PriorCheck,
 from ..geometry import Camera, RigidTransform
 
 DOUBTFUL_TRUST = 0.15
-"""Below it, an answer looks worse than 19 of 20 right ones: usually the intrinsics are wrong."""
+"""Below it, an answer looks worse than 17 of 20 right ones of difficult places: the intrinsics may be wrong."""
 
 _NUMBER = re.compile(r"-?[\d.]+")
 _CAPTURED = "captured by the server"
