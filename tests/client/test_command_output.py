@@ -42,7 +42,7 @@ def test_a_corrected_parameter_of_the_camera_has_its_line() -> None:
         IntrinsicsCheck("K1", 0.0, 0.02, 0.05, 0.01, False, False),
     )
     assert [it.strip() for it in lines(localized(intrinsics_checks=checks)) if it.startswith("  camera")] == [
-        "camera    FOCAL_LENGTH is 525.0, the photograph says 530.3 +- 0.8: used"
+        "camera    focal_x_px is 525.0, the photograph says 530.3 +- 0.8: used"
     ]
 
 

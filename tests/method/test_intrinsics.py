@@ -134,6 +134,25 @@ def test_a_contradicted_parameter_is_estimated_with_the_pose(case: str) -> None:
     assert [it.conflict for it in judged.intrinsics_checks] == wrong.tolist()
 
 
+@pytest.mark.parametrize("case", LARGE)
+def test_a_wide_prior_leaves_the_intrinsics_to_the_photograph(case: str) -> None:
+    """As for a camera of which nobody knows the focal length: the same pose as with the defaults, and no conflict."""
+    scene = make_scene(random_for("large", case), SceneOptions(outlier_share=0.1))
+    found = adjusted(misread(scene, tuple(LARGE[case])), IntrinsicsSigma(focal_share=0.2, principal_share=0.2, k1=0.6))
+    assert found.intrinsics
+    assert (found.intrinsics.removed != 0).any()
+    assert_pose_close(found.world_from_camera, scene.world_from_query, metres=0.012, degrees=0.2)
+    assert wrong_intrinsics(found.intrinsics, "best", IntrinsicsOptions()) is None
+
+
+def test_a_prior_as_wide_as_that_of_estimates_ends() -> None:
+    """A parameter that is off by more than such a prior is estimated once, not again and again."""
+    scene = misread(make_scene(random_for("large", "wide"), SceneOptions(outlier_share=0.1)), (-0.26, 0, 0, 0))
+    found = adjusted(scene, IntrinsicsSigma(focal_share=0.24))
+    assert found.intrinsics
+    assert found.intrinsics.removed[0] == pytest.approx(-0.26, abs=0.005)
+
+
 def test_right_intrinsics_are_never_rejected() -> None:
     for case in range(6):
         few = SceneOptions(point_count=80, noise_px=1.5, outlier_share=0.2)

@@ -22,6 +22,13 @@ from ..geometry import Camera, RigidTransform
 DOUBTFUL_TRUST = 0.15
 """Below it, an answer looks worse than 17 of 20 right ones of difficult places: the intrinsics may be wrong."""
 
+_FIELDS = {
+    "FOCAL_LENGTH": "focal_x_px",
+    "PRINCIPAL_X": "principal_x_px",
+    "PRINCIPAL_Y": "principal_y_px",
+    "K1": "k1",
+}
+"""Of CameraIntrinsics, as rejections name them, by parameter."""
 _NUMBER = re.compile(r"-?[\d.]+")
 _CAPTURED = "captured by the server"
 
@@ -158,9 +165,10 @@ def _differs(check: IntrinsicsCheck) -> bool:
 
 def _corrected(check: IntrinsicsCheck) -> str:
     """How a parameter of the camera differs from what the photograph says."""
+    name = _FIELDS.get(check.parameter, check.parameter)
     digits = 3 if check.parameter == "K1" else 1
     return (
-        f"{check.parameter} is {check.given:.{digits}f}, the photograph says {check.estimated:.{digits}f} +- "
+        f"{name} is {check.given:.{digits}f}, the photograph says {check.estimated:.{digits}f} +- "
         f"{check.estimated_sigma:.{digits}f}: used"
     )
 

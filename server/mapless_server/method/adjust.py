@@ -180,9 +180,10 @@ def _recalibrated(
     usual: Array,
 ) -> PoseEstimate:
     """The estimate with the parameters that the photograph contradicts; the one found if it contradicts none."""
-    held = usual.copy()
-    wide = WIDE_SIGMA * np.array([1, query.camera.width_px, query.camera.width_px, 1])
-    while (worst := _contradicted(found, options.suspicion, held < usual * 2)) is not None:
+    held, is_held = usual.copy(), np.ones(4, bool)
+    wide = np.maximum(usual, WIDE_SIGMA * np.array([1, query.camera.width_px, query.camera.width_px, 1]))
+    while (worst := _contradicted(found, options.suspicion, is_held)) is not None:
+        is_held[list(worst)] = False
         held[list(worst)] = wide[list(worst)]
         better = _with_errors(query, references, structure, matches, found, options, priors, usual, held)
         if better is None or better.intrinsics is None:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, Camera, Distortion, RadialTangential
 
 from .features.image import undistort_pixels
-from .options import check_bounds
+from .options import IntrinsicsSigma, check_bounds
 from .views import View
 
 NAMES = ("focal length", "principal point x", "principal point y", "k1")
@@ -86,12 +86,16 @@ class IntrinsicsEvidence:
         return np.asarray(self.motion @ self.covariance @ self.motion.T)
 
     def contradicted(self, options: ContradictionOptions) -> NDArray[np.bool_]:
-        """(4,): which parameters are significantly wrong, and by more than one standard deviation of the prior."""
+        """(4,): which parameters are significantly wrong, and by more than one standard deviation of the prior.
+
+        A prior that is wider than the default does not raise that limit: the photograph then knows better.
+        """
         width_px, size = self.given.width_px, np.abs(self.value)
+        usual = np.minimum(self.prior_sigma, IntrinsicsSigma().of(self.given))
         limit = np.array(
             [options.focal_share, options.principal_share * width_px, options.principal_share * width_px, options.k1]
         )
-        significant = (size > options.sigmas * self.sigma) & (size > self.prior_sigma)
+        significant = (size > options.sigmas * self.sigma) & (size > usual)
         return np.asarray(significant & (self.sigma < limit))
 
 
