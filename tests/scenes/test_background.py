@@ -12,7 +12,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -184,6 +184,26 @@ class TestResults:
             server = Server(store, BackgroundOptions(pairs=1), widths=[False])
             server.background.match_waiting()
             assert set(server.stored()) == {("r0", "r1"), ("r3", "r4")}
+
+    def test_what_is_added_during_a_calibration_is_matched_before_the_next(self, store: Store) -> None:
+        server, waiting = Server(store, widths=[False]), list[int]()
+
+        class Calibrations:
+            kind = "planted"
+
+            def calibrate_next(self, _: Callable[[], None]) -> bool:
+                waiting.append(server.pairs.count_waiting(server.name()))
+                if len(waiting) == 1:
+                    store.delete_reference(SCENE, "r1")
+                    store.add_references(SCENE, [new(1)])
+                return len(waiting) < 2
+
+            def maintain(self) -> None:
+                """Nothing is damaged."""
+
+        server.background._calibrations = cast(Any, Calibrations())
+        server.background._match_and_calibrate()
+        assert waiting == [0, 0]
 
     def test_one_that_is_added_later_is_matched_with_those_before(self, store: Store, compared: Counter[int]) -> None:
         server = Server(store, widths=[False])

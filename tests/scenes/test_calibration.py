@@ -110,6 +110,8 @@ class TestFit:
 
         right, wrong = ([with_lens(it, error) for it in spread(20, 1.0)] for error in (0.0, 0.03))
         assert lens_contradictions(right) == []
+        certain = [replace(it, lens=replace(it.lens, sigma=0.01 * prior)) for it in right if it.lens]
+        assert lens_contradictions(certain) == []  # half a pixel is usual, however certain
         assert [it.partition(" off")[0] for it in lens_contradictions(wrong)] == ["focal length"]
         assert fit(wrong, KIND, 1).lens_error[0] == pytest.approx(0.03, abs=0.002)
         assert lens_contradictions(spread(20, 1.0)) == []
@@ -162,7 +164,8 @@ class Server:
         self.calibrations = SceneCalibrations(store, self.calibrator, self.counts)
 
     def run(self, pause: Callable[[], None] = lambda: None) -> SelfCalibration | None:
-        self.calibrations.calibrate_waiting(pause)
+        while self.calibrations.calibrate_next(pause):
+            pass
         return self.store.get_attributes(SCENE).self_calibration(KIND)
 
 

@@ -138,10 +138,14 @@ class BackgroundMatching:
             self._thread.join()
 
     def _match_and_calibrate(self) -> None:
+        """Calibrates the waiting scenes; before each, the references that were added meanwhile are matched."""
         self.match_waiting()
-        if self._calibrations is not None:
-            self._step_begin_s = time.monotonic()
-            self._calibrations.calibrate_waiting(self._wait_for_callers)
+        while self._calibrate_next():
+            self.match_waiting()
+
+    def _calibrate_next(self) -> bool:
+        self._step_begin_s = time.monotonic()
+        return self._calibrations is not None and self._calibrations.calibrate_next(self._wait_for_callers)
 
     def match_waiting(self) -> None:
         """Matches the references that may be claimed now, until there are none; raises if the store fails."""

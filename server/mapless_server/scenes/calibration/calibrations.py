@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.store import SelfCalibration, Store
@@ -54,20 +54,20 @@ class SceneCalibrations:
         """Of the answers that it calibrates."""
         return self._calibrator.kind
 
-    def calibrate_waiting(self, pause: Callable[[], None]) -> None:
-        """Calibrates the scenes that may be claimed now, until there are none; raises if the store fails.
+    def calibrate_next(self, pause: Callable[[], None]) -> bool:
+        """Calibrates one scene that may be claimed now; False if there is none. Raises if the store fails.
 
         Args:
             pause: called in the middle of the work; may raise, which ends it.
         """
         database = self._store.database
-        while claim := claim_scene(database, self.kind):
-            self._observer.scenes_wait(count_waiting(database, self.kind))
-            try:
-                self._calibrate(claim, pause)
-            except (_Lost, NotFound):
-                continue
+        claim = claim_scene(database, self.kind)
         self._observer.scenes_wait(count_waiting(database, self.kind))
+        if claim is None:
+            return False
+        with suppress(_Lost, NotFound):
+            self._calibrate(claim, pause)
+        return True
 
     def maintain(self) -> None:
         """Deletes damaged calibrations, which are made again."""

@@ -40,6 +40,9 @@ _FACTORS = np.exp(np.linspace(np.log(0.15), np.log(6.0), 57))
 _NOISES = np.array([0.0, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.7, 2.2])
 """Values of f, and of s by the median radius, that are tried."""
 
+_UNITS = ((100.0, " %"), (1.0, " px"), (1.0, " px"), (1.0, ""))
+"""Of `NAMES` in messages, with the factor to each."""
+
 _FARTHEST_LOG = 3.0
 """Standard deviations beyond which an error counts no more."""
 
@@ -164,17 +167,21 @@ def lens_contradictions(results: Sequence[LeftOut]) -> list[str]:
     """What the references together contradict in their intrinsics, a phrase for each parameter.
 
     A parameter is named whose error is more than three standard deviations of it, both of what the references say and
-    of what calibrated lenses have.
+    of what calibrated lenses have. Pixels are those of the reduced image.
     """
     evidence = [it.lens for it in results if it.is_right and it.lens is not None]
     values, sigmas = _lens(evidence)
     if not evidence:
         return []
-    usual = np.median([it.prior_sigma for it in evidence], axis=0)
+    usual = np.median([it.prior_sigma for it in evidence], axis=0).tolist()
     found = []
-    for name, value, sigma, limit in zip(NAMES, values, sigmas, 3 * usual, strict=True):
-        if abs(value) > max(3 * sigma, limit):
-            found.append(f"{name} off by {value:.3g} (standard deviation {sigma:.2g})")
+    for name, (factor, unit), *numbers in zip(NAMES, _UNITS, values, sigmas, usual, strict=True):
+        value, sigma, usual_sigma = (factor * it for it in numbers)
+        if abs(value) > 3 * max(sigma, usual_sigma):
+            found.append(
+                f"{name} off by {value:.3g}{unit} (standard deviation {sigma:.2g}{unit}; of calibrated lenses "
+                f"{usual_sigma:.2g}{unit})"
+            )
     return found
 
 
