@@ -23,6 +23,7 @@ from mapless_server.method.results import (
     PoseStage,
     Structure,
     Support,
+    TwoViewSupport,
 )
 from mapless_server.method.tracks import Tracks
 from mapless_server.method.uncertainty.radii import accuracy_from_covariance, error_radii
@@ -144,6 +145,15 @@ class TestBetter:
             chosen = better(first, second)
             assert chosen.tier is STRONG
             assert isinstance(chosen.answer.outcome, Localization) is expected
+
+    def test_a_rejected_pose_has_the_inliers_of_two_views_too(self) -> None:
+        first, second = found(rejected(RejectionReason.AMBIGUOUS), 0.0, 10), found(localized(3.0, inliers=60), 3.0, 60)
+        assert isinstance(better(first, second).answer.outcome, Localization)
+        assert first.support is not None
+        many = np.zeros(50, np.intp)
+        two_view = TwoViewSupport(many, many, many, np.zeros(50), np.ones(50, bool), np.tile([0.0, 0, 9], (50, 1)))
+        first = replace(first, support=replace(first.support, two_view=two_view))
+        assert isinstance(better(first, second).answer.outcome, Rejection)
 
     def test_a_pose_that_contradicted_a_prior_is_no_evidence(self) -> None:
         first = found(rejected(RejectionReason.PRIOR_CONFLICT), 0.0, 300)

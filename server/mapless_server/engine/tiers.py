@@ -121,7 +121,7 @@ def _rejected_pose(answer: Answer) -> tuple[RigidTransform, int] | None:
     judged = isinstance(outcome, Rejection) and outcome.reason in (RejectionReason.GATE, RejectionReason.AMBIGUOUS)
     if not judged or support is None or support.estimate is None:
         return None
-    return support.estimate.world_from_camera.shifted(support.origin), int(support.estimate.inliers.sum())
+    return support.estimate.world_from_camera.shifted(support.origin), support.inlier_count()
 
 
 def _places_apart(result: Result) -> Hint:

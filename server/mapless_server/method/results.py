@@ -206,6 +206,12 @@ class Support:
     two_view: TwoViewSupport | None = None
     query_matches: tuple[Matches, ...] = ()
 
+    def inlier_count(self) -> int:
+        """Inliers of the estimate, and of two views."""
+        assert self.estimate is not None
+        of_two_views = 0 if self.two_view is None else int(self.two_view.inliers.sum())
+        return int(self.estimate.inliers.sum()) + of_two_views
+
     def distance_m(self) -> float:
         """Median depth of the inliers' points at the estimate; always positive."""
         assert self.estimate is not None
