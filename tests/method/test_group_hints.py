@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from support.groups import NOTHING
 from support.scenes import make_scene, random_for
 
-from mapless_server.method.answer import Answer
+from mapless.geometry import RigidTransform, Similarity
+from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.groups.checks import hinted_group
 from mapless_server.method.groups.images import rejection_without_matches
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
+from mapless_server.method.results import MetricScale, PoseStage, ScaleStage
 
 SCENE = make_scene(random_for("group hints"))
 NAMES = [reference.name for reference in SCENE.references]
@@ -57,6 +60,15 @@ def test_the_advice_follows_from_the_shared_features(reason: RejectionReason, be
     assert hint.advice is advice
     if reason is not RejectionReason.SCALE_UNRELIABLE:
         assert str(best) in hint.message
+
+
+def test_depths_of_a_network_do_not_pose_a_group() -> None:
+    pose = RigidTransform.identity()
+    scale = MetricScale(1.0, ScaleStage.NETWORK, 0.0, 0, Similarity(1.0, np.eye(3), np.zeros(3)), pose)
+    answer = Answer(Localization(pose, np.eye(6), PoseStage.REFINED, 50, 60, 0.7), scale)
+    outcome = rejection_without_matches([replace(NOTHING, answer=answer)])
+    assert outcome.reason is RejectionReason.TOO_FEW_MATCHES
+    assert "with a single reference" in outcome.message
 
 
 def test_without_matches_the_hint_is_the_furthest_photographs() -> None:

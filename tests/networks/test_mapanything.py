@@ -25,7 +25,6 @@ from mapless_server.networks.mapanything import Decoded, MapAnything, MapAnythin
 from mapless_server.networks.view_conditions import (
     GivenMaps,
     RelativePoses,
-    along_rays,
     normalize_depths,
     pinhole_rays,
     quaternions_from_rotations,
@@ -87,7 +86,7 @@ def maps_of(case: dict[str, Tensor], height: int, width: int) -> GivenMaps | Non
         rays = torch.nn.functional.normalize(case["in_ray_directions"].flatten(0, 1), dim=-1)
     if not case["has_depth"].any():
         return GivenMaps(rays, case["has_rays"].flatten())
-    depths = along_rays(case["in_depth_z"].flatten(0, 1), rays)
+    depths = case["in_depth_z"].flatten(0, 1) / rays[..., 2].abs()  # along the rays
     masks = (case[name].flatten() for name in ("has_depth", "is_metric_scale"))
     return GivenMaps(rays, case["has_rays"].flatten(), depths, *masks)
 

@@ -53,7 +53,8 @@ class OneReferenceOptions:
         min_inliers: fewer give no pose.
         shared_matches: errors that matches share, of the depths of one surface or of a lens, do not average out over
             more matches than so many.
-        rotation_factor: on standard deviations of the rotation, as of other answers.
+        rotation_factor: on standard deviations of the rotation. Poses from several references needed it with a
+            covariance of this form; with one reference it is not measured.
         scores: quantiles, at `LEVELS`, of the scores of right answers (see `score_of`), from `research.one_reference`:
             of 138 pairs of photographs of nine places, each of which counts alike, with depths triangulated from other
             photographs, an error of 3 % common to all of them and of 5 % of each.

@@ -71,11 +71,6 @@ def _focal_and_principal(intrinsics: Tensor) -> tuple[Tensor, Tensor]:
     return intrinsics[:, :2, :2].diagonal(dim1=1, dim2=2), intrinsics[:, :2, 2]
 
 
-def along_rays(depth_z: Tensor, rays: Tensor) -> Tensor:
-    """Distances (V, H, W) along unit rays (V, H, W, 3) to what is at these depths (V, H, W) along the optical axis."""
-    return depth_z / rays[..., 2].abs()
-
-
 def normalize_depths(depths: Tensor) -> tuple[Tensor, Tensor]:
     """log(1 + depth / s), holes staying 0, of depths (V, H, W); and s (V,), each view's mean of those above 0."""
     known = depths > 0

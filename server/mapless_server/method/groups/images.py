@@ -180,7 +180,10 @@ def rejection_without_matches(images: Sequence[GroupImage]) -> Rejection:
     outcomes = [(i, image.answer.outcome) for i, image in enumerate(images)]
     rejected = [(order.index(outcome.reason), i, outcome) for i, outcome in outcomes if isinstance(outcome, Rejection)]
     if not rejected:
-        return Rejection(RejectionReason.TOO_FEW_MATCHES, "no image has 2D-3D matches")
+        message = "no image has 2D-3D matches"
+        if any(_is_of_network(image.answer) for image in images):
+            message += " with triangulated points: depths that a network predicts with a single reference do not count"
+        return Rejection(RejectionReason.TOO_FEW_MATCHES, message)
     _, i, furthest = max(rejected, key=lambda it: (it[0], -it[1]))
     return Rejection(furthest.reason, f"no image has 2D-3D matches; image {i}: {furthest.message}", furthest.hint)
 
@@ -188,8 +191,8 @@ def rejection_without_matches(images: Sequence[GroupImage]) -> Rejection:
 def group_gate_failure(matched: Sequence[PosedImage], inlier_px: float, options: GroupGateOptions) -> str | None:
     """Why the pose of a group fails the gate; None if it passes.
 
-    `gate.gate_failure` with sums over the photographs; and because no judge follows, a share of the points must be
-    found, over more than one corner.
+    `gate.gate_failure` with sums over the photographs; besides, a share of the points must be found, over more than
+    one corner.
     """
     inlier_total = sum(int(it.inliers.sum()) for it in matched)
     count = (

@@ -51,7 +51,7 @@ class RigOptions:
     gate: GroupGateOptions = field(default_factory=GroupGateOptions)
     joint: JointOptions = field(default_factory=JointOptions)
     judge: JudgeOptions = field(default_factory=JudgeOptions)
-    coverage: float = 0.97
+    coverage: float = 0.95
     rounds: int = 2
 
     def __post_init__(self) -> None:

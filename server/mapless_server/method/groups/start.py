@@ -54,7 +54,7 @@ class SequenceOptions:
     gate: GroupGateOptions = field(default_factory=GroupGateOptions)
     joint: JointOptions = field(default_factory=JointOptions)
     judge: JudgeOptions = field(default_factory=JudgeOptions)
-    coverage: float = 0.97
+    coverage: float = 0.95
     drift: DriftOptions = field(default_factory=DriftOptions)
     jumps: JumpOptions = field(default_factory=JumpOptions)
     rounds: int = 2

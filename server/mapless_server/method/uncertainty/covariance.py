@@ -68,7 +68,7 @@ def adjusted_covariance(
     """All parts of a pose's covariance (6, 6) but that of the scale, with the factors; None if it is not determined.
 
     Args:
-        problem: of the adjustment, without priors on the query's pose.
+        problem: of the adjustment; priors on the query's pose take no part.
         bundle: its optimum.
         options: see there.
         is_offset: whether the bundle is known not to be at the optimum.

@@ -9,7 +9,8 @@ parts cross each other (Cameron, Gelbach and Miller, Robust inference with multi
     references    from the poses q_(i) without the observations of reference i, i = 1 ... K,
                   C_r = (K - 1) / K sum_i (q_(i) - mean) (q_(i) - mean)^T;
     regions       of the photograph, with equally many matches each. One of them weighs little, so the change without it
-                  is the sum of its matches' influences s_c (the infinitesimal jackknife), and C_p = sum_c s_c s_c^T.
+                  is the sum of its matches' influences s_c (the infinitesimal jackknife), and
+                  C_p = sum_c (s_c - mean) (s_c - mean)^T.
 
 Both are of the pose as it is estimated: by the normal equations of the adjustment at its optimum (see `bundle`), where
 the references may move and far ones are held less, and of which each q_(i) is one Gauss-Newton step.
@@ -79,7 +80,7 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
     """How the query's pose changes without parts of the data; None if all together do not determine it.
 
     Args:
-        problem: of the adjustment, without priors on the query's pose.
+        problem: of the adjustment; priors on the query's pose take no part.
         bundle: its optimum, or values near it.
         max_matches: of the query, evenly thinned. What a reference or a region shares is the same in all of them.
     """
