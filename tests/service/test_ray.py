@@ -112,17 +112,22 @@ def photographed() -> Place:
 
 
 def asked(place: Place) -> list[bytes]:
-    """Requests with references named and with none, so that the server chooses; and two that it must reject."""
+    """Requests with references named and with none, so that the server chooses; and two that it must reject.
+
+    With generic radii: the scene calibrates itself at some time between two of them.
+    """
+    generic = pb.LocalizeRequest(options=pb.LocalizeOptions(ignore_calibration=True)).SerializeToString()
     first, second = place.queries[:2]
     names = [reference.name for reference in place.references[:5]]
     grey = np.full((first.camera.height_px, first.camera.width_px, 3), 127, np.uint8)
-    return [
+    requests = [
         photo_request(first.data, first.camera, names),
         photo_request(first.data, first.camera, ()),
         photo_request(second.data, second.camera, ()),
         photo_request(encode(".jpg", grey), first.camera, ()),
         photo_request(first.data, first.camera, names[:1]),
     ]
+    return [request + generic for request in requests]  # concatenated messages are merged
 
 
 def answered(address: str, request: bytes) -> bytes:
