@@ -87,7 +87,7 @@ def test_a_reference_is_shown_and_its_photograph_downloaded(
     assert run("reference", "download", scene, "view") == (0, "view.png\n", "")
     assert (tmp_path / "view.png").read_bytes() == PHOTO
     code, _, error = run("reference", "download", scene, "view")
-    assert (code, error) == (2, "mapless: view.png: File exists\n")
+    assert (code, error) == (2, "mapless: view.png exists; --force overwrites it\n")
     assert run("reference", "download", scene, "view", "--force")[0] == 0
     assert run("reference", "download", scene, "lost")[0] == 1
 

@@ -161,8 +161,11 @@ def download_reference(client: Client, arguments: argparse.Namespace) -> int:
         return 0
     kind = {b"\xff\xd8": ".jpg", b"\x89P": ".png", b"RI": ".webp"}.get(image[:2], "")
     file = arguments.output or Path(f"{found.reference_id}{kind}")
-    with file.open("wb" if arguments.force else "xb") as target:
-        target.write(image)
+    try:
+        with file.open("wb" if arguments.force else "xb") as target:
+            target.write(image)
+    except FileExistsError:
+        raise ValueError(f"{file} exists; --force overwrites it") from None
     print(file)
     return 0
 
