@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapless import names, wire
+from mapless.calls.localization import localize
 from mapless.geometry import MAX_COORDINATE_M, Camera, Fisheye, RadialTangential, RigidTransform, rotation_from_vector
 from mapless.priors import PositionPrior, set_priors
 from mapless.requests import NewReference, create_request
@@ -58,6 +59,11 @@ def test_cameras_come_back_as_they_were(distortion: RadialTangential | Fisheye |
             lambda it: create_request("s", it),
             NewReference(3, b"x", CAMERA, RigidTransform.identity()),  # type: ignore[arg-type]
             "reference_id must be a text, is 3",
+        ),
+        (
+            lambda it: next(localize(b"x", CAMERA, "s", intrinsics_uncertainty=it)),
+            40,
+            "must be an IntrinsicsUncertainty, .* is 40",
         ),
     ],
 )

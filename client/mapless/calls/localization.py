@@ -100,7 +100,7 @@ def localize(
     )
     set_priors(request, priors or Priors())
     if intrinsics_uncertainty is not None:
-        request.intrinsics_uncertainty.CopyFrom(pb.IntrinsicsUncertainty(**asdict(intrinsics_uncertainty)))
+        request.intrinsics_uncertainty.CopyFrom(_uncertainty_to_message(intrinsics_uncertainty))
     if capture_time is not None:
         request.capture_time.FromDatetime(capture_time)
     if session_from_camera is not None:
@@ -225,6 +225,15 @@ def localize_sequence(
     )
     response = yield Call(f"{SERVICE}/LocalizeSequence", request, pb.LocalizeSequenceResponse, timeout_s)
     return sequence_from_message(response)
+
+
+def _uncertainty_to_message(uncertainty: IntrinsicsUncertainty) -> pb.IntrinsicsUncertainty:
+    if not isinstance(uncertainty, IntrinsicsUncertainty):
+        raise TypeError(
+            "intrinsics_uncertainty must be an IntrinsicsUncertainty, such as "
+            f"IntrinsicsUncertainty(focal_sigma_px=20), is {uncertainty!r}"
+        )
+    return pb.IntrinsicsUncertainty(**asdict(uncertainty))
 
 
 def _rig_image_to_message(image: RigImage, scene: str) -> pb.RigImage:
