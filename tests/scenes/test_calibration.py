@@ -113,7 +113,7 @@ class TestFit:
         certain = [replace(it, lens=replace(it.lens, sigma=0.01 * prior)) for it in right if it.lens]
         assert lens_contradictions(certain) == []  # half a pixel is usual, however certain
         assert [it.partition(" off")[0] for it in lens_contradictions(wrong)] == ["focal length"]
-        assert fit(wrong, KIND, 1).lens_error[0] == pytest.approx(0.03, abs=0.002)
+        assert "off by 3" in lens_contradictions(wrong)[0]
         assert lens_contradictions(spread(20, 1.0)) == []
 
     def test_two_answers_say_nothing(self) -> None:

@@ -43,8 +43,7 @@ def let_pass(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
 
 def of(store: Store, factor: float = 2.0, kind: str = KIND) -> SelfCalibration:
     generation = store.get_generation(OFFICE)
-    lens = (0.001, -0.5, 1 / 7, 0.01), (0.002, 0.1, 0.2, 0.03)
-    return SelfCalibration(kind, generation, 12, factor, 0.5, 0.01, 0.1, (0.0, 1 / 3, 1.0), *lens)
+    return SelfCalibration(kind, generation, 12, factor, 0.5, 0.01, 0.1, (0.0, 1 / 3, 1.0))
 
 
 def claimed(store: Store, kind: str = KIND) -> CalibrationClaim:

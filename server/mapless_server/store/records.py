@@ -28,7 +28,7 @@ class DatumWithoutMetres(ValueError):
     """A scene has a datum, although its unit of length is not the metre."""
 
 
-CALIBRATION_MODEL = 1
+CALIBRATION_MODEL = 2
 """Raised whenever the same references would give another `SelfCalibration`, or answers use it in another way."""
 
 
@@ -44,8 +44,6 @@ class SelfCalibration:
         reference_noise_m, reference_noise_deg: errors of the references' own poses, not exceeded in 68 % of cases: no
             answer is free of them.
         trust_quantiles: of the generic trust of right answers, at the levels of `method.trust.judge`; empty: unknown.
-        lens_error, lens_sigma: (4,) of the intrinsics of the references, as `method.intrinsics` orders them, and
-            standard deviations; empty: unknown.
     """
 
     kind: str
@@ -56,8 +54,6 @@ class SelfCalibration:
     reference_noise_m: float = 0.0
     reference_noise_deg: float = 0.0
     trust_quantiles: tuple[float, ...] = ()
-    lens_error: tuple[float, ...] = ()
-    lens_sigma: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("position_factor", "rotation_factor"):

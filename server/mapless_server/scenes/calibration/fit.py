@@ -131,7 +131,6 @@ def fit(results: Sequence[LeftOut], kind: str, generation: int, options: FitOpti
         noise_m,
         noise_deg,
         tuple(quantiles.tolist()),
-        *_lens([it.lens for it in right if it.lens is not None]),
     )
 
 
@@ -170,9 +169,9 @@ def lens_contradictions(results: Sequence[LeftOut]) -> list[str]:
     of what calibrated lenses have. Pixels are those of the reduced image.
     """
     evidence = [it.lens for it in results if it.is_right and it.lens is not None]
-    values, sigmas = _lens(evidence)
     if not evidence:
         return []
+    values, sigmas = _lens(evidence)
     usual = np.median([it.prior_sigma for it in evidence], axis=0).tolist()
     found = []
     for name, (factor, unit), *numbers in zip(NAMES, _UNITS, values, sigmas, usual, strict=True):
@@ -185,17 +184,15 @@ def lens_contradictions(results: Sequence[LeftOut]) -> list[str]:
     return found
 
 
-def _lens(evidence: Sequence[IntrinsicsEvidence]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _lens(evidence: Sequence[IntrinsicsEvidence]) -> tuple[list[float], list[float]]:
     """What the references together say of the errors of their intrinsics, and its standard deviations; both (4,).
 
     The median over the references, so that one wrong pose does not count, and the spread about it: references of one
     lens that disagree do not become certain by their number alone.
     """
-    if not evidence:
-        return (), ()
     values = np.array([it.value for it in evidence])
     middle = np.median(values, axis=0)
     spread = 1.4826 * np.median(np.abs(values - middle), axis=0)
     claimed = np.median([it.sigma for it in evidence], axis=0)
     sigma = 1.2533 * np.maximum(spread, claimed) / np.sqrt(len(values))
-    return tuple(middle.tolist()), tuple(sigma.tolist())
+    return middle.tolist(), sigma.tolist()
