@@ -104,6 +104,7 @@ def queries_from_message(
                 rerank=reranks and bool(message.references),
                 priors=priors,
                 is_part=True,
+                is_generic=request.options.ignore_calibration,
             )
         )
     return tuple(queries)
