@@ -174,6 +174,21 @@ def test_epipolar_share_is_the_planted_share_of_two_references() -> None:
         assert found == pytest.approx(expected, abs=0.05), "but for wrong ones that are on the line by chance"
 
 
+def test_keypoints_without_a_place_are_no_evidence() -> None:
+    """Every second has none; half of the matches are wrong."""
+    support = support_of()
+    assert support.estimate is not None
+    matches = query_matches_of(support)
+    for of_reference in matches:
+        wrong = np.arange(len(of_reference)) < 0.5 * len(of_reference)
+        of_reference[wrong, 1] = np.roll(of_reference[wrong, 1], 7)
+    keypoints = support.query.features.keypoints.copy()
+    keypoints[::2] = np.nan
+    query = replace(support.query, features=replace(support.query.features, keypoints=keypoints))
+    counts, pose = support.inliers_by_reference(), support.estimate.world_from_camera
+    assert epipolar_share(query, support.references, matches, counts, pose) == pytest.approx(0.25, abs=0.06)
+
+
 def test_the_unit_of_the_world_is_no_evidence() -> None:
     support = support_of()
     assert support.estimate is not None

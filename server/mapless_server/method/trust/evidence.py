@@ -126,9 +126,13 @@ def epipolar_share(
     inlier_counts: Sequence[int],
     world_from_query: RigidTransform,
 ) -> float:
-    """Share of the matches on their epipolar lines, of the two references with the most inliers, multiplied."""
+    """Share of the matches on their epipolar lines, of the two references with the most inliers, multiplied.
+
+    Keypoints that have no place in an estimated lens, NaN, do not count.
+    """
     strongest = np.argsort(-np.array(inlier_counts), kind="stable")[:2]
-    chosen = [query_matches[i] for i in strongest]
+    has_place = np.asarray(np.isfinite(query.features.keypoints).all(axis=1))
+    chosen = [query_matches[i][has_place[query_matches[i][:, 0]]] for i in strongest]
     if len(chosen) < 2 or not all(map(len, chosen)):
         return 0.0
     matches = TwoViewMatches.of(query, [references[i] for i in strongest], chosen)
