@@ -90,7 +90,7 @@ class AdjustOptions:
     max_error_px: float = 8.0
     iterations: int = 8
     min_decrease: float = 1e-5
-    suspicion: ContradictionOptions = field(default_factory=lambda: ContradictionOptions(4.0, 0.06, 0.06, 0.15))
+    suspicion: ContradictionOptions = field(default_factory=lambda: ContradictionOptions(2.0, 0.06, 0.06, 0.15))
     contradiction: ContradictionOptions = field(default_factory=ContradictionOptions)
     rounds: int = 4
     pose_errors: PoseErrorOptions = field(default_factory=PoseErrorOptions)
