@@ -15,8 +15,7 @@ from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, ran
 
 import mapless_server.method.localize as method
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method import localize as localize_module
-from mapless_server.method import pnp
+from mapless_server.method import alternatives, pnp
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.coarse import Bucket, Outcome, Reconstructor, Request
 from mapless_server.method.coarse.device import DeviceReconstruction
@@ -485,7 +484,7 @@ def test_pnp_failed_is_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pnp, "ransac", lambda *_: None)
     found = pose_of(answer_of(pipeline)).world_from_camera
     assert_pose_close(found, SCENE.world_from_query, metres=0.02, degrees=0.2)  # by two_view
-    monkeypatch.setattr(localize_module, "solve_two_view", lambda *_: None)
+    monkeypatch.setattr(alternatives, "solve_two_view", lambda *_: None)
     answer = answer_of(pipeline)
     assert reason_of(answer) is RejectionReason.PNP_FAILED
     assert list(answer.stage_seconds)[-2:] == ["pnp", "two_view"]

@@ -30,6 +30,7 @@ one_reference                (ours) pose from one reference, by a network's dept
 answer, hints                the answer of the method; what would help after a rejection
 coarse/                      query and references reconstructed together, up to scale
 on_device/                   scale, structure and match where a network left its output
-pipeline, localize           a query between the stages; the stages in order
+pipeline, alternatives       a query between the stages; poses where the stages have no points
+localize                     the stages in order
 groups/                      several photographs posed together
 """

@@ -20,7 +20,7 @@ from .coarse import Bucket, Outcome, Reconstructor, Request, reconstruct_one
 from .coarse.geometric import GeometricReconstructor
 from .context import StageContext
 from .correspond import Correspondences, Matcher
-from .match import PAPER_MATCH, MatchOptions
+from .match import PAPER_MATCH, MatchOptions, match_points
 from .one_reference import OneReferenceOptions
 from .options import LocalizeOptions, Variant
 from .pnp import PnpOptions
@@ -29,7 +29,7 @@ from .rejection import Rejection, RejectionReason
 from .results import MetricScale, PointMatches, PoseStage, Structure, Support
 from .scale import estimate_scale, network_scale
 from .scale_equations import ScaleOptions
-from .structure import PAPER_STRUCTURE, StructureOptions
+from .structure import PAPER_STRUCTURE, StructureOptions, build_structure
 from .trust.gate import GateOptions
 from .trust.judge import JudgeOptions
 from .trust.two_view import TwoViewGateOptions
@@ -309,3 +309,19 @@ def _answered_if_final(coarse: Coarse) -> Coarse | Answer:
 def _unverified(scale: MetricScale, stage: PoseStage) -> Localization:
     """The initial pose, which nothing has checked."""
     return Localization(scale.world_from_query, None, stage, 0, 0, 0.0, scale_source=scale.source)
+
+
+def structure_and_matches(coarse: Coarse, scale: MetricScale) -> tuple[Structure, PointMatches]:
+    """Computed on the device together with the scale, or else here."""
+    if coarse.structure is not None and coarse.matches is not None:
+        return coarse.structure, coarse.matches
+    prepared, reconstruction = coarse.prepared, coarse.reconstruction
+    assert isinstance(reconstruction, Reconstruction)
+    references, correspondences = prepared.references, prepared.correspondences
+    with prepared.context.stage("structure"):
+        structure = build_structure(reconstruction, scale, references, correspondences, prepared.structure_options)
+    with prepared.context.stage("match"):
+        initial, options = scale.world_from_query, prepared.match_options
+        prior_pose = prepared.priors.pose.world_from_camera if prepared.priors.pose else None
+        matches = match_points(prepared.query, references, structure, correspondences, initial, options, prior_pose)
+    return structure, matches

@@ -1,0 +1,85 @@
+"""Poses where `localize` has no points: from one reference, or from references that share too little."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from .answer import Answer, Localization
+from .one_reference import one_reference_failure, solve_one_reference, trust_of_score
+from .pipeline import Coarse
+from .rejection import Rejection, RejectionReason
+from .results import MetricScale, Support
+from .trust.judge import contradiction
+from .trust.two_view import (
+    lacks_distance,
+    one_reference_rejection,
+    two_view_evidence,
+    two_view_failure,
+    two_view_trust,
+)
+from .trust.votes import votes_of
+from .two_view.solve import solve_two_view
+from .views import Reconstruction
+
+
+def from_one_reference(coarse: Coarse, scale: MetricScale) -> Answer:
+    """From a single reference, by the network's depths and metres; priors are compared with the pose, and not used."""
+    prepared, options = coarse.prepared, coarse.prepared.pipeline.options
+    assert isinstance(coarse.reconstruction, Reconstruction)
+    given = prepared.query, prepared.references, coarse.reconstruction, scale, prepared.correspondences.query_matches
+    with prepared.context.stage("pnp"):
+        found = solve_one_reference(*given, prepared.origin, options.one_reference)
+    if isinstance(found, Rejection):
+        return coarse.answer(found)
+    estimate = found.support.estimate
+    assert estimate is not None
+    checks = prepared.priors.check(estimate.world_from_camera, estimate.covariance)
+    estimate = replace(estimate, prior_checks=tuple(replace(it, used=False) for it in checks))
+    support = replace(found.support, estimate=estimate)
+    trust = trust_of_score(found.score, options.one_reference)
+    failure = one_reference_failure(found, trust, prepared.options.coverage, options.gate)
+    if failure:
+        return coarse.answer(Rejection(RejectionReason.GATE, failure), support)
+    return coarse.answer(replace(Localization.of(estimate, trust), scale_source=scale.source), support)
+
+
+def from_two_views(coarse: Coarse, answer: Answer) -> Answer:
+    """The answer from two-view matches and 2D-3D matches together; the given rejection if that gives none."""
+    support = _two_view_support(coarse, answer.support)
+    answer = replace(answer, stage_seconds=dict(coarse.prepared.context.stage_seconds))
+    if support is None or support.estimate is None:
+        return answer
+    prepared, options = coarse.prepared, coarse.prepared.pipeline.options
+    query_matches, estimate = prepared.correspondences.query_matches, support.estimate
+    with prepared.context.stage("judge"):
+        evidence = two_view_evidence(support, query_matches, options.two_view_gate)
+        doubt, trust = (
+            two_view_failure(evidence, options.two_view_gate),
+            two_view_trust(evidence, options.two_view_gate),
+        )
+        rejection = None if doubt else contradiction(support, votes_of(support, query_matches), options.judge)
+    if rejection:
+        return coarse.answer(rejection, support)
+    if doubt and lacks_distance(evidence, options.two_view_gate):
+        assert isinstance(answer.outcome, Rejection)
+        return replace(answer, outcome=one_reference_rejection(answer.outcome.reason, doubt, support))
+    if doubt or trust < 1 - prepared.options.coverage:
+        return answer
+    return coarse.answer(Localization.of(estimate, trust, support.two_view), support)
+
+
+def _two_view_support(coarse: Coarse, found: Support | None) -> Support | None:
+    """The pose from two-view matches and wide correspondences; a pose found before is a candidate."""
+    prepared, options = coarse.prepared, coarse.prepared.pipeline.options
+    query, references, context = prepared.query, prepared.references, prepared.context
+    query_matches, matcher = prepared.correspondences.query_matches, prepared.pipeline.matcher
+    known = [found.estimate.world_from_camera] if found and found.estimate else []
+    with context.stage("two_view"):
+        wide = matcher.correspond(query, references, True, context.check, query_matches)
+        stages = prepared.structure_options, prepared.match_options, options.adjust
+        result = solve_two_view(query, references, wide, known, prepared.origin, *stages, options.two_view)
+    if result is None or result.estimate is None:
+        return None
+    checks = prepared.priors.check(result.estimate.world_from_camera, result.estimate.covariance)
+    unused = tuple(replace(it, used=False) for it in checks)
+    return replace(result, estimate=replace(result.estimate, prior_checks=unused))
