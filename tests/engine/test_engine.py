@@ -534,8 +534,8 @@ def add_undescribed(setting: Setting, count: int) -> None:
     """References new0, new1, ... with features that no tier has."""
     of_others = {"others": View(CAMERA, FEATURES)}
     photos = [encode(".png", textured(seed=20 + i)) for i in range(count)]
-    news = [NewReference(f"new{i}", photo, CAMERA, pose(9.0 + i), of_others) for i, photo in enumerate(photos)]
-    setting.store.add_references(SCENE, news)
+    added = [NewReference(f"new{i}", photo, CAMERA, pose(9.0 + i), of_others) for i, photo in enumerate(photos)]
+    setting.store.add_references(SCENE, added)
 
 
 class TestDescribe:

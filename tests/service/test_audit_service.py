@@ -75,8 +75,8 @@ def test_a_damaged_reference_is_reported_by_page_and_by_name(tmp_path: Path, wha
     store = Store.open(tmp_path)
     with serving_really(tmp_path, store) as address, Client(address) as client:
         client.create_scene("s")
-        news = [NewReference(f"r{i}", encode(".png", pixels), CAMERA, pose) for i, (pixels, pose) in enumerate(SHOTS)]
-        client.add_references("s", news[:4])
+        added = [NewReference(f"r{i}", encode(".png", pixels), CAMERA, pose) for i, (pixels, pose) in enumerate(SHOTS)]
+        client.add_references("s", added[:4])
         damage(store, SceneKey("s"), "r1", what)
         listed = list(client.audit_scene("s"))
         assert [audit.verdict for audit in listed] == ["CONSISTENT", "UNVERIFIABLE", "CONSISTENT", "CONSISTENT"]

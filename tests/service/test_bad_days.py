@@ -415,8 +415,8 @@ class TestScenesThatGo:
 
         def make(client: Client) -> None:
             client.create_scene("s")
-            news = [NewReference(f"r{i}", PHOTO, CAMERA, pose(float(life[0]))) for i in range(3)]
-            client.add_references("s", news)
+            added = [NewReference(f"r{i}", PHOTO, CAMERA, pose(float(life[0]))) for i in range(3)]
+            client.add_references("s", added)
 
         def ask(address: str, asked: tuple[str, ...]) -> Iterator[str]:
             with Client(address, ONCE) as client:

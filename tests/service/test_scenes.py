@@ -197,8 +197,8 @@ def test_added_references_that_contradict_their_scene_are_said(client: Client, s
     client.create_scene("added", down_in_world=(0.0, -1.0, 0.0))
     first = client.add_reference("added", NewReference("a", PHOTO, CAMERA, pose(0.0)))
     assert first.warnings == ()  # one shows no typical direction
-    news = [NewReference(f"b{i}", PHOTO, CAMERA, pose(i)) for i in (1.0, 2.0)]
-    for stored in client.add_references("added", news):
+    added = [NewReference(f"b{i}", PHOTO, CAMERA, pose(i)) for i in (1.0, 2.0)]
+    for stored in client.add_references("added", added):
         assert "degrees off the down of 3 reference cameras" in stored.warnings[0]
     request = create_request("scenes/added", NewReference("c", PHOTO, CAMERA, pose(3.0)))
     (text,) = stubs.references.CreateReference(request, timeout=20).warnings

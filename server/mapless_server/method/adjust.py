@@ -98,7 +98,8 @@ class AdjustOptions:
 
     def __post_init__(self) -> None:
         check_bounds(self, "inlier_px min_kept_share loss_scale_sigma max_error_px", above=0)
-        check_bounds(self, "iterations min_decrease rounds", above=0)
+        check_bounds(self, "iterations min_decrease", above=0)
+        check_bounds(self, "rounds", at_least=2)  # the last one only reads the photograph again
 
 
 def adjust_pose(
