@@ -12,7 +12,7 @@ from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
 from mapless_server.method.coarse import Request, reconstruct_one
-from mapless_server.method.coarse.geometric import GeometricOptions, GeometricReconstructor
+from mapless_server.method.coarse.geometric import GeometricReconstructor
 from mapless_server.method.correspond import Correspondences, Matcher
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.views import PosedView, ReconstructedView, Reconstruction, View
@@ -185,9 +185,3 @@ def test_random_matches_are_rejected_as_low_overlap() -> None:
         )
         wrong = replace(correspondences, query_matches=shuffled)
         assert rejection_of(scene.query, scene.references, wrong).reason is RejectionReason.LOW_OVERLAP, seed
-
-
-def test_options_outside_their_bounds_are_refused() -> None:
-    for options in ({"min_baseline_m": 0.0}, {"cell_px": 0}):
-        with pytest.raises(ValueError, match="must be"):
-            GeometricOptions(**options)

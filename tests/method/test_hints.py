@@ -10,7 +10,7 @@ from support.scenes import make_scene, random_for
 
 from mapless.geometry import RigidTransform
 from mapless_server.method.answer import Answer, Localization
-from mapless_server.method.hints import HintOptions, hinted
+from mapless_server.method.hints import hinted
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.method.results import PoseStage
 from mapless_server.method.views import PosedView, View
@@ -119,8 +119,3 @@ def test_poses_and_existing_hints_are_not_changed() -> None:
     assert hinted(localized, view_of(900), SCENE.references) is localized
     own = Answer(Rejection(RejectionReason.GATE, "planted", Hint("pnp", Advice.CHECK_PRIOR, "Own.")))
     assert hinted(own, view_of(900), SCENE.references) is own
-
-
-def test_options_outside_their_bounds_are_refused() -> None:
-    with pytest.raises(ValueError, match="must be"):
-        HintOptions(few_matches=50, many_matches=20)

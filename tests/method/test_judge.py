@@ -218,18 +218,6 @@ def test_a_support_without_a_pose_is_refused() -> None:
         evidence(replace(support_of(), estimate=None))
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"scores": (1.0, 0.0) * (len(LEVELS) // 2)},
-        {"scores": (0.0,)},
-    ],
-)
-def test_options_outside_their_bounds_are_refused(wrong: dict[str, tuple[float, ...]]) -> None:
-    with pytest.raises(ValueError, match="must be"):
-        JudgeOptions(**wrong)  # type: ignore[arg-type]
-
-
 def test_agreement_with_gravity_only_adds_to_the_trust() -> None:
     """As much as its chance is small, and less than if nothing but chance made poses wrong."""
     doubtful = Evidence(40, 60, 0.2, 0.5, 0.2, 0.3, 0.02, 0.03)

@@ -297,9 +297,3 @@ def test_superpoint_keypoints_are_whole_pixels(tmp_path: Path) -> None:
     assert 20 < len(view.features) <= 200
     assert_is_well_formed(view.features, 16)
     np.testing.assert_array_equal(view.features.keypoints, np.rint(view.features.keypoints))
-
-
-def test_options_outside_their_bounds_are_refused() -> None:
-    for options in ({"max_keypoints": 0}, {"max_side_px": 8}, {"min_score": 1.0}, {"min_score": float("nan")}):
-        with pytest.raises(ValueError, match="must be"):
-            LearnedOptions(**options)

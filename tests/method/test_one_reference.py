@@ -233,10 +233,3 @@ def test_broken_output_is_rejected(broken: str) -> None:
     assert isinstance(outcome, Rejection)
     expected = RejectionReason.TOO_FEW_MATCHES if broken == "few" else RejectionReason.SCALE_UNRELIABLE
     assert outcome.reason is expected
-
-
-def test_options_outside_their_bounds_are_refused() -> None:
-    with pytest.raises(ValueError, match="scores must be"):
-        OneReferenceOptions(scores=(1.0, 0.0))
-    with pytest.raises(ValueError, match="first_depth_sigma must be"):
-        OneReferenceOptions(first_depth_sigma=0.5)

@@ -161,8 +161,3 @@ def test_threads_get_the_tokens_of_their_keys() -> None:
     assert not wrong
     assert counters.device_hits + counters.host_hits + counters.misses == 1600
     assert max(counters.device_bytes, counters.host_bytes) <= 5 * SIZE
-
-
-def test_options_outside_their_bounds_are_refused() -> None:
-    with pytest.raises(ValueError, match="must be"):
-        TokenCacheOptions(device_bytes=-1)

@@ -35,7 +35,7 @@ from mapless_server.method.trust.two_view import (
     two_view_trust,
 )
 from mapless_server.method.two_view.matches import TwoViewMatches
-from mapless_server.method.two_view.pose import RelativePoseOptions, band_chance, disc_chance
+from mapless_server.method.two_view.pose import band_chance, disc_chance
 from mapless_server.method.two_view.solve import TwoViewOptions, solve_two_view
 from mapless_server.method.views import Features, Matches, PosedView, View
 from mapless_tools.ingest.check.epipolar import sampson_px
@@ -296,12 +296,3 @@ def test_trust_rises_with_the_second_references_share() -> None:
 def test_each_lack_of_evidence_is_named(evidence: TwoViewEvidence, part: str) -> None:
     assert part in (two_view_failure(evidence, GATE) or "")
     assert two_view_failure(TwoViewEvidence(-50.0, -20.0, 100, 200, 40, 0.5, 0.5), GATE) is None
-
-
-def test_wrong_options_are_named() -> None:
-    with pytest.raises(ValueError, match=r"RelativePoseOptions.epipolar_px must be above 0, is 0"):
-        RelativePoseOptions(epipolar_px=0)
-    with pytest.raises(ValueError, match=r"TwoViewOptions.min_inliers must be at least 7, is 3"):
-        TwoViewOptions(min_inliers=3)
-    with pytest.raises(ValueError, match=r"TwoViewGateOptions.shares must be 8 rising numbers"):
-        TwoViewGateOptions(shares=(0.1, 0.2))

@@ -13,7 +13,6 @@ from mapless.geometry import RigidTransform
 from mapless_server.scenes import Coverage, CoverageVerdict
 from mapless_server.scenes.audit.coverage import CoverageOptions, check_coverage
 from mapless_server.scenes.audit.neighbourhood import PairMatches
-from mapless_server.scenes.audit.visibility import VisibilityOptions
 
 
 @pytest.fixture(scope="module")
@@ -84,10 +83,3 @@ def test_the_forecast_does_not_depend_on_where_the_world_begins(scene: Synthetic
     here = check(scene, pairs, scene.world_from_query)
     assert there.expected_match_count == pytest.approx(here.expected_match_count, abs=2)
     assert there.position_68_m == pytest.approx(here.position_68_m, rel=0.05)
-
-
-def test_an_option_out_of_range_is_named() -> None:
-    with pytest.raises(ValueError, match=r"CoverageOptions.least_matches must be above 0 and at most 80, is 100"):
-        CoverageOptions(least_matches=100.0)
-    with pytest.raises(ValueError, match=r"VisibilityOptions.max_scale must be above 1, is 1"):
-        VisibilityOptions(max_scale=1.0)

@@ -222,22 +222,3 @@ def slow_spread(
             break
         chosen.append(max(left, key=lambda i: (worth(i), -i)))
     return chosen
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("apart_m", -1.0),
-        ("apart_deg", 181.0),
-        ("nearby_weight", 1.5),
-        ("nearby_weight", math.nan),
-        ("same_place_m", -1.0),
-        ("per_place", 0),
-        ("pool", 0),
-        ("smallest_pool", 0),
-    ],
-)
-def test_an_option_outside_its_bounds_is_named(field: str, value: float) -> None:
-    options: dict[str, Any] = {field: value}
-    with pytest.raises(ValueError, match=f"RankOptions.{field} must be .* is {value}"):
-        RankOptions(**options)

@@ -134,16 +134,6 @@ def run_through(toy: Toy) -> None:
     raise AssertionError("it never ends")
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [("max_queued_s", 0.0), ("max_bytes", -1), ("flow_share", 1.1), ("time_margin", 0.9), ("first_stage_interval", 1)],
-)
-def test_an_option_outside_its_bounds_is_named(field: str, value: float) -> None:
-    options: dict[str, Any] = {field: value}
-    with pytest.raises(ValueError, match=f"WorkQueueOptions.{field} must be .*, is {value}"):
-        WorkQueueOptions(**options)
-
-
 class TestAdmission:
     def test_a_queue_is_bounded_by_time_with_room_for_a_new_caller(self) -> None:
         toy = Toy()

@@ -65,7 +65,7 @@ class PoseErrorOptions:
     def __post_init__(self) -> None:
         for name in ("own", "drift"):
             if not getattr(self, name) or min(getattr(self, name)) <= 0:
-                raise ValueError(f"{name} must be numbers above 0, not {getattr(self, name)}")
+                raise ValueError(f"PoseErrorOptions.{name} must be numbers above 0, is {getattr(self, name)}")
         check_bounds(self, "usual_own usual_drift prior_log own_inflation drift_inflation", above=0)
 
 

@@ -1,0 +1,72 @@
+"""Options check themselves: a value outside its bounds is named with its class, its field and the bound."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+import pytest
+
+NAN = float("nan")
+OUTSIDE: dict[str, list[tuple[str, Any]]] = {
+    "engine.tiers.EscalationOptions": [("doubtful_trust", -1.0), ("doubtful_radius_m", -1.0), ("clearly_more", 0.5)]
+    + [("time_share", 0.0), ("time_share", 1.5), ("same_position_m", NAN), ("same_rotation_deg", -1.0)],
+    "method.adjust.AdjustOptions": [("max_error_px", 0.0), ("iterations", 0), ("loss_scale_sigma", -1.0)],
+    "method.coarse.geometric.GeometricOptions": [("min_baseline_m", 0.0), ("cell_px", 0)],
+    "method.coarse.grids.GridOptions": [("pixel_limit", 10), ("aspects", ()), ("max_stretch", 0.9)]
+    + [("max_half_field_deg", 90)],
+    "method.coarse.token_cache.TokenCacheOptions": [("device_bytes", -1)],
+    "method.correspond.CorrespondOptions": [("reference_ratio", 1.1), ("query_ratio", 0.0), ("epipolar_px", NAN)]
+    + [("wide_ratio", 2.0), ("guided_similarity", -2.0)],
+    "method.features.network.LearnedOptions": [("max_keypoints", 0), ("max_side_px", 8), ("min_score", 1.0)]
+    + [("min_score", NAN)],
+    "method.features.sift.SiftOptions": [("max_keypoints", 0), ("max_side_px", 8), ("contrast_threshold", NAN)],
+    "method.groups.drift.DriftOptions": [("share", 0.0), ("floor_m", -1.0), ("loss_scale", 0.0), ("deg_per_m", -0.1)],
+    "method.hints.HintOptions": [("few_matches", 1000)],
+    "method.lightglue.LightGlueOptions": [("min_score", 1.0), ("max_keypoints", 0), ("pairs_at_once", 0)],
+    "method.match.MatchOptions": [("radius_px", -1.0), ("min_similarity", 2.0), ("radius_px", NAN)],
+    "method.one_reference.OneReferenceOptions": [("scores", (1.0, 0.0)), ("first_depth_sigma", 0.5)],
+    "method.options.IntrinsicsSigma": [("focal_share", 0.0), ("principal_share", -1.0), ("k1", NAN), ("k1", 2.0)],
+    "method.pnp.PnpOptions": [
+        ("inlier_px", 0.0),
+        ("loss_scale_px", NAN),
+        ("min_matches", 3),
+        ("min_iterations", 9999),
+    ],
+    "method.pose_errors.PoseErrorOptions": [("own", ()), ("drift", (0.0,)), ("prior_log", 0.0)]
+    + [("drift_inflation", -1.0)],
+    "method.priors.gravity.GravityOptions": [("batch", 0), ("max_samples", 0), ("confidence", 1.0), ("refined", 0)],
+    "method.retrieve.RetrieveOptions": [("apart_m", -1.0), ("nearby_weight", 1.5), ("nearby_weight", NAN)],
+    "method.scale_equations.ScaleOptions": [("min_baseline_m", 11.0), ("min_ratios", 0), ("max_deviation", NAN)]
+    + [("max_pair_cameras", 1)],
+    "method.structure.StructureOptions": [("iterations", 0), ("loss_scale_sigma", 0.0), ("max_residual_sigma", -1.0)]
+    + [("min_parallax_deg", 90.0)],
+    "method.trust.agreement.AgreementOptions": [("splits", 0), ("shuffling", -0.1)],
+    "method.trust.ambiguity.AmbiguityOptions": [("min_share", 0.0), ("min_own_share", 1.5), ("min_keypoints", 3)]
+    + [("agreeing_px", 1.0)],
+    "method.trust.gate.GateOptions": [("max_log10_false_alarms", NAN)],
+    "method.trust.judge.JudgeOptions": [("scores", (1.0, 0.0) * 10), ("scores", (0.0,))],
+    "method.trust.two_view.TwoViewGateOptions": [("shares", (0.1, 0.2))],
+    "method.two_view.pose.RelativePoseOptions": [("epipolar_px", 0)],
+    "method.two_view.solve.TwoViewOptions": [("min_inliers", 3)],
+    "method.uncertainty.covariance.UncertaintyOptions": [("region_factor", -0.1), ("rotation_factor", 0.0)]
+    + [("max_matches", 0), ("position_factor", 0.0)],
+    "scenes.audit.coverage.CoverageOptions": [("least_matches", 100.0)],
+    "scenes.audit.options.AuditOptions": [("position_tolerance_m", 0.0)],
+    "scenes.audit.visibility.VisibilityOptions": [("max_scale", 1.0)],
+    "scenes.retrieval.ranking.RankOptions": [("apart_m", -1.0), ("apart_deg", 181.0), ("nearby_weight", 1.5)]
+    + [("nearby_weight", NAN), ("same_place_m", -1.0), ("per_place", 0), ("pool", 0), ("smallest_pool", 0)],
+    "scheduling.options.WorkQueueOptions": [("max_queued_s", 0.0), ("max_bytes", -1), ("flow_share", 1.1)]
+    + [("time_margin", 0.9), ("first_stage_interval", 1)],
+}
+
+
+@pytest.mark.parametrize(("name", "field", "value"), [(name, *it) for name, its in OUTSIDE.items() for it in its])
+def test_an_option_outside_its_bounds_is_named(name: str, field: str, value: Any) -> None:
+    module, _, kind = name.rpartition(".")
+    if kind in ("LearnedOptions", "LightGlueOptions"):
+        pytest.importorskip("torch", reason="the networks' extra is not installed")
+    options = getattr(import_module(f"mapless_server.{module}"), kind)
+    with pytest.raises(ValueError, match=rf"{kind}\.{field} must be") as caught:
+        options(**{field: value})
+    assert str(value) in str(caught.value)
