@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
 import grpc
 import pytest
 from google.rpc import error_details_pb2, status_pb2
+from support.clients import hosted
 from support.planted_answers import diagnostics, localized, rejected
 
 from mapless import wire
@@ -81,12 +82,8 @@ def refuse(context: grpc.ServicerContext) -> None:
 @pytest.fixture
 def server() -> Iterator[FewAtATime]:
     service = FewAtATime()
-    running = grpc.server(ThreadPoolExecutor(2 * COUNT))
-    add_LocalizationServiceServicer_to_server(service, running)
-    service.address = f"127.0.0.1:{running.add_insecure_port('127.0.0.1:0')}"
-    running.start()
-    yield service
-    running.stop(None).wait()
+    with hosted(add=partial(add_LocalizationServiceServicer_to_server, service), threads=2 * COUNT) as service.address:
+        yield service
 
 
 @pytest.fixture

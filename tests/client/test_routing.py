@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from concurrent import futures
 from typing import Any
 
 import grpc
@@ -12,7 +11,7 @@ from google.protobuf import empty_pb2
 from google.protobuf.message import Message
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.clients import Connect, awaiting
+from support.clients import Connect, awaiting, hosted
 
 from mapless import Client, ConnectOptions, names
 from mapless.errors import MaplessError
@@ -96,21 +95,16 @@ class Recording(grpc.GenericRpcHandler):
 @pytest.mark.parametrize("connect", [Client, awaiting], ids=["blocking", "asyncio"])
 def test_clients_send_it_beside_what_they_always_send(connect: Connect) -> None:
     recording = Recording()
-    server = grpc.server(futures.ThreadPoolExecutor(2), handlers=[recording])
-    port = server.add_insecure_port("127.0.0.1:0")
-    server.start()
-    try:
-        with connect(f"127.0.0.1:{port}", ConnectOptions(token="t", client_id="robot-7")) as client:
-            for call in (
-                lambda: client.get_scene("kitchen"),
-                lambda: client.get_reference("scenes/hall", "r1"),
-                lambda: list(client.list_references("a.b")),
-                lambda: list(client.list_scenes()),
-                lambda: client.get_scene("no\nname"),
-            ):
-                with pytest.raises(MaplessError):
-                    call()
-    finally:
-        server.stop(None).wait(20)
+    options = ConnectOptions(token="t", client_id="robot-7")
+    with hosted(recording) as address, connect(address, options) as client:
+        for call in (
+            lambda: client.get_scene("kitchen"),
+            lambda: client.get_reference("scenes/hall", "r1"),
+            lambda: list(client.list_references("a.b")),
+            lambda: list(client.list_scenes()),
+            lambda: client.get_scene("no\nname"),
+        ):
+            with pytest.raises(MaplessError):
+                call()
     assert [it.get(SCENE_KEY) for it in recording.seen] == ["scenes/kitchen", "scenes/hall", "scenes/a.b", None, None]
     assert all((it["authorization"], it["x-client-id"]) == ("Bearer t", "robot-7") for it in recording.seen)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent import futures
+from functools import partial
 
 import grpc
 import numpy as np
 import pytest
+from support.clients import hosted
 from support.servers import CAMERA, PHOTO, pose
 
 from mapless import Client, DeadlineExceeded, LocalizationResult, wire
@@ -30,14 +31,8 @@ class Hasty(LocalizationServiceServicer):
 
 @pytest.fixture
 def client() -> Iterator[Client]:
-    with futures.ThreadPoolExecutor(1) as pool:
-        server = grpc.server(pool)
-        add_LocalizationServiceServicer_to_server(Hasty(), server)
-        port = server.add_insecure_port("127.0.0.1:0")
-        server.start()
-        with Client(f"127.0.0.1:{port}") as connected:
-            yield connected
-        server.stop(None).wait()
+    with hosted(add=partial(add_LocalizationServiceServicer_to_server, Hasty())) as address, Client(address) as client:
+        yield client
 
 
 def test_a_coarse_pose_has_its_stage(client: Client) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.programs import printed
 from support.servers import CAMERA, PHOTO, pose, serving
 
 import mapless
@@ -71,9 +72,8 @@ def test_generated_code_is_that_of_the_protos(tmp_path: Path) -> None:
 
 
 def test_the_client_imports_nothing_heavy() -> None:
-    program = "import mapless, mapless.__main__, sys; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
-    imported = {name.partition(".")[0] for name in done.stdout.split()}
+    modules = printed("import mapless, mapless.__main__, sys; print(*sys.modules)").split()
+    imported = {name.partition(".")[0] for name in modules}
     heavy = {"torch", "cv2", "scipy", "sqlalchemy", "pydantic", "typer", "poselib", "grpc_status"}
     assert imported & (heavy | {"mapless_server"}) == set()
     assert {"grpc", "numpy"} <= imported

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import logging
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
-from concurrent import futures
+from functools import partial
 from typing import Any
 
-import grpc
 import pytest
 from opentelemetry.proto.collector.trace.v1 import trace_service_pb2, trace_service_pb2_grpc
 from opentelemetry.sdk.trace import ReadableSpan
 from opentelemetry.sdk.trace.export import SpanExporter, SpanExportResult
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 from opentelemetry.trace import SpanKind, StatusCode
+from support.clients import hosted
+from support.programs import printed
 
 from mapless_server.extras import install_hint
 from mapless_server.observability.otlp import OtlpTracer, make_otlp_tracer
@@ -151,15 +150,14 @@ def test_every_value_has_a_form_as_an_attribute() -> None:
 
 
 def test_opentelemetry_is_imported_only_where_traces_are_wanted() -> None:
-    program = (
-        "import sys\n"
-        "from mapless_server.serve import running\n"
-        "from mapless_server.settings import Settings\n"
-        "tracer = running._make_tracer(Settings())\n"
-        "print(repr(tracer.begin('/m', [], 0.0).trace_id), 'opentelemetry' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout == "'' False\n"
+    said = printed("""if True:
+        import sys
+        from mapless_server.serve import running
+        from mapless_server.settings import Settings
+        tracer = running._make_tracer(Settings())
+        print(repr(tracer.begin('/m', [], 0.0).trace_id), 'opentelemetry' in sys.modules)
+    """)
+    assert said == "'' False\n"
 
 
 @pytest.mark.parametrize("endpoint", ["localhost:4317", "ftp://host:1", "http://", "nonsense"])
@@ -192,15 +190,10 @@ class Collector(trace_service_pb2_grpc.TraceServiceServicer):
 @pytest.fixture
 def collector() -> Iterator[tuple[Collector, str]]:
     collector = Collector()
-    with futures.ThreadPoolExecutor(2) as pool:
-        server = grpc.server(pool)
-        add: Any = trace_service_pb2_grpc.add_TraceServiceServicer_to_server
-        add(collector, server)
-        port = server.add_insecure_port("127.0.0.1:0")
-        server.start()
-        yield collector, f"http://127.0.0.1:{port}"
+    add: Any = trace_service_pb2_grpc.add_TraceServiceServicer_to_server
+    with hosted(add=partial(add, collector)) as address:
+        yield collector, f"http://{address}"
         collector.gate.set()
-        server.stop(None).wait()
 
 
 def test_a_real_collector_gets_the_call_when_the_server_ends(collector: tuple[Collector, str]) -> None:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from support.programs import printed
 
 from mapless_server.method.features import make_extractor
 from mapless_server.networks.weights import WeightsMissing
@@ -102,14 +102,13 @@ def test_features_named_in_the_settings_are_never_replaced(tmp_path: Path) -> No
 
 
 def test_a_server_without_networks_does_not_load_torch(tmp_path: Path) -> None:
-    program = (
-        "import sys; from pathlib import Path; from mapless_server.serve.assembly import make_tiers\n"
-        "from mapless_server.settings import Settings\n"
-        "make_tiers(Settings(data_dir=Path(sys.argv[1]), weights_dir=Path(sys.argv[1])))\n"
-        "print('torch' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", program, tmp_path], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"
+    program = """if True:
+        import sys; from pathlib import Path; from mapless_server.serve.assembly import make_tiers
+        from mapless_server.settings import Settings
+        make_tiers(Settings(data_dir=Path(sys.argv[1]), weights_dir=Path(sys.argv[1])))
+        print('torch' in sys.modules)
+    """
+    assert printed(program, tmp_path) == "False\n"
 
 
 def test_features_without_a_network_need_no_torch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import pytest
 import typer.main
+from support.programs import printed
 from typer.testing import CliRunner
 
 from mapless_server.settings import Settings, bounds_text, default_text
@@ -76,6 +74,4 @@ def test_every_command_either_serves_or_needs_an_extra() -> None:
 @pytest.mark.parametrize("module", ["mapless_tools.cli.app", "mapless_server.serve.command"])
 def test_help_imports_nothing_heavy(module: str) -> None:
     heavy = ("cv2", "grpc", "jinja2", "matplotlib", "numpy", "scipy", "sqlalchemy", "torch")
-    program = f"import sys, {module}; print([it for it in {heavy} if it in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout == "[]\n"
+    assert printed(f"import sys, {module}; print([it for it in {heavy} if it in sys.modules])") == "[]\n"

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from concurrent import futures
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from http.client import HTTPSConnection
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ import yaml  # type: ignore[import-untyped]
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from support import envoys
 from support.certificates import authority, signed
+from support.clients import hosted
 from support.documents import blocks
 from support.envoys import ENVOY, Gateway, configured, fetched, gateway, program
 from support.postgres import shared_cluster
@@ -403,26 +405,24 @@ class Echo(grpc.GenericRpcHandler):
 
 def test_servers_get_the_callers_metadata_and_address(tmp_path: Path) -> None:
     echo = Echo()
-    server = grpc.server(futures.ThreadPoolExecutor(4), handlers=[echo])
     service = health.HealthServicer()
     service.set("mapless.v1.LocalizationService", health_pb2.HealthCheckResponse.SERVING)
-    health_pb2_grpc.add_HealthServicer_to_server(service, server)
-    port = server.add_insecure_port("127.0.0.1:0")
-    server.start()
-    try:
-        with gateway(tmp_path, [f"127.0.0.1:{port}"]) as running, channel_to(running) as channel:
-            call = channel.unary_unary("/mapless.v1.LocalizationService/Localize")
-            call(b"", timeout=50)
-            said = [
-                ("x-client-id", "robot-7"),
-                ("x-request-id", "mine"),
-                ("authorization", "Bearer t"),
-                ("x-mapless-scene", "scenes/hall"),
-                ("x-envoy-upstream-rq-timeout-ms", "1"),  # not the caller's to say
-            ]
-            call(b"", timeout=50, metadata=said)
-    finally:
-        server.stop(None).wait(20)
+    add = partial(health_pb2_grpc.add_HealthServicer_to_server, service)
+    with (
+        hosted(echo, add=add) as address,
+        gateway(tmp_path, [address]) as running,
+        channel_to(running) as channel,
+    ):
+        call = channel.unary_unary("/mapless.v1.LocalizationService/Localize")
+        call(b"", timeout=50)
+        said = [
+            ("x-client-id", "robot-7"),
+            ("x-request-id", "mine"),
+            ("authorization", "Bearer t"),
+            ("x-mapless-scene", "scenes/hall"),
+            ("x-envoy-upstream-rq-timeout-ms", "1"),  # not the caller's to say
+        ]
+        call(b"", timeout=50, metadata=said)
     silent, talkative = echo.metadata
     # Without it all callers of the gateway would be one to the server, which is to be fair between them.
     assert silent["x-client-id"] == "127.0.0.1"

@@ -7,16 +7,16 @@ import json
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from concurrent import futures
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import grpc
 import numpy as np
 import pytest
-from support.clients import Awaiting, status
+from support.clients import Awaiting, hosted, status
 from support.servers import CAMERA, PHOTO, pose
 
 from mapless import (
@@ -95,16 +95,11 @@ class Played(LocalizationServiceServicer):
 @contextmanager
 def playing(*attempts: Attempt) -> Iterator[tuple[str, Played]]:
     servicer = Played(list(attempts))
-    with futures.ThreadPoolExecutor(4) as pool:
-        server = grpc.server(pool)
-        add_LocalizationServiceServicer_to_server(servicer, server)
-        port = server.add_insecure_port("127.0.0.1:0")
-        server.start()
+    with hosted(add=partial(add_LocalizationServiceServicer_to_server, servicer)) as address:
         try:
-            yield f"127.0.0.1:{port}", servicer
+            yield address, servicer
         finally:
             servicer.gone.set()
-            server.stop(None).wait()
 
 
 @pytest.fixture(params=[Client, Awaiting], ids=["blocking", "asyncio"])

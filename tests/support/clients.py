@@ -122,6 +122,26 @@ def status(code: str, retry_after_s: float | None = None) -> grpc.Status:
     return _Status(grpc.StatusCode[code], [retry] if retry_after_s is not None else [])
 
 
+def _serves_nothing_else(_: Any) -> None:
+    pass
+
+
+@contextmanager
+def hosted(
+    *handlers: grpc.GenericRpcHandler, add: Callable[[Any], object] = _serves_nothing_else, threads: int = 4
+) -> Iterator[str]:
+    """The address of a server with these handlers, and with the servicers that `add` adds to it."""
+    with futures.ThreadPoolExecutor(threads) as pool:
+        server = grpc.server(pool, handlers, options=[("grpc.max_receive_message_length", -1)])
+        add(server)
+        port = server.add_insecure_port("127.0.0.1:0")
+        server.start()
+        try:
+            yield f"127.0.0.1:{port}"
+        finally:
+            server.stop(None).wait()
+
+
 @contextmanager
 def failing(
     statuses: Sequence[grpc.Status],
@@ -130,14 +150,8 @@ def failing(
 ) -> Iterator[tuple[str, Failing]]:
     """Such a server and its address."""
     handler = Failing(statuses, answers, does_it)
-    with futures.ThreadPoolExecutor(4) as pool:
-        server = grpc.server(pool, [handler], options=[("grpc.max_receive_message_length", -1)])
-        port = server.add_insecure_port("127.0.0.1:0")
-        server.start()
-        try:
-            yield f"127.0.0.1:{port}", handler
-        finally:
-            server.stop(None).wait()
+    with hosted(handler) as address:
+        yield address, handler
 
 
 @contextmanager

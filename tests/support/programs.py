@@ -118,6 +118,12 @@ def program(
         process.communicate(timeout=LIMIT_S)
 
 
+def printed(program: str, *arguments: object) -> str:
+    """What a Python program prints that comes to its end without an error."""
+    command = [sys.executable, "-c", program, *map(str, arguments)]
+    return subprocess.run(command, stdout=subprocess.PIPE, text=True, timeout=LIMIT_S, check=True).stdout
+
+
 @contextmanager
 def real(folder: Path, **settings: Any) -> Iterator[Program]:
     """`python -m mapless_server`, at once."""
