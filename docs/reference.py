@@ -6,7 +6,6 @@ one of them.
 
 from __future__ import annotations
 
-import argparse
 import ast
 import os
 import re
@@ -22,7 +21,7 @@ import typer.cli
 from google.protobuf import descriptor_pb2
 
 from mapless import errors as client_errors
-from mapless.cli.arguments import make_parser
+from mapless.cli.arguments import all_parsers, make_parser
 from mapless_server import errors, settings
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling import Refusal
@@ -152,16 +151,8 @@ def client_commands() -> str:
     """`mapless` and its commands: the help of each."""
     os.environ["COLUMNS"] = "100"  # argparse wraps by it
     return "\n\n".join(
-        f"### `{parser.prog}`\n\n```text\n{parser.format_help().rstrip()}\n```" for parser in _parsers(make_parser())
+        f"### `{parser.prog}`\n\n```text\n{parser.format_help().rstrip()}\n```" for parser in all_parsers(make_parser())
     )
-
-
-def _parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
-    yield parser
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            for child in action.choices.values():
-                yield from _parsers(child)
 
 
 # The interface

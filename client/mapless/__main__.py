@@ -10,6 +10,7 @@ from pathlib import Path
 
 from .cli.arguments import connect_options, make_parser
 from .cli.folder import EXIT_FAILED, EXIT_USAGE
+from .cli.suggesting import suggesting
 from .client import Client
 from .errors import MaplessError
 
@@ -20,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; exits."""
     try:
         parsed = make_parser().parse_args(arguments)
-        with Client(parsed.address, connect_options(parsed)) as client:
+        with Client(parsed.address, connect_options(parsed)) as client, suggesting(client):
             sys.exit(parsed.run(client, parsed))
     except MaplessError as error:
         print(f"mapless: {_source_of(error, parsed)}{error}", file=sys.stderr)

@@ -18,6 +18,10 @@ _NOT_CONNECTED_BECAUSE = {
     "Socket closed": "the server closes the connection at once; if it uses TLS, give --tls or --ca FILE (Python: tls, "
     "root_certificates), and --cert if it requires a client certificate",
     "WRONG_VERSION_NUMBER": "the server does not use TLS",
+    "Expected SETTINGS frame": "what answers there does not speak gRPC (HTTP/2); it may be the port of the metrics",
+    "certificate has expired": "the server's certificate has expired, or the clock of this machine is fast",
+    "certificate is not yet valid": "the server's certificate is not valid yet, or the clock of this machine is slow",
+    "Hostname Verification Check failed": "the server's certificate is for another name",
     "unable to get local issuer certificate": "the server's certificate is not signed by a known authority; give its "
     "certificate with --ca FILE (Python: root_certificates)",
     "Failed to create security handshaker": "the given certificates are unusable; they must be PEM",
@@ -37,6 +41,7 @@ class MaplessError(Exception):
         field: path of the wrong field in the request, "intrinsics.focal_x_px", or None.
         retry_after_s: seconds after which the server requests a retry, or None.
         request_id: identifies the call in the server's log; empty if the call did not reach it.
+        resource: the scene or reference that does not exist or exists already, "scenes/{scene}"; else empty.
     """
 
     def __init__(
@@ -48,6 +53,7 @@ class MaplessError(Exception):
         field: str | None = None,
         retry_after_s: float | None = None,
         request_id: str = "",
+        resource: str = "",
     ) -> None:
         named = f" (field {field})" if field and field not in message else ""
         super().__init__(f"{reason or code}: {message}{named}")
@@ -57,6 +63,7 @@ class MaplessError(Exception):
         self.field = field
         self.retry_after_s = retry_after_s
         self.request_id = request_id
+        self.resource = resource
 
 
 class InvalidArgument(MaplessError):
@@ -122,6 +129,7 @@ def from_rpc_error(error: Any) -> MaplessError:
     info = _detail(status, error_details_pb2.ErrorInfo())
     retry = _detail(status, error_details_pb2.RetryInfo())
     request = _detail(status, error_details_pb2.RequestInfo())
+    resource = _detail(status, error_details_pb2.ResourceInfo())
     code: grpc.StatusCode = error.code()
     failure = _BY_CODE.get(code.name, MaplessError)(
         code.name,
@@ -130,6 +138,7 @@ def from_rpc_error(error: Any) -> MaplessError:
         field=(info.metadata.get("field") if info else None),
         retry_after_s=retry.retry_delay.ToNanoseconds() / 1e9 if retry else None,
         request_id=metadata.get("x-request-id", "") or (request.request_id if request else ""),
+        resource=resource.resource_name if resource else "",
     )
     failure.__cause__ = error
     return failure

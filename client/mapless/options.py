@@ -30,6 +30,9 @@ def _checked(address: str) -> str:
         tls = ", and encrypt with --tls (Python: tls)" if scheme in ("https", "grpcs") else ""
         example = host or "localhost:50051"
         raise ValueError(f"an address is host:port, without scheme and path: {example}{tls}, is {address!a}")
+    port = re.search(r":(\d+)$", host)
+    if port is not None and not 0 < int(port[1]) < 65536:
+        raise ValueError(f"the port of an address must be 1 to 65535, is {port[1]}")
     return address
 
 

@@ -84,8 +84,9 @@ def connected(connection: Connection, settings: Settings) -> Iterator[Client]:
         ServerFailed: our own server did not start.
     """
     from mapless import Client
+    from mapless.cli.suggesting import suggesting
 
-    with reachable(connection, settings) as (address, options), Client(address, options) as client:
+    with reachable(connection, settings) as (address, options), Client(address, options) as client, suggesting(client):
         yield client
 
 

@@ -386,11 +386,13 @@ class TestCommand:
             "localize",
             datetime(2099, 1, 1, tzinfo=timezone.utc),
         )
-        code, listed, _ = self.run("list", path=path)
+        (entry,) = json.loads(self.run("list", path=path)[1])  # for programs, without the hash
+        assert {*entry} == {"name", "tenant", "role", "expires"}
+        code, listed, _ = self.run("list", "--text", path=path)
         assert code == 0
         assert listed == "robot-7  localize  tenant acme  expires 2099-01-01T00:00:00+00:00\n"
         assert self.run("revoke", "robot-7", path=path) == (0, "", "")
-        assert self.run("list", path=path) == (0, "", "")
+        assert self.run("list", "--text", path=path) == (0, "", "")
 
     @pytest.mark.parametrize(
         ("arguments", "code", "error_text"),
@@ -414,9 +416,9 @@ class TestCommand:
         assert command.DEFAULT_TENANT == DEFAULT_TENANT
         monkeypatch.setenv("MAPLESS_TOKEN", "mapless_x")
         monkeypatch.delenv("MAPLESS_TOKENS_FILE", raising=False)
-        result = CliRunner().invoke(command.token_app, ["list"])
+        result = CliRunner().invoke(command.token_app, ["list", "--text"])
         assert (result.exit_code, "MAPLESS_TOKENS_FILE" in result.stderr) == (2, True)
         create_token(path, "a", "t", "read", None)
         monkeypatch.setenv("MAPLESS_TOKENS_FILE", str(path))
-        result = CliRunner().invoke(command.token_app, ["list"])
+        result = CliRunner().invoke(command.token_app, ["list", "--text"])
         assert result.stdout == "a  read      tenant t  never expires\n"

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,12 +19,12 @@ from google.protobuf import json_format
 from support.servers import BLACK, CAMERA, PHOTO, RunningServer, pose
 
 import mapless
-from mapless import Camera, Client, NewReference, wire
+from mapless import AlreadyExists, Camera, Client, NewReference, wire
 from mapless.__main__ import main
 from mapless.cli.arguments import make_parser
 from mapless.cli.output import plain
 
-HEALTHY = "SERVING\nLocalizationService SERVING\nReferenceService SERVING\n"
+HEALTHY = dict.fromkeys(("server", "LocalizationService", "ReferenceService"), "SERVING")
 CLIENT = Path(mapless.__file__).parents[1]
 
 
@@ -84,7 +85,7 @@ def test_a_reference_is_shown_and_its_photograph_downloaded(
     client.add_reference(scene, NewReference("view", PHOTO, CAMERA, pose(1.5)))
     code, shown, _ = run("reference", "show", scene, "view")
     assert (code, shown["reference_id"], shown["world_from_camera"]["translation_m"]["x"]) == (0, "view", 1.5)
-    assert run("reference", "download", scene, "view") == (0, "view.png\n", "")
+    assert run("reference", "download", scene, "view") == (0, {"file": "view.png"}, "")
     assert (tmp_path / "view.png").read_bytes() == PHOTO
     code, _, error = run("reference", "download", scene, "view")
     assert (code, error) == (2, "mapless: view.png exists; --force overwrites it\n")
@@ -103,6 +104,61 @@ def test_lists_are_tables_on_a_terminal(run: Run, client: Client, scene: str, mo
     assert run("reference", "list", scene, "--json")[1][0]["reference_id"] == "r0"
 
 
+def test_text_and_json_follow_one_rule(
+    run: Run, scene: str, camera_json: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every command that prints: JSON in a pipe, text on a terminal, and the reverse by a flag."""
+    photo = tmp_path / "view.png"
+    photo.write_bytes(PHOTO)
+    pose_json = json_format.MessageToJson(wire.transform_to_message(pose(1.0)))
+    camera = ("--camera", camera_json)
+    commands: list[tuple[object, ...]] = [
+        ("health",),
+        ("scene", "get", scene),
+        ("scene", "list"),
+        ("scene", "update", scene, "--down", "0", "0", "-1"),
+        ("reference", "show", scene, "r0"),
+        ("reference", "list", scene),
+        ("reference", "download", scene, "r0", "--force", "--output", tmp_path / "r0.png"),
+        ("localize", scene, photo, *camera),
+        ("retrieve", scene, photo, *camera),
+        ("coverage", scene, *camera, "--pose", pose_json),
+        ("doctor",),
+    ]
+    for is_terminal, flag in ((False, "--text"), (True, "--json")):
+        monkeypatch.setattr("sys.stdout.isatty", lambda it=is_terminal: it, raising=False)
+        for command in commands:
+            assert isinstance(run(*command)[1], str) == is_terminal, command
+            assert isinstance(run(*command, flag)[1], str) != is_terminal, command
+
+
+def test_the_text_of_single_things(run: Run, scene: str) -> None:
+    printed = run("scene", "get", scene, "--text")[1].splitlines()
+    assert [line.split() for line in printed[:3]] == [["scene", scene], ["references", "3"], ["unit", "m"]]
+    printed = run("reference", "show", scene, "r1", "--text")[1].splitlines()
+    assert [line.split(maxsplit=1)[1] for line in printed[1:4]] == ["96x64", "80.00 81.00 px", "47.50 31.50 px"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [(("scene", "get", "kitchn"), "kitchen"), (("reference", "show", "kitchen", "viev"), "view")],
+)
+def test_a_wrong_name_gets_a_suggestion(run: Run, client: Client, arguments: tuple[str, ...], meant: str) -> None:
+    with suppress(AlreadyExists):
+        client.create_scene("kitchen")
+        client.add_reference("kitchen", NewReference("view", PHOTO, CAMERA, pose(1.5)))
+    code, _, error = run(*arguments)
+    assert (code, error.endswith(f"; did you mean {meant!r}?\n")) == (1, True)
+    assert "did you mean" not in run("scene", "get", "something-else")[2]
+
+
+def test_the_shell_completes_commands() -> None:
+    script = subprocess.run([sys.executable, "-m", "mapless", "completion", "bash"], capture_output=True, text=True)
+    typed = 'COMP_WORDS=(mapless reference sh); COMP_CWORD=2; _shtab_mapless; echo "${COMPREPLY[@]}"'
+    done = subprocess.run(["bash", "-c", f"{script.stdout}\n{typed}"], capture_output=True, text=True)
+    assert (done.stdout, script.stderr + done.stderr) == ("show\n", "")
+
+
 @pytest.mark.parametrize(
     ("arguments", "meant"),
     [
@@ -111,6 +167,8 @@ def test_lists_are_tables_on_a_terminal(run: Run, client: Client, scene: str, mo
         (("scene", "lst"), "list"),
         (("reference", "shwo", "s", "r"), "show"),
         (("scene", "create", "s", "--unit", "meter"), "metre"),
+        (("reference", "add", "s", "a.jpg", "--camra", "c.json"), "--camera"),
+        (("--adress", "localhost:1", "health"), "--address"),
     ],
 )
 def test_a_wrong_command_gets_a_suggestion(run: Run, arguments: tuple[str, ...], meant: str) -> None:
@@ -426,4 +484,4 @@ def test_the_address_is_that_of_the_environment(
     monkeypatch.setenv("MAPLESS_ADDRESS", server.address)
     with pytest.raises(SystemExit) as caught:
         main(["health"])
-    assert (caught.value.code, capsys.readouterr().out) == (0, HEALTHY)
+    assert (caught.value.code, json.loads(capsys.readouterr().out)) == (0, HEALTHY)

@@ -85,26 +85,26 @@ def test_the_list_shows_licence_and_presence(folder: Path, file: Path, fetched: 
     def row(name: str) -> str:
         return next(line for line in listed.splitlines() if line.startswith(name))
 
-    listed = run("list").stdout
+    listed = run("list", "--text").stdout
     assert str(folder) in listed
     assert "absent" in row("free")
     assert "MIT" in row("free")
     assert "not known" in row("free")
     assert hashlib.sha256(CONTENT).hexdigest()[:8] in row("bound")
     assert run("add", "bound", file).exit_code == 0
-    listed = run("list").stdout
+    listed = run("list", "--text").stdout
     assert "official" in row("bound")
     assert "absent" in row("free")
     file.write_bytes(safetensors({"a": np.zeros(500_000, np.float32)}))
     assert run("add", "bound", file, "--unofficial").exit_code == 0
-    listed = run("list").stdout
+    listed = run("list", "--text").stdout
     assert re.search(r"not +2\.0 MB .*\n.* official ", listed)
     assert "non-commercial" in listed
     assert not fetched
 
 
 def test_the_real_list_names_every_licence_that_restricts(folder: Path) -> None:
-    listed = run("list").stdout
+    listed = run("list", "--text").stdout
     assert listed.count("non-commercial") == 2
     assert listed.count("research only") == 2
 
@@ -175,7 +175,7 @@ def test_errors_are_one_line(folder: Path, file: Path, tmp_path: Path, monkeypat
     file.write_bytes(b"PK\x03\x04" + bytes(100))
     assert "a zip archive, as PyTorch's pickles are" in error_text(run("add", "pi3", file), 1)
     monkeypatch.setenv("MAPLESS_WEIGHT_DIR", "x")
-    assert "MAPLESS_WEIGHT_DIR is not a setting" in error_text(run("list"), 2)
+    assert "MAPLESS_WEIGHT_DIR is not a setting" in error_text(run("list", "--text"), 2)
 
 
 def test_a_file_that_does_not_fit_the_network_is_refused(folder: Path, file: Path) -> None:

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import itertools
 import os
 import re
+import sys
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn
 
+from ..client import Client
 from ..options import ConnectOptions
 from ..shortcut import ADDRESS_VARIABLE, TOKEN_VARIABLE, default_address
-from . import commands, localize
+from . import commands, doctor, localize
 
 DESCRIPTION = """\
 The command `mapless`: what the client can do, from a shell.
 
-`localize` prints a few lines on a terminal, the lists a table, and both JSON with all fields where standard output is
-no terminal, or with --json. All other commands print JSON. Exit codes: 0 success, 1 a call failed, 2 wrong usage,
-3 a photograph was not localized (the answer has the reason).
+Commands print short text on a terminal, and JSON with all fields where standard output is no terminal; --json and
+--text decide otherwise. Exit codes: 0 success, 1 a call failed, 2 wrong usage, 3 a photograph was not localized (the
+answer has the reason).
 """
 
 FILE_FORMATS = """\
@@ -37,7 +41,8 @@ or its matrix, 4x4 or 3x4:
 
 _COUNT_DEFAULT = "(default: the server's)"
 
-_CONNECTION_DEFAULTS: dict[str, Any] = {
+_COMMON_DEFAULTS: dict[str, Any] = {
+    "json": None,
     "timeout": 30.0,
     "tls": False,
     "ca": None,
@@ -49,7 +54,25 @@ _CONNECTION_DEFAULTS: dict[str, Any] = {
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that suggests what a wrong command or choice was meant to be."""
+    """A parser that suggests what a wrong command, choice or flag was meant to be."""
+
+    commands: argparse._SubParsersAction[Any] | None = None
+
+    def add_subparsers(self, **options: Any) -> argparse._SubParsersAction[Any]:
+        """Remembers its commands, after which flags are theirs."""
+        self.commands = super().add_subparsers(**options)
+        return self.commands
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Rejects unknown flags first: without them, what they were meant to be might be reported as missing."""
+        args = sys.argv[1:] if args is None else list(args)
+        ends = {"--", *(self.commands.choices if self.commands else ())}
+        for flag in itertools.takewhile(lambda it: it not in ends, args):
+            name = flag.partition("=")[0]
+            if re.match("--[a-z]", name) and not any(it.startswith(name) for it in self._option_string_actions):
+                nearest = difflib.get_close_matches(name, self._option_string_actions, 1)
+                super().error(f"unknown flag {name}{f'; did you mean {nearest[0]!r}?' if nearest else ''}")
+        return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
         """Prints the message and exits."""
@@ -60,11 +83,11 @@ class _Parser(argparse.ArgumentParser):
 
 
 class _Command(_Parser):
-    """A command, which accepts the flags of the connection too; they override those given before the command."""
+    """A command, which accepts the common flags too; they override those given before the command."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        _add_connection(self)
+        _add_common(self)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -76,9 +99,10 @@ def make_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"mapless {version('mapless')}")
-    _add_connection(parser)
-    parser.set_defaults(**_CONNECTION_DEFAULTS, address=default_address())
+    _add_common(parser)
+    parser.set_defaults(**_COMMON_DEFAULTS, address=default_address())
     groups = parser.add_subparsers(title="commands", required=True, metavar="COMMAND", parser_class=_Command)
+    _add_doctor(groups)
     health = groups.add_parser(
         "health",
         help="whether the server accepts calls",
@@ -91,7 +115,47 @@ def make_parser() -> argparse.ArgumentParser:
     _add_reference(groups.add_parser("reference", help="add, show, download, list, delete"))
     _add_localize(groups.add_parser("localize", help="localize a photograph, or a folder of them"))
     _add_questions(groups)
+    completion = groups.add_parser(
+        "completion",
+        help="print a script that completes this command line",
+        description='Completes commands, flags and files. In bash: eval "$(mapless completion bash)".',
+    )
+    completion.add_argument("shell", choices=("bash", "zsh", "tcsh"))
+    completion.set_defaults(run=_completion)
     return parser
+
+
+def _completion(client: Client, arguments: argparse.Namespace) -> int:
+    """Prints the script; needs the package shtab."""
+    try:
+        import shtab
+    except ImportError:
+        raise ValueError("completion needs the Python package shtab: pip install 'mapless[completion]'") from None
+    parser = make_parser()
+    for action in [it for one in all_parsers(parser) for it in one._actions if it.type is Path]:
+        vars(action)["complete"] = shtab.FILE
+    print(shtab.complete(parser, arguments.shell))
+    return 0
+
+
+def all_parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """A parser and those of its commands."""
+    yield parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for child in action.choices.values():
+                yield from all_parsers(child)
+
+
+def _add_doctor(groups: argparse._SubParsersAction[_Command]) -> None:
+    checks = groups.add_parser(
+        "doctor",
+        help="check the connection to a server, and say what to do about what is wrong",
+        description="Checks address, protocol and TLS, services, token, clock, versions, and a query: a reference's "
+        "photograph is localized in its own scene. Exit code 0 if nothing is wrong, else 1.",
+    )
+    checks.add_argument("--scene", help="scene of the query (default: the first with references)")
+    checks.set_defaults(run=doctor.run)
 
 
 def connect_options(arguments: argparse.Namespace) -> ConnectOptions:
@@ -109,7 +173,7 @@ def connect_options(arguments: argparse.Namespace) -> ConnectOptions:
     )
 
 
-def _add_connection(parser: argparse.ArgumentParser) -> None:
+def _add_common(parser: argparse.ArgumentParser) -> None:
     """Adds flags without defaults, so that a command without them keeps the values given before it."""
     group = parser.add_argument_group("connection")
 
@@ -117,13 +181,16 @@ def _add_connection(parser: argparse.ArgumentParser) -> None:
         group.add_argument(flag, default=argparse.SUPPRESS, **options)
 
     add("--address", help=f"of the server (default: that in {ADDRESS_VARIABLE}, or localhost:50051)")
-    add("--timeout", type=float, help=f"of a call, seconds (default: {_CONNECTION_DEFAULTS['timeout']:g})")
+    add("--timeout", type=float, help=f"of a call, seconds (default: {_COMMON_DEFAULTS['timeout']:g})")
     add("--tls", action="store_true", help="encrypt; --ca and --cert imply it")
     add("--ca", type=Path, metavar="FILE", help="certificate that signed the server's, PEM (default: the system's)")
     add("--cert", type=Path, metavar="FILE", help="the client's certificate, PEM, if the server requires one")
     add("--key", type=Path, metavar="FILE", help="its key, PEM")
     add("--token-file", type=Path, metavar="FILE", help=f"holds the token (default: that in {TOKEN_VARIABLE})")
     add("--client-id", help="identifies this user among those of the token")
+    group = parser.add_argument_group("printing")
+    add("--json", action="store_const", const=True, help="JSON, on a terminal too")
+    add("--text", action="store_const", const=False, dest="json", help="text, where standard output is no terminal too")
 
 
 def _add_scene(scene: argparse.ArgumentParser) -> None:
@@ -147,8 +214,7 @@ def _add_scene(scene: argparse.ArgumentParser) -> None:
         one = actions.add_parser(action)
         one.add_argument("scene")
         one.set_defaults(run=run)
-    listing = actions.add_parser("list", help="a table on a terminal, else JSON")
-    _add_json(listing)
+    listing = actions.add_parser("list", help="all scenes")
     listing.set_defaults(run=commands.list_scenes)
 
 
@@ -182,9 +248,8 @@ def _add_reference(reference: argparse.ArgumentParser) -> None:
     add.add_argument("--camera", required=True, help="its camera, see `mapless --help`")
     add.add_argument("--pose", required=True, help="its world_from_camera, likewise")
     add.set_defaults(run=commands.add_reference)
-    listing = actions.add_parser("list", help="a table on a terminal, else JSON")
+    listing = actions.add_parser("list", help="all references of a scene")
     listing.add_argument("scene")
-    _add_json(listing)
     listing.set_defaults(run=commands.list_references)
     for action, run, text in (
         ("show", commands.show_reference, "its camera, pose, hash and number of features"),
@@ -198,10 +263,6 @@ def _add_reference(reference: argparse.ArgumentParser) -> None:
         if action == "download":
             one.add_argument("--output", type=Path, metavar="FILE", help="default: ID.jpg, .png or .webp; - for stdout")
             one.add_argument("--force", action="store_true", help="overwrite the file")
-
-
-def _add_json(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--json", action="store_true", help="JSON on a terminal, too")
 
 
 def _add_localize(command: argparse.ArgumentParser) -> None:
@@ -247,8 +308,7 @@ def _add_localize(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument("--parallel", type=int, default=2, help="concurrent calls for a folder (default: %(default)s)")
     shown = command.add_argument_group("output")
-    shown.add_argument("--json", action="store_true", help="JSON on a terminal, too; for a folder one line each")
-    shown.add_argument("--output", type=Path, metavar="FILE", help="write the JSON to a file")
+    shown.add_argument("--output", type=Path, metavar="FILE", help="write JSON to a file; of a folder one line each")
     shown.add_argument("--debug", action="store_true", help="include the matches that support the answer in the JSON")
     shown.add_argument("--draw", type=Path, metavar="FOLDER", help="write an HTML report for each photograph")
     command.set_defaults(run=localize.run)

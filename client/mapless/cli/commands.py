@@ -1,4 +1,4 @@
-"""All commands except `localize`: each makes a call and prints its answer as JSON."""
+"""All commands except `localize` and `doctor`: each makes a call and prints its answer."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from ..cameras import read_camera, read_pose
 from ..client import Client
 from ..errors import NotFound
 from ..geodesy import Datum
-from ..geometry import Quaternion
+from ..geometry import Quaternion, RigidTransform, lens_model_of
 from ..names import check_id
 from ..requests import NewReference
 from ..results import Reference, Scene
 from .folder import EXIT_FAILED, EXIT_REJECTED
 from .localize import priors
-from .output import print_json, print_table
+from .output import card, show, table
 
 _BLANK = "nothing can be matched with it; it is blank, dark or blurred"
 _STATE = {True: "SERVING", False: "NOT_SERVING"}
@@ -29,11 +29,12 @@ _STATE = {True: "SERVING", False: "NOT_SERVING"}
 def health(client: Client, arguments: argparse.Namespace) -> int:
     """State of the server and of each service: changes can be rejected while queries are answered."""
     serving = client.is_serving()
-    print(_STATE[serving])
+    states = {"server": _STATE[serving]}
     for service in SERVICES:
         # A proxy may answer for the whole server only.
         with suppress(NotFound):
-            print(f"{service.rpartition('.')[2]} {_STATE[client.is_serving(service)]}")
+            states[service.rpartition(".")[2]] = _STATE[client.is_serving(service)]
+    show(arguments, states, card(**states))
     return 0 if serving else EXIT_FAILED
 
 
@@ -41,9 +42,8 @@ def create_scene(client: Client, arguments: argparse.Namespace) -> int:
     """Creates a scene."""
     datum, down = _datum(arguments), arguments.down
     is_arbitrary = arguments.unit == "arbitrary"
-    return print_json(
-        client.create_scene(arguments.scene, datum=datum, down_in_world=down, arbitrary_unit=is_arbitrary)
-    )
+    scene = client.create_scene(arguments.scene, datum=datum, down_in_world=down, arbitrary_unit=is_arbitrary)
+    return show(arguments, scene, _scene_card(scene))
 
 
 def update_scene(client: Client, arguments: argparse.Namespace) -> int:
@@ -59,7 +59,7 @@ def update_scene(client: Client, arguments: argparse.Namespace) -> int:
         raise ValueError("nothing to change: give --datum, --down, --unit or --forget")
     scene = client.update_scene(arguments.scene, **changes)
     _warn(scene.warnings)
-    return print_json(scene)
+    return show(arguments, scene, _scene_card(scene))
 
 
 def _warn(warnings: Sequence[str]) -> None:
@@ -80,19 +80,32 @@ def _datum(arguments: argparse.Namespace) -> Datum | None:
 
 def get_scene(client: Client, arguments: argparse.Namespace) -> int:
     """Prints a scene with its datum and calibration."""
-    return print_json(client.get_scene(arguments.scene))
+    scene = client.get_scene(arguments.scene)
+    return show(arguments, scene, _scene_card(scene))
+
+
+def _scene_card(scene: Scene) -> list[str]:
+    down, calibration = scene.down_in_world, scene.calibration
+    return card(
+        scene=scene.scene_id,
+        references=scene.reference_count,
+        unit=_unit(scene),
+        datum=f"{_place(scene.datum)}, {scene.datum.height_m:.2f} m" if scene.datum else None,
+        down=None if down is None else " ".join(f"{it:.4f}" for it in down),
+        calibration=f"measured with {calibration.query_count} photographs" if calibration else None,
+        created=_minute(scene),
+    )
+
+
+def _unit(scene: Scene) -> str:
+    return "arbitrary" if scene.arbitrary_unit else "m"
 
 
 def list_scenes(client: Client, arguments: argparse.Namespace) -> int:
     """Lists all scenes."""
     scenes = list(client.list_scenes())
-    if arguments.json or not sys.stdout.isatty():
-        return print_json(scenes)
-    rows = [
-        (it.scene_id, it.reference_count, "arbitrary" if it.arbitrary_unit else "m", _place(it.datum), _minute(it))
-        for it in scenes
-    ]
-    return print_table(("SCENE", "REFERENCES", "UNIT", "LATITUDE, LONGITUDE", "CREATED"), rows)
+    rows = [(it.scene_id, it.reference_count, _unit(it), _place(it.datum), _minute(it)) for it in scenes]
+    return show(arguments, scenes, table(("SCENE", "REFERENCES", "UNIT", "LATITUDE, LONGITUDE", "CREATED"), rows))
 
 
 def _place(datum: Datum | None) -> str:
@@ -121,7 +134,7 @@ def add_reference(client: Client, arguments: argparse.Namespace) -> int:
     if not stored.feature_count:
         print(f"mapless: warning: {arguments.photo} is stored, but has no local features: {_BLANK}", file=sys.stderr)
     _warn(stored.warnings)
-    return print_json(stored)
+    return show(arguments, stored, _reference_card(stored))
 
 
 def _id_of(photo: Path) -> str:
@@ -137,19 +150,43 @@ def list_references(client: Client, arguments: argparse.Namespace) -> int:
     if client.get_scene(arguments.scene).arbitrary_unit:
         print("mapless: note: the scene's unit of length is arbitrary, not the metre", file=sys.stderr)
     references = list(client.list_references(arguments.scene))
-    if arguments.json or not sys.stdout.isatty():
-        return print_json(references)
-    rows = []
-    for it in references:
-        position = [f"{coordinate:.3f}" for coordinate in it.world_from_camera.translation]
-        size = f"{it.camera.width_px}x{it.camera.height_px}"
-        rows.append((it.reference_id, size, *position, it.feature_count, _minute(it)))
-    return print_table(("REFERENCE", "SIZE", "X", "Y", "Z", "FEATURES", "CREATED"), rows)
+    rows = [
+        (it.reference_id, _size(it), *_position(it.world_from_camera), it.feature_count, _minute(it))
+        for it in references
+    ]
+    head = ("REFERENCE", "SIZE", "X", "Y", "Z", "FEATURES", "CREATED")
+    return show(arguments, references, table(head, rows))
+
+
+def _size(it: Reference) -> str:
+    return f"{it.camera.width_px}x{it.camera.height_px}"
+
+
+def _position(pose: RigidTransform) -> list[str]:
+    return [f"{coordinate:.3f}" for coordinate in pose.translation]
+
+
+def _reference_card(it: Reference) -> list[str]:
+    camera, q = it.camera, it.world_from_camera.quaternion()
+    lens = None if camera.distortion is None else lens_model_of(camera.distortion)
+    return card(
+        reference=it.reference_id,
+        size=_size(it),
+        focal=f"{camera.focal_x_px:.2f} {camera.focal_y_px:.2f} px",
+        principal=f"{camera.principal_x_px:.2f} {camera.principal_y_px:.2f} px",
+        lens=None if lens is None else f"{lens} {' '.join(f'{k:g}' for k in vars(camera.distortion).values())}",
+        position=" ".join(_position(it.world_from_camera)),
+        rotation=f"x {q.x:.4f}  y {q.y:.4f}  z {q.z:.4f}  w {q.w:.4f}",
+        features=it.feature_count,
+        sha256=it.image_sha256,
+        created=_minute(it),
+    )
 
 
 def show_reference(client: Client, arguments: argparse.Namespace) -> int:
     """Prints a reference without its photograph."""
-    return print_json(client.get_reference(arguments.scene, arguments.reference))
+    found = client.get_reference(arguments.scene, arguments.reference)
+    return show(arguments, found, _reference_card(found))
 
 
 def download_reference(client: Client, arguments: argparse.Namespace) -> int:
@@ -166,8 +203,7 @@ def download_reference(client: Client, arguments: argparse.Namespace) -> int:
             target.write(image)
     except FileExistsError:
         raise ValueError(f"{file} exists; --force overwrites it") from None
-    print(file)
-    return 0
+    return show(arguments, {"file": str(file)}, [str(file)])
 
 
 def delete_reference(client: Client, arguments: argparse.Namespace) -> int:
@@ -179,14 +215,23 @@ def delete_reference(client: Client, arguments: argparse.Namespace) -> int:
 def retrieve(client: Client, arguments: argparse.Namespace) -> int:
     """Finds the references most similar to a photograph."""
     camera = read_camera(arguments.camera, arguments.photo)
-    return print_json(
-        client.retrieve_references(arguments.photo, camera, arguments.scene, arguments.count, priors=priors(arguments))
-    )
+    given = priors(arguments)
+    found = client.retrieve_references(arguments.photo, camera, arguments.scene, arguments.count, priors=given)
+    rows = [(it.name.rpartition("/")[2], f"{it.similarity:.3f}", *_position(it.world_from_camera)) for it in found]
+    return show(arguments, found, table(("REFERENCE", "SIMILARITY", "X", "Y", "Z"), rows))
 
 
 def coverage(client: Client, arguments: argparse.Namespace) -> int:
     """Predicts whether a photograph at a pose would be localized."""
     pose, camera = read_pose(arguments.pose), read_camera(arguments.camera)
     found = client.check_coverage(arguments.scene, pose, camera)
-    print_json(found)
+    unit = "units" if found.arbitrary_unit else "m"
+    radius = None if found.position_68_m is None else f"within {found.position_68_m:.3g} {unit} (68 %)"
+    text = card(
+        verdict=found.verdict,
+        position=radius,
+        matches=f"{found.expected_match_count} expected, in {100 * found.image_share:.0f} % of the image",
+        references=len(found.references),
+    )
+    show(arguments, found, [*text, found.message])
     return EXIT_REJECTED if found.verdict == "NOT_LOCALIZABLE" else 0

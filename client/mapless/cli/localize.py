@@ -63,7 +63,7 @@ def _one(client: Client, arguments: argparse.Namespace) -> int:
     indent = None if arguments.progressive else 2  # of several answers each is a line
     with _opened(arguments.output) as file:
         for answer in itertools.chain([first], answers):
-            if arguments.json or arguments.output or not sys.stdout.isatty():
+            if arguments.output or output.is_json(arguments):
                 print(json.dumps(output.plain(_printed(answer, arguments)), indent=indent), file=file, flush=True)
             else:
                 print("\n".join(output.lines(answer)), file=file, flush=True)
@@ -76,7 +76,7 @@ def _folder(client: Client, arguments: argparse.Namespace) -> int:
     photos = photos_of(arguments.photo, arguments.camera)
     names = [photo.name for photo in photos]
     width = max(map(len, names))
-    as_json = bool(arguments.json or arguments.output or not sys.stdout.isatty())
+    as_json = bool(arguments.output) or output.is_json(arguments)
     tally = Tally(len(photos))
     try:
         with (

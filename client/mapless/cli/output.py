@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import json
 import math
 import re
+import sys
 from collections.abc import Sequence
 from datetime import datetime
 from enum import Enum
@@ -33,22 +35,32 @@ _NUMBER = re.compile(r"-?[\d.]+")
 _CAPTURED = "captured by the server"
 
 
-def print_json(value: object) -> int:
-    """Prints a value as JSON; returns exit code 0."""
-    print(json.dumps(plain(value), indent=2), flush=True)
+def is_json(arguments: argparse.Namespace) -> bool:
+    """The rule of all commands: text on a terminal, JSON elsewhere; --json and --text decide otherwise."""
+    return bool(arguments.json if arguments.json is not None else not sys.stdout.isatty())
+
+
+def show(arguments: argparse.Namespace, value: object, text: Sequence[str]) -> int:
+    """Prints a value as JSON or its text, by the rule of all commands; returns exit code 0."""
+    print(json.dumps(plain(value), indent=2) if is_json(arguments) else "\n".join(text), flush=True)
     return 0
 
 
-def print_table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> int:
-    """Prints rows below their head, numbers to the right; returns exit code 0."""
+def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:
+    """Lines of a table: rows below their head, numbers to the right."""
     columns = [[name, *map(str, cells)] for name, *cells in zip(head, *rows, strict=True)]
     for column in columns:
         is_number = len(column) > 1 and all(map(_NUMBER.fullmatch, column[1:]))
         width = max(map(len, column))
         column[:] = [cell.rjust(width) if is_number else cell.ljust(width) for cell in column]
-    for line_cells in zip(*columns, strict=True):
-        print("  ".join(line_cells).rstrip())
-    return 0
+    return ["  ".join(cells).rstrip() for cells in zip(*columns, strict=True)]
+
+
+def card(**fields: object) -> list[str]:
+    """Lines of one thing: a name and a value in each, without those that are None."""
+    known = {name: value for name, value in fields.items() if value is not None}
+    width = max(map(len, known), default=0)
+    return [f"{name:{width}}  {value}" for name, value in known.items()]
 
 
 def plain(value: Any) -> Any:

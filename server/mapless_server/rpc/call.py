@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from urllib.parse import unquote
 
+from mapless_server import __version__
 from mapless_server.engine.query import Caller
 from mapless_server.observability.tracing import CallRecord, Metadata
 from mapless_server.scheduling import Flow, StageRecord
@@ -19,6 +20,7 @@ from .receiving import Context
 
 REQUEST_ID_KEY = "x-request-id"
 CLIENT_ID_KEY = "x-client-id"
+TIME_KEY, VERSION_KEY = "x-mapless-time", "x-mapless-version"
 ANSWER_MARGIN_SHARE = 0.02
 """Share of the time given by which the answer is early: gRPC rounds the time up when it sends it, by at most 1 %."""
 ANSWER_MARGIN_S = 0.01
@@ -52,6 +54,11 @@ class Call:
     def caller(self) -> Caller:
         """The caller, as the engine knows it."""
         return Caller(Flow(self.principal.tenant, self.client), self.deadline_s)
+
+    @property
+    def trailers(self) -> tuple[tuple[str, str], ...]:
+        """Of an answer that succeeds; its caller is authenticated, and may know the version."""
+        return (REQUEST_ID_KEY, self.request_id), (TIME_KEY, f"{time.time():.3f}"), (VERSION_KEY, __version__)
 
     def note(self, **fields: object) -> None:
         """Adds fields to the call's line in the log and to its trace; they cannot replace those of every line."""

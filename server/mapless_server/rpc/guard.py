@@ -20,7 +20,7 @@ from mapless_server.observability.logs import as_extra
 from mapless_server.observability.tracing import CallSpan, Metadata, NoTracer, Tracer
 from mapless_server.security import ENDLESS_METHODS, OPEN_METHODS, Principal
 
-from .call import REQUEST_ID_KEY, Call, Deadlines, begin_call, metadata_of
+from .call import Call, Deadlines, begin_call, metadata_of
 from .receiving import Context, OpenMethods, Receiver, quiet_ended_calls
 from .sending import ENDLESS_SEND_LIMIT_S, SEND_LIMIT_S, Sender
 
@@ -111,7 +111,7 @@ class CallGuard:
                     self._principal(method, context)
                     self._check_admission(method)
                     response = await reply(handler, method, call, context)
-                    context.set_trailing_metadata(((REQUEST_ID_KEY, call.request_id),))
+                    context.set_trailing_metadata(call.trailers)
                     result.code = "OK"
                     return response
                 except RequestError as error:

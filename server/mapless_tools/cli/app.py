@@ -28,7 +28,6 @@ from .weights import weights_app
 app = typer.Typer(
     help="Visual localization without a map, as a gRPC service.",
     no_args_is_help=True,
-    add_completion=False,
     # A traceback with local variables would print image bytes and secrets.
     pretty_exceptions_show_locals=False,
 )

@@ -17,6 +17,8 @@ import typer
 from mapless_server.serve.command import fail
 from mapless_tools.connection import Connection, Scene, with_connection_flags
 
+from .printing import AsJson, printed_as_json
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -43,6 +45,7 @@ def audit_command(
     html: Annotated[Path | None, typer.Option(help="HTML file for the whole report.")] = None,
     page_size: Annotated[int, typer.Option(help="References a call, 1 to 100; each takes up to a second.")] = 10,
     everything: Annotated[bool, typer.Option("--all", help="Print consistent references, too.")] = False,
+    as_json: AsJson = None,
     *,
     connection: Connection,
 ) -> None:
@@ -85,7 +88,7 @@ def audit_command(
         raise
     finally:
         if examined.total is not None:
-            _report(examined, everything, report, html)
+            _report(examined, everything, report, html, as_json)
     if any(a.verdict in ALARMS for a in examined.audits):
         raise typer.Exit(1)
 
@@ -128,7 +131,7 @@ def timeout_s(page_size: int) -> float:
     return min(5.0 + 3.0 * (page_size or MAX_PAGE), MAX_TIMEOUT_S)
 
 
-def _report(examined: Examined, everything: bool, report: Path | None, html: Path | None) -> None:
+def _report(examined: Examined, everything: bool, report: Path | None, html: Path | None, as_json: bool | None) -> None:
     """Prints and writes the findings."""
     from rich.console import Console
 
@@ -137,13 +140,14 @@ def _report(examined: Examined, everything: bool, report: Path | None, html: Pat
     examined = replace(examined, audits=worst_first(examined.audits))
     shown = [a for a in examined.audits if everything or a.verdict != "CONSISTENT"]
     console = Console(soft_wrap=True)
-    for warning in examined.warnings:
-        console.print(f"warning: {warning}", markup=False, highlight=False)
-    if shown:
-        Console().print(table_of(shown))
-        for audit in shown:
-            console.print(f"{reference_id_of(audit)}: {audit.message}", markup=False, highlight=False)
-    console.print(summary_of(examined), markup=False)
+    if not printed_as_json(as_json, to_json(examined)):
+        for warning in examined.warnings:
+            console.print(f"warning: {warning}", markup=False, highlight=False)
+        if shown:
+            Console().print(table_of(shown))
+            for audit in shown:
+                console.print(f"{reference_id_of(audit)}: {audit.message}", markup=False, highlight=False)
+        console.print(summary_of(examined), markup=False)
     if report is not None:
         write_json(report, to_json(examined))
     if html is not None:

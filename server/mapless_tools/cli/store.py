@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mapless_server.serve.command import fail
+
+from .printing import AsJson, printed_as_json
 
 if TYPE_CHECKING:
     from mapless_server.store.database import Database
@@ -37,6 +40,7 @@ def verify_command(
     file: Annotated[Path | None, typer.Argument(help="A backup; default: the store.")] = None,
     config: Config = None,
     data_dir: DataDir = None,
+    as_json: AsJson = None,
 ) -> None:
     """Read every row of the store or of a backup and report damage; exit code 1 if there is any."""
     from mapless_server.store.sqlite import SqliteDatabase
@@ -50,6 +54,8 @@ def verify_command(
     ):
         database.lift_limits(connection)
         found = verify(connection, on_progress)
+    if printed_as_json(as_json, asdict(found)):
+        raise typer.Exit(1 if found.faults else 0)
     _report(found, "whole")
 
 

@@ -12,6 +12,8 @@ import typer
 
 from mapless_server.serve.command import fail
 
+from .printing import AsJson, printed_as_json
+
 token_app = typer.Typer(help="Tokens that callers must have: create, list and revoke them.", no_args_is_help=True)
 
 DEFAULT_TENANT = "default"
@@ -38,15 +40,17 @@ def create_command(
 
 
 @token_app.command("list")
-def list_command(tokens_file: TokensFile = None) -> None:
+def list_command(tokens_file: TokensFile = None, as_json: AsJson = None) -> None:
     """Show all tokens with their roles, tenants and expiry."""
     from mapless_server.security import read_tokens
 
     with _tokens_file(tokens_file) as path:
-        tokens = read_tokens(path).tokens
+        tokens = sorted(read_tokens(path).tokens, key=lambda token: (token.tenant, token.name))
+    if printed_as_json(as_json, [it.model_dump(mode="json", exclude={"sha256"}) for it in tokens]):
+        return
     now = datetime.now(timezone.utc)
     width = max((len(it.name) for it in tokens), default=0)
-    for it in sorted(tokens, key=lambda token: (token.tenant, token.name)):
+    for it in tokens:
         end = "never expires"
         if it.expires is not None:
             end = f"{'expired' if it.expires <= now else 'expires'} {it.expires.isoformat()}"

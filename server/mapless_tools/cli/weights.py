@@ -15,12 +15,14 @@ from rich.table import Table
 
 from mapless_server.networks.weights.catalogue import CATALOGUE, Weights, WheelMember, named
 from mapless_server.networks.weights.errors import FetchError, LicenceNotAccepted, UnknownWeights, WeightsError
-from mapless_server.networks.weights.folder import Status, look_up, path_of, temporary_folder
+from mapless_server.networks.weights.folder import Status, Stored, look_up, path_of, temporary_folder
 from mapless_server.networks.weights.install import Installed, Progress, add, check, fetch
 from mapless_server.networks.weights.sources import require_converter
 from mapless_server.serve.command import fail
 from mapless_server.serve.signals import terminable
 from mapless_server.settings import ConfigError, load_settings
+
+from .printing import AsJson, printed_as_json
 
 weights_app = typer.Typer(
     help="Weights of networks: list them, fetch them, add files of your own, check them.", no_args_is_help=True
@@ -33,15 +35,17 @@ Name = Annotated[str, typer.Argument(help="Name, as listed.")]
 
 
 @weights_app.command("list")
-def list_command(weights_dir: WeightsDir = None) -> None:
+def list_command(weights_dir: WeightsDir = None, as_json: AsJson = None) -> None:
     """Show which weights there are, what for, under which licence, and which are in the folder."""
     table = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False)  # 80 columns: two are as wide as their longest word
     widths = {"licence": len("non-commercial"), "here": len("official")}
     for heading in ("name", "for", "licence", "here", "size", "SHA-256"):
         table.add_column(heading, no_wrap=heading not in widths, overflow="fold", width=widths.get(heading))
     with _weights_folder(weights_dir) as folder:
-        for weights in CATALOGUE:
-            stored = look_up(weights, folder)
+        found = [(weights, look_up(weights, folder)) for weights in CATALOGUE]
+        if printed_as_json(as_json, [_plain(*it) for it in found]):
+            return
+        for weights, stored in found:
             table.add_row(
                 weights.name,
                 weights.purpose,
@@ -54,6 +58,19 @@ def list_command(weights_dir: WeightsDir = None) -> None:
     console.print(table)
     note = f"\nThe folder: {folder}. Digests are those of the official files, and so are sizes of what is absent."
     console.print(note, highlight=False, soft_wrap=True)
+
+
+def _plain(weights: Weights, stored: Stored) -> dict[str, object]:
+    """For programs; the digest is that of the official file."""
+    return {
+        "name": weights.name,
+        "for": weights.purpose,
+        "licence": str(weights.licence),
+        "here": stored.status.value,
+        "path": str(stored.path),
+        "size_bytes": stored.size_bytes or weights.size_bytes,
+        "sha256": weights.sha256,
+    }
 
 
 @weights_app.command("fetch")

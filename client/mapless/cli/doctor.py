@@ -1,0 +1,300 @@
+"""`mapless doctor`: checks a connection step by step, and says what to do about what is wrong."""
+
+from __future__ import annotations
+
+import argparse
+import socket
+import ssl
+import time
+from collections.abc import Callable
+from contextlib import closing, suppress
+from dataclasses import dataclass, field, replace
+from importlib.metadata import version
+
+import grpc
+import numpy as np
+
+from ..answers import Rejected
+from ..calls.health import SERVICES
+from ..client import Client
+from ..connecting import explained
+from ..errors import DeadlineExceeded, MaplessError, NotFound, from_rpc_error
+from ..options import ConnectOptions
+from ..results import Reference
+from ..v1 import reference_service_pb2 as pb
+from .folder import EXIT_FAILED
+from .output import show
+from .suggesting import suggesting
+
+OK, WRONG, NOTE, SKIPPED = "ok", "wrong", "note", "skipped"
+
+_CALL_LIMIT_S = 10.0
+_QUERY_LIMIT_S = 30.0
+_CONNECT_LIMIT_S = 3.0
+_MAX_OFFSET_S = 5.0
+"""Of two clocks. Certificates and tokens expire, and times of captures are compared, by minutes at the least."""
+_MAX_ERROR = 0.05
+"""Of a reference's photograph, which is matched with itself, from its stored pose; metres or units."""
+_TIME_KEY, _VERSION_KEY = "x-mapless-time", "x-mapless-version"
+_LOOPBACK = ("127.", "::1")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Result of a check: `state` is "ok", "wrong", "note" or "skipped"; `advice` what to do, or empty."""
+
+    check: str
+    state: str
+    message: str = ""
+    advice: str = ""
+
+
+@dataclass
+class _Session:
+    """What the checks share; `trailers` and `clock_error_s` are known after that of the token."""
+
+    client: Client
+    address: str
+    options: ConnectOptions
+    scene: str | None
+    trailers: dict[str, str] = field(default_factory=dict)
+    sent_s: float = 0.0
+    answered_s: float = 0.0
+
+
+def run(client: Client, arguments: argparse.Namespace) -> int:
+    """Makes all checks and prints their findings."""
+    options = replace(client.options, timeout_s=min(client.options.timeout_s, _CALL_LIMIT_S), max_attempts=1)
+    findings: list[Finding] = []
+    with Client(arguments.address, options) as own:
+        session = _Session(own, arguments.address, options, arguments.scene)
+        for check, (examine, _) in _CHECKS.items():
+            if any(it.state == WRONG and _CHECKS[it.check][1] for it in findings):
+                findings.append(Finding(check, SKIPPED))
+                continue
+            try:
+                with suggesting(own):
+                    state, message, advice = examine(session)
+            except MaplessError as error:
+                where = f"the server's log has more, under {error.request_id}" if error.request_id else ""
+                state, message, advice = WRONG, str(error), _ADVICE.get(error.reason, where)
+            findings.append(Finding(check, state, message, advice))
+    show(arguments, findings, [line for it in findings for line in _lines(it)])
+    return EXIT_FAILED if any(it.state == WRONG for it in findings) else 0
+
+
+def _lines(it: Finding) -> list[str]:
+    return [f"{it.state:7}  {it.check:8}  {it.message}".rstrip(), *([f"{'':19}{it.advice}"] if it.advice else [])]
+
+
+_Result = tuple[str, str, str]
+"""State, message and advice."""
+
+
+def _check_address(session: _Session) -> _Result:
+    """Resolves the name, and connects to each of its addresses."""
+    host, port = _host_and_port(session.address)
+    if not host:
+        return NOTE, f"{session.address} has a form of gRPC's own, which is not examined", ""
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError) as error:
+        advice = "check the spelling of --address (or MAPLESS_ADDRESS), and the network's name server"
+        return WRONG, f"the name {host} cannot be resolved: {getattr(error, 'strerror', None) or error}", advice
+    answers = [_connected(family, endpoint) for family, *_, endpoint in found]
+    if "" in answers:
+        return OK, f"{found[answers.index('')][4][0]} port {port} accepts connections", ""
+    refused = "; ".join(f"{it[4][0]}: {answer}" for it, answer in zip(found, answers, strict=True))
+    advice = f"start the server (mapless-server serve), or correct --address; firewalls must let port {port} through"
+    return WRONG, f"nothing answers at {session.address} ({refused})", advice
+
+
+def _connected(family: int, endpoint: tuple[object, ...]) -> str:
+    """Why no connection can be made; empty if it can."""
+    try:
+        with closing(socket.socket(family, socket.SOCK_STREAM)) as probe:
+            probe.settimeout(_CONNECT_LIMIT_S)
+            probe.connect(endpoint)
+    except OSError as error:
+        return error.strerror or "no answer"
+    return ""
+
+
+def _check_protocol(session: _Session) -> _Result:
+    """Speaks gRPC with the server, encrypted or not as the options say."""
+    tls = session.options.tls
+    try:
+        session.client.is_serving()
+    except DeadlineExceeded:
+        return WRONG, "connections are accepted, but nothing answers", "the server hangs, or it is no gRPC server"
+    except MaplessError as error:
+        if error.code != "UNAVAILABLE" or not error.message.startswith("cannot connect"):
+            raise
+        failed = explained(error, session.address, session.options).message.partition(": ")[2]
+        speaks_tls = _speaks_tls(session.address)
+        if speaks_tls and not tls:
+            return (
+                WRONG,
+                "the server uses TLS, and --tls is not given",
+                "give --tls, or --ca FILE with the authority's certificate",
+            )
+        if tls and not speaks_tls and "SETTINGS" not in failed:
+            return (
+                WRONG,
+                "the server does not use TLS",
+                "leave out --tls, --ca and --cert, or give the server a certificate",
+            )
+        advice = "give --cert and --key where the server requires a client certificate" if "closes" in failed else ""
+        return WRONG, failed, advice
+    host, _ = _host_and_port(session.address)
+    if tls:
+        return OK, "gRPC, encrypted, and the server's certificate is valid", ""
+    if session.options.token is None or host == "localhost" or host.startswith(_LOOPBACK):
+        return OK, "gRPC, not encrypted", ""
+    return (
+        NOTE,
+        "gRPC, not encrypted: the token is sent in clear text",
+        "serve with TLS (settings tls_certificate and tls_key)",
+    )
+
+
+def _check_services(session: _Session) -> _Result:
+    """Asks for the state of the server and its services."""
+    states = {"the server": session.client.is_serving()}
+    for service in SERVICES:
+        with suppress(NotFound):  # a proxy may answer for the whole server only
+            states[service.rpartition(".")[2]] = session.client.is_serving(service)
+    silent = [name for name, is_serving in states.items() if not is_serving]
+    if not silent:
+        return OK, "serving", ""
+    advice = "wait while it starts or drains; if it is ReferenceService alone, the store cannot be written: see the log"
+    return WRONG, f"not serving: {', '.join(silent)}", advice
+
+
+def _check_token(session: _Session) -> _Result:
+    """Lists one scene, which the least role may; keeps the trailers."""
+    options = session.options
+    with options.channel(session.address) as channel:
+        method = channel.unary_unary(
+            "/mapless.v1.ReferenceService/ListScenes",
+            request_serializer=pb.ListScenesRequest.SerializeToString,
+            response_deserializer=pb.ListScenesResponse.FromString,
+        )
+        session.sent_s = time.time()
+        try:
+            request = pb.ListScenesRequest(page_size=1)
+            _, call = method.with_call(request, timeout=options.timeout_s, metadata=options.metadata())
+        except grpc.RpcError as error:
+            raise from_rpc_error(error) from error
+        session.answered_s = time.time()
+        session.trailers = {str(key): str(value) for key, value in call.trailing_metadata() or ()}
+    return OK, "accepted" if options.token else "none given, and none is needed", ""
+
+
+def _check_clock(session: _Session) -> _Result:
+    """Compares the clocks, to within the time of the call."""
+    try:
+        server_s = float(session.trailers.get(_TIME_KEY, ""))
+    except ValueError:
+        return NOTE, "the server, or a proxy before it, does not send its time", ""
+    offset_s = (session.sent_s + session.answered_s) / 2 - server_s
+    if abs(offset_s) - (session.answered_s - session.sent_s) / 2 <= _MAX_OFFSET_S:
+        return OK, f"within {max(abs(offset_s), 0.1):.1f} s of the server's", ""
+    direction = "ahead of" if offset_s > 0 else "behind"
+    advice = "synchronize both machines (NTP): certificates and tokens expire by the clock"
+    return WRONG, f"this machine's clock is {abs(offset_s):.0f} s {direction} the server's", advice
+
+
+def _check_version(session: _Session) -> _Result:
+    """Compares the versions of client and server."""
+    libraries = f"grpcio {version('grpcio')}, protobuf {version('protobuf')}"
+    client, server = version("mapless"), session.trailers.get(_VERSION_KEY, "")
+    if not server:
+        return NOTE, f"client {client} ({libraries}); the server's is not known", ""
+    if server == client:
+        return OK, f"client and server {client} ({libraries})", ""
+    return (
+        NOTE,
+        f"client {client}, server {server} ({libraries})",
+        "they work together; what only one of them knows is ignored",
+    )
+
+
+def _check_query(session: _Session) -> _Result:
+    """Localizes a reference's photograph in its own scene."""
+    client = session.client
+    scene = session.scene or next((it.scene_id for it in client.list_scenes() if it.reference_count), None)
+    known: Reference | None = next(client.list_references(scene, page_size=1), None) if scene else None
+    if scene is None or known is None:
+        there = f"scene {scene} has no references" if scene else "no scene has references"
+        return (
+            NOTE,
+            f"{there}, so nothing can be localized",
+            "add some: mapless reference add, or mapless-server import",
+        )
+    reference = client.get_reference(scene, known.reference_id, include_image=True)
+    start_s = time.monotonic()
+    answer = client.localize(reference.image or b"", reference.camera, scene, timeout_s=_QUERY_LIMIT_S)
+    took = f"in {time.monotonic() - start_s:.2f} s"
+    what = f"the photograph of reference {reference.reference_id} of scene {scene}"
+    if isinstance(answer, Rejected):
+        return (
+            WRONG,
+            f"{what} was not localized: {answer.reason}, {answer.message}",
+            answer.hint.message if answer.hint else "",
+        )
+    error = float(np.linalg.norm(answer.world_from_camera.translation - reference.world_from_camera.translation))
+    unit = "units" if answer.arbitrary_unit else "m"
+    if error > _MAX_ERROR:
+        return (
+            NOTE,
+            f"{what} was localized {error:.3f} {unit} from its stored pose, {took}",
+            f"mapless-server audit {scene}",
+        )
+    return OK, f"{what} was localized {took}, {error:.3f} {unit} from its stored pose", ""
+
+
+def _host_and_port(address: str) -> tuple[str, int]:
+    """Of "host:port"; an empty host for gRPC's other forms."""
+    host, colon, port = address.rpartition(":")
+    if not colon or (":" in host and not host.startswith("[")):
+        host, port = address, "443"
+    is_plain = "/" not in address and not address.startswith(("ipv4:", "ipv6:", "dns:", "unix:", "xds:"))
+    return (host.strip("[]"), int(port)) if is_plain and port.isdecimal() else ("", 0)
+
+
+def _speaks_tls(address: str) -> bool:
+    """Whether a TLS handshake gets as far as the server's certificate, whatever that is worth."""
+    host, port = _host_and_port(address)
+    context = ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    context.set_alpn_protocols(["h2"])
+    try:
+        with (
+            socket.create_connection((host, port), _CONNECT_LIMIT_S) as raw,
+            context.wrap_socket(raw, server_hostname=host) as secure,
+        ):
+            return secure.version() is not None
+    except OSError:
+        return False
+
+
+_CHECKS: dict[str, tuple[Callable[[_Session], _Result], bool]] = {
+    "address": (_check_address, True),
+    "protocol": (_check_protocol, True),
+    "services": (_check_services, True),
+    "token": (_check_token, True),
+    "clock": (_check_clock, False),
+    "version": (_check_version, False),
+    "query": (_check_query, False),
+}
+"""The checks in their order, and whether those after it need it."""
+
+_TOKENS = "give it with --token-file or in MAPLESS_TOKEN; `mapless-server token create` makes one"
+_ADVICE = {
+    "TOKEN_MISSING": _TOKENS,
+    "TOKEN_INVALID": _TOKENS,
+    "TOKEN_EXPIRED": _TOKENS,
+    "ROLE_TOO_LOW": "use a token of the role localize or write",
+}
+"""By the reason of an error."""
