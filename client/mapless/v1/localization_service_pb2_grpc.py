@@ -39,6 +39,9 @@ class LocalizationServiceStub(object):
     * `x-mapless-scene`: "scenes/{scene}", the scene of the call, as in the request itself. For load balancers
     in front of several servers, which keep a scene's calls at one server by it; servers ignore it.
 
+    Trailing metadata of an answer: `x-request-id`, and where the call succeeds `x-mapless-time`, seconds since 1970 by the
+    server's clock, and `x-mapless-version`, its version.
+
     Every error is a google.rpc.Status with one ErrorInfo (domain "mapless"), a RequestInfo, for INVALID_ARGUMENT a BadRequest
     that names the field, and for NOT_FOUND and ALREADY_EXISTS a ResourceInfo. A message over the server's limit (32 MiB unless configured otherwise) is RESOURCE_EXHAUSTED, without
     RetryInfo: sending it again does not help.
@@ -90,6 +93,9 @@ class LocalizationServiceServicer(object):
     many calls each of them makes; without it, each connection is one caller.
     * `x-mapless-scene`: "scenes/{scene}", the scene of the call, as in the request itself. For load balancers
     in front of several servers, which keep a scene's calls at one server by it; servers ignore it.
+
+    Trailing metadata of an answer: `x-request-id`, and where the call succeeds `x-mapless-time`, seconds since 1970 by the
+    server's clock, and `x-mapless-version`, its version.
 
     Every error is a google.rpc.Status with one ErrorInfo (domain "mapless"), a RequestInfo, for INVALID_ARGUMENT a BadRequest
     that names the field, and for NOT_FOUND and ALREADY_EXISTS a ResourceInfo. A message over the server's limit (32 MiB unless configured otherwise) is RESOURCE_EXHAUSTED, without
@@ -220,6 +226,9 @@ class LocalizationService(object):
     many calls each of them makes; without it, each connection is one caller.
     * `x-mapless-scene`: "scenes/{scene}", the scene of the call, as in the request itself. For load balancers
     in front of several servers, which keep a scene's calls at one server by it; servers ignore it.
+
+    Trailing metadata of an answer: `x-request-id`, and where the call succeeds `x-mapless-time`, seconds since 1970 by the
+    server's clock, and `x-mapless-version`, its version.
 
     Every error is a google.rpc.Status with one ErrorInfo (domain "mapless"), a RequestInfo, for INVALID_ARGUMENT a BadRequest
     that names the field, and for NOT_FOUND and ALREADY_EXISTS a ResourceInfo. A message over the server's limit (32 MiB unless configured otherwise) is RESOURCE_EXHAUSTED, without
