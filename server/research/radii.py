@@ -23,11 +23,11 @@ import numpy as np
 from scipy.special import bdtrik
 
 from mapless.geometry import Array
-from mapless_server.method.adjust import AdjustOptions
 from mapless_server.method.answer import Localization
 from mapless_server.method.features import FeatureExtractor, make_extractor
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import StageOptions
+from mapless_server.method.pose_problem import AdjustOptions
 from mapless_server.method.uncertainty.covariance import UncertaintyOptions
 from mapless_server.method.uncertainty.radii import error_radii
 

@@ -13,9 +13,10 @@ from support.planted import NOISE, disturbed, drifted, stages, true_corresponden
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform
-from mapless_server.method.adjust import AdjustOptions, adjust_pose, pose_problem
+from mapless_server.method.adjust import adjust_pose
 from mapless_server.method.bundle import Bundle, BundleProblem
 from mapless_server.method.pnp import PnpOptions, solve_pose
+from mapless_server.method.pose_problem import AdjustOptions, pose_problem
 from mapless_server.method.results import PointMatches, PoseEstimate
 
 

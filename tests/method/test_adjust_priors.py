@@ -12,9 +12,10 @@ from support.planted import NOISE, true_structure
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method.adjust import AdjustOptions, adjust_pose, pose_problem
+from mapless_server.method.adjust import adjust_pose
 from mapless_server.method.perturbation import moved
 from mapless_server.method.pnp import PnpOptions, solve_pose
+from mapless_server.method.pose_problem import AdjustOptions, pose_problem
 from mapless_server.method.priors.known import NO_PRIORS, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
 from mapless_server.method.results import PointMatches, PoseEstimate, Structure
 

@@ -11,8 +11,8 @@ from support.planted import NOISE, true_structure
 from support.scenes import SceneOptions, make_scene, random_for
 
 from mapless.geometry import Array
-from mapless_server.method.adjust import AdjustOptions, pose_problem
 from mapless_server.method.bundle import Bundle, BundleProblem
+from mapless_server.method.pose_problem import AdjustOptions, pose_problem
 from mapless_server.method.tracks import Tracks
 from mapless_server.method.uncertainty.dispersion import LEAST_LEFT, Dispersion, disperse
 

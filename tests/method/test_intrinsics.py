@@ -12,10 +12,11 @@ from support.planted import NOISE, stages, true_structure
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, Camera, Distortion, Fisheye, RadialTangential
-from mapless_server.method.adjust import AdjustOptions, adjust_pose, pose_problem, with_intrinsics
+from mapless_server.method.adjust import adjust_pose
 from mapless_server.method.features import undistort_pixels
 from mapless_server.method.intrinsics import IntrinsicsEvidence, corrected, keypoint_motion
 from mapless_server.method.options import IntrinsicsSigma
+from mapless_server.method.pose_problem import AdjustOptions, pose_problem, with_intrinsics
 from mapless_server.method.rejection import Advice, RejectionReason
 from mapless_server.method.results import PoseEstimate
 from mapless_server.method.trust.intrinsics import IntrinsicsOptions, intrinsics_checks, wrong_intrinsics

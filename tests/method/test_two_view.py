@@ -14,7 +14,6 @@ import pytest
 from support.scenes import CAMERA, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method.adjust import AdjustOptions
 from mapless_server.method.answer import Localization
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.correspond import Correspondences, Matcher
@@ -23,6 +22,7 @@ from mapless_server.method.match import MatchOptions
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.perturbation import moved, rotation_vector
 from mapless_server.method.pipeline import Pipeline
+from mapless_server.method.pose_problem import AdjustOptions
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
 from mapless_server.method.results import Support
 from mapless_server.method.structure import StructureOptions

@@ -14,9 +14,10 @@ from support.planted import NOISE, disturbed, drifted, metric_scale, stages, tru
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, Similarity
-from mapless_server.method.adjust import AdjustOptions, adjust_pose, pose_covariance
+from mapless_server.method.adjust import adjust_pose, pose_covariance
 from mapless_server.method.perturbation import rotation_vector
 from mapless_server.method.pnp import PnpOptions, solve_pose
+from mapless_server.method.pose_problem import AdjustOptions
 from mapless_server.method.results import PoseEstimate, PoseStage, Structure, Support
 from mapless_server.method.uncertainty.covariance import UncertaintyOptions, scale_covariance
 

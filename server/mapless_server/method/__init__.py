@@ -23,6 +23,8 @@ resection                    pose and focal length from fixed points
 pose_errors                  (ours) errors of the references' given poses: how large, and how alike for neighbours
 bundle                       (ours) everything adjusted together
 uncertainty/                 the covariance of a pose
+pose_problem                 (ours) the problem of one pose, and the estimate at its optimum
+recalibrate                  (ours) intrinsics that a photograph contradicts are estimated too
 adjust                       (ours) the last refinement
 two_view/                    (ours) pose from matches with posed references, without points
 trust/                       whether a pose is accepted, and its trust

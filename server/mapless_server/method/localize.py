@@ -77,19 +77,8 @@ def prepare(
     bucket = pipeline.reconstructor.bucket(query, nearby)
     with context.stage("correspond"):
         correspondences = pipeline.matcher.correspond(query, references, False, context.check, query_matches)
-    return Prepared(
-        query,
-        nearby,
-        tuple(references),
-        origin,
-        pipeline,
-        options,
-        correspondences,
-        bucket,
-        context,
-        priors.shifted(-origin),
-        is_metric,
-    )
+    given = query, nearby, tuple(references), origin, pipeline, options
+    return Prepared(*given, correspondences, bucket, context, priors.shifted(-origin), is_metric)
 
 
 def refine(coarse: Coarse) -> Answer:

@@ -14,7 +14,6 @@ from typing import Any, TypeVar
 
 from mapless.geometry import Array
 
-from .adjust import AdjustOptions
 from .answer import Answer, Localization, shifted
 from .coarse import Bucket, Outcome, Reconstructor, Request, reconstruct_one
 from .coarse.geometric import GeometricReconstructor
@@ -24,6 +23,7 @@ from .match import PAPER_MATCH, MatchOptions, match_points
 from .one_reference import OneReferenceOptions
 from .options import LocalizeOptions, Variant
 from .pnp import PnpOptions
+from .pose_problem import AdjustOptions
 from .priors.known import NO_PRIORS, Priors
 from .rejection import Rejection, RejectionReason
 from .results import MetricScale, PointMatches, PoseStage, Structure, Support

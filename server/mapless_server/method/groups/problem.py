@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
-from ..adjust import LEAST_DAMPING, AdjustOptions
 from ..bundle import Bundle, BundleProblem, NormalEquations, Poses, bundle_of
 from ..optimize import solve_step
 from ..options import check_bounds
 from ..perturbation import reprojection_errors_px, world_jacobian
 from ..pose_errors import most_probable, pose_errors
+from ..pose_problem import LEAST_DAMPING, AdjustOptions
 from ..priors.known import Priors
 from ..results import PointMatches
 from ..structure import tracks_with_query

@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
-from ..adjust import AdjustOptions, adjust_pose
+from ..adjust import adjust_pose
 from ..correspond import Correspondences
 from ..match import MatchOptions, match_points, vote
 from ..observations import triangulate
 from ..options import check_bounds
 from ..perturbation import reprojection_errors_px
+from ..pose_problem import AdjustOptions
 from ..results import PointMatches, PoseEstimate, PoseStage, Structure, Support, TwoViewSupport
 from ..structure import StructureOptions, observe, refine_points, tracks_of
 from ..tracks import Tracks

@@ -1,0 +1,143 @@
+"""The problem that adjusts one query's pose, and the estimate at its optimum.
+
+    min  sum_obs rho(|r_o|^2 / sigma_o^2) + xi^T C^-1 xi,
+
+over the query's pose, its points and small motions xi of the references, which a prior holds to their given poses. Its
+covariance C, by which neighbours move together and far references are held less, is found for each query from the
+references' observations (see `pose_errors`). The points are eliminated (see `bundle`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, RigidTransform
+
+from .bundle import Bundle, BundleProblem, bundle_of
+from .intrinsics import ContradictionOptions, intrinsics_evidence, keypoint_motion
+from .options import check_bounds
+from .perturbation import reprojection_errors_px, world_jacobian
+from .pose_errors import PoseErrorOptions, most_probable, pose_errors
+from .results import PointMatches, PoseEstimate, PoseStage, Structure
+from .structure import tracks_with_query
+from .uncertainty.covariance import UncertaintyOptions, adjusted_covariance
+from .views import PosedView, View
+
+LEAST_DAMPING = 1e-9
+"""Keeps the points determined where they are eliminated at the given poses."""
+
+
+@dataclass(frozen=True)
+class AdjustOptions:
+    """Options of the adjustment.
+
+    Attributes:
+        loss_scale_sigma: of the Cauchy loss, under which the influence of outliers vanishes.
+        error_inflation: factor by which standard deviations from the sum over residuals are typically too small; it
+            sets the weight of priors. The answer's covariance does not use it (see `uncertainty`).
+        inlier_px: as in the pose solver; the inliers of the answer are those of its own pose.
+        min_kept_share: an adjustment that keeps a smaller share of the inliers has diverged and is not used.
+        max_error_px: matches with a larger error under the initial pose are not used.
+        iterations: at most so many Levenberg-Marquardt steps.
+        min_decrease: stop when a step lowers the cost by a smaller share.
+        suspicion: when a parameter of the intrinsics is estimated with the pose. A large error leaves few inliers, of
+            which those with other errors are missing.
+        contradiction: when this estimate is used.
+        rounds: at most so many times an estimated parameter's photograph is read again.
+        pose_errors: of the errors of the references' poses.
+        uncertainty: of the answer's covariance.
+    """
+
+    loss_scale_sigma: float = 1.4
+    error_inflation: float = 2.0
+    inlier_px: float = 4.0
+    min_kept_share: float = 0.8
+    max_error_px: float = 8.0
+    iterations: int = 8
+    min_decrease: float = 1e-5
+    suspicion: ContradictionOptions = field(default_factory=lambda: ContradictionOptions(2.0, 0.06, 0.06, 0.15))
+    contradiction: ContradictionOptions = field(default_factory=ContradictionOptions)
+    rounds: int = 4
+    pose_errors: PoseErrorOptions = field(default_factory=PoseErrorOptions)
+    uncertainty: UncertaintyOptions = field(default_factory=UncertaintyOptions)
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "inlier_px min_kept_share loss_scale_sigma max_error_px", above=0)
+        check_bounds(self, "iterations min_decrease", above=0)
+        check_bounds(self, "rounds", at_least=2)  # the last one only reads the photograph again
+
+
+def pose_problem(
+    query: View,
+    references: Sequence[PosedView],
+    structure: Structure,
+    matches: PointMatches,
+    used: NDArray[np.intp],
+    world_from_query: RigidTransform,
+    options: AdjustOptions,
+) -> tuple[BundleProblem, Bundle]:
+    """The problem of one query without priors, and its start; `used` are the indices of the matches to use."""
+    views = [*references, PosedView("", "", query, world_from_query)]
+    tracks, chosen = tracks_with_query(structure, matches.point[used], matches.keypoint[used], len(references))
+    observations, start, depth_m = bundle_of(tracks, views, structure, chosen)
+    given = start.poses[:-1]
+    free = np.zeros((6 * len(references),) * 2)
+    problem = BundleProblem(observations, tracks.view, given, free, options.loss_scale_sigma)
+    centres = np.array([it.world_from_camera.translation for it in references])
+    observing = np.unique(tracks.view)[:-1]  # the last is the query
+    focal_px = float(np.median([references[i].view.camera.focal_x_px for i in observing]))
+    level_px = float(structure.noise.level_px)
+    errors = pose_errors(centres, given.rotation, world_from_query.translation, level_px, focal_px, depth_m, observing)
+    matrix, gradient, _ = problem.linearize(start).reduced(LEAST_DAMPING)
+    own, drift = most_probable(errors, matrix, gradient, options.pose_errors)
+    covariance = errors.covariance(own, drift)
+    return replace(problem, information=np.asarray(np.linalg.inv(covariance), np.float64)), start
+
+
+def with_intrinsics(problem: BundleProblem, bundle: Bundle, query: View) -> tuple[BundleProblem, Bundle]:
+    """The same problem and values with errors of the query's intrinsics as unknowns, without a prior on them."""
+    is_query = problem.view == len(problem.given.rotation)
+    observations = problem.observations
+    motion = keypoint_motion(query.camera, query.distortion, observations.pixel[is_query])
+    motion = motion / observations.sigma_px[is_query, None, None]
+    wider = replace(problem, keypoint_motion=motion, intrinsics_information=np.zeros(4), intrinsics_offset=np.zeros(4))
+    return wider, replace(bundle, intrinsics=np.zeros(4))
+
+
+def adjusted_estimate(
+    query: View,
+    structure: Structure,
+    matches: PointMatches,
+    used: NDArray[np.intp],
+    estimate: PoseEstimate,
+    problem: BundleProblem,
+    bundle: Bundle,
+    options: AdjustOptions,
+    intrinsics: tuple[View, Array, Array, Array],
+) -> PoseEstimate | None:
+    """The estimate at the optimum, its covariance without priors; None if it has diverged.
+
+    `intrinsics`: the query with its intrinsics as given, the errors that are removed from them, and the standard
+    deviations `prior_sigma` and `held_sigma` of `intrinsics_evidence`.
+    """
+    pose = bundle.world_from_query
+    pixels = query.features.keypoints[matches.keypoint].astype(np.float64)
+    points = structure.x_in_world.copy()
+    points[np.unique(matches.point[used])] = bundle.points
+    errors_px = reprojection_errors_px(query.camera, pose, points[matches.point], pixels)
+    inliers = errors_px < options.inlier_px
+    if inliers.sum() < max(1, options.min_kept_share * estimate.inliers.sum()):
+        return None
+    covariance = adjusted_covariance(problem, bundle, options.uncertainty)
+    if covariance is None:
+        return None
+    wider, there = with_intrinsics(problem, bundle, query)
+    matrix, gradient, _ = wider.linearize(there).reduced(LEAST_DAMPING)
+    evidence = intrinsics_evidence(matrix, gradient, *intrinsics, options.error_inflation, world_jacobian(pose))
+    if evidence is not None:
+        covariance = covariance + evidence.pose_covariance
+    return PoseEstimate(pose, PoseStage.REFINED, inliers, errors_px, covariance, is_adjusted=True, intrinsics=evidence)

@@ -1,0 +1,109 @@
+"""Intrinsics that the photograph contradicts are estimated with the pose.
+
+The most significant one first; then the photograph is read again with its value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array
+
+from .intrinsics import PRINCIPAL, ContradictionOptions, corrected_view
+from .optimize import MinimizeOptions, minimize
+from .perturbation import reprojection_errors_px
+from .pose_problem import AdjustOptions, adjusted_estimate, pose_problem, with_intrinsics
+from .priors.known import Priors
+from .results import PointMatches, PoseEstimate, Structure
+from .views import PosedView, View
+
+WIDE_SIGMA = np.array([0.3, 0.3, 0.3, 1.0])
+"""Of an estimated parameter: focal length and k1, and principal point as a share of the width."""
+MAX_HELD = 3.0
+"""An estimate that leaves the prior by more standard deviations has diverged."""
+LEAST_MATCHES = 20
+"""For a pose and intrinsics."""
+
+
+def recalibrated(
+    query: View,
+    references: Sequence[PosedView],
+    structure: Structure,
+    matches: PointMatches,
+    found: PoseEstimate,
+    options: AdjustOptions,
+    priors: Priors,
+    usual: Array,
+) -> PoseEstimate:
+    """The estimate with the parameters that the photograph contradicts; the one found if it contradicts none."""
+    held, is_held = usual.copy(), np.ones(4, bool)
+    wide = np.maximum(usual, WIDE_SIGMA * np.array([1, query.camera.width_px, query.camera.width_px, 1]))
+    while (worst := _contradicted(found, options.suspicion, is_held)) is not None:
+        is_held[list(worst)] = False
+        held[list(worst)] = wide[list(worst)]
+        better = _with_errors(query, references, structure, matches, found, options, priors, usual, held)
+        if better is None or better.intrinsics is None:
+            break
+        if not better.intrinsics.contradicted(options.contradiction)[list(worst)].any():
+            break
+        found = better
+    return found
+
+
+def _contradicted(
+    found: PoseEstimate, options: ContradictionOptions, is_held: NDArray[np.bool_]
+) -> tuple[int, ...] | None:
+    """The parameter, or both of the principal point, that the photograph contradicts most; of those that are held."""
+    evidence = found.intrinsics
+    if evidence is None:
+        return None
+    wrong = evidence.contradicted(options) & is_held
+    worst = int(np.argmax(np.where(wrong, np.abs(evidence.value) / evidence.sigma, 0.0)))
+    if not wrong[worst]:
+        return None
+    return PRINCIPAL if worst in PRINCIPAL else (worst,)
+
+
+def _with_errors(
+    query: View,
+    references: Sequence[PosedView],
+    structure: Structure,
+    matches: PointMatches,
+    found: PoseEstimate,
+    options: AdjustOptions,
+    priors: Priors,
+    usual: Array,
+    held: Array,
+) -> PoseEstimate | None:
+    """The estimate with errors of the intrinsics as unknowns, of prior standard deviations `held`; None if it fails."""
+    assert found.intrinsics is not None
+    errors, pose, view = found.intrinsics.removed, found.world_from_camera, found.view or query
+    steps = MinimizeOptions(options.iterations, options.min_decrease)
+    change: Array | None = None
+    for left in reversed(range(options.rounds)):
+        pixels = view.features.keypoints[matches.keypoint].astype(np.float64)
+        errors_px = reprojection_errors_px(view.camera, pose, structure.x_in_world[matches.point], pixels)
+        used = np.flatnonzero(errors_px < options.max_error_px)
+        if len(used) < LEAST_MATCHES:
+            return None
+        problem, start = pose_problem(view, references, structure, matches, used, pose, options)
+        problem = replace(problem, priors=priors, prior_weight=options.error_inflation**2)
+        if not left or (change is not None and (np.abs(change) < usual / 10).all()):
+            break
+        wider, there = with_intrinsics(problem, start, view)
+        wider = replace(wider, intrinsics_information=held**-2.0, intrinsics_offset=errors)
+        bundle = minimize(wider, there, steps)
+        pose, change = bundle.world_from_query, bundle.intrinsics
+        errors = errors + change
+        if np.abs(errors / held).max() > MAX_HELD:
+            return None
+        view = corrected_view(query, errors)
+    terms = (query, errors, usual, held)
+    before = replace(found, inliers=errors_px < options.inlier_px)
+    bundle = minimize(problem, start, steps)
+    better = adjusted_estimate(view, structure, matches, used, before, problem, bundle, options, terms)
+    return better and replace(better, view=view)
