@@ -26,7 +26,7 @@ $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check uv
 	$(INSTALL) $(TORCH)
-	$(INSTALL) --editable '.[server,tools,networks,otel,postgres,ray,view,dev]'
+	$(INSTALL) --editable '.[server,tools,networks,otel,postgres,ray,view,gateway,dev]'
 	touch $@
 
 setup: $(VENV)/.installed  ## Create .venv with everything

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Iterator
+from copy import copy
+from dataclasses import replace
 from functools import wraps
 from types import TracebackType
 from typing import Any, Concatenate, ParamSpec, TypeVar
@@ -86,6 +88,19 @@ class Client:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.close()
+
+    def acting_for(self, token: str | None, client_id: str = "") -> Client:
+        """A client on the same connection with another token and client id, for programs that serve several users.
+
+        It ends with this client.
+
+        Raises:
+            ValueError: see `ConnectOptions`.
+        """
+        other = copy(self)
+        other.options = replace(self.options, token=token, client_id=client_id)
+        other._methods = Methods(self._channel, other.options.metadata())
+        return other
 
     def close(self) -> None:
         """Ends the connection; calls still running fail."""

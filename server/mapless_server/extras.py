@@ -11,8 +11,11 @@ _EXTRA_OF = {
     "matplotlib": "tools",
     "opentelemetry": "otel",
     "PIL": "networks",
+    "python_multipart": "gateway",
+    "starlette": "gateway",
     "torch": "networks",
     "transformers": "superpoint",
+    "uvicorn": "gateway",
     "viser": "view",
 }
 """By the name under which a package is imported; all others belong to `server`."""

@@ -66,7 +66,7 @@ def main() -> None:
     if arguments.input is not None:
         print("accepted" if load(arguments.target).check(arguments.input.read_bytes()) else "refused")
         return
-    with atheris.instrument_imports(include=["mapless", "mapless_server"]):
+    with atheris.instrument_imports(include=["mapless", "mapless_server", "mapless_tools"]):
         target = load(arguments.target)
 
     seeds = target.seeds()

@@ -18,6 +18,7 @@ TARGETS = {
     "localization": "request validation",
     "references": "request validation",
     "metadata": "request validation",
+    "gateway": "request validation",
     "colmap": "importers",
     "captures": "importers",
     "benchmarks": "importers",

@@ -48,6 +48,7 @@ def localize(
     allow_coarse: bool = False,
     coverage: float = 0.0,
     ignore_calibration: bool = False,
+    confidential: bool = False,
     axes: Axes | str = "",
     include_debug: bool = False,
     capture_time: datetime | None = None,
@@ -72,6 +73,7 @@ def localize(
             `LocalizationResult.pose_stage` "COARSE" and no covariance, instead of raising `DeadlineExceeded`.
         coverage: share of right answers to accept, above 0 and below 1; 0 for the server's default.
         ignore_calibration: whether radii and trust are to be the generic ones, as if the scene had no calibration.
+        confidential: whether the photograph serves this answer alone: it is neither captured nor shown to watchers.
         axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: of `session_from_camera` and of
             `LocalizationResult.in_axes`.
         include_debug: whether the answer includes the matches that support it.
@@ -96,6 +98,7 @@ def localize(
             include_debug=include_debug,
             coverage=coverage,
             ignore_calibration=ignore_calibration,
+            confidential=confidential,
         ),
     )
     set_priors(request, priors or Priors())
@@ -159,6 +162,7 @@ def localize_rig(
     *,
     reference_count: int = 0,
     coverage: float = 0.0,
+    confidential: bool = False,
     capture_time: datetime | None = None,
     session_from_rig: RigidTransform | None = None,
     timeout_s: float | None = None,
@@ -172,6 +176,7 @@ def localize_rig(
         scene: the scene to localize in.
         reference_count: number of references that the server chooses for each photograph; 0 for its default.
         coverage: see `localize`; holds for the joint pose, and for each photograph alone.
+        confidential: see `localize`.
         capture_time: time of the photographs, with time zone; returned with the answer.
         session_from_rig: the device's own pose of the rig at that time, OpenCV's axes; used for
             `RigLocalization.world_from_session`.
@@ -180,7 +185,7 @@ def localize_rig(
     request = pb.LocalizeRigRequest(
         scene=scene_name(scene),
         images=[_rig_image_to_message(image, scene) for image in images],
-        options=pb.LocalizeOptions(reference_count=reference_count, coverage=coverage),
+        options=pb.LocalizeOptions(reference_count=reference_count, coverage=coverage, confidential=confidential),
     )
     if capture_time is not None:
         request.capture_time.FromDatetime(capture_time)
@@ -197,6 +202,7 @@ def localize_sequence(
     estimate_session_scale: bool = False,
     reference_count: int = 0,
     coverage: float = 0.0,
+    confidential: bool = False,
     axes: Axes | str = "",
     timeout_s: float | None = None,
 ) -> Exchange[SequenceLocalization | GroupRejected]:
@@ -211,6 +217,7 @@ def localize_sequence(
         estimate_session_scale: whether the scale of the device's poses is unknown; the device must have moved.
         reference_count: number of references that the server chooses for each photograph; 0 for its default.
         coverage: see `localize`; holds for the joint pose, and for each photograph alone.
+        confidential: see `localize`.
         axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: of the device's poses and of
             `SequenceLocalization.world_from_session`.
         timeout_s: deadline of the call.
@@ -220,7 +227,10 @@ def localize_sequence(
         frames=[_frame_to_message(frame, scene) for frame in frames],
         estimate_session_scale=estimate_session_scale,
         options=pb.LocalizeOptions(
-            reference_count=reference_count, coverage=coverage, axes=wire.enum_value(pb.Axes, axes)
+            reference_count=reference_count,
+            coverage=coverage,
+            confidential=confidential,
+            axes=wire.enum_value(pb.Axes, axes),
         ),
     )
     response = yield Call(f"{SERVICE}/LocalizeSequence", request, pb.LocalizeSequenceResponse, timeout_s)

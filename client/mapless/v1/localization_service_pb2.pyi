@@ -255,7 +255,7 @@ class PosePrior(_message.Message):
     def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ...) -> None: ...
 
 class LocalizeOptions(_message.Message):
-    __slots__ = ("variant", "scale_strategy", "reference_count", "allow_coarse", "rerank_references", "axes", "include_debug", "coverage", "ignore_calibration")
+    __slots__ = ("variant", "scale_strategy", "reference_count", "allow_coarse", "rerank_references", "axes", "include_debug", "coverage", "ignore_calibration", "confidential")
     VARIANT_FIELD_NUMBER: _ClassVar[int]
     SCALE_STRATEGY_FIELD_NUMBER: _ClassVar[int]
     REFERENCE_COUNT_FIELD_NUMBER: _ClassVar[int]
@@ -265,6 +265,7 @@ class LocalizeOptions(_message.Message):
     INCLUDE_DEBUG_FIELD_NUMBER: _ClassVar[int]
     COVERAGE_FIELD_NUMBER: _ClassVar[int]
     IGNORE_CALIBRATION_FIELD_NUMBER: _ClassVar[int]
+    CONFIDENTIAL_FIELD_NUMBER: _ClassVar[int]
     variant: Variant
     scale_strategy: ScaleStrategy
     reference_count: int
@@ -274,7 +275,8 @@ class LocalizeOptions(_message.Message):
     include_debug: bool
     coverage: float
     ignore_calibration: bool
-    def __init__(self, variant: _Optional[_Union[Variant, str]] = ..., scale_strategy: _Optional[_Union[ScaleStrategy, str]] = ..., reference_count: _Optional[int] = ..., allow_coarse: bool = ..., rerank_references: bool = ..., axes: _Optional[_Union[Axes, str]] = ..., include_debug: bool = ..., coverage: _Optional[float] = ..., ignore_calibration: bool = ...) -> None: ...
+    confidential: bool
+    def __init__(self, variant: _Optional[_Union[Variant, str]] = ..., scale_strategy: _Optional[_Union[ScaleStrategy, str]] = ..., reference_count: _Optional[int] = ..., allow_coarse: bool = ..., rerank_references: bool = ..., axes: _Optional[_Union[Axes, str]] = ..., include_debug: bool = ..., coverage: _Optional[float] = ..., ignore_calibration: bool = ..., confidential: bool = ...) -> None: ...
 
 class LocalizeResponse(_message.Message):
     __slots__ = ("localization", "rejection", "diagnostics", "capture_time", "session_from_camera", "debug")

@@ -104,7 +104,8 @@ class LocalizationServiceServicer(object):
 
     def Localize(self, request, context):
         """Localizes one photograph. Safe to retry. Stores nothing, unless the server's operator has it capture calls of this and
-        the next three methods: then `Diagnostics.captured` is true, and the server keeps its photographs for a time.
+        the next three methods: then `Diagnostics.captured` is true, and the server keeps its photographs for a time. It
+        never captures a call with LocalizeOptions.confidential.
 
         "I could not localize this" is an answer (Rejection), not an error. Errors:
 

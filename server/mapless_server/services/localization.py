@@ -137,7 +137,8 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         if request.options.include_debug and debug is not None:
             response.debug.CopyFrom(debug)
         self._capture(request, response, call, [(query, result)])
-        self._watchers.publish(query.scene_key, request, response, debug)
+        if not request.options.confidential:
+            self._watchers.publish(query.scene_key, request, response, debug)
         return response
 
     async def LocalizeRig(self, request: pb.LocalizeRigRequest, call: Call) -> pb.LocalizeRigResponse:
@@ -232,7 +233,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         )
 
     def _capture(self, request: Request, response: Response, call: Call, parts: Sequence[tuple[Query, Result]]) -> None:
-        if self._recorder is not None:
+        if self._recorder is not None and not request.options.confidential:
             self._recorder.record(request, response, call, parts, self._engine().tiers)
 
 

@@ -14,6 +14,7 @@ from mapless_server.extras import missing_package
 from mapless_server.serve.command import fail, serve_command
 from mapless_tools.calibrate.command import calibrate_command
 from mapless_tools.evaluate.cli import evaluate_command
+from mapless_tools.gateway.command import gateway_command
 from mapless_tools.ingest.command import ImportCommand, export_command, import_command
 from mapless_tools.load.command import load_app
 from mapless_tools.replay.command import replay_command
@@ -77,6 +78,7 @@ _add_tool("calibrate", calibrate_command)
 _add_tool("evaluate", evaluate_command)
 _add_tool("replay", replay_command)
 _add_tool("view", view_command, extra="view")
+_add_tool("gateway", gateway_command, extra="gateway")
 _add_tool("demo", demo_command)
 _add_tool("bench", bench_command)
 _add_tool("bench-network", bench_network_command)

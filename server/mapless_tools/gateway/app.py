@@ -1,0 +1,215 @@
+"""The gateway's HTTP interface: what is served under which path."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.middleware.cors import CORSMiddleware
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import HTMLResponse, JSONResponse, Response
+from starlette.routing import BaseRoute, Mount, Route
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp
+
+from mapless import MaplessError, Rejected, Unavailable
+from mapless.aio import Client
+from mapless.exchange import Call, Exchange
+from mapless.names import parse_scene_name, scene_name
+from mapless.v1 import localization_service_pb2 as pb
+
+from . import geopose, openapi, plain
+from .failures import Failure, of_server
+from .guard import Guard, GuardOptions
+
+LOCALIZE = "mapless.v1.LocalizationService/Localize"
+_SENT_HEADERS = (
+    "authorization",
+    "connect-protocol-version",
+    "connect-timeout-ms",
+    "content-type",
+    "grpc-timeout",
+    "x-client-id",
+    "x-grpc-web",
+    "x-mapless-scene",
+    "x-request-id",
+    "x-user-agent",
+)
+"""What browsers may send besides what they may always."""
+_READ_HEADERS = ("grpc-message", "grpc-status", "grpc-status-details-bin", "retry-after", "x-request-id")
+_PREFLIGHT_S = 7200
+Handler = Callable[[Request], Awaitable[Response]]
+
+
+@dataclass(frozen=True)
+class GatewayOptions:
+    """What is served, and to whom.
+
+    Attributes:
+        scene: of requests that name none; "" for none.
+        pages: folder that is served at "/"; None for none.
+        guard: limits of what is taken.
+    """
+
+    scene: str = ""
+    pages: Path | None = None
+    guard: GuardOptions = field(default_factory=GuardOptions)
+
+
+def gateway(connect: Callable[[], Client], options: GatewayOptions, rpc: ASGIApp | None = None) -> ASGIApp:
+    """The application.
+
+    Args:
+        connect: makes the client, when the event loop runs.
+        options: what is served.
+        rpc: what serves browsers' calls, at the paths of gRPC; None for nothing.
+    """
+    handlers = _Handlers(connect, options)
+    routes: list[BaseRoute] = [
+        Route("/geopose", handlers.status, methods=["GET"]),
+        Route("/geopose", handlers.geopose, methods=["POST"]),
+        Route("/scenes/{scene}/geopose", handlers.status, methods=["GET"]),
+        Route("/scenes/{scene}/geopose", handlers.geopose, methods=["POST"]),
+        Route("/v1/localize", handlers.localize, methods=["POST"]),
+        Route("/openapi.json", handlers.description, methods=["GET"]),
+        Route("/docs", handlers.page, methods=["GET"]),
+    ]
+    if rpc is not None:
+        routes += [Mount(f"/mapless.v1.{service}", rpc) for service in ("LocalizationService", "ReferenceService")]
+    if options.pages is not None:
+        routes.append(Mount("/", StaticFiles(directory=options.pages, html=True)))
+    cors = Middleware(
+        CORSMiddleware,
+        allow_origins=options.guard.origins,
+        allow_methods=["GET", "POST"],
+        allow_headers=_SENT_HEADERS,
+        expose_headers=_READ_HEADERS,
+        max_age=_PREFLIGHT_S,
+    )
+    errors: dict[Any, Any] = {404: _not_found, 405: _not_allowed}
+    return Guard(Starlette(routes=routes, middleware=[cors], exception_handlers=errors), options.guard)
+
+
+def _handler(handle: Callable[[_Handlers, Request], Awaitable[Response]]) -> Callable[[_Handlers, Request], Any]:
+    """Answers errors with their JSON; here, so that pages of other origins can read it."""
+
+    @wraps(handle)
+    async def handled(self: _Handlers, request: Request) -> Response:
+        try:
+            return await handle(self, request)
+        except Failure as failure:
+            return failure.response()
+        except MaplessError as error:
+            return of_server(error).response()
+        except ClientDisconnect:  # nobody reads it
+            return Failure("the request ended before its end", reason="DISCONNECTED").response()
+
+    return handled
+
+
+@dataclass
+class _Handlers:
+    """Answers requests by calls of a client."""
+
+    connect: Callable[[], Client]
+    options: GatewayOptions
+    _client: Client | None = None
+
+    def _client_for(self, request: Request) -> Client:
+        """With the caller's token, where the request has one."""
+        if self._client is None:
+            self._client = self.connect()
+        given, identity = request.headers.get("authorization"), request.headers.get("x-client-id", "")
+        if given is None and not identity:
+            return self._client
+        token = self._client.options.token
+        if given is not None:
+            scheme, _, token = given.partition(" ")
+            if scheme.lower() != "bearer":
+                raise Failure("must be: Bearer TOKEN", 401, reason="UNAUTHENTICATED", field="authorization")
+        try:
+            return self._client.acting_for(token, identity)
+        except ValueError as error:
+            raise Failure(str(error), 401, reason="UNAUTHENTICATED", field="authorization") from None
+
+    def _scene_of(self, request: Request) -> str:
+        scene = request.path_params.get("scene", self.options.scene)
+        if not scene:
+            raise Failure("this gateway has no scene of its own: use /scenes/SCENE/geopose", 404, reason="NO_SCENE")
+        try:
+            parse_scene_name(name := scene_name(scene))
+        except ValueError as error:
+            raise Failure(str(error), field="scene") from None
+        return name
+
+    @_handler
+    async def status(self, request: Request) -> Response:
+        """Whether the server behind serves, as clients of the protocol ask."""
+        if not await self._client_for(request).is_serving():
+            raise of_server(Unavailable("UNAVAILABLE", "the server does not serve", retry_after_s=1.0))
+        return JSONResponse({"status": "running"})
+
+    @_handler
+    async def geopose(self, request: Request) -> Response:
+        """A request of the GeoPose Protocol."""
+        geopose.check_version(request.headers.get("accept", ""))
+        client, scene = self._client_for(request), self._scene_of(request)
+        asked = await asyncio.to_thread(geopose.read_request, await request.body())
+        datum = (await client.get_scene(scene)).datum
+        if datum is None:
+            raise Failure(
+                f"{scene} has no datum, so its poses have no place on the Earth", 409, reason="NO_DATUM", field="scene"
+            )
+        photograph = await asyncio.to_thread(geopose.photograph_of, asked, datum)
+        try:
+            answer = await client.localize(
+                photograph.image,
+                photograph.camera,
+                scene,
+                priors=photograph.priors,
+                confidential=photograph.is_confidential,
+            )
+        except MaplessError as error:
+            name, dot, rest = (error.field or "").partition(".")
+            raise of_server(error, photograph.prior_fields.get(name, name) + dot + rest) from None
+        if isinstance(answer, Rejected):
+            hint = answer.hint.message if answer.hint else None
+            raise Failure(answer.message, 422, reason=answer.reason, hint=hint)
+        response = geopose.response_to(photograph, answer)
+        return JSONResponse(response, media_type=geopose.MEDIA_TYPE)
+
+    @_handler
+    async def localize(self, request: Request) -> Response:
+        """A photograph as a form."""
+        client = self._client_for(request)
+        asked = await plain.read_form(request.headers, request.stream(), self.options.scene)
+        return JSONResponse(await asyncio.to_thread(plain.to_json, await client.run(_localized(asked))))
+
+    async def description(self, request: Request) -> Response:
+        """What is served, for programs."""
+        return JSONResponse(openapi.description())
+
+    async def page(self, request: Request) -> Response:
+        """What is served, for people."""
+        return HTMLResponse(openapi.page())
+
+
+def _localized(request: pb.LocalizeRequest) -> Exchange[pb.LocalizeResponse]:
+    """The answer as the server sends it."""
+    response: pb.LocalizeResponse = yield Call(LOCALIZE, request, pb.LocalizeResponse)
+    return response
+
+
+async def _not_found(request: Request, error: Exception) -> Response:
+    return Failure(f"nothing is served at {request.url.path[:200]!a}", 404, reason="NOT_FOUND").response()
+
+
+async def _not_allowed(request: Request, error: Exception) -> Response:
+    message = f"{request.url.path[:200]!a} does not take {request.method[:20]!a}"
+    return Failure(message, 405, reason="METHOD_NOT_ALLOWED").response()

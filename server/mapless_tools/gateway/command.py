@@ -1,0 +1,72 @@
+"""`mapless-server gateway`: the GeoPose Protocol, plain HTTP and calls of browsers."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mapless_server.serve.command import fail
+from mapless_tools.connection import Connection, with_connection_flags
+
+
+@with_connection_flags
+def gateway_command(
+    scene: Annotated[str, typer.Option(help="Id of the scene of requests that name none.")] = "",
+    host: Annotated[str, typer.Option(help="Address that it listens on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port; 0 takes any free one.")] = 8080,
+    allow_origin: Annotated[
+        list[str] | None,
+        typer.Option(help="Origin whose pages may call, https://app.example; may be repeated; * for all."),
+    ] = None,
+    pages: Annotated[Path | None, typer.Option(help="Folder of pages to serve, such as client/web/dist.")] = None,
+    max_body_mib: Annotated[float, typer.Option(help="Largest request.")] = 32.0,
+    max_requests: Annotated[int, typer.Option(help="Requests at a time; further ones are refused.")] = 32,
+    tls_certificate: Annotated[Path | None, typer.Option(help="Of the gateway, PEM; headsets need it.")] = None,
+    tls_key: Annotated[Path | None, typer.Option(help="Its key, PEM.")] = None,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Listen beyond this machine without TLS, or to a server without tokens.")
+    ] = False,
+    *,
+    connection: Connection,
+) -> None:
+    """Serve HTTP in front of a server: GeoPose Protocol 2, a form for curl, gRPC-Web and Connect for browsers.
+
+    A token given here is used for requests of the GeoPose Protocol and of the form that have none of their own, never
+    for the calls of browsers.
+    """
+    from mapless import MaplessError
+    from mapless_server.extras import install_hint
+    from mapless_server.serve.signals import terminable
+    from mapless_server.settings import ConfigError, load_settings
+    from mapless_tools.child import ServerFailed
+    from mapless_tools.connection import reachable
+
+    try:
+        from .serving import Binding, run
+    except ImportError as error:
+        fail(install_hint(error))
+    from .app import GatewayOptions
+    from .guard import GuardOptions
+
+    try:
+        binding = Binding(host, port, tls_certificate, tls_key, insecure)
+        guard = GuardOptions(tuple(allow_origin or ()), binding.is_loopback, round(max_body_mib * 2**20), max_requests)
+        if pages is not None and not (pages / "index.html").is_file():
+            raise ValueError(
+                f"--pages {pages} holds no index.html; in client/web, build it by npm install && npm run build"
+            )
+        options = GatewayOptions(scene, pages, guard)
+        settings = load_settings({}).settings
+        with terminable(), reachable(connection, settings) as (server, connect):
+            if not connection.address:
+                print(f"a server was started at {server}", file=sys.stderr)
+            run(server, connect, options, binding)
+    except (ValueError, ConfigError) as error:
+        fail(str(error))
+    except (MaplessError, ServerFailed, OSError) as error:
+        fail(str(error), code=1)
+    except KeyboardInterrupt:
+        raise typer.Exit(130) from None

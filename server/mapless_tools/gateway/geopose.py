@@ -1,0 +1,373 @@
+"""Open AR Cloud's GeoPose Protocol, version 2: a request to a photograph with priors, an answer to a response.
+
+The protocol has no description for machines; its authority is github.com/OpenArCloud/oscp-geopose-protocol (README.md
+and the Python library) and the schemas of gpp-access. What clients leave out or fill with zeros is taken as unknown.
+"""
+# ruff: noqa: N815  members carry the names of the protocol
+
+from __future__ import annotations
+
+import base64
+import binascii
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import cv2
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from mapless import Camera, Datum, GeoPositionPrior, LocalizationResult, PosePrior, Priors
+from mapless.geodesy import GeoPose, pose_from_geopose
+from mapless_server.errors import InvalidArgument
+from mapless_server.images import ImageLimits
+from mapless_server.images.decode import image_size
+from mapless_tools.ingest.formats.colmap.cameras import PARAMETERS, ColmapCamera
+
+from .failures import Failure
+
+MEDIA_TYPE = "application/vnd.oscp+json;version=2.0"
+CAMERA = "sensorReadings.cameraReadings"
+_MAX_VALUES = 100_000
+"""Of a request's JSON, whose objects take ten times the memory of their text; requests of devices have hundreds."""
+_FUTURE_S = 300.0
+"""Clocks of devices differ from ours by less."""
+_WALK_M_PER_S = 2.0
+_TURN_DEG_PER_S = 90.0
+"""How fast a prior loses its worth: a person walks and looks around."""
+_OLD_S = 60.0
+"""Older priors say nothing that a photograph does not."""
+_UNKNOWN_SIGMA_M = 50.0
+"""Of a position without an accuracy: that of a receiver among houses."""
+_SIGMAS_OF_68 = 1.5
+"""A 68 % radius in the plane, in standard deviations."""
+_MAX_SIGMA_M = 1e4
+
+Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+Text = Annotated[str, Field(max_length=1000)]
+Ignored = Any
+
+
+class _Message(BaseModel):
+    """Members that are not named are ignored: clients send some of their own."""
+
+    model_config = ConfigDict(extra="ignore")
+
+
+class Position(_Message):
+    """Of a GeoPose: WGS84, degrees and metres above the ellipsoid."""
+
+    lat: Annotated[Number, Field(ge=-90, le=90)]
+    lon: Annotated[Number, Field(ge=-180, le=180)]
+    h: Annotated[Number, Field(ge=-12_000, le=100_000)]
+
+
+class Quaternion(_Message):
+    """Of a GeoPose: turns x forward, y left, z up to east, north, up."""
+
+    x: Number
+    y: Number
+    z: Number
+    w: Number
+
+
+class GeoPoseMessage(_Message):
+    """OGC GeoPose 1.0, Basic-Quaternion."""
+
+    position: Position
+    quaternion: Quaternion
+
+
+class Accuracy(_Message):
+    """Radii that contain the error in 68 % of cases: metres and degrees."""
+
+    position: Number
+    orientation: Number
+
+
+class Response(_Message):
+    """An answer, and one that a request gives back as a prior."""
+
+    id: Text
+    timestamp: Number
+    accuracy: Accuracy
+    type: Text = "geopose"
+    geopose: GeoPoseMessage
+
+
+class CameraParameters(_Message):
+    """COLMAP's model and its parameters; the centre of the top-left pixel is (0.5, 0.5)."""
+
+    model: Text = "UNKNOWN"
+    modelParams: Annotated[list[Number], Field(max_length=20)] = []
+
+
+class Orientation(_Message):
+    """How the device was held; the pose is that of the raster as it is sent."""
+
+    mirrored: bool = False
+
+
+class CameraReading(_Message):
+    """A photograph."""
+
+    timestamp: Number = 0.0
+    sensorId: Text = ""
+    privacy: Ignored = None
+    imageFormat: Text = "JPG"
+    size: Annotated[list[Number], Field(min_length=2, max_length=2)] | None = None
+    imageBytes: str
+    imageOrientation: Orientation | None = None
+    params: CameraParameters | None = None
+
+
+class GeolocationReading(_Message):
+    """A position of a receiver; `heading` and `speed` are ignored."""
+
+    timestamp: Number = 0.0
+    privacy: Ignored = None
+    latitude: Annotated[Number, Field(ge=-90, le=90)]
+    longitude: Annotated[Number, Field(ge=-180, le=180)]
+    altitude: Number | None = None
+    accuracy: Number | None = None
+    altitudeAccuracy: Number | None = None
+
+
+class SensorReadings(_Message):
+    """The photograph and the position are used; readings of other sensors are taken and ignored."""
+
+    cameraReadings: Annotated[list[CameraReading], Field(max_length=100, fail_fast=True)] = []
+    geolocationReadings: Annotated[list[GeolocationReading], Field(max_length=1000, fail_fast=True)] = []
+    wiFiReadings: Ignored = None
+    bluetoothReadings: Ignored = None
+    accelerometerReadings: Ignored = None
+    gyroscopeReadings: Ignored = None
+    magnetometerReadings: Ignored = None
+
+
+class Request(_Message):
+    """One photograph, and what is known of where it was taken."""
+
+    id: Text
+    timestamp: Number
+    type: Literal["geopose"] = "geopose"
+    sensors: Ignored = None
+    sensorReadings: SensorReadings
+    priorPoses: Annotated[list[Response], Field(max_length=1000, fail_fast=True)] = []
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """What a request asks.
+
+    Attributes:
+        request_id, timestamp_ms: of the response: those of the request and of the photograph.
+        image: the file's bytes.
+        camera: that took it.
+        priors: what is known of the pose.
+        prior_fields: where the request has each prior, by the field of the call.
+        is_confidential: whether the photograph serves the answer alone.
+    """
+
+    request_id: str
+    timestamp_ms: float
+    image: bytes
+    camera: Camera
+    priors: Priors
+    prior_fields: dict[str, str]
+    is_confidential: bool
+
+
+def check_version(accept: str) -> None:
+    """Refuses a client that accepts another version of the protocol alone."""
+    for part in accept.replace(" ", "").lower().split(","):
+        kind, _, parameters = part.partition(";")
+        if kind == "application/vnd.oscp+json":
+            version = dict(it.split("=", 1) for it in parameters.split(";") if "=" in it).get("version", "2.0")
+            if version.split(".")[0] != "2":
+                raise Failure(
+                    f"version {version[:20]} of the protocol is not served, 2.0 is",
+                    406,
+                    reason="VERSION",
+                    field="accept",
+                )
+
+
+def read_request(body: bytes) -> Request:
+    """The request of a body; Failure names what is wrong, and where."""
+    if sum(map(body.count, (b",", b"[", b"{"))) > _MAX_VALUES:
+        raise Failure(f"the JSON has more than {_MAX_VALUES} values")
+    try:
+        return Request.model_validate_json(body)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+        where = _path(first["loc"])
+        if where == "sensorReadings" and first["type"] == "model_type" and b'"cameraReadings"' not in body:
+            raise Failure("must be an object: version 1 of the protocol is not served, 2.0 is", field=where) from None
+        raise Failure(f"{where or 'the body'}: {first['msg']}", field=where) from None
+
+
+def photograph_of(request: Request, datum: Datum, now_s: float | None = None) -> Photograph:
+    """The photograph of a request for a scene with this datum; Failure names what is wrong, and where."""
+    readings, now_ms = request.sensorReadings, 1000 * (time.time() if now_s is None else now_s)
+    _check_past(request.timestamp, now_ms, "timestamp")
+    cameras = [(i, it) for i, it in enumerate(readings.cameraReadings) if it.imageFormat.upper() != "DEPTH"]
+    if len(cameras) != 1:
+        raise Failure(f"one photograph is localized at a time, the request has {len(cameras)}", field=CAMERA)
+    ((i, reading),) = cameras
+    where = f"{CAMERA}[{i}]"
+    _check_past(reading.timestamp, now_ms, f"{where}.timestamp")
+    taken_ms = reading.timestamp or request.timestamp
+    image, camera = _image_of(reading, where)
+    geo, geo_field = _position_prior(readings.geolocationReadings, taken_ms, now_ms)
+    pose, pose_field = _pose_prior(request.priorPoses, taken_ms, now_ms, datum)
+    return Photograph(
+        request.id,
+        taken_ms,
+        image,
+        camera,
+        Priors(geo_position=geo, pose=pose),
+        {
+            "image": f"{where}.imageBytes",
+            "intrinsics": f"{where}.params",
+            "geo_position_prior": geo_field,
+            "pose_prior": pose_field,
+        },
+        # The protocol has no words for its policies, so none of them is read as leave to keep a photograph.
+        any(it is not None for it in (reading.privacy, *(geo.privacy for geo in readings.geolocationReadings))),
+    )
+
+
+def response_to(photograph: Photograph, answer: LocalizationResult) -> dict[str, Any]:
+    """The protocol's response; Failure for an answer without a place on the Earth."""
+    if answer.geo_pose is None or answer.accuracy is None:
+        raise Failure("the answer has no place on the Earth", 502, reason="MALFORMED_ANSWER")
+    return {
+        "id": photograph.request_id,
+        "timestamp": photograph.timestamp_ms,
+        "accuracy": {"position": answer.accuracy.position_68_m, "orientation": answer.accuracy.rotation_68_deg},
+        "type": "geopose",
+        "geopose": answer.geo_pose.to_json(),
+    }
+
+
+def _image_of(reading: CameraReading, where: str) -> tuple[bytes, Camera]:
+    text = reading.imageBytes
+    if text.startswith("data:"):
+        text = text.partition(",")[2]
+    try:
+        image = base64.b64decode(text.encode("ascii"), validate=True)
+    except (binascii.Error, UnicodeEncodeError) as error:
+        raise Failure(f"is not base64: {error}", field=f"{where}.imageBytes") from None
+    if reading.imageOrientation is not None and reading.imageOrientation.mirrored:
+        raise Failure("a mirrored photograph cannot be localized", field=f"{where}.imageOrientation.mirrored")
+    size = None if reading.size is None or not any(reading.size) else tuple(reading.size)
+    if size is not None and any(it < 1 or it % 1 for it in size):
+        raise Failure("must be two positive whole numbers: width and height, pixels", field=f"{where}.size")
+    channels = {"RGBA32": 4, "GRAY8": 1}.get(reading.imageFormat.upper())
+    if channels is not None and size is not None and len(image) == size[0] * size[1] * channels:
+        image = _encoded(image, int(size[0]), int(size[1]), channels)
+    try:
+        width_px, height_px = image_size(image, ImageLimits())
+    except InvalidArgument as error:
+        raise Failure(str(error), reason=error.reason, field=f"{where}.imageBytes") from None
+    if size not in (None, (width_px, height_px)):
+        given = "x".join(f"{it:g}" for it in size or ())
+        raise Failure(f"the image is {width_px}x{height_px} pixels, not {given}", field=f"{where}.size")
+    return image, _camera_of(reading.params or CameraParameters(), width_px, height_px, f"{where}.params")
+
+
+def _encoded(pixels: bytes, width_px: int, height_px: int, channels: int) -> bytes:
+    """A PNG of pixels; what is too small for one is left as it is."""
+    if not pixels:
+        return pixels
+    raster = np.frombuffer(pixels, np.uint8).reshape(height_px, width_px, channels)
+    bgr = cv2.cvtColor(raster, cv2.COLOR_RGBA2BGR) if channels == 4 else raster
+    _, png = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    return png.tobytes()
+
+
+def _camera_of(given: CameraParameters, width_px: int, height_px: int, where: str) -> Camera:
+    model = given.model.upper()
+    if model not in PARAMETERS:
+        raise Failure(
+            f"the camera's intrinsics are needed: one of COLMAP's models and its parameters, not {given.model[:40]!a}",
+            field=f"{where}.model",
+        )
+    names = PARAMETERS[model]
+    if len(given.modelParams) != len(names):
+        raise Failure(
+            f"{model} has {len(names)} parameters ({', '.join(names)}), given are {len(given.modelParams)}",
+            field=f"{where}.modelParams",
+        )
+    try:
+        return ColmapCamera(1, model, width_px, height_px, given.modelParams).camera()
+    except ValueError as error:
+        raise Failure(str(error), field=where) from None
+
+
+def _position_prior(
+    readings: Sequence[GeolocationReading], taken_ms: float, now_ms: float
+) -> tuple[GeoPositionPrior | None, str]:
+    """The prior of the reading that is nearest to the photograph in time, and its field; without an age it has none."""
+    found: list[tuple[float, int]] = []
+    for i, reading in enumerate(readings):
+        _check_past(reading.timestamp, now_ms, f"sensorReadings.geolocationReadings[{i}].timestamp")
+        age_s = abs(taken_ms - reading.timestamp) / 1000 if reading.timestamp else 0.0
+        if age_s <= _OLD_S:
+            found.append((age_s, i))
+    if not found:
+        return None, ""
+    age_s, i = min(found)
+    reading = readings[i]
+    accuracy_m = reading.accuracy or 0.0
+    sigma_m = accuracy_m / _SIGMAS_OF_68 if accuracy_m > 0 else _UNKNOWN_SIGMA_M
+    sigma_m = min(max(math.hypot(sigma_m, _WALK_M_PER_S * age_s), 0.1), _MAX_SIGMA_M)
+    # Many devices give a height of 0, or one above the sea, and no accuracy of it.
+    knows_height = reading.altitude is not None and (reading.altitudeAccuracy or 0.0) > 0
+    height = (
+        (reading.altitude, min(max(reading.altitudeAccuracy or 0.0, 0.1), _MAX_SIGMA_M))
+        if knows_height and -12_000 <= (reading.altitude or 0.0) <= 100_000
+        else (None, 0.0)
+    )
+    prior = GeoPositionPrior(reading.latitude, reading.longitude, sigma_m, *height)
+    return prior, f"sensorReadings.geolocationReadings[{i}]"
+
+
+def _pose_prior(
+    earlier: Sequence[Response], taken_ms: float, now_ms: float, datum: Datum
+) -> tuple[PosePrior | None, str]:
+    """The prior of the newest earlier response, and its field: less certain for each second since."""
+    for i, it in enumerate(earlier):
+        _check_past(it.timestamp, now_ms, f"priorPoses[{i}].timestamp")
+    if not earlier:
+        return None, ""
+    i = max(range(len(earlier)), key=lambda i: earlier[i].timestamp)
+    newest, where = earlier[i], f"priorPoses[{i}]"
+    age_s = abs(taken_ms - newest.timestamp) / 1000
+    accuracy = newest.accuracy
+    if age_s > _OLD_S or not (0 <= accuracy.position <= _MAX_SIGMA_M and 0 <= accuracy.orientation <= 180):
+        return None, ""
+    try:
+        pose = GeoPose.from_json(newest.geopose.model_dump())
+        world_from_camera = pose_from_geopose(pose, datum)
+    except ValueError as error:
+        raise Failure(str(error), field=f"{where}.geopose") from None
+    sigma_m = max(math.hypot(accuracy.position, _WALK_M_PER_S * age_s), 0.01)
+    sigma = math.radians(min(max(math.hypot(accuracy.orientation, _TURN_DEG_PER_S * age_s), 0.1), 180.0))
+    return PosePrior(world_from_camera, np.diag([sigma_m**2] * 3 + [sigma**2] * 3)), where
+
+
+def _check_past(timestamp_ms: float, now_ms: float, field: str) -> None:
+    ahead_s = (timestamp_ms - now_ms) / 1000
+    if ahead_s > _FUTURE_S:
+        raise Failure(
+            f"is {ahead_s:.6g} s ahead of the gateway's clock; milliseconds since 1970 are expected", field=field
+        )
+
+
+def _path(parts: Sequence[int | str]) -> str:
+    """("a", 0, "b") is "a[0].b"."""
+    return "".join(f"[{it}]" if isinstance(it, int) else f".{it}" for it in parts).lstrip(".")

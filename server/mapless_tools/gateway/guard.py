@@ -1,0 +1,124 @@
+"""What reaches the gateway at all: pages of allowed origins, a bounded number of requests, each of bounded size."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from .failures import Failure
+
+_LOOPBACK_NAMES = ("127.0.0.1", "localhost", "[::1]")
+
+
+@dataclass(frozen=True)
+class GuardOptions:
+    """Limits of what is taken.
+
+    Attributes:
+        origins: of pages that may call besides the gateway's own, "https://app.example"; ("*",) for all.
+        is_loopback: whether it listens on this machine alone. Other names that lead here are then refused: a page
+            whose own name was pointed at this machine would count as the gateway's.
+        max_body_bytes: of a request. A photograph of 16 MiB, the most that servers take, is 22.4 MB in base64.
+        max_requests: at a time; further ones are refused. With the size, it bounds the memory.
+        body_s: in which a request has to arrive.
+    """
+
+    origins: Sequence[str] = ()
+    is_loopback: bool = True
+    max_body_bytes: int = 32 * 2**20
+    max_requests: int = 32
+    body_s: float = 60.0
+
+    def __post_init__(self) -> None:
+        for name in ("max_body_bytes", "max_requests", "body_s"):
+            if not (value := getattr(self, name)) > 0:
+                raise ValueError(f"{name} must be above 0, is {value:g}")
+        for origin in self.origins:
+            scheme, separator, host = origin.partition("://")
+            if origin != "*" and (scheme not in ("http", "https") or not separator or not host or "/" in host):
+                raise ValueError(f"an origin is https://host or https://host:port, without a path, is {origin!a}")
+
+
+@dataclass
+class Guard:
+    """Refuses what must not reach the application `app`."""
+
+    app: ASGIApp
+    options: GuardOptions = field(default_factory=GuardOptions)
+    _running: int = 0
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handles a request; anything else passes."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        has_begun = False
+
+        async def noting(message: Message) -> None:
+            nonlocal has_begun
+            has_begun = True
+            await send(message)
+
+        self._running += 1
+        try:
+            self._check(scope)
+            await self.app(scope, self._bounded(receive), noting)
+        except Failure as failure:
+            if not has_begun:
+                await failure.response()(scope, receive, send)
+        finally:
+            self._running -= 1
+
+    def _check(self, scope: Scope) -> None:
+        headers = Headers(scope=scope)
+        host, origin = headers.get("host", ""), headers.get("origin")
+        is_local = (host.rpartition(":")[0] or host) in _LOOPBACK_NAMES or host in _LOOPBACK_NAMES
+        if self.options.is_loopback and not is_local:
+            raise Failure(
+                f"this gateway listens on the loopback interface, and is not {host!a}", 403, reason="FOREIGN_HOST"
+            )
+        own = (f"http://{host}", f"https://{host}")
+        if origin is not None and origin not in (*own, *self.options.origins) and "*" not in self.options.origins:
+            raise Failure(
+                f"pages of the origin {origin!a} may not call; the gateway's operator allows them by --allow-origin",
+                403,
+                reason="FOREIGN_ORIGIN",
+            )
+        if int(length if (length := headers.get("content-length", "0")).isdecimal() else 0) > (
+            self.options.max_body_bytes
+        ):
+            raise self._too_large()
+        if self._running > self.options.max_requests:
+            raise Failure("too many requests at a time", 503, reason="GATEWAY_BUSY", retry_after_s=1.0)
+
+    def _too_large(self) -> Failure:
+        return Failure(
+            f"the request is larger than {self.options.max_body_bytes} bytes", 413, reason="REQUEST_TOO_LARGE"
+        )
+
+    def _bounded(self, receive: Receive) -> Receive:
+        """The body, as long as it is small enough and arrives in time."""
+        deadline_s = time.monotonic() + self.options.body_s
+        size, is_complete = 0, False
+
+        async def bounded() -> Message:
+            nonlocal size, is_complete
+            if is_complete:  # what follows is the end of the connection
+                return await receive()
+            try:
+                message = await asyncio.wait_for(receive(), deadline_s - time.monotonic())
+            except asyncio.TimeoutError:
+                late = f"the request did not arrive within {self.options.body_s:g} s"
+                raise Failure(late, 408, reason="REQUEST_LATE") from None
+            size += len(message.get("body", b""))
+            is_complete = not message.get("more_body", False)
+            if size > self.options.max_body_bytes:
+                raise self._too_large()
+            return message
+
+        return bounded

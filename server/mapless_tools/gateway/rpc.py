@@ -1,0 +1,147 @@
+"""Calls of browsers: gRPC-Web and Connect, by the library connectrpc, become gRPC calls of the server.
+
+Messages pass as they are, also fields that this version does not know; so do deadlines, cancellation, tokens, and
+errors with their details. Each call carries its caller's own token, never the gateway's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable
+from contextlib import suppress
+from typing import Any
+
+import grpc
+import grpc.aio
+from connectrpc.code import Code
+from connectrpc.compat import google_protobuf_codecs
+from connectrpc.errors import ConnectError, ErrorDetail
+from connectrpc.method import IdempotencyLevel, MethodInfo, StreamType
+from connectrpc.request import RequestContext
+from connectrpc.server import ConnectASGIApplication, Endpoint
+from google.protobuf.descriptor import MethodDescriptor, ServiceDescriptor
+from google.protobuf.message import DecodeError
+from google.protobuf.message_factory import GetMessageClass
+from google.rpc import status_pb2
+from protobuf.wkt import Any as AnyMessage
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from mapless.v1 import localization_service_pb2, reference_service_pb2
+
+from .failures import Failure
+
+_PASSED_METADATA = ("authorization", "x-client-id", "x-mapless-scene", "x-request-id")
+_CONTENT_TYPES = ("application/grpc-web", "application/connect+", "application/proto", "application/json")
+_DETAILS = "grpc-status-details-bin"
+_CODES = {"CANCELLED": Code.CANCELED}  # spelled differently
+_SERVICES: tuple[ServiceDescriptor, ...] = (
+    *localization_service_pb2.DESCRIPTOR.services_by_name.values(),
+    *reference_service_pb2.DESCRIPTOR.services_by_name.values(),
+)
+Connect = Callable[[], grpc.aio.Channel]
+
+
+class _Application(ConnectASGIApplication[None]):
+    """All methods of a server's interface."""
+
+    path = "/"
+
+
+def rpc_application(connect: Connect, max_message_bytes: int) -> ASGIApp:
+    """The application that serves the interface's methods at gRPC's paths.
+
+    Args:
+        connect: makes the channel to the server, when the event loop runs.
+        max_message_bytes: of a request.
+    """
+    channel: list[grpc.aio.Channel] = []
+
+    def connected() -> grpc.aio.Channel:
+        if not channel:
+            channel.append(connect())
+        return channel[0]
+
+    def endpoints(_: None) -> dict[str, Any]:
+        return {
+            f"/{service.full_name}/{method.name}": _endpoint(connected, service, method)
+            for service in _SERVICES
+            for method in service.methods
+        }
+
+    application = _Application(
+        service=None,
+        endpoints=endpoints,
+        read_max_bytes=max_message_bytes,
+        compressions=(),  # photographs are compressed, and all else is small
+        codecs=google_protobuf_codecs(),
+    )
+
+    async def serve(scope: Scope, receive: Receive, send: Send) -> None:
+        headers = Headers(scope=scope)
+        wrong = None
+        if scope["method"] != "POST":
+            wrong = Failure("calls are sent by POST", 405, reason="METHOD_NOT_ALLOWED")
+        elif not headers.get("content-type", "").startswith(_CONTENT_TYPES):
+            wrong = Failure(f"must be one of {', '.join(_CONTENT_TYPES)}", 415, field="content-type")
+        if wrong is not None:
+            await wrong.response()(scope, receive, send)
+            return
+        readable = [pair for pair in scope["headers"] if all(part.isascii() for part in pair)]
+        passed: Any = {**scope, "headers": readable}
+        with suppress(Failure):  # of what is received: has been answered
+            await application(passed, receive, send)
+
+    return serve
+
+
+def _endpoint(connected: Connect, service: ServiceDescriptor, method: MethodDescriptor) -> Any:
+    request_type, response_type = GetMessageClass(method.input_type), GetMessageClass(method.output_type)
+    path = f"/{service.full_name}/{method.name}"
+
+    def begin(make: Callable[..., Any], request: Any, context: RequestContext[Any, Any]) -> Any:
+        call = make(
+            path, request_serializer=request_type.SerializeToString, response_deserializer=response_type.FromString
+        )
+        given = context.request_headers
+        metadata = tuple((name, given[name]) for name in _PASSED_METADATA if name in given)
+        timeout_s = None if context.timeout_ms is None else max(context.timeout_ms, 0) / 1000
+        return call(request, timeout=timeout_s, metadata=metadata)
+
+    async def unary(request: Any, context: RequestContext[Any, Any]) -> Any:
+        try:
+            return await begin(connected().unary_unary, request, context)
+        except grpc.aio.AioRpcError as error:
+            raise _error(error, context) from None
+
+    async def stream(request: Any, context: RequestContext[Any, Any]) -> AsyncIterator[Any]:
+        call = begin(connected().unary_stream, request, context)
+        try:
+            async for message in call:
+                yield message
+        except grpc.aio.AioRpcError as error:
+            raise _error(error, context) from None
+        finally:
+            call.cancel()
+
+    info = MethodInfo(
+        name=method.name,
+        service_name=service.full_name,
+        input=request_type,
+        output=response_type,
+        idempotency_level=IdempotencyLevel.UNKNOWN,
+        stream_type=StreamType.SERVER_STREAM if method.server_streaming else StreamType.UNARY,
+    )
+    return Endpoint.server_stream(info, stream) if method.server_streaming else Endpoint.unary(info, unary)
+
+
+def _error(error: grpc.aio.AioRpcError, context: RequestContext[Any, Any]) -> ConnectError:
+    metadata = dict(error.trailing_metadata() or ())
+    if request_id := metadata.get("x-request-id"):
+        context.response_trailers["x-request-id"] = str(request_id)
+    try:
+        status = status_pb2.Status.FromString(metadata.get(_DETAILS, b""))
+    except DecodeError:  # of a proxy in between
+        status = status_pb2.Status()
+    details = [ErrorDetail(AnyMessage(type_url=it.type_url, value=it.value)) for it in status.details]
+    name = error.code().name
+    return ConnectError(_CODES.get(name) or Code(name.lower()), error.details() or "", details)

@@ -1,0 +1,108 @@
+"""The gateway's process: from options to a server that listens, and its end."""
+
+from __future__ import annotations
+
+import socket
+import sys
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import uvicorn
+
+from mapless import Client, ConnectOptions, Unauthenticated, aio
+from mapless_server.security import is_loopback
+
+from .app import GatewayOptions, gateway
+
+_GRACE_S = 10
+
+
+@dataclass(frozen=True)
+class Binding:
+    """Where to listen.
+
+    Attributes:
+        host, port: port 0 takes any free one.
+        certificate, key: files, PEM; None for no TLS.
+        insecure: whether to listen beyond this machine without TLS, or to a server without tokens.
+    """
+
+    host: str
+    port: int
+    certificate: Path | None = None
+    key: Path | None = None
+    insecure: bool = False
+
+    def __post_init__(self) -> None:
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("--tls-certificate and --tls-key go together")
+        for file in (self.certificate, self.key):
+            if file is not None and not file.is_file():
+                raise ValueError(f"{file} is no file")
+        if self.certificate is None and not self.insecure and not self.is_loopback:
+            raise ValueError(
+                f"on {self.host} photographs and tokens would pass in clear: give --tls-certificate and --tls-key, "
+                "listen on 127.0.0.1, or give --insecure if something in front encrypts"
+            )
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether only this machine can connect."""
+        return is_loopback(self.host)
+
+
+def run(server: str, connect: ConnectOptions, options: GatewayOptions, binding: Binding) -> None:
+    """Serves until a signal ends it.
+
+    Args:
+        server: its address.
+        connect: how to connect to it.
+        options: what to serve.
+        binding: where to listen.
+
+    Raises:
+        ValueError: the server gives everybody all rights, and must not.
+        MaplessError: the server cannot be reached to find that out.
+        OSError: the port is taken.
+    """
+    if not (binding.is_loopback or binding.insecure):
+        _check_tokens(server, replace(connect, token=None))
+    # A caller that waits tries again itself, when the server says; the gateway does not hold its photograph meanwhile.
+    once = replace(connect, max_attempts=1)
+    rpc = None
+    if find_spec("connectrpc") is not None:
+        from .rpc import rpc_application
+
+        rpc = rpc_application(lambda: once.aio_channel(server), options.guard.max_body_bytes)
+    else:
+        print("gRPC-Web is not served: connectrpc is not installed, which needs Python 3.11", file=sys.stderr)
+    application = gateway(lambda: aio.Client(server, once), options, rpc)
+    config = uvicorn.Config(
+        application,
+        log_level="warning",
+        server_header=False,
+        timeout_graceful_shutdown=_GRACE_S,
+        ssl_certfile=binding.certificate,
+        ssl_keyfile=binding.key,
+    )
+    host, is_v6 = binding.host, ":" in binding.host
+    family = socket.AF_INET6 if is_v6 else socket.AF_INET
+    with socket.create_server((host, binding.port), family=family, backlog=128) as listening:
+        scheme = "http" if binding.certificate is None else "https"
+        name = f"[{host}]" if is_v6 else host
+        # Read by programs that take any port: keep its form.
+        print(f"mapless-server gateway is on {scheme}://{name}:{listening.getsockname()[1]}", flush=True)
+        uvicorn.Server(config).run([listening])
+
+
+def _check_tokens(server: str, connect: ConnectOptions) -> None:
+    with Client(server, connect) as client:
+        try:
+            next(iter(client.list_scenes()), None)
+        except Unauthenticated:
+            return
+    raise ValueError(
+        "the server requires no tokens: through this gateway everybody who can reach it could read and delete all "
+        "scenes; give the server tokens_file, or give --insecure if something in front restricts access"
+    )
