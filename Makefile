@@ -33,8 +33,9 @@ setup: $(VENV)/.installed  ## Create .venv with everything
 
 # The matrices are small: threads gain nothing, and wait for one another where cores are shared. Not so the full networks.
 THREADS ?= 1
-# Two processes, of which the one that has finished takes over tests of the other; WORKERS= for one process.
-WORKERS ?= -n 2 --dist worksteal
+# Three processes, for tests of servers wait a quarter of their time: two use 1.5 of two cores. The one that has finished takes
+# over tests of the others; WORKERS= for one process.
+WORKERS ?= -n 3 --dist worksteal
 test: setup $(PROTO_VENV)/.installed  ## Run the tests in at most five minutes; ARGS=... for pytest
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=$(THREADS) PROTO_PYTHON=$(PROTO_VENV)/bin/python $(BIN)/python -m pytest $(WORKERS) $(ARGS)
 
