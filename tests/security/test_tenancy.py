@@ -15,12 +15,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.images import encode, textured
+from support.requests import REFERENCE_SERVICE, new_reference, requests_on
 
 from mapless import wire
-from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless.v1 import reference_service_pb2 as pb
-from mapless.v1.geometry_pb2 import Vector3
 from mapless.wire import FieldError
 from mapless_server.engine.query import Description
 from mapless_server.errors import NotFound, RequestError
@@ -41,8 +39,6 @@ from mapless_server.security import (
 from mapless_server.services.references import ReferenceService
 from mapless_server.store import Store
 
-CAMERA = Camera(96, 64, 80.0, 81.0, 47.5, 31.5)
-PHOTO, OTHER_PHOTO = encode(".png", textured(seed=1)), encode(".png", textured(seed=2))
 # Names that a wrong comparison would confuse: by case, prefix, pattern, and order around "/".
 TENANTS = [DEFAULT_TENANT, "acme", "ACME", "acme0", "acme-", "acm_", "a"]
 
@@ -154,45 +150,10 @@ def server(tmp_path: Path) -> Iterator[Server]:
         yield server
 
 
-def create_request(scene_id: str, reference_id: str, photo: bytes = PHOTO) -> pb.CreateReferenceRequest:
-    pose = RigidTransform(rotation_from_vector([0.1, 0.2, 0.3]), np.array([1.0, 2.0, 3.0]))
-    return pb.CreateReferenceRequest(
-        scene=f"scenes/{scene_id}",
-        reference_id=reference_id,
-        reference=pb.Reference(
-            image=photo,
-            intrinsics=wire.camera_to_message(CAMERA),
-            world_from_camera=wire.transform_to_message(pose),
-        ),
-    )
-
-
 def requests_for(scene_id: str, reference_id: str) -> dict[str, Any]:
     """A good request of every RPC but CreateScene and ListScenes, which name no scene that must exist."""
-    scene = f"scenes/{scene_id}"
-    reference = f"{scene}/references/{reference_id}"
-    new = create_request(scene_id, "new")
-    return {
-        "GetScene": pb.GetSceneRequest(name=scene),
-        "ListReferences": pb.ListReferencesRequest(scene=scene),
-        "GetReference": pb.GetReferenceRequest(name=reference, include_image=True),
-        "CreateReference": new,
-        "BatchCreateReferences": pb.BatchCreateReferencesRequest(scene=scene, requests=[new]),
-        "DeleteReference": pb.DeleteReferenceRequest(name=reference),
-        "RetrieveReferences": pb.RetrieveReferencesRequest(
-            scene=scene, image=PHOTO, intrinsics=wire.camera_to_message(CAMERA)
-        ),
-        "AuditScene": pb.AuditSceneRequest(scene=scene),
-        "CheckCoverage": pb.CheckCoverageRequest(
-            scene=scene,
-            world_from_camera=new.reference.world_from_camera,
-            intrinsics=wire.camera_to_message(CAMERA),
-        ),
-        "UpdateScene": pb.UpdateSceneRequest(
-            scene=pb.Scene(name=scene, down_in_world=Vector3(z=-1)), update_mask={"paths": ["down_in_world"]}
-        ),
-        "DeleteScene": pb.DeleteSceneRequest(name=scene),
-    }
+    named = requests_on(scene_id, reference_id, "new")
+    return {method.removeprefix(REFERENCE_SERVICE): it for method, it in named.items() if REFERENCE_SERVICE in method}
 
 
 def seen(server: Server, tenant: str) -> Any:
@@ -215,7 +176,7 @@ def test_a_page_token_of_another_tenant_is_rejected(server: Server, method: str)
         for scene_id in ("s", "t"):
             server.call(tenant, "CreateScene", pb.CreateSceneRequest(scene_id=scene_id))
         for reference_id in ("a", "b"):
-            server.call(tenant, "CreateReference", create_request("s", reference_id))
+            server.call(tenant, "CreateReference", new_reference("s", reference_id))
 
     def request(**page: Any) -> Any:
         if method == "ListScenes":
@@ -236,7 +197,7 @@ def test_tokens_of_scenes_are_never_those_of_references(server: Server) -> None:
         for scene_id in ("scenes", "t"):
             server.call(tenant, "CreateScene", pb.CreateSceneRequest(scene_id=scene_id))
         for reference_id in ("a", "b"):
-            server.call(tenant, "CreateReference", create_request("scenes", reference_id))
+            server.call(tenant, "CreateReference", new_reference("scenes", reference_id))
     token = server.call(
         DEFAULT_TENANT, "ListReferences", pb.ListReferencesRequest(scene="scenes/scenes", page_size=1)
     ).next_page_token
@@ -246,7 +207,7 @@ def test_tokens_of_scenes_are_never_those_of_references(server: Server) -> None:
 
 def test_one_tenants_cache_is_not_read_by_another(server: Server) -> None:
     server.call("acme", "CreateScene", pb.CreateSceneRequest(scene_id="s"))
-    server.call("acme", "CreateReference", create_request("s", "r"))
+    server.call("acme", "CreateReference", new_reference("s", "r"))
     mine = key_of("acme", "s")
     assert len(server.store.load_references(mine, ["r"], "stand-in").references) == 1
     assert len(server.store.list_changes(mine, None, "").added) == 1
@@ -262,7 +223,7 @@ def test_one_tenants_cache_is_not_read_by_another(server: Server) -> None:
         if tenant != "acme":
             # The same id and the same generation, and yet other references.
             server.call(tenant, "CreateScene", pb.CreateSceneRequest(scene_id="s"))
-            server.call(tenant, "CreateReference", create_request("s", f"of.{tenant}.own"))
+            server.call(tenant, "CreateReference", new_reference("s", f"of.{tenant}.own"))
             theirs = server.store.list_changes(key_of(tenant, "s"), None, "")
             assert [it.reference_id for it in theirs.added] == [f"of.{tenant}.own"]
             assert theirs.generation == server.store.get_scene(mine).generation

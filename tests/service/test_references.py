@@ -24,8 +24,8 @@ from mapless import (
     NewReference,
     NotFound,
     ResourceExhausted,
-    wire,
 )
+from mapless.requests import create_request
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.v1.geometry_pb2 import Quaternion
 from mapless_server.errors import Overloaded
@@ -34,16 +34,8 @@ from mapless_server.services.messages import references
 from mapless_server.store import ReferenceRecord, Store
 
 
-def create_request(reference_id: str) -> pb.CreateReferenceRequest:
-    """A good one."""
-    return pb.CreateReferenceRequest(
-        reference_id=reference_id,
-        reference=pb.Reference(
-            image=PHOTO,
-            intrinsics=wire.camera_to_message(CAMERA),
-            world_from_camera=wire.transform_to_message(pose(0.5)),
-        ),
-    )
+def new_reference(reference_id: str) -> pb.CreateReferenceRequest:
+    return create_request("", NewReference(reference_id, PHOTO, CAMERA, pose(0.5)))
 
 
 def test_the_life_of_a_scene(client: Client) -> None:
@@ -161,7 +153,7 @@ ITEM = "requests[1]"
 REFERENCE = f"{ITEM}.reference"
 BAD_BATCHES: dict[str, tuple[str, Any] | tuple[str, Any, str]] = {
     "none": ("requests", None),
-    "1001": ("requests", [create_request(f"x{i}") for i in range(999)]),
+    "1001": ("requests", [new_reference(f"x{i}") for i in range(999)]),
     "no id": (f"{ITEM}.reference_id", None),
     "id with ..": (f"{ITEM}.reference_id", "a..b"),
     "id with /": (f"{ITEM}.reference_id", "a/b"),
@@ -183,7 +175,7 @@ BAD_BATCHES: dict[str, tuple[str, Any] | tuple[str, Any, str]] = {
 def test_a_batch_with_one_bad_item_stores_nothing(client: Client, stubs: Stubs, scene: str, name: str) -> None:
     path, value, *other = BAD_BATCHES[name]
     batch = pb.BatchCreateReferencesRequest(
-        scene=f"scenes/{scene}", requests=[create_request("n0"), create_request("n1")]
+        scene=f"scenes/{scene}", requests=[new_reference("n0"), new_reference("n1")]
     )
     set_field(batch, path, value)
     error = failure_of(stubs.references.BatchCreateReferences, batch)
@@ -210,7 +202,7 @@ def test_the_client_names_the_bad_reference_of_a_batch(server: RunningServer, sc
 
 def test_a_batch_with_a_taken_id_stores_nothing(client: Client, stubs: Stubs, scene: str) -> None:
     batch = pb.BatchCreateReferencesRequest(
-        scene=f"scenes/{scene}", requests=[create_request("n0"), create_request("r1")]
+        scene=f"scenes/{scene}", requests=[new_reference("n0"), new_reference("r1")]
     )
     error = failure_of(stubs.references.BatchCreateReferences, batch)
     assert (error.code, error.field) == ("ALREADY_EXISTS", "requests[1].reference_id")
@@ -223,7 +215,7 @@ def test_names_are_checked_everywhere(client: Client, stubs: Stubs) -> None:
         (stubs.references.CreateScene, pb.CreateSceneRequest(scene_id=".."), "scene_id"),
         (stubs.references.GetScene, pb.GetSceneRequest(name="scenes/.."), "name"),
         (stubs.references.DeleteScene, pb.DeleteSceneRequest(name=bad), "name"),
-        (stubs.references.CreateReference, create_request("x"), "scene"),
+        (stubs.references.CreateReference, new_reference("x"), "scene"),
         (stubs.references.GetReference, pb.GetReferenceRequest(name=bad), "name"),
         (stubs.references.ListReferences, pb.ListReferencesRequest(scene=bad), "scene"),
         (stubs.references.DeleteReference, pb.DeleteReferenceRequest(name=bad), "name"),

@@ -16,6 +16,7 @@ import pytest
 from google.protobuf.message import Message
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 from support.certificates import Pair, authority, signed
+from support.requests import requests_of_all, requests_on
 from support.servers import CAMERA, PHOTO, RunningServer, failure_of, localize_request, pose, serving
 from support.waiting import wait_until
 
@@ -30,11 +31,8 @@ from mapless import (
     ResourceExhausted,
     Unauthenticated,
     Unavailable,
-    wire,
 )
 from mapless.v1 import localization_service_pb2 as localization_pb
-from mapless.v1 import reference_service_pb2 as reference_pb
-from mapless.v1.geometry_pb2 import Vector3
 from mapless_server.security import METHOD_ROLES, Role, create_token, revoke_token, sha256_of
 
 LIMIT_S = 30.0
@@ -91,66 +89,7 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
         yield guarded
 
 
-def requests_on(scene_id: str) -> dict[str, Message]:
-    """A good request of every method that names a scene, none of which would harm it; deletions come last."""
-    scene = f"scenes/{scene_id}"
-    reference = reference_pb.CreateReferenceRequest(scene=scene, reference_id="r", reference=_reference())
-    requests: dict[str, Message] = {
-        "LocalizationService/Localize": localize_request(scene_id),
-        "LocalizationService/LocalizeProgressively": localize_request(scene_id),
-        "LocalizationService/LocalizeRig": localization_pb.LocalizeRigRequest(scene=scene, images=[_image()]),
-        "LocalizationService/LocalizeSequence": localization_pb.LocalizeSequenceRequest(
-            scene=scene, frames=[_frame(), _frame()]
-        ),
-        "LocalizationService/WatchQueries": localization_pb.WatchQueriesRequest(scene=scene),
-        "ReferenceService/GetScene": reference_pb.GetSceneRequest(name=scene),
-        "ReferenceService/ListReferences": reference_pb.ListReferencesRequest(scene=scene),
-        "ReferenceService/GetReference": reference_pb.GetReferenceRequest(name=f"{scene}/references/r"),
-        "ReferenceService/CreateReference": reference,
-        "ReferenceService/BatchCreateReferences": reference_pb.BatchCreateReferencesRequest(
-            scene=scene, requests=[reference]
-        ),
-        "ReferenceService/RetrieveReferences": reference_pb.RetrieveReferencesRequest(
-            scene=scene, image=PHOTO, intrinsics=_reference().intrinsics
-        ),
-        "ReferenceService/AuditScene": reference_pb.AuditSceneRequest(scene=scene),
-        "ReferenceService/CheckCoverage": reference_pb.CheckCoverageRequest(
-            scene=scene, world_from_camera=_reference().world_from_camera, intrinsics=_reference().intrinsics
-        ),
-        "ReferenceService/UpdateScene": reference_pb.UpdateSceneRequest(
-            scene=reference_pb.Scene(name=scene, down_in_world=Vector3(z=-1)),
-            update_mask={"paths": ["down_in_world"]},
-        ),
-        "ReferenceService/DeleteReference": reference_pb.DeleteReferenceRequest(name=f"{scene}/references/r"),
-        "ReferenceService/DeleteScene": reference_pb.DeleteSceneRequest(name=scene),
-    }
-    return {f"/mapless.v1.{method}": request for method, request in requests.items()}
-
-
-def _image() -> localization_pb.RigImage:
-    return localization_pb.RigImage(
-        image=PHOTO, intrinsics=wire.camera_to_message(CAMERA), rig_from_camera=wire.transform_to_message(pose(0.0))
-    )
-
-
-def _frame() -> localization_pb.SequenceFrame:
-    return localization_pb.SequenceFrame(
-        image=PHOTO, intrinsics=wire.camera_to_message(CAMERA), session_from_camera=wire.transform_to_message(pose(0.0))
-    )
-
-
-def _reference() -> reference_pb.Reference:
-    return reference_pb.Reference(
-        image=PHOTO,
-        intrinsics=wire.camera_to_message(CAMERA),
-        world_from_camera=wire.transform_to_message(pose(0.0)),
-    )
-
-
-ALL_REQUESTS = requests_on("shared") | {
-    "/mapless.v1.ReferenceService/CreateScene": reference_pb.CreateSceneRequest(scene_id="shared"),
-    "/mapless.v1.ReferenceService/ListScenes": reference_pb.ListScenesRequest(),
-}
+ALL_REQUESTS = requests_of_all("shared")
 
 
 def test_every_method_is_tried() -> None:
