@@ -11,7 +11,7 @@ NAN = float("nan")
 OUTSIDE: dict[str, list[tuple[str, Any]]] = {
     "engine.tiers.EscalationOptions": [("doubtful_trust", -1.0), ("doubtful_radius_m", -1.0), ("clearly_more", 0.5)]
     + [("time_share", 0.0), ("time_share", 1.5), ("same_position_m", NAN), ("same_rotation_deg", -1.0)],
-    "method.adjust.AdjustOptions": [("max_error_px", 0.0), ("iterations", 0), ("loss_scale_sigma", -1.0)],
+    "method.pose_problem.AdjustOptions": [("max_error_px", 0.0), ("iterations", 0), ("loss_scale_sigma", -1.0)],
     "method.coarse.geometric.GeometricOptions": [("min_baseline_m", 0.0), ("cell_px", 0)],
     "method.coarse.grids.GridOptions": [("pixel_limit", 10), ("aspects", ()), ("max_stretch", 0.9)]
     + [("max_half_field_deg", 90)],
@@ -32,12 +32,12 @@ OUTSIDE: dict[str, list[tuple[str, Any]]] = {
     "method.pose_errors.PoseErrorOptions": [("own", ()), ("drift", (0.0,)), ("prior_log", 0.0)]
     + [("drift_inflation", -1.0)],
     "method.priors.gravity.GravityOptions": [("batch", 0), ("max_samples", 0), ("confidence", 1.0), ("refined", 0)],
-    "method.retrieve.RetrieveOptions": [("apart_m", -1.0), ("nearby_weight", 1.5), ("nearby_weight", NAN)],
+    "scenes.retrieval.ranking.RetrieveOptions": [("apart_m", -1.0), ("nearby_weight", 1.5), ("nearby_weight", NAN)],
     "method.scale_equations.ScaleOptions": [("min_baseline_m", 11.0), ("min_ratios", 0), ("max_deviation", NAN)]
     + [("max_pair_cameras", 1)],
     "method.structure.StructureOptions": [("iterations", 0), ("loss_scale_sigma", 0.0), ("max_residual_sigma", -1.0)]
     + [("min_parallax_deg", 90.0)],
-    "method.trust.agreement.AgreementOptions": [("splits", 0), ("shuffling", -0.1)],
+    "method.trust.evidence.AgreementOptions": [("splits", 0), ("shuffling", -0.1)],
     "method.trust.ambiguity.AmbiguityOptions": [("min_share", 0.0), ("min_own_share", 1.5), ("min_keypoints", 3)]
     + [("agreeing_px", 1.0)],
     "method.trust.gate.GateOptions": [("max_log10_false_alarms", NAN)],

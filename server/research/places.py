@@ -24,8 +24,8 @@ from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline, StageOptions
 from mapless_server.method.priors.known import NO_PRIORS, Priors
 from mapless_server.method.results import Support
-from mapless_server.method.retrieve import choose_references
 from mapless_server.method.views import PosedView, View
+from mapless_server.scenes.retrieval.ranking import choose_references
 from mapless_tools.dataset import Frame, read_folder
 from mapless_tools.evaluate.metrics import pose_error
 

@@ -24,7 +24,7 @@ from mapless.geometry import Array
 from mapless_server.method.features import FeatureExtractor, make_extractor
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.trust.judge import trust_in_scene
-from mapless_server.method.uncertainty import gap
+from mapless_server.method.uncertainty import radii as uncertainty
 from mapless_server.method.uncertainty.radii import Accuracy
 from mapless_server.scenes.calibration.calibrator import left_out
 from mapless_server.scenes.calibration.fit import FitOptions, LeftOut, fit
@@ -123,7 +123,7 @@ class Tested:
 
 def test(samples: Sequence[Sample], growth: float, options: FitOptions | None) -> list[Tested]:
     """Each scene and kind of features, calibrated with these options; None for generic radii."""
-    gap.POSITION_GROWTH = gap.ROTATION_GROWTH = growth
+    uncertainty.POSITION_GROWTH = uncertainty.ROTATION_GROWTH = growth
     found = []
     for scene, features in dict.fromkeys((it.scene, it.features) for it in samples):
         own = [it for it in samples if (it.scene, it.features) == (scene, features)]

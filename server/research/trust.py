@@ -30,10 +30,8 @@ from mapless_server.method.correspond import make_matcher
 from mapless_server.method.features import FeatureExtractor, make_extractor
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.rejection import RejectionReason
-from mapless_server.method.trust.agreement import AgreementOptions
-from mapless_server.method.trust.evidence import Evidence, evidence_of
+from mapless_server.method.trust.evidence import AgreementOptions, Evidence, evidence_of, votes_of
 from mapless_server.method.trust.judge import LEVELS
-from mapless_server.method.trust.votes import votes_of
 from mapless_server.method.views import Features
 from mapless_tools.dataset import read_folder
 

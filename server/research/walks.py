@@ -21,7 +21,6 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.answer import Answer
 from mapless_server.method.coarse.make import make_reconstructor
-from mapless_server.method.context import StageContext
 from mapless_server.method.correspond import make_matcher
 from mapless_server.method.groups.checks import check_unit
 from mapless_server.method.groups.drift import DriftOptions
@@ -29,7 +28,7 @@ from mapless_server.method.groups.images import GroupImage, tracked_support
 from mapless_server.method.groups.sequence import SequenceEstimate, solve_sequence
 from mapless_server.method.groups.start import SequenceOptions
 from mapless_server.method.localize import prepare, refine
-from mapless_server.method.options import LocalizeOptions, Variant
+from mapless_server.method.options import LocalizeOptions, StageContext, Variant
 from mapless_server.method.pipeline import Pipeline, reconstruct
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.uncertainty.radii import accuracy_from_covariance

@@ -12,13 +12,13 @@ from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 from mapless.geometry import RigidTransform
 from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.results import PoseEstimate, Support
-from mapless_server.method.trust.agreement import (
+from mapless_server.method.trust.evidence import (
     NO_AGREEMENT,
     AgreementOptions,
     disagreement_of_matches,
     disagreement_of_references,
+    votes_of,
 )
-from mapless_server.method.trust.votes import votes_of
 
 OPTIONS = AgreementOptions()
 DISTANCE_M = 4.0

@@ -17,10 +17,16 @@ from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import PoseEstimate, Support
-from mapless_server.method.trust.agreement import AgreementOptions
-from mapless_server.method.trust.evidence import Evidence, epipolar_share, evidence_of, findable_count, hull_share
+from mapless_server.method.trust.evidence import (
+    AgreementOptions,
+    Evidence,
+    epipolar_share,
+    evidence_of,
+    findable_count,
+    hull_share,
+    votes_of,
+)
 from mapless_server.method.trust.judge import LEVELS, JudgeOptions, judge, trust_of
-from mapless_server.method.trust.votes import votes_of
 from mapless_server.method.views import Matches, PosedView
 
 OPTIONS = JudgeOptions()

@@ -20,10 +20,9 @@ from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.coarse import Bucket, Outcome, Reconstructor, Request
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.geometric import GeometricReconstructor
-from mapless_server.method.context import StageContext
 from mapless_server.method.correspond import Correspondences, Matcher
 from mapless_server.method.localize import MIN_FEATURES, localize, prepare, refine
-from mapless_server.method.options import LocalizeOptions, ScaleStrategy, Variant
+from mapless_server.method.options import LocalizeOptions, ScaleStrategy, StageContext, Variant
 from mapless_server.method.pipeline import Coarse, Pipeline, Prepared, StageOptions, coarse_answer, reconstruct
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import PoseStage, ScaleStage

@@ -24,8 +24,8 @@ from support.waiting import wait_until
 
 from mapless_server.errors import Unavailable
 from mapless_server.method import correspond
-from mapless_server.method.context import StageContext
 from mapless_server.method.correspond import CorrespondOptions, Matcher, PairMatching, in_order
+from mapless_server.method.options import StageContext
 from mapless_server.method.views import Features, Matches, PosedView, View
 from mapless_server.scenes import background
 from mapless_server.scenes.background import BackgroundMatching, BackgroundOptions

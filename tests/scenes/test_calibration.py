@@ -20,8 +20,7 @@ from mapless_server.errors import Unavailable
 from mapless_server.method.intrinsics import IntrinsicsEvidence
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.trust.judge import LEVELS, trust_in_scene
-from mapless_server.method.uncertainty.gap import USUAL_GAP, growth
-from mapless_server.method.uncertainty.radii import Accuracy
+from mapless_server.method.uncertainty.radii import USUAL_GAP, Accuracy, growth
 from mapless_server.method.views import PosedView
 from mapless_server.scenes.calibration.calibrations import SceneCalibrations
 from mapless_server.scenes.calibration.calibrator import Calibrator, CalibratorOptions

@@ -21,7 +21,7 @@ from support.stores import Folder
 from mapless.geometry import Camera
 from mapless_server.errors import DataLoss, NotFound, RequestError
 from mapless_server.images import ImageLimits
-from mapless_server.method.context import StageContext
+from mapless_server.method.options import StageContext
 from mapless_server.method.views import View
 from mapless_server.scenes import library as library_module
 from mapless_server.scenes.library import FeaturesMissing, Loaded, ReferenceLibrary, load_usable

@@ -14,7 +14,7 @@ from support.planted_damage import damage
 from support.servers import CAMERA, StandInDescriptor, StandInExtractor, pose
 
 from mapless_server.errors import DataLoss, NotFound
-from mapless_server.method.context import StageContext
+from mapless_server.method.options import StageContext
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.security import SceneKey

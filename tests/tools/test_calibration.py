@@ -15,8 +15,7 @@ from support.scenes import random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless.scenes import Calibration
-from mapless_server.method.uncertainty.gap import USUAL_GAP
-from mapless_server.method.uncertainty.radii import Accuracy, accuracy_from_covariance
+from mapless_server.method.uncertainty.radii import USUAL_GAP, Accuracy, accuracy_from_covariance
 from mapless_server.services.messages.radii import (
     Conditions,
     Factors,

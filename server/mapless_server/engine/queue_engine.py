@@ -11,9 +11,9 @@ from typing import Any, TypeVar, cast
 
 from mapless.geometry import RigidTransform
 from mapless_server.errors import DeadlineExceeded, Overloaded, RequestError, Unavailable
-from mapless_server.method.context import StageContext
 from mapless_server.method.groups.rig import RigEstimate
 from mapless_server.method.groups.sequence import SequenceEstimate
+from mapless_server.method.options import StageContext
 from mapless_server.method.rejection import Rejection
 from mapless_server.scenes import Choice, Coverage, Narrowing, ReferenceAudit, Selection, Viewpoint
 from mapless_server.scenes.background import BackgroundMatching

@@ -18,17 +18,17 @@ from mapless_server.errors import DataLoss, NotFound, Unavailable
 from mapless_server.method import localize as method
 from mapless_server.method import pipeline
 from mapless_server.method.answer import Answer, Localization
-from mapless_server.method.context import StageContext
 from mapless_server.method.groups.images import tracked_support
 from mapless_server.method.hints import hinted
+from mapless_server.method.options import StageContext
 from mapless_server.method.pipeline import Coarse, Prepared
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import Support
-from mapless_server.method.retrieve import spread_choice
 from mapless_server.method.trust.judge import trust_in_scene
 from mapless_server.method.views import Matches, PosedView, View
 from mapless_server.scenes import Choice, Narrowing, RankOptions, Selection
 from mapless_server.scenes.library import FeaturesMissing, Loaded, load_usable
+from mapless_server.scenes.retrieval.ranking import spread_choice
 from mapless_server.scheduling import Abandoned, Done, Ending, Failure, Fallback, Job, Next, StageResult, Step
 from mapless_server.store import SceneAttributes
 
@@ -345,7 +345,9 @@ class QueryStages:
             raise ArithmeticError(f"the method's answer is not finite: {answer.outcome}, {answer.scale}")
         assert run.view is not None
         tier, narrowing = self._tiers[run.tier], run.query.narrowing
-        answer = hinted(_checked_against(narrowing, answer), run.view, run.references, not narrowing.is_empty)
+        answer = _checked_against(narrowing, answer)
+        if isinstance(answer.outcome, Rejection):
+            answer = hinted(answer, run.view, run.references, not narrowing.is_empty)
         prefix = "" if run.best is None else f"{tier.features}/"
         seconds = {} if run.best is None else dict(run.best.stage_seconds)
         for stage, spent_s in (run.context.stage_seconds | answer.stage_seconds).items():

@@ -3,7 +3,7 @@
 Begin with `localize`, the stages in order. A module imports only modules above it in this list, which has no circle:
 
 choices                      names of backends and features, for settings
-options, context             how options check themselves; cancelling and timing of a computation
+options                      how options check themselves; cancelling and timing of a computation
 arrays, perturbation         NumPy or torch; small motions of poses, coordinates of their errors
 optimize                     robust losses; Levenberg-Marquardt, the only one
 views                        photographs with features and poses; the result of the coarse stage
@@ -11,7 +11,6 @@ rejection                    "no pose" is a result
 features/                    local features of a photograph
 tracks                       observations of the same point
 lightglue, correspond        matches among references, and of the query with them (lightglue: by a network)
-retrieve                     the references most similar to a photograph
 priors/                      what is known of the query's pose beforehand
 intrinsics                   errors of the query's intrinsics, and the evidence of them
 results                      scale, structure, matches, pose estimate and its support: data between stages

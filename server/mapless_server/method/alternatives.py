@@ -9,6 +9,7 @@ from .one_reference import one_reference_failure, solve_one_reference, trust_of_
 from .pipeline import Coarse
 from .rejection import Rejection, RejectionReason
 from .results import MetricScale, Support
+from .trust.evidence import votes_of
 from .trust.judge import contradiction
 from .trust.two_view import (
     lacks_distance,
@@ -17,7 +18,6 @@ from .trust.two_view import (
     two_view_failure,
     two_view_trust,
 )
-from .trust.votes import votes_of
 from .two_view.solve import solve_two_view
 from .views import Reconstruction
 

@@ -14,8 +14,7 @@ from dataclasses import replace
 from .adjust import adjust_pose, pose_covariance
 from .alternatives import from_one_reference, from_two_views
 from .answer import Answer, Localization, is_better
-from .context import StageContext
-from .options import LocalizeOptions, Variant
+from .options import LocalizeOptions, StageContext, Variant
 from .pipeline import Coarse, Pipeline, Prepared, reconstruct, structure_and_matches, with_wide_correspondences
 from .pnp import solve_pose
 from .priors.known import NO_PRIORS, Priors

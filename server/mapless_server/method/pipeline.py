@@ -17,11 +17,10 @@ from mapless.geometry import Array
 from .answer import Answer, Localization, shifted
 from .coarse import Bucket, Outcome, Reconstructor, Request, reconstruct_one
 from .coarse.geometric import GeometricReconstructor
-from .context import StageContext
 from .correspond import Correspondences, Matcher
 from .match import PAPER_MATCH, MatchOptions, match_points
 from .one_reference import OneReferenceOptions
-from .options import LocalizeOptions, Variant
+from .options import LocalizeOptions, StageContext, Variant
 from .pnp import PnpOptions
 from .pose_problem import AdjustOptions
 from .priors.known import NO_PRIORS, Priors

@@ -18,9 +18,8 @@ from dataclasses import dataclass
 from functools import partial
 
 from mapless_server.errors import DataLoss, NotFound
-from mapless_server.method.context import StageContext
 from mapless_server.method.correspond import in_order
-from mapless_server.method.options import check_bounds
+from mapless_server.method.options import StageContext, check_bounds
 from mapless_server.method.views import Matches, PosedView
 from mapless_server.store import Store
 from mapless_server.store.matching_use import delete_unused, record_use

@@ -8,8 +8,8 @@ from collections import OrderedDict
 from collections.abc import Mapping
 
 from mapless_server.errors import DataLoss, NotFound
-from mapless_server.method.context import StageContext
 from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.options import StageContext
 from mapless_server.security import SceneKey
 from mapless_server.store import Store
 

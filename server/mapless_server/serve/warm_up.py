@@ -20,10 +20,9 @@ from mapless.geometry import Camera, RigidTransform
 from mapless_server.engine.query import Caller, Photo, Query
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.method.answer import Localization
-from mapless_server.method.context import StageContext
 from mapless_server.method.correspond import Matcher
 from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.options import LocalizeOptions, StageContext
 from mapless_server.method.views import Photograph, PosedView
 from mapless_server.scenes import Choice, Narrowing
 from mapless_server.scheduling import Flow

@@ -156,7 +156,7 @@ def _skip_generations(source: Connection, target: Connection) -> None:
         raised = {key: max(saved[key], former.get(key, 0)) + GENERATIONS_SKIPPED for key in saved}
         target.execute(insert(scene_generation), [{"scene_id": key, "generation": it} for key, it in raised.items()])
     latest = select(column.generation).where(column.scene_id == scene.c.scene_id).scalar_subquery()
-    target.execute(update(scene).where(~deletion.is_detached(scene.c.scene_id)).values(first_generation=latest))
+    target.execute(update(scene).where(~queries.is_detached(scene.c.scene_id)).values(first_generation=latest))
 
 
 def _verify_copy(source: Connection, path: Path, on_progress: Progress) -> Verification:

@@ -21,8 +21,8 @@ from mapless_server.security import SceneKey
 
 from . import codec, queries, rows
 from .database import Database
-from .deletion import is_detached
 from .pairs import FIRST_RETRY_S, LONGEST_RETRY_S
+from .queries import is_detached
 from .records import SelfCalibration
 from .store import Store
 from .tables import reference, scene, scene_calibration, scene_generation

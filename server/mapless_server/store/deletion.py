@@ -13,13 +13,14 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from itertools import accumulate
 
-from sqlalchemy import Column, ColumnElement, Connection, ScalarSelect, delete, func, insert, literal, select, update
+from sqlalchemy import Column, Connection, ScalarSelect, delete, func, insert, literal, select, update
 
 from mapless_server.errors import Overloaded
 from mapless_server.security import SceneKey
 
 from .database import Database
 from .faults import DamagedPages
+from .queries import DETACHED, is_detached
 from .tables import features, global_descriptor, image, reference, reference_pair, scene
 
 logger = logging.getLogger(__name__)
@@ -35,11 +36,7 @@ REFERENCES_AT_A_TIME = 100
 PAUSE_S = 0.01
 """Between transactions, so that other writers get SQLite's lock, which is given in no order."""
 
-_DETACHED = "-/"
-"""Prefix of the keys of detached scenes: no tenant's name is a hyphen."""
-_DETACHED_END = "-0"
-"""The first text, by code point, after all of them."""
-_DAMAGED = f"{_DETACHED}damaged"
+_DAMAGED = f"{DETACHED}damaged"
 """Key of the references that were deleted but whose pages cannot be freed, since the database cannot read them."""
 
 
@@ -134,7 +131,7 @@ def _log_failure(error: Exception) -> None:
 
 def detach_scene(connection: Connection, scene_key: SceneKey) -> str:
     """Deletes a scene but keeps its references' rows, under the returned key; the caller has the scene's lock."""
-    key = f"{_DETACHED}{uuid.uuid4().hex}"
+    key = f"{DETACHED}{uuid.uuid4().hex}"
     # It gets no generation, so no other statement takes it for a scene.
     connection.execute(insert(scene).values(scene_id=key, create_time_us=0))
     connection.execute(update(reference).where(reference.c.scene_id == scene_key).values(scene_id=key))
@@ -191,8 +188,3 @@ def delete_empty(connection: Connection) -> None:
 def delete_detached(connection: Connection) -> None:
     """Deletes all detached scenes at once."""
     connection.execute(delete(scene).where(is_detached(scene.c.scene_id)))
-
-
-def is_detached(scene_id: ColumnElement[str]) -> ColumnElement[bool]:
-    """Whether a row belongs to a detached scene."""
-    return (scene_id >= _DETACHED) & (scene_id < _DETACHED_END)

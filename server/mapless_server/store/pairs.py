@@ -24,8 +24,8 @@ from mapless_server.security import SceneKey
 
 from . import codec, queries
 from .database import Database
-from .deletion import is_detached
 from .faults import unless_damaged
+from .queries import is_detached
 from .tables import reference, reference_matching, reference_pair, scene, scene_generation
 
 CLAIM_S = 60.0

@@ -17,11 +17,12 @@ from typing import Any
 
 from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
 from mapless_server.errors import RequestError
 
 from .database import StoreError
-from .faults import postgresql_faults_translated
+from .faults import DamagedPages, disk_full, is_damage, unavailable
 from .migrations import migrate, read_version
 from .tables import SCHEMA_VERSION
 
@@ -53,6 +54,11 @@ _SESSION_OPTIONS = {
 _MIGRATION_LOCK = 0x6D61706C657373
 """Any number that other programs on the same database do not use: "mapless"."""
 _UNLIMITED = ("statement_timeout", "lock_timeout", "idle_in_transaction_session_timeout")
+
+# Faults, by class or all of SQLSTATE: https://www.postgresql.org/docs/current/errcodes-appendix.html
+_FULL = "53100"
+_BUSY = ("40001", "40P01", "55P03", "57014")
+_AWAY = ("08", "25006", "25P03", "53", "57P")
 
 
 class PostgresqlDatabase:
@@ -105,13 +111,13 @@ class PostgresqlDatabase:
     @contextmanager
     def read(self) -> Iterator[Connection]:
         """Implements Database."""
-        with postgresql_faults_translated(), self._engine.begin() as connection:
+        with _faults_translated(), self._engine.begin() as connection:
             yield connection
 
     @contextmanager
     def write(self) -> Iterator[Connection]:
         """Implements Database."""
-        with postgresql_faults_translated(), self._writing_engine.begin() as connection:
+        with _faults_translated(), self._writing_engine.begin() as connection:
             yield connection
 
     def lift_limits(self, connection: Connection) -> None:
@@ -202,3 +208,32 @@ def _create_engine(url: URL, cursors_are_binary: bool = True) -> Engine:
 
 def _first_line(error: object) -> str:
     return str(error).partition("\n")[0].strip()
+
+
+@contextmanager
+def _faults_translated() -> Iterator[None]:
+    """Raises faults of PostgreSQL as RequestError where a caller can act on them."""
+    try:
+        yield
+    except PoolTimeoutError as error:
+        raise unavailable("the store is busy") from error
+    except DBAPIError as error:
+        translated = _translated(error)
+        if translated is None:
+            raise
+        raise translated from error.orig
+
+
+def _translated(error: DBAPIError) -> RequestError | None:
+    state: str = getattr(error.orig, "sqlstate", None) or ""
+    if state.startswith(_FULL):
+        return disk_full()
+    if is_damage(error):
+        return DamagedPages()
+    if state.startswith(_BUSY):
+        return unavailable("the store is busy")
+    # The library's own faults have no state: it cannot connect, or the connection broke.
+    is_away = error.connection_invalidated or type(error.orig).__name__ == "OperationalError"
+    if state.startswith(_AWAY) or (not state and is_away):
+        return unavailable("the store is not there")
+    return None

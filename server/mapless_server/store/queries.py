@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Row, Select, Table, delete, select, update
+from sqlalchemy import ColumnElement, Connection, Row, Select, Table, and_, delete, select, update
 from sqlalchemy.dialects import postgresql, sqlite
 
 from mapless.names import reference_name, scene_name
 from mapless_server.errors import AlreadyExists, NotFound
 from mapless_server.security import DEFAULT_TENANT, KEY_SEPARATOR, SceneKey, end_of_keys, key_of, scene_id_of
 
-from .deletion import is_detached
+from . import rows
+from .faults import unless_damaged
+from .records import IndexedReference, SceneChanges
 from .tables import (
     features,
     global_descriptor,
@@ -24,6 +27,10 @@ from .tables import (
     scene_generation,
 )
 
+DETACHED = "-/"
+"""Prefix of the keys of detached scenes: no tenant's name is a hyphen."""
+_DETACHED_END = "-0"
+"""The first text, by code point, after all of them."""
 _IDS_PER_STATEMENT = 500
 """Databases bound the number of parameters of a statement."""
 
@@ -47,13 +54,13 @@ def select_scenes_of(tenant: str, after: str) -> Select[Any]:
 
 def find_scene(connection: Connection, scene_key: SceneKey) -> Row[Any]:
     """The row of `select_scenes` for one scene. Raises NotFound."""
-    return _one(connection, select_scenes().where(scene.c.scene_id == scene_key), _scene_not_found(scene_key))
+    return _one(connection, select_scenes().where(scene.c.scene_id == scene_key), lambda: _scene_not_found(scene_key))
 
 
 def find_attributes(connection: Connection, scene_key: SceneKey) -> Row[Any]:
     """Columns `scene_id`, `attributes` and `attributes_sha256` of a scene. Raises NotFound."""
     statement: Select[Any] = select(scene.c.scene_id, scene.c.attributes, scene.c.attributes_sha256)
-    return _one(connection, statement.where(scene.c.scene_id == scene_key), _scene_not_found(scene_key))
+    return _one(connection, statement.where(scene.c.scene_id == scene_key), lambda: _scene_not_found(scene_key))
 
 
 def find_calibrations(connection: Connection, scene_key: SceneKey) -> Sequence[Row[Any]]:
@@ -68,7 +75,7 @@ def read_generation(connection: Connection, scene_key: SceneKey) -> int:
     statement: Select[Any] = select(scene_generation.c.generation).join(
         scene, scene.c.scene_id == scene_generation.c.scene_id
     )
-    row = _one(connection, statement.where(scene.c.scene_id == scene_key), _scene_not_found(scene_key))
+    row = _one(connection, statement.where(scene.c.scene_id == scene_key), lambda: _scene_not_found(scene_key))
     generation: int = row.generation
     return generation
 
@@ -168,7 +175,7 @@ def features_by_key(connection: Connection, keys: Sequence[str], extractor: str)
 
 def find_by_key(connection: Connection, key: str, *columns: ColumnElement[Any]) -> Row[Any]:
     """Columns of the reference with this key. Raises NotFound if it was deleted."""
-    return _one(connection, select(*columns).where(_exists(key)), _reference_deleted())
+    return _one(connection, select(*columns).where(_exists(key)), _reference_deleted)
 
 
 def lock_reference(connection: Connection, key: str) -> Row[Any]:
@@ -177,7 +184,7 @@ def lock_reference(connection: Connection, key: str) -> Row[Any]:
     Raises NotFound if it was deleted before.
     """
     statement: Select[Any] = select(reference.c.scene_id, reference.c.reference_id).where(_exists(key))
-    return _one(connection, statement.with_for_update(read=True, key_share=True), _reference_deleted())
+    return _one(connection, statement.with_for_update(read=True, key_share=True), _reference_deleted)
 
 
 def find_image(connection: Connection, key: str) -> Row[Any]:
@@ -187,7 +194,7 @@ def find_image(connection: Connection, key: str) -> Row[Any]:
         .outerjoin(image, image.c.reference_key == reference.c.key)
         .where(_exists(key))
     )
-    return _one(connection, statement, _reference_deleted())
+    return _one(connection, statement, _reference_deleted)
 
 
 def has_features(connection: Connection, key: str, extractor: str) -> bool:
@@ -201,6 +208,11 @@ def has_descriptor(connection: Connection, key: str, name: str) -> bool:
     """Whether a reference has a global descriptor of this name."""
     column = global_descriptor.c
     return connection.scalar(select(column.name).where(column.reference_key == key, column.name == name)) is not None
+
+
+def is_detached(scene_id: ColumnElement[str]) -> ColumnElement[bool]:
+    """Whether a row belongs to a detached scene."""
+    return (scene_id >= DETACHED) & (scene_id < _DETACHED_END)
 
 
 def insert_new(connection: Connection, table: Table, row: Mapping[str, Any]) -> bool:
@@ -225,10 +237,10 @@ def _scene_not_found(scene_key: SceneKey) -> NotFound:
     return NotFound(f"there is no scene {scene_id!r}", field="scene", resource=scene_name(scene_id))
 
 
-def _one(connection: Connection, statement: Select[Any], missing: NotFound) -> Row[Any]:
+def _one(connection: Connection, statement: Select[Any], missing: Callable[[], NotFound]) -> Row[Any]:
     row = connection.execute(statement).one_or_none()
     if row is None:
-        raise missing
+        raise missing()
     return row
 
 
@@ -253,3 +265,68 @@ def _upsert(connection: Connection, table: Table) -> Any:
 def _portions(ids: Sequence[str]) -> Iterator[Sequence[str]]:
     for start in range(0, len(ids), _IDS_PER_STATEMENT):
         yield ids[start : start + _IDS_PER_STATEMENT]
+
+
+_ROWS_AT_A_TIME = 2000
+"""A few megabytes, so that a scene that is read whole is not in memory twice."""
+
+_Found = tuple[tuple[IndexedReference, ...], tuple[str, ...]]
+"""References, and the ids of damaged ones; both ordered by id."""
+
+
+def read_changes(
+    connection: Connection, scene_key: SceneKey, since_generation: int | None, descriptor_name: str
+) -> SceneChanges:
+    """See `Store.list_changes`; in the caller's transaction, which must see one moment."""
+    row = find_scene(connection, scene_key)
+    generation: int = row.generation
+    # A later generation than the scene's is that of a database which has been replaced by a backup.
+    if since_generation is None or not row.first_generation <= since_generation <= generation:
+        added, damaged = _read(connection, scene_key, -1, descriptor_name)
+        return SceneChanges(generation, added, frozenset(), True, damaged)
+    if since_generation == generation:
+        return SceneChanges(generation, (), frozenset(), False)
+    removed = removed_reference.c
+    gone = select(removed.reference_key).where(removed.scene_id == scene_key, removed.generation > since_generation)
+    added, damaged = _read(connection, scene_key, since_generation, descriptor_name)
+    return SceneChanges(generation, added, frozenset(connection.scalars(gone)), False, damaged)
+
+
+def _read(connection: Connection, scene_key: SceneKey, after_generation: int, descriptor_name: str) -> _Found:
+    """The references that were added or described after a generation."""
+    column, descriptor = reference.c, global_descriptor.c
+    is_changed = and_(column.scene_id == scene_key, column.generation > after_generation)
+    indexed: Select[Any] = select(
+        column.reference_id, column.key, column.geometry, column.geometry_sha256, descriptor.data, descriptor.sha256
+    ).outerjoin(global_descriptor, and_(descriptor.reference_key == column.key, descriptor.name == descriptor_name))
+
+    def read_together() -> _Found:
+        result = connection.execute(indexed.where(is_changed), execution_options={"yield_per": _ROWS_AT_A_TIME})
+        references: list[IndexedReference] = []
+        damaged: list[str] = []
+        for portion in result.partitions():
+            some, damaged_ids = rows.indexed_references(portion, descriptor_name)
+            references += some
+            damaged += damaged_ids
+        return tuple(sorted(references, key=lambda it: it.reference_id)), tuple(sorted(damaged))
+
+    def read_each() -> _Found:
+        changed = select(column.reference_id, column.key).where(is_changed).order_by(column.reference_id)
+        references: list[IndexedReference] = []
+        damaged: list[str] = []
+        for row in connection.execute(changed).all():
+            one = indexed.where(column.key == row.key)
+            found = unless_damaged(connection, partial(_all, connection, one), lambda: None)
+            if found is None:
+                damaged.append(row.reference_id)
+                continue
+            some, damaged_ids = rows.indexed_references(found, descriptor_name)
+            references += some
+            damaged += damaged_ids
+        return tuple(references), tuple(damaged)
+
+    return unless_damaged(connection, read_together, read_each)
+
+
+def _all(connection: Connection, statement: Select[Any]) -> Sequence[Row[Any]]:
+    return connection.execute(statement).all()

@@ -16,9 +16,9 @@ from mapless_server.security import SceneKey
 
 from . import queries, rows, tables
 from .cache import LruCache
-from .changes import read_changes
 from .database import Database
 from .faults import DamagedPages, unless_damaged
+from .queries import read_changes
 from .records import DescribedReference, ReferenceRecord, SceneAttributes, SceneChanges, SceneRecord, SceneSnapshot
 
 P = ParamSpec("P")

@@ -170,7 +170,7 @@ def descriptor_owner(key: str, name: str) -> str:
 
 
 def indexed_references(found: Sequence[Row[Any]], descriptor_name: str) -> tuple[list[IndexedReference], list[str]]:
-    """From rows as `changes` selects them, all at once for speed; and the ids of those that are damaged."""
+    """From rows of `queries.read_changes`, all at once for speed; and the ids of those that are damaged."""
     intact = [row for row in found if _is_intact(row, descriptor_name)]
     poses = codec.decode_poses([row.geometry for row in intact])
     vectors = iter(codec.decode_descriptors([row.data for row in intact if row.sha256 is not None]))

@@ -21,10 +21,10 @@ from urllib.parse import quote
 from sqlalchemy import URL, Connection, Engine, create_engine, event
 from sqlalchemy.exc import DBAPIError
 
-from mapless_server.errors import FailedPrecondition, RequestError
+from mapless_server.errors import FailedPrecondition, RequestError, Unavailable
 
 from .database import StoreError
-from .faults import is_damage, sqlite_faults_translated
+from .faults import RETRY_AFTER_S, DamagedPages, disk_full, is_damage, unavailable
 from .folder_lock import FolderLock
 from .migrations import migrate, read_version
 from .tables import SCHEMA_VERSION
@@ -43,6 +43,9 @@ SPACE_TO_OPEN_BYTES = 64 * 1024
 
 _URI_PREFIX = "file:"
 _BEGIN_OPTION = "sqlite_begin_statement"
+
+# Its faults are known by their texts, which have not changed in decades; codes reach Python from 3.11 on only.
+_BROKEN = ("disk I/O error", "unable to open database file")
 
 
 def has_wal_reset_bug(version: tuple[int, int, int]) -> bool:
@@ -181,7 +184,7 @@ class SqliteDatabase:
     def read(self) -> Iterator[Connection]:
         """Implements Database."""
         # Rolled back, as closing does: after a damaged page SQLite refuses to commit even an empty transaction.
-        with sqlite_faults_translated(), self._engine.connect() as connection:
+        with _faults_translated(), self._engine.connect() as connection:
             connection.begin()
             yield connection
 
@@ -190,7 +193,7 @@ class SqliteDatabase:
         """Implements Database."""
         if self.only_reads:
             raise FailedPrecondition("the store can only be read", reason="STORE_READ_ONLY")
-        with sqlite_faults_translated(), self._write_lock, self._writing_engine.begin() as connection:
+        with _faults_translated(), self._write_lock, self._writing_engine.begin() as connection:
             yield connection
 
     def lift_limits(self, connection: Connection) -> None:
@@ -199,7 +202,7 @@ class SqliteDatabase:
     def free_space(self) -> None:
         """Implements Database."""
         suppressed = suppress(self._engine.dialect.loaded_dbapi.Error)  # the journal then stays as it is
-        with sqlite_faults_translated(), self._write_lock, self._engine.connect() as connection, suppressed:
+        with _faults_translated(), self._write_lock, self._engine.connect() as connection, suppressed:
             # Writers wait while this waits for readers.
             _execute(connection, f"PRAGMA busy_timeout={FREE_SPACE_TIMEOUT_MS}")
             try:
@@ -308,3 +311,30 @@ def choose_library() -> ModuleType:
     with suppress(ImportError):
         libraries.insert(0, importlib.import_module("pysqlite3.dbapi2"))
     return next((it for it in libraries if not has_wal_reset_bug(it.sqlite_version_info)), libraries[0])
+
+
+@contextmanager
+def _faults_translated() -> Iterator[None]:
+    """Raises faults of SQLite as RequestError where a caller can act on them."""
+    try:
+        yield
+    except DBAPIError as error:
+        translated = _translated(error)
+        if translated is None:
+            raise
+        raise translated from error
+
+
+def _translated(error: DBAPIError) -> RequestError | None:
+    text = str(error.orig)
+    if is_damage(error):
+        return DamagedPages()
+    if "is locked" in text:
+        return Unavailable("the store is busy", retry_after_s=RETRY_AFTER_S)
+    if "is full" in text:
+        return disk_full()
+    if "readonly database" in text:
+        return FailedPrecondition("the store can only be read", reason="STORE_READ_ONLY")
+    if any(it in text for it in _BROKEN):
+        return unavailable("the store's disk fails")
+    return None

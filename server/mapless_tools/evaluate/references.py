@@ -12,9 +12,9 @@ from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, decode_image, image_size
 from mapless_server.method.correspond import OPTIONS
 from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.retrieve import choose_references
 from mapless_server.method.views import PosedView, View
 from mapless_server.networks.weights import WeightsError
+from mapless_server.scenes.retrieval.ranking import choose_references
 from mapless_server.serve.assembly import image_limits, make_first_features
 from mapless_server.settings import Settings, available_cores
 from mapless_tools.dataset import Dataset, Frame

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mapless_server import __version__
-from mapless_server.method.retrieve import RetrieveOptions
+from mapless_server.scenes.retrieval.ranking import RetrieveOptions
 from mapless_tools.output_files import finite
 
 from .metrics import QueryResult, Summary, summarize

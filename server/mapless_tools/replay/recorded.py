@@ -15,8 +15,8 @@ from mapless.names import reference_name
 from mapless_server.engine.references import QueryViews
 from mapless_server.errors import DataLoss
 from mapless_server.images import decode_image
-from mapless_server.method.context import StageContext
 from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.options import StageContext
 from mapless_server.method.views import Photograph, PosedView, View
 from mapless_server.scenes import Choice, Selection
 from mapless_server.scenes.library import STORED_IMAGES, Loaded

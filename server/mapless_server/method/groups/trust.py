@@ -17,10 +17,18 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform
 
 from ..rejection import Rejection
-from ..trust.agreement import NO_AGREEMENT, AgreementOptions
-from ..trust.evidence import Evidence, epipolar_share, expected_share, findable_count, hull_share
+from ..trust.evidence import (
+    NO_AGREEMENT,
+    AgreementOptions,
+    Evidence,
+    Votes,
+    epipolar_share,
+    expected_share,
+    findable_count,
+    hull_share,
+    votes_on,
+)
 from ..trust.judge import JudgeOptions, low_trust, trust_of
-from ..trust.votes import Votes, votes_on
 from .generalized import CameraMatches, rig_ransac
 from .images import PosedImage
 

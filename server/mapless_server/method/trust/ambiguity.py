@@ -29,8 +29,8 @@ from ..pnp import PnpOptions, ransac
 from ..rejection import Hypothesis
 from ..results import Support
 from ..uncertainty.radii import Accuracy, accuracy_from_covariance
+from .evidence import Votes
 from .gate import false_alarms
-from .votes import Votes
 
 
 @dataclass(frozen=True)

@@ -28,11 +28,9 @@ from ..options import check_bounds
 from ..rejection import Hypothesis, Rejection, RejectionReason
 from ..results import Support
 from ..views import Matches
-from .agreement import AgreementOptions
 from .ambiguity import AmbiguityOptions, find_rival
-from .evidence import Evidence, evidence_of
+from .evidence import AgreementOptions, Evidence, Votes, evidence_of, votes_of
 from .intrinsics import IntrinsicsOptions, wrong_intrinsics
-from .votes import Votes, votes_of
 
 _RARE = (0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075)
 LEVELS = (*_RARE, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)

@@ -11,8 +11,8 @@ import numpy as np
 
 from mapless.names import parse_reference_name, reference_name
 from mapless_server.errors import DataLoss, NotFound, RequestError, Unavailable
-from mapless_server.method.context import StageContext
 from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.options import StageContext
 from mapless_server.method.views import PosedView
 from mapless_server.security import SceneKey, scene_id_of
 

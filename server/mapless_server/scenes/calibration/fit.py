@@ -29,8 +29,7 @@ from mapless.geometry import Array
 from mapless_server.method.intrinsics import NAMES, IntrinsicsEvidence
 from mapless_server.method.options import check_bounds
 from mapless_server.method.trust.judge import LEVELS
-from mapless_server.method.uncertainty.gap import growth
-from mapless_server.method.uncertainty.radii import Accuracy
+from mapless_server.method.uncertainty.radii import Accuracy, growth
 from mapless_server.store import SelfCalibration
 
 RIGHT_SHARE, RIGHT_DEG = 0.05, 5.0

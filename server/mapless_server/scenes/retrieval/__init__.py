@@ -5,7 +5,5 @@ vlad         the descriptor that is made of local features, and its vocabularies
 megaloc      the paper's descriptor, a network on the pixels; needs torch
 index        a scene's descriptors and poses in memory
 narrowing    limits and likely values of the camera's pose
-ranking      the selection: by similarity, spread in space, within the limits
-
-`method.retrieve` compares the features themselves, of few candidates.
+ranking      the selection: by similarity, spread in space, within the limits; then by matches of features, of few
 """

@@ -16,8 +16,7 @@ from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.priors.known import PriorCheck
 from mapless_server.method.rejection import Hint, IntrinsicsCheck, Rejection
 from mapless_server.method.results import MetricScale
-from mapless_server.method.uncertainty.gap import viewpoint_gap
-from mapless_server.method.uncertainty.radii import accuracy_from_covariance
+from mapless_server.method.uncertainty.radii import accuracy_from_covariance, viewpoint_gap
 from mapless_server.store import SceneAttributes
 
 from .queries import enum_from_message, enum_to_message

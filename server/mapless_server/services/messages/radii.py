@@ -11,8 +11,7 @@ import numpy as np
 from mapless.geometry import Array
 from mapless.scenes import MAX_FACTOR, MIN_FACTOR, Calibration
 from mapless_server.method.options import Variant
-from mapless_server.method.uncertainty.gap import growth
-from mapless_server.method.uncertainty.radii import Accuracy
+from mapless_server.method.uncertainty.radii import Accuracy, growth
 from mapless_server.store import SceneAttributes, SelfCalibration, calibration_kind
 
 _SELF_CALIBRATED = Variant.BEST.name

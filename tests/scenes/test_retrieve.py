@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from support.scenes import CAMERA, SceneOptions, make_scene, random_for, unit_rows
 
 from mapless.geometry import Array, RigidTransform
-from mapless_server.method.retrieve import RetrieveOptions, choose_references, spread_choice
 from mapless_server.method.views import Features, PosedView, View
+from mapless_server.scenes.retrieval.ranking import RetrieveOptions, choose_references, spread_choice
 
 LINE = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [1.0, 0, 0], [1.1, 0, 0]])
 
