@@ -19,6 +19,10 @@ unexport PYTHONDONTWRITEBYTECODE
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
 
+# Kapture's own library, to which tests compare ours. Without what it depends on, a compiler of 200 MB among it, and hence in
+# a folder of its own.
+KAPTURE := kapture==1.1.12 numpy-quaternion==2024.0.13
+
 # uv installs in seconds what takes pip minutes.
 INSTALL = $(BIN)/python .ci/uv.py pip install --quiet
 
@@ -27,6 +31,7 @@ $(VENV)/.installed: pyproject.toml
 	$(BIN)/pip install --quiet --disable-pip-version-check uv
 	$(INSTALL) $(TORCH)
 	$(INSTALL) --editable '.[server,tools,networks,otel,postgres,ray,view,gateway,dev]'
+	$(INSTALL) --no-deps --target $(VENV)/kapture $(KAPTURE)
 	touch $@
 
 setup: $(VENV)/.installed  ## Create .venv with everything

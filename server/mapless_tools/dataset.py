@@ -146,6 +146,7 @@ def read_folder(path: Path, skips_unusable: bool = False) -> Dataset:
     if not frames:
         first = refused[0]
         raise ValueError(f"{path}: none of {len(refused)} frames can be used; {first.frame}: {first.reason}")
+    datum, down_in_world = read_place(file, content)
     return Dataset(
         path.resolve().name,
         tuple(frames),
@@ -153,9 +154,14 @@ def read_folder(path: Path, skips_unusable: bool = False) -> Dataset:
         _text(content, "source"),
         _text(content, "ground_truth"),
         refused=tuple(refused),
-        datum=_parsed(path, content, "datum", Datum.from_json),
-        down_in_world=_parsed(path, content, "down_in_world", _direction),
+        datum=datum,
+        down_in_world=down_in_world,
     )
+
+
+def read_place(file: Path, content: Mapping[str, Any]) -> tuple[Datum | None, Vector | None]:
+    """Datum and direction of gravity of a file's content, each None if it is not there; ValueError names the field."""
+    return _parsed(file, content, "datum", Datum.from_json), _parsed(file, content, "down_in_world", _direction)
 
 
 def read_json(file: Path) -> Any:
@@ -173,13 +179,13 @@ def _text(content: Mapping[str, Any], field: str) -> str:
     return printable(text) if isinstance(text, str) else ""
 
 
-def _parsed(path: Path, content: Mapping[str, Any], field: str, read: Callable[[object], Parsed]) -> Parsed | None:
+def _parsed(file: Path, content: Mapping[str, Any], field: str, read: Callable[[object], Parsed]) -> Parsed | None:
     if content.get(field) is None:
         return None
     try:
         return read(content[field])
     except ValueError as error:
-        raise ValueError(f"{path / FILE_NAME}: {field}: {error}") from error
+        raise ValueError(f"{file}: {field}: {error}") from error
 
 
 def _direction(content: object) -> Vector:

@@ -1,4 +1,4 @@
-"""Importers: our own cameras.json, nerfstudio's transforms.json, captures of phones, TUM RGB-D."""
+"""Importers: our own cameras.json, nerfstudio's transforms.json, captures of phones, TUM RGB-D, kapture with a rig."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from support.layouts import opengl
 
 from mapless_tools.ingest.formats import Intrinsics, ReadOptions
-from mapless_tools.ingest.formats.writing import PosedImage, cameras_files
+from mapless_tools.ingest.formats.writing import PosedImage, cameras_files, kapture_files
 
 from .importing import CAMERA, TRUTH, Layout, image_of, numbers, target
 
@@ -67,6 +67,14 @@ def _trajectory() -> bytes:
     return "\n".join(rows).encode()
 
 
+def _kapture() -> dict[str, bytes]:
+    images = [PosedImage(f"{i}.png", CAMERA, pose) for i, pose in enumerate(TRUTH.poses)]
+    tables = {name: text.encode() for name, text in kapture_files(images, "a test").items()}
+    trajectories = tables["sensors/trajectories.txt"].replace(b"1, camera1", b"1, rig")
+    rigs = b"# kapture format: 1.1\nrig, camera1, 1, 0, 0, 0, 0.1, 0, 0\n"
+    return tables | {"sensors/trajectories.txt": trajectories, "sensors/rigs.txt": rigs}
+
+
 def _with_intrinsics(folder: Path) -> ReadOptions:
     return ReadOptions(intrinsics=Intrinsics(30.0, 31.0, 15.25, 16.75))
 
@@ -102,6 +110,7 @@ LAYOUTS = (
         _IMAGES,
         _with_intrinsics,
     ),
+    Layout("kapture", "rig", _kapture(), [f"sensors/records_data/{i}.png" for i in range(3)]),
 )
 
 TARGET = target(

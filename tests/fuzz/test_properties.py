@@ -181,11 +181,12 @@ def test_poses_and_names_survive_the_layouts_that_we_write(
     lens = RadialTangential(0.1, -0.2, 0.01, 0.02)
     images = []
     for name, pose, is_distorted in planted:
-        (folder / "images").mkdir(exist_ok=True)
-        (folder / "images" / f"{name}.png").write_bytes(image_of(".png", 0))
+        place = folder / LAYOUTS[layout].images
+        place.mkdir(parents=True, exist_ok=True)
+        (place / f"{name}.png").write_bytes(image_of(".png", 0))
         camera = Camera(**{**vars(CAMERA), "distortion": lens if is_distorted else None})
         images.append(PosedImage(f"{name}.png", camera, pose))
-    for file, text in LAYOUTS[layout](images, "a test").items():
+    for file, text in LAYOUTS[layout].files(images, "a test").items():
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
         (folder / file).write_text(text)
     dataset = read_dataset(folder)

@@ -23,7 +23,7 @@ from mapless_server.security import SceneKey
 from mapless_server.store import Store
 from mapless_tools.cli.app import app
 from mapless_tools.ingest.formats import read_dataset
-from mapless_tools.ingest.formats.writing import PosedImage, cameras_files
+from mapless_tools.ingest.formats.writing import LAYOUTS, PosedImage, cameras_files
 
 LENSES = (None, RadialTangential(0.1, -0.2, 0.01, 0.02, 0.3), Fisheye(0.1, 0.2, 0.3, 0.4))
 ENDINGS = (".png", ".jpg", ".webp")
@@ -47,7 +47,7 @@ def filled(client: Client) -> Iterator[tuple[str, list[NewReference]]]:
     client.delete_scene(scene)
 
 
-@pytest.mark.parametrize("layout", ["cameras", "colmap"])
+@pytest.mark.parametrize("layout", list(LAYOUTS))
 def test_an_export_imports_as_the_same_scene(
     server: RunningServer, client: Client, filled: tuple[str, list[NewReference]], layout: str, tmp_path: Path
 ) -> None:
@@ -67,14 +67,15 @@ def test_an_export_imports_as_the_same_scene(
     assert "0 added, 3 skipped as duplicates, 0 refused" in again.stdout
 
 
+@pytest.mark.parametrize("layout", ["cameras", "kapture"])
 def test_where_a_scene_is_on_the_earth_goes_along(
-    server: RunningServer, client: Client, filled: tuple[str, list[NewReference]], tmp_path: Path
+    server: RunningServer, client: Client, filled: tuple[str, list[NewReference]], layout: str, tmp_path: Path
 ) -> None:
     scene, _ = filled
     datum = Datum(47.1 / 3, 8.1 / 3, 400.1 / 3, enu_from_y_up(30))
     client.update_scene(scene, datum=datum, down_in_world=(0.01, -1.0, 0.02))
     exported = client.get_scene(scene)
-    assert run(server, "export", scene, tmp_path / "out").exit_code == 0
+    assert run(server, "export", scene, tmp_path / "out", "--format", layout).exit_code == 0
     copy = f"{scene}-copy"
     done = run(server, "import", tmp_path / "out", copy, "--skip-check")
     assert done.exit_code == 0, done.output
@@ -128,7 +129,7 @@ def test_absent_or_empty_scenes_and_unwritable_layouts(server: RunningServer, cl
     done = run(server, "export", scene, tmp_path / "b")
     assert (done.exit_code, "has no references" in done.stderr) == (2, True)
     done = run(server, "export", scene, tmp_path / "c", "--format", "7scenes")
-    assert (done.exit_code, "cameras or colmap" in done.stderr) == (2, True)
+    assert (done.exit_code, "cameras, colmap, kapture, gltf" in done.stderr) == (2, True)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -161,3 +162,16 @@ def test_where_all_are_damaged_no_folder_is_left_behind(tmp_path: Path) -> None:
         for _ in range(2):
             done = run(server, "export", "s", tmp_path / "out")
             assert (done.exit_code, "0 of 1 written, 1 damaged" in done.stderr) == (1, True)
+
+
+def test_a_scene_to_look_at_is_one_file(
+    server: RunningServer, filled: tuple[str, list[NewReference]], tmp_path: Path
+) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    scene, references = filled
+    done = run(server, "export", scene, tmp_path / "out", "--format", "gltf")
+    assert done.exit_code == 0, done.output
+    (file,) = (tmp_path / "out").iterdir()
+    assert file.name == f"{scene}.glb"
+    names = {*trimesh.load(file).graph.nodes}
+    assert {it.reference_id for it in references} | {f"photograph of {it.reference_id}" for it in references} <= names

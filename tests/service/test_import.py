@@ -37,7 +37,7 @@ def folder(tmp_path: Path) -> Path:
     for i, pose in enumerate(truth(COUNT).poses):
         write_image(path / "images" / f"p{i:02d}.png", seed=i)
         images.append(PosedImage(f"p{i:02d}.png", CAMERA, pose))
-    content = json.loads(LAYOUTS["cameras"](images, "a test")["cameras.json"])
+    content = json.loads(LAYOUTS["cameras"].files(images, "a test")["cameras.json"])
     for i, frame in enumerate(content["frames"]):
         frame["split"] = "train" if i < 8 else "test"
     (path / "cameras.json").write_text(json.dumps(content))
@@ -215,7 +215,7 @@ def test_after_a_termination_the_next_run_continues(tmp_path: Path) -> None:
     for i, pose in enumerate(truth(count).poses):
         write_image(folder / "images" / f"p{i:03d}.png", i, 160, 120)
         images.append(PosedImage(f"p{i:03d}.png", Camera(160, 120, 150.0, 150.0, 79.5, 59.5), pose))
-    (folder / "cameras.json").write_text(LAYOUTS["cameras"](images, "a test")["cameras.json"])
+    (folder / "cameras.json").write_text(LAYOUTS["cameras"].files(images, "a test")["cameras.json"])
     environment = os.environ | {"MAPLESS_DATA_DIR": str(tmp_path / "store")}
     report = tmp_path / "report.json"
     arguments = [sys.executable, "-m", "mapless_tools", "import", str(folder), "place", "--skip-check"]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_tools.dataset import Dataset, Frame
+from mapless_tools.ingest.formats.writing import LAYOUTS, PosedImage, write_file
 from support.images import encode, textured
 
 CAMERA = Camera(96, 64, 80.0, 81.0, 47.25, 30.75)
@@ -55,6 +56,18 @@ def write_cameras(
         size = {"width": camera.width_px, "height": camera.height_px, "K": camera.matrix().tolist(), "dist": None}
         frames.append({"image": f"images/{i}{suffix}", "world_from_camera": pose.matrix().tolist()} | size)
     (folder / "cameras.json").write_text(json.dumps({"metric": True, "source": "planted", "frames": frames}))
+    return folder
+
+
+def write_layout(folder: Path, layout: str, planted: Truth) -> Path:
+    """A folder in one of the layouts that are written; the folder."""
+    images = []
+    for i, pose in enumerate(planted.poses):
+        write_image(folder / LAYOUTS[layout].images / f"{i}.png", seed=i)
+        images.append(PosedImage(f"{i}.png", planted.camera, pose))
+    for path, text in LAYOUTS[layout].files(images, "a test").items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        write_file(folder / path, text.encode())
     return folder
 
 

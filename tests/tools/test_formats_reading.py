@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.layouts import CAMERA, Truth, assert_reads, reasons, truth, write_image
+from support.layouts import CAMERA, Truth, assert_reads, reasons, truth, write_image, write_layout
 
 from mapless.geometry import Fisheye, RadialTangential
 from mapless_tools.dataset import read_folder
@@ -18,17 +18,6 @@ from mapless_tools.ingest.formats import read_dataset, recognize
 from mapless_tools.ingest.formats.writing import LAYOUTS, PosedImage, image_name, write_file
 
 TRUTH = truth()
-
-
-def write_layout(folder: Path, layout: str, planted: Truth = TRUTH) -> Path:
-    images = []
-    for i, pose in enumerate(planted.poses):
-        write_image(folder / "images" / f"{i}.png", seed=i)
-        images.append(PosedImage(f"{i}.png", planted.camera, pose))
-    for path, text in LAYOUTS[layout](images, "a test").items():
-        (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        write_file(folder / path, text.encode())
-    return folder
 
 
 @pytest.mark.parametrize("layout", list(LAYOUTS))
@@ -42,7 +31,7 @@ def test_a_layout_that_is_written_is_recognized_and_reads_back(tmp_path: Path, l
 
 
 def test_a_folder_of_two_layouts_is_not_guessed_at(tmp_path: Path) -> None:
-    write_layout(write_layout(tmp_path, "cameras"), "colmap")
+    write_layout(write_layout(tmp_path, "cameras", TRUTH), "colmap", TRUTH)
     with pytest.raises(ValueError, match="cameras, colmap; name one with --format"):
         read_dataset(tmp_path)
     for layout in ("cameras", "colmap"):
@@ -62,7 +51,7 @@ def test_folders_without_a_layout_and_layouts_without_a_name(tmp_path: Path) -> 
 
 
 def test_cameras_json_keeps_what_is_usable_and_names_the_rest(tmp_path: Path) -> None:
-    file = write_layout(tmp_path, "cameras") / "cameras.json"
+    file = write_layout(tmp_path, "cameras", TRUTH) / "cameras.json"
     content = json.loads(file.read_text())
     good = content["frames"][0]
     left_handed = np.diag([1.0, 1.0, -1.0, 1.0]).tolist()
@@ -93,7 +82,7 @@ def test_cameras_json_keeps_what_is_usable_and_names_the_rest(tmp_path: Path) ->
 
 
 def test_a_folder_with_nothing_usable_says_why_of_the_first(tmp_path: Path) -> None:
-    file = write_layout(tmp_path, "cameras") / "cameras.json"
+    file = write_layout(tmp_path, "cameras", TRUTH) / "cameras.json"
     content = json.loads(file.read_text())
     for frame in content["frames"]:
         del frame["K"]
@@ -103,7 +92,7 @@ def test_a_folder_with_nothing_usable_says_why_of_the_first(tmp_path: Path) -> N
 
 
 def test_splits_and_ground_truth_of_cameras_json(tmp_path: Path) -> None:
-    file = write_layout(tmp_path, "cameras") / "cameras.json"
+    file = write_layout(tmp_path, "cameras", TRUTH) / "cameras.json"
     content = json.loads(file.read_text()) | {"ground_truth": "laser scan"}
     for frame, split in zip(content["frames"], ("train", "test", "", "train"), strict=True):
         frame["split"] = split
@@ -116,7 +105,7 @@ def test_splits_and_ground_truth_of_cameras_json(tmp_path: Path) -> None:
 def test_long_ids_come_back_from_their_file_names(tmp_path: Path) -> None:
     name = image_name("r" * 128, b"\x89PNG")
     write_image(tmp_path / "images" / name)
-    text = LAYOUTS["cameras"]([PosedImage(name, CAMERA, TRUTH.poses[0])], "a test")["cameras.json"]
+    text = LAYOUTS["cameras"].files([PosedImage(name, CAMERA, TRUTH.poses[0])], "a test")["cameras.json"]
     (tmp_path / "cameras.json").write_text(text)
     (frame,) = read_dataset(tmp_path).frames
     assert frame.name == "r" * 128

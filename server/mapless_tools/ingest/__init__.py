@@ -14,5 +14,6 @@ FORMATS = {
     "nerf": "nerf",
     "tum": "tum",
     "arkit": "arkit",
+    "kapture": "kapture",
 }
 """Layouts that can be read: each name, and the module of `formats` that reads it. Here, where --help has it quickly."""

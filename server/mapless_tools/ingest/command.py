@@ -113,7 +113,7 @@ def import_command(
 def export_command(
     scene: Scene,
     folder: Annotated[Path, typer.Argument(help="Folder to write to; must be empty or not be there.")],
-    format: Annotated[str, typer.Option(help="Layout: cameras or colmap.")] = "cameras",
+    format: Annotated[str, typer.Option(help="Layout: cameras, colmap, kapture, or gltf to look at.")] = "cameras",
     data_dir: DataDir = None,
     *,
     connection: Connection,

@@ -5,44 +5,21 @@ It is also how a store is rescued of which a disk has damaged something: the ref
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
-from mapless import Client, DataLoss
+from mapless import Client, Reference
 from mapless_tools.progress import Progress
 
-from .formats.writing import IMAGES, LAYOUTS, PosedImage, image_name, write_file
+from .fetching import Export, fetch_all
+from .formats.writing import LAYOUTS, PosedImage, image_name, write_file
 
-PARALLEL = 4
-
-
-@dataclass(frozen=True)
-class Export:
-    """What became of a scene's references.
-
-    Attributes:
-        written: how many lie in the folder.
-        damaged: the server's messages about the others, by their ids, in their order.
-    """
-
-    written: int
-    damaged: Mapping[str, str]
-
-    @property
-    def total(self) -> int:
-        """How many the scene has."""
-        return self.written + len(self.damaged)
+FORMATS = (*LAYOUTS, "gltf")
 
 
 def check_target(folder: Path, layout: str) -> None:
     """Raises ValueError unless the folder is empty or not there, and the layout is one that is written."""
-    if layout not in LAYOUTS:
-        raise ValueError(f"format must be {' or '.join(LAYOUTS)}, not {layout!r}")
+    if layout not in FORMATS:
+        raise ValueError(f"format must be one of {', '.join(FORMATS)}, not {layout!r}")
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder} is not a folder")
     if folder.is_dir() and any(folder.iterdir()):
@@ -52,8 +29,8 @@ def check_target(folder: Path, layout: str) -> None:
 def export_scene(client: Client, scene: str, folder: Path, layout: str, progress: Progress) -> Export:
     """Writes a scene's references into a folder, but for those that are damaged.
 
-    The layout `cameras` has the scene's datum, down and unit, too. A calibration is of these references on a server of
-    this version, and is measured anew elsewhere; a backup keeps it.
+    The layouts `cameras` and `kapture` have the scene's datum, down and unit, too. A calibration is of these references
+    on a server of this version, and is measured anew elsewhere; a backup keeps it.
 
     The description is written last, so that a folder without it is an interrupted export. Where every reference is
     damaged, nothing is left in the folder.
@@ -64,51 +41,24 @@ def export_scene(client: Client, scene: str, folder: Path, layout: str, progress
         MaplessError: a call failed.
     """
     check_target(folder, layout)
+    if layout == "gltf":
+        from .gltf import export_gltf
+
+        return export_gltf(client, scene, folder, progress)
+    written = LAYOUTS[layout]
+    place = folder / written.images
+
+    def take(reference: Reference) -> PosedImage:
+        image = reference.image or b""
+        name = image_name(reference.reference_id, image)
+        place.mkdir(parents=True, exist_ok=True)
+        write_file(place / name, image)
+        return PosedImage(name, reference.camera, reference.world_from_camera)
+
     known = client.get_scene(scene)
-    references = _reference_ids(client, scene)
-    if not references:
-        raise ValueError(f"scene {scene} has no references")
-    (folder / IMAGES).mkdir(parents=True, exist_ok=True)
-    progress("writing images", 0, len(references))
-    images: list[PosedImage] = []
-    damaged: dict[str, str] = {}
-    threads = ThreadPoolExecutor(PARALLEL, "export")
-    try:
-        found = threads.map(partial(_write_image, client, folder, scene), references)
-        for reference_id, image in zip(references, found, strict=True):
-            if isinstance(image, PosedImage):
-                images.append(image)
-            else:
-                damaged[reference_id] = image
-            progress("writing images", len(images) + len(damaged), len(references))
-    finally:
-        threads.shutdown(wait=True, cancel_futures=True)
+    images, damaged = fetch_all(client, scene, take, progress)
     if images:
-        for path, text in LAYOUTS[layout](images, f"mapless scene {scene}", known).items():
+        for path, text in written.files(images, f"mapless scene {scene}", known).items():
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
             write_file(folder / path, text.encode())
-    else:
-        (folder / IMAGES).rmdir()
     return Export(len(images), damaged)
-
-
-def _reference_ids(client: Client, scene: str) -> list[str]:
-    """Of all references, damaged ones too."""
-    with suppress(DataLoss):
-        return [reference.reference_id for reference in client.list_references(scene, page_size=1000)]
-    # A list ends at a reference whose pose is damaged; an audit names it and continues, but examines each reference.
-    return [audit.name.rpartition("/")[2] for audit in client.audit_scene(scene)]
-
-
-def _write_image(client: Client, folder: Path, scene: str, reference_id: str) -> PosedImage | str:
-    """Fetches an image and writes it, bit by bit as it was stored; or what is damaged."""
-    try:
-        reference = client.get_reference(scene, reference_id, include_image=True)
-    except DataLoss as error:
-        return error.message
-    image = reference.image or b""
-    if hashlib.sha256(image).hexdigest() != reference.image_sha256:
-        return f"reference {reference_id!r}: the image received is not the one that was stored"
-    name = image_name(reference_id, image)
-    write_file(folder / IMAGES / name, image)
-    return PosedImage(name, reference.camera, reference.world_from_camera)

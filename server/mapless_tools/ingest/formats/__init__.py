@@ -1,4 +1,4 @@
-"""Layouts in which photographs with poses lie on disks, read into `dataset.Dataset`, and two that are written.
+"""Layouts in which photographs with poses lie on disks, read into `dataset.Dataset`, and those that are written.
 
 Each layout is a module with `fits(path) -> bool` and `read(path, options) -> Dataset`; its docstring describes the
 files. Conventions of a layout end there: the cameras and poses that it returns follow ours. A new one is a new module,

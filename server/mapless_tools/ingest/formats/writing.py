@@ -14,20 +14,21 @@ from mapless.geometry import DEFAULT_LENS_MODEL, Camera, RigidTransform, lens_mo
 from mapless_tools.dataset import FILE_NAME
 
 from .colmap.cameras import from_camera
+from .kapture import PROPERTIES
 
 IMAGES = "images"
 
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """An image that lies in the folder IMAGES under `name`, with its camera and pose."""
+    """An image that lies in the layout's folder of images under `name`, with its camera and pose."""
 
     name: str
     camera: Camera
     world_from_camera: RigidTransform
 
 
-class Layout(Protocol):
+class Describe(Protocol):
     """Contents of files by their paths."""
 
     def __call__(self, images: Sequence[PosedImage], source: str, scene: Scene | None = None) -> dict[str, str]:
@@ -35,14 +36,29 @@ class Layout(Protocol):
         ...
 
 
-def cameras_files(images: Sequence[PosedImage], source: str, scene: Scene | None = None) -> dict[str, str]:
-    """`cameras.json`, with the scene's datum, down and unit."""
-    is_metric = scene is None or not scene.arbitrary_unit
-    content: dict[str, Any] = {"source": source, "metric": is_metric, "units": "metre" if is_metric else "arbitrary"}
+@dataclass(frozen=True)
+class Layout:
+    """A layout that is written: the files that describe the images, and the folder that these lie in."""
+
+    files: Describe
+    images: str = IMAGES
+
+
+def _properties(scene: Scene | None) -> dict[str, Any]:
+    """What is known of a scene as a whole: unit, datum, direction of gravity."""
+    content: dict[str, Any] = {"metric": scene is None or not scene.arbitrary_unit}
     if scene is not None and scene.datum is not None:
         content["datum"] = scene.datum.to_json()
     if scene is not None and scene.down_in_world is not None:
         content["down_in_world"] = scene.down_in_world
+    return content
+
+
+def cameras_files(images: Sequence[PosedImage], source: str, scene: Scene | None = None) -> dict[str, str]:
+    """`cameras.json`, with the scene's datum, down and unit."""
+    properties = _properties(scene)
+    unit = "metre" if properties["metric"] else "arbitrary"
+    content: dict[str, Any] = {"source": source, "units": unit, **properties}
     content["frames"] = [_entry(image) for image in images]
     return {FILE_NAME: json.dumps(content, indent=1, allow_nan=False) + "\n"}
 
@@ -63,15 +79,37 @@ def model_texts(images: Sequence[PosedImage]) -> dict[str, str]:
         cameras.append(f"{camera_id} {it.model} {it.width_px} {it.height_px} {_words(it.parameters)}")
     lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; then its observations, none here"]
     for image_id, image in enumerate(images, 1):
-        camera_from_world = image.world_from_camera.inverse()
-        q = camera_from_world.quaternion()
-        pose = _words([q.w, q.x, q.y, q.z, *camera_from_world.translation.tolist()])
-        lines += [f"{image_id} {pose} {camera_ids[image.camera]} {image.name}", ""]
+        lines += [f"{image_id} {_camera_from_world(image)} {camera_ids[image.camera]} {image.name}", ""]
     contents = {"cameras": cameras, "images": lines, "points3D": ["# POINT3D_ID X Y Z R G B ERROR TRACK[]: none"]}
     return {f"{name}.txt": "\n".join(it) + "\n" for name, it in contents.items()}
 
 
-LAYOUTS: Mapping[str, Layout] = {"cameras": cameras_files, "colmap": colmap_files}
+def kapture_files(images: Sequence[PosedImage], source: str, scene: Scene | None = None) -> dict[str, str]:
+    """The tables of a kapture 1.1; each image has a time of its own, and images of one camera share it."""
+    sensors: dict[Camera, str] = {}
+    trajectories, records = [], []
+    for time, image in enumerate(images):
+        sensor = sensors.setdefault(image.camera, f"camera{len(sensors) + 1}")
+        trajectories.append(f"{time}, {sensor}, {_camera_from_world(image, ', ')}")
+        records.append(f"{time}, {sensor}, {image.name}")
+    cameras = []
+    for camera, sensor in sensors.items():
+        it = from_camera(sensor, camera)
+        cameras.append(f"{sensor}, , camera, {it.model}, {it.width_px}, {it.height_px}, {_words(it.parameters, ', ')}")
+    notes = [f"# {source}", f"{PROPERTIES}{json.dumps(_properties(scene))}"]
+    tables = {
+        "sensors": [*notes, "# sensor_id, name, sensor_type, [sensor_params]+", *cameras],
+        "trajectories": ["# timestamp, device_id, qw, qx, qy, qz, tx, ty, tz", *trajectories],
+        "records_camera": ["# timestamp, device_id, image_path", *records],
+    }
+    return {f"sensors/{name}.txt": "\n".join(["# kapture format: 1.1", *it]) + "\n" for name, it in tables.items()}
+
+
+LAYOUTS: Mapping[str, Layout] = {
+    "cameras": Layout(cameras_files),
+    "colmap": Layout(colmap_files),
+    "kapture": Layout(kapture_files, "sensors/records_data"),
+}
 """Layouts that are written, by name."""
 
 
@@ -110,6 +148,13 @@ def _entry(image: PosedImage) -> dict[str, Any]:
     return entry if model == DEFAULT_LENS_MODEL else entry | {"lens": model}
 
 
-def _words(numbers: Sequence[float]) -> str:
+def _camera_from_world(image: PosedImage, separator: str = " ") -> str:
+    """The pose as COLMAP and kapture have it: qw qx qy qz tx ty tz."""
+    pose = image.world_from_camera.inverse()
+    q = pose.quaternion()
+    return _words([q.w, q.x, q.y, q.z, *pose.translation.tolist()], separator)
+
+
+def _words(numbers: Sequence[float], separator: str = " ") -> str:
     """Numbers that are read back as they were."""
-    return " ".join(repr(float(number)) for number in numbers)
+    return separator.join(repr(float(number)) for number in numbers)

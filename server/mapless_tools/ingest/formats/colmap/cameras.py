@@ -42,13 +42,13 @@ class ColmapCamera:
     """A camera as a model has it.
 
     Attributes:
-        camera_id: COLMAP's.
-        model: one of MODEL_NAMES.
+        camera_id: COLMAP's, or the layout's that has COLMAP's cameras.
+        model: one of MODEL_NAMES, or another that is no camera of ours.
         width_px, height_px: size of its images.
         parameters: as many as the model has.
     """
 
-    camera_id: int
+    camera_id: int | str
     model: str
     width_px: int
     height_px: int
@@ -81,7 +81,7 @@ def _distortion(model: str, value: dict[str, float]) -> Distortion | None:
     return None if lens == RadialTangential() else lens
 
 
-def from_camera(camera_id: int, camera: Camera) -> ColmapCamera:
+def from_camera(camera_id: int | str, camera: Camera) -> ColmapCamera:
     """A camera of ours as COLMAP's."""
     lens = camera.distortion
     model = "PINHOLE"

@@ -26,7 +26,7 @@ class Model:
     """
 
     file: Path
-    cameras: Mapping[int, ColmapCamera]
+    cameras: Mapping[int | str, ColmapCamera]
     images: Mapping[str, ImageRecord]
     refused: Sequence[tuple[str, str]]
 
@@ -63,7 +63,7 @@ def read_model(folder: Path) -> Model:
     if ending is None:
         raise ValueError(f"{folder} holds no COLMAP model")
     cameras_file, images_file = folder / f"cameras{ending}", folder / f"images{ending}"
-    cameras: dict[int, ColmapCamera] = {}
+    cameras: dict[int | str, ColmapCamera] = {}
     for camera in read_cameras(cameras_file):
         if camera.camera_id in cameras:
             raise ValueError(f"{cameras_file}: camera {camera.camera_id} occurs twice")

@@ -1,0 +1,93 @@
+"""The references of a scene, fetched side by side; those that are damaged are named."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TypeVar
+
+from mapless import Client, DataLoss, Reference
+from mapless_tools.progress import Progress
+
+PARALLEL = 4
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Export:
+    """What became of a scene's references.
+
+    Attributes:
+        written: how many lie in the folder.
+        damaged: the server's messages about the others, by their ids, in their order.
+    """
+
+    written: int
+    damaged: Mapping[str, str]
+
+    @property
+    def total(self) -> int:
+        """How many the scene has."""
+        return self.written + len(self.damaged)
+
+
+def fetch_all(
+    client: Client,
+    scene: str,
+    take: Callable[[Reference], T],
+    progress: Progress,
+    pictures: int | None = None,
+) -> tuple[list[T], dict[str, str]]:
+    """What `take`, in threads, makes of each reference, in order; and the server's messages about the damaged ones.
+
+    Args:
+        client: a client of the server.
+        scene: id of the scene.
+        take: called with a reference.
+        progress: reports how many are done.
+        pictures: how many, evenly spread, have their photographs; None for all.
+
+    Raises:
+        ValueError: the scene has no references.
+    """
+    references = _reference_ids(client, scene)
+    if not references:
+        raise ValueError(f"scene {scene} has no references")
+    step = 1 if pictures is None else -(-len(references) // pictures)
+
+    def fetch(position: int) -> tuple[T | None, str]:
+        try:
+            with_image = position % step == 0
+            reference = client.get_reference(scene, references[position], include_image=with_image)
+        except DataLoss as error:
+            return None, error.message
+        if with_image and hashlib.sha256(reference.image or b"").hexdigest() != reference.image_sha256:
+            return None, f"reference {reference.reference_id!r}: the image received is not the one that was stored"
+        return take(reference), ""
+
+    progress("references", 0, len(references))
+    taken: list[T] = []
+    damaged: dict[str, str] = {}
+    threads = ThreadPoolExecutor(PARALLEL, "export")
+    try:
+        for reference_id, (found, message) in zip(references, threads.map(fetch, range(len(references))), strict=True):
+            if found is None:
+                damaged[reference_id] = message
+            else:
+                taken.append(found)
+            progress("references", len(taken) + len(damaged), len(references))
+    finally:
+        threads.shutdown(wait=True, cancel_futures=True)
+    return taken, damaged
+
+
+def _reference_ids(client: Client, scene: str) -> list[str]:
+    """Of all references, damaged ones too."""
+    with suppress(DataLoss):
+        return [reference.reference_id for reference in client.list_references(scene, page_size=1000)]
+    # A list ends at a reference whose pose is damaged; an audit names it and continues, but examines each reference.
+    return [audit.name.rpartition("/")[2] for audit in client.audit_scene(scene)]

@@ -1,0 +1,171 @@
+"""kapture 1.x (NAVER LABS Europe), and LaMAR's Capture sessions, which have its tables with inverse poses.
+
+kapture: `sensors/sensors.txt` (id, name, type, model, width, height, parameters), `sensors/trajectories.txt`
+(timestamp, device, qw qx qy qz tx ty tz of device_from_world), `sensors/rigs.txt` (rig, device, sensor_from_rig; rigs
+may hold rigs), `sensors/records_camera.txt` (timestamp, sensor, path in `sensors/records_data`). Camera models, axes
+and the corner from which principal points count are COLMAP's. All else, such as depth maps, is ignored.
+
+Capture: a session's folder with `sensors.txt`, `rigs.txt` (rig_from_sensor), `trajectories.txt` (world_from_device),
+`images.txt` (paths in `raw_data`), and perhaps `proc/alignment_trajectories.txt`, which has the poses in the world that
+all sessions share.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from mapless.geometry import RigidTransform
+from mapless_tools.dataset import Dataset, finite_numbers, read_place
+
+from .collecting import Collector, read_text, rotation_of
+from .colmap.cameras import PARAMETERS, ColmapCamera
+from .options import ReadOptions
+
+PROPERTIES = "# mapless: "
+"""Begins a comment of our own exports in sensors.txt: what kapture has no field for, as JSON."""
+
+_MAX_NESTED = 10  # rigs in rigs, as kapture's own library
+
+
+def fits(path: Path) -> bool:
+    """Whether a folder has this layout."""
+    return (path / "sensors" / "sensors.txt").is_file() or all(
+        (path / name).is_file() for name in ("sensors.txt", "images.txt")
+    )
+
+
+def read(path: Path, options: ReadOptions) -> Dataset:
+    """Reads it; see `read_dataset`."""
+    is_capture = not (path / "sensors" / "sensors.txt").is_file()
+    if is_capture and not fits(path):
+        raise ValueError(
+            f"{path} holds no sensors/sensors.txt; name one kapture of several, such as its mapping folder"
+        )
+    tables = path if is_capture else path / "sensors"
+    records = tables / ("images.txt" if is_capture else "records_camera.txt")
+    collector = Collector(tables / ("raw_data" if is_capture else "records_data"))
+    trajectories = tables / "trajectories.txt"
+    aligned = path / "proc" / "alignment_trajectories.txt"
+    if is_capture and aligned.is_file():
+        trajectories = aligned
+        collector.notes.append(f"poses are those of {aligned.relative_to(path)}, in the world of all sessions")
+    properties = _properties(tables / "sensors.txt")
+    cameras = _cameras(tables / "sensors.txt")
+    poses = _Poses(trajectories, tables / "rigs.txt", is_capture)
+    for place, (timestamp, sensor, image) in _rows(records, 3):
+        with collector.attempt(f"{place} ({image})"):
+            if sensor not in cameras:
+                raise ValueError(f"sensor {sensor!r} is no camera of sensors.txt")
+            collector.add(image, cameras[sensor].camera(), poses.world_from_device(timestamp, sensor))
+    is_metric = is_capture or bool(properties.get("metric", False))
+    dataset = collector.dataset(path.resolve().name, "kapture", metric=is_metric, source=f"kapture {path.name}")
+    datum, down = read_place(tables / "sensors.txt", properties)
+    return replace(dataset, datum=datum, down_in_world=down)
+
+
+def _properties(file: Path) -> dict[str, Any]:
+    """What our own exports say of the scene; ValueError for another version of the format."""
+    lines = read_text(file).splitlines()
+    version = re.match(r"#\s*kapture format:\s*(\S+)", lines[0]) if lines else None
+    if version is not None and not version[1].startswith("1."):
+        raise ValueError(f"{file}:1: kapture format {version[1]} is not known, only 1.x")
+    for line in lines:
+        if line.startswith(PROPERTIES):
+            with suppress(ValueError, RecursionError):
+                content = json.loads(line.removeprefix(PROPERTIES))
+                return content if isinstance(content, dict) else {}
+    return {}
+
+
+def _cameras(file: Path) -> dict[str, ColmapCamera]:
+    """The cameras by id; those of unknown models are refused where an image is theirs."""
+    cameras = {}
+    for place, (sensor, _, kind, *parameters) in _rows(file, 3):
+        if kind != "camera":
+            continue
+        if len(parameters) < 3:
+            raise ValueError(f"{place}: a camera has a model, width and height, found {len(parameters)} parameters")
+        model = parameters[0]
+        numbers = finite_numbers(parameters[1:], f"{place}: parameters of the camera").tolist()
+        width_px, height_px = map(int, numbers[:2])
+        wanted = PARAMETERS.get(model)
+        if wanted is not None and len(numbers) != 2 + len(wanted):
+            raise ValueError(f"{place}: {model} has parameters w h {' '.join(wanted)}, found {len(numbers)} numbers")
+        cameras[sensor] = ColmapCamera(sensor, model, width_px, height_px, numbers[2:])
+    return cameras
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A pose as a file has it, read when it is needed: one that is damaged concerns its images alone."""
+
+    place: str
+    words: list[str]
+    is_inverse: bool
+
+    def pose(self) -> RigidTransform:
+        """Of the device in the world, or of the sensor in the rig."""
+        if "" in self.words:
+            raise ValueError(f"{self.place}: the pose is not complete")
+        numbers = finite_numbers(self.words, f"{self.place}: the pose", (7,))
+        given = RigidTransform(rotation_of(numbers[:4], self.place), numbers[4:])
+        return given.inverse() if self.is_inverse else given
+
+
+class _Poses:
+    """Poses of devices, by their own trajectories and those of the rigs that they are mounted on."""
+
+    def __init__(self, trajectories: Path, rigs: Path, is_capture: bool) -> None:
+        self._file = trajectories
+        self._world_from_device: dict[tuple[int, str], _Row] = {}
+        self._mounts: dict[str, list[tuple[str, _Row]]] = {}
+        for place, (timestamp, device, *words) in _rows(trajectories, 9):
+            self._world_from_device[_whole(timestamp, place), device] = _Row(place, words[:7], not is_capture)
+        if rigs.is_file():
+            for place, (rig, device, *words) in _rows(rigs, 9):
+                self._mounts.setdefault(device, []).append((rig, _Row(place, words[:7], not is_capture)))
+
+    def world_from_device(self, timestamp: str, device: str) -> RigidTransform:
+        """The pose of a device at a time; ValueError if neither it nor a rig that it is mounted on has one."""
+        pose = self._found(_whole(timestamp, "timestamp"), device, _MAX_NESTED)
+        if pose is None:
+            mounted = (
+                f", nor do its rigs ({', '.join(rig for rig, _ in self._mounts[device])})"
+                if device in self._mounts
+                else ""
+            )
+            raise ValueError(f"pose: {self._file.name} has none of {device!r} at {timestamp}{mounted}")
+        return pose
+
+    def _found(self, timestamp: int, device: str, depth: int) -> RigidTransform | None:
+        if (timestamp, device) in self._world_from_device:
+            return self._world_from_device[timestamp, device].pose()
+        if depth:
+            for rig, mount in self._mounts.get(device, ()):
+                world_from_rig = self._found(timestamp, rig, depth - 1)
+                if world_from_rig is not None:
+                    return world_from_rig.compose(mount.pose())
+        return None
+
+
+def _whole(text: str, what: str) -> int:
+    try:
+        return int(text[:20])
+    except ValueError:
+        raise ValueError(f"{what}: a timestamp is a whole number, is {text!r}") from None
+
+
+def _rows(file: Path, least: int) -> Iterator[tuple[str, list[str]]]:
+    """Rows of a table, each with its place; ValueError if it cannot be read or a row is too short."""
+    for number, line in enumerate(read_text(file).splitlines(), 1):
+        if line.strip() and not line.startswith("#"):
+            words = [word.strip() for word in line.split(",")]
+            if len(words) < least:
+                raise ValueError(f"{file}:{number}: expected at least {least} values with commas, found {len(words)}")
+            yield f"{file.name}:{number}", words

@@ -1,0 +1,283 @@
+"""A scene as one binary glTF file: its cameras as frusta with small photographs, and points that they share.
+
+Any viewer opens it. The root node turns the scene's world to glTF's axes (y up); below it, positions count from the
+middle of the scene, so that single precision is enough. Each reference is a node with glTF's axes of cameras (x right,
+y up, z back); `extras` have the reference's id, camera and pose, and the scene's datum, down and unit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pygltflib import (
+    ARRAY_BUFFER,
+    FLOAT,
+    GLTF2,
+    LINES,
+    POINTS,
+    TRIANGLES,
+    UNSIGNED_BYTE,
+    Accessor,
+    Asset,
+    Attributes,
+    Buffer,
+    BufferView,
+    Camera,
+    Material,
+    Mesh,
+    Node,
+    PbrMetallicRoughness,
+    Perspective,
+    Primitive,
+    Scene,
+    Texture,
+    TextureInfo,
+)
+from pygltflib import Image as EmbeddedImage
+
+from mapless import Client, LocalizationResult, MaplessError, Reference
+from mapless import Scene as KnownScene
+from mapless.geometry import Array, Quaternion, RigidTransform
+from mapless_tools.progress import Progress
+from mapless_tools.view.scenery import Scenery, lay_out
+
+from .fetching import Export, fetch_all
+from .formats.collecting import OPENCV_FROM_OPENGL
+from .formats.writing import write_file
+
+PICTURES, THUMBNAIL_PX = 200, 128
+"""Photographs in the file, and the longer side of each: some kilobytes, so that a page can load the file."""
+POINT_SOURCES = 40
+"""References that are localized among the others for the points that they share; each takes as long as a query."""
+_LINE_COLOUR = [0.2, 0.5, 1.0, 1.0]
+_GAMMA = 2.2
+"""Of photographs; colours of points are linear in glTF."""
+_UNLIT = "KHR_materials_unlit"
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A reference, its photograph (small, JPEG), and what it sees: points (N, 3) of the world, colours (N, 3)."""
+
+    reference: Reference
+    thumbnail: bytes | None = None
+    points: Array | None = None
+    colours: NDArray[np.uint8] | None = None
+
+
+def export_gltf(client: Client, scene: str, folder: Path, progress: Progress) -> Export:
+    """Writes SCENE.glb into a folder; see `export_scene`."""
+    known = client.get_scene(scene)
+    left = iter(range(POINT_SOURCES))
+
+    def take(reference: Reference) -> View:
+        if reference.image is None:
+            return View(reference)
+        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        image: Any = cv2.imdecode(np.frombuffer(reference.image, np.uint8), flags)
+        if image is None:
+            return View(reference)
+        points = _points(client, scene, reference, image) if next(left, None) is not None else (None, None)
+        return View(reference, _thumbnail(image), *points)
+
+    views, damaged = fetch_all(client, scene, take, progress, PICTURES)
+    if views:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_file(folder / f"{scene}.glb", to_gltf(known, views))
+    return Export(len(views), damaged)
+
+
+def _thumbnail(image: NDArray[np.uint8]) -> bytes:
+    scale = THUMBNAIL_PX / max(image.shape[:2])
+    size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
+    return bytes(cv2.imencode(".jpg", cv2.resize(image, size, interpolation=cv2.INTER_AREA))[1])
+
+
+def _points(
+    client: Client, scene: str, reference: Reference, image: NDArray[np.uint8]
+) -> tuple[Array, NDArray[np.uint8]] | tuple[None, None]:
+    """Points in the world that a reference's photograph shares with others, and their colours; None without.
+
+    A scene without points is a scene, too: nothing of this ends the export.
+    """
+    try:
+        answer = client.localize(reference.image or b"", reference.camera, scene, include_debug=True)
+    except MaplessError:
+        return None, None
+    if not isinstance(answer, LocalizationResult) or answer.debug is None:
+        return None, None
+    debug = answer.debug
+    agrees = debug.is_inlier
+    column, row = np.rint(debug.query_px[agrees]).astype(int).T
+    colours = image[row.clip(0, image.shape[0] - 1), column.clip(0, image.shape[1] - 1), ::-1]
+    return debug.x_in_world[agrees], colours
+
+
+def to_gltf(scene: KnownScene, views: Sequence[View]) -> bytes:
+    """The file's content."""
+    scenery = lay_out(scene, [it.reference for it in views], PICTURES)
+    file = _File(scene, scenery)
+    for view in views:
+        file.add_camera(view)
+    seen = [(it.points, it.colours) for it in views if it.points is not None and it.colours is not None]
+    if any(len(points) for points, _ in seen):
+        file.add_points(np.concatenate([it for it, _ in seen]), np.concatenate([it for _, it in seen]))
+    return file.content()
+
+
+class _File:
+    """A glTF file as it grows; offsets are filled in at its end."""
+
+    def __init__(self, scene: KnownScene, scenery: Scenery) -> None:
+        self._scenery = scenery
+        self._blob = bytearray()
+        self._frustums: dict[Any, tuple[int, int]] = {}
+        self._in_world: list[int] = []
+        datum = scene.datum.to_json() if scene.datum else None
+        about = {"scene": scene.scene_id, "arbitrary_unit": scene.arbitrary_unit, "datum": datum}
+        about |= {"down_in_world": scene.down_in_world, "origin_in_world": scenery.origin.tolist()}
+        self._gltf = GLTF2(
+            asset=Asset(version="2.0", generator="mapless-server export"),
+            scene=0,
+            scenes=[Scene(name=scene.scene_id, nodes=[0])],
+            nodes=[Node(name=scene.scene_id, rotation=_upright(scenery.down), children=self._in_world, extras=about)],
+            materials=[
+                _material("lines", baseColorFactor=_LINE_COLOUR),
+                _material("points", baseColorFactor=[1.0, 1.0, 1.0, 1.0]),
+            ],
+            extensionsUsed=[_UNLIT],
+        )
+
+    def add_camera(self, view: View) -> None:
+        """A node with a camera, its frustum, and its photograph if there is one."""
+        reference = view.reference
+        pose = self._scenery.placed(reference.world_from_camera)
+        turned = RigidTransform(pose.rotation @ OPENCV_FROM_OPENGL, pose.translation)
+        q = turned.quaternion()
+        camera, mesh = self._frustum(reference)
+        # A node of its own, without children: some readers end at a camera.
+        children = [self._node(Node(name=f"camera of {reference.reference_id}", camera=camera))]
+        if view.thumbnail is not None:
+            picture = self._picture(reference, view.thumbnail)
+            children.append(self._node(Node(name=f"photograph of {reference.reference_id}", mesh=picture)))
+        about = {"reference": reference.reference_id, "camera": _plain(reference.camera)}
+        about |= {"world_from_camera": reference.world_from_camera.matrix().tolist()}
+        node = Node(
+            name=reference.reference_id,
+            translation=turned.translation.tolist(),
+            rotation=[q.x, q.y, q.z, q.w],
+            mesh=mesh,
+            children=children,
+            extras=about,
+        )
+        self._in_world.append(self._node(node))
+
+    def add_points(self, points: Array, colours: NDArray[np.uint8]) -> None:
+        """One node with all points."""
+        positions = self._array((points - self._scenery.origin).astype(np.float32), FLOAT, "VEC3")
+        linear = np.rint(255 * (colours / 255) ** _GAMMA).astype(np.uint8)
+        rgba = np.concatenate([linear, np.full((len(colours), 1), 255, np.uint8)], axis=1)  # four bytes: aligned
+        colour = self._array(rgba, UNSIGNED_BYTE, "VEC4", normalized=True)
+        mesh = self._mesh("points", Attributes(POSITION=positions, COLOR_0=colour), POINTS, material=1)
+        self._in_world.append(self._node(Node(name="points", mesh=mesh)))
+
+    def content(self) -> bytes:
+        """The file, complete."""
+        self._gltf.buffers = [Buffer(byteLength=len(self._blob))]
+        self._gltf.set_binary_blob(bytes(self._blob))
+        return b"".join(self._gltf.save_to_bytes())
+
+    def _frustum(self, reference: Reference) -> tuple[int, int]:
+        """The camera and the mesh of lines of a reference's intrinsics, which many references share."""
+        camera = reference.camera
+        if camera not in self._frustums:
+            perspective = Perspective(
+                yfov=float(2 * np.arctan(camera.height_px / 2 / camera.focal_y_px)),
+                aspectRatio=camera.width_px / camera.focal_x_px * camera.focal_y_px / camera.height_px,
+                znear=self._scenery.size_m / 100,
+            )
+            self._gltf.cameras.append(Camera(type="perspective", perspective=perspective))
+            corners = self._corners(reference)
+            apex = np.zeros(3)
+            ends = [(apex, it) for it in corners] + [(corners[i], corners[(i + 1) % 4]) for i in range(4)]
+            lines = self._array(np.array(ends, np.float32).reshape(-1, 3), FLOAT, "VEC3")
+            mesh = self._mesh("frustum", Attributes(POSITION=lines), LINES, material=0)
+            self._frustums[camera] = len(self._gltf.cameras) - 1, mesh
+        return self._frustums[camera]
+
+    def _corners(self, reference: Reference) -> Array:
+        """(4, 3) corners of the photograph at the frustum's end, glTF's axes, from the top left on clockwise."""
+        camera = reference.camera.pinhole()
+        right, bottom = camera.width_px - 0.5, camera.height_px - 0.5
+        rays = camera.rays(np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]]))
+        return rays / rays[:, 2:] * self._scenery.size_m @ OPENCV_FROM_OPENGL
+
+    def _picture(self, reference: Reference, thumbnail: bytes) -> int:
+        """A mesh of two triangles with the photograph."""
+        gltf = self._gltf
+        gltf.images.append(EmbeddedImage(bufferView=self._view(thumbnail), mimeType="image/jpeg"))
+        gltf.textures.append(Texture(source=len(gltf.images) - 1))
+        gltf.materials.append(_material("photograph", baseColorTexture=TextureInfo(index=len(gltf.textures) - 1)))
+        around = [0, 3, 2, 0, 2, 1]  # counterclockwise where the camera stands
+        positions = self._array(self._corners(reference)[around].astype(np.float32), FLOAT, "VEC3")
+        uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)[around]
+        attributes = Attributes(POSITION=positions, TEXCOORD_0=self._array(uv, FLOAT, "VEC2"))
+        return self._mesh("photograph", attributes, TRIANGLES, material=len(gltf.materials) - 1)
+
+    def _node(self, node: Node) -> int:
+        self._gltf.nodes.append(node)
+        return len(self._gltf.nodes) - 1
+
+    def _mesh(self, name: str, attributes: Attributes, mode: int, material: int) -> int:
+        self._gltf.meshes.append(
+            Mesh(name=name, primitives=[Primitive(attributes=attributes, mode=mode, material=material)])
+        )
+        return len(self._gltf.meshes) - 1
+
+    def _array(self, values: NDArray[Any], component: int, kind: str, normalized: bool = False) -> int:
+        accessor = Accessor(
+            bufferView=self._view(values.tobytes(), ARRAY_BUFFER),
+            componentType=component,
+            count=len(values),
+            type=kind,
+            normalized=normalized,
+            min=values.min(axis=0).tolist(),
+            max=values.max(axis=0).tolist(),
+        )
+        self._gltf.accessors.append(accessor)
+        return len(self._gltf.accessors) - 1
+
+    def _view(self, data: bytes, target: int | None = None) -> int:
+        self._gltf.bufferViews.append(
+            BufferView(buffer=0, byteOffset=len(self._blob), byteLength=len(data), target=target)
+        )
+        self._blob += data + bytes(-len(data) % 4)
+        return len(self._gltf.bufferViews) - 1
+
+
+def _upright(down: Array) -> list[float]:
+    """x, y, z, w of the rotation from the world to glTF's axes, in which y points up."""
+    up = -np.asarray(down, float)
+    side = np.eye(3)[np.argmin(np.abs(up))]
+    back = np.cross(side, up)
+    back /= np.linalg.norm(back)
+    q = Quaternion.from_matrix(np.stack([np.cross(up, back), up, back]))
+    return [q.x, q.y, q.z, q.w]
+
+
+def _material(name: str, **colour: Any) -> Material:
+    """One that is seen without lights, from both sides."""
+    metallic = PbrMetallicRoughness(metallicFactor=0.0, **colour)
+    return Material(
+        name=name, pbrMetallicRoughness=metallic, doubleSided=True, extensions={_UNLIT: {}}, alphaCutoff=None
+    )
+
+
+def _plain(camera: Any) -> dict[str, Any]:
+    return {name: value for name, value in asdict(camera).items() if value is not None}
