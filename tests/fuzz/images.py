@@ -114,9 +114,13 @@ def seeds() -> tuple[bytes, ...]:
     )
 
 
+def chunk(kind: bytes, body: bytes) -> bytes:
+    """Of a PNG."""
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
 def _with_chunk(png: bytes, kind: bytes, body: bytes) -> bytes:
-    chunk = struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-    return png[:33] + chunk + png[33:]
+    return png[:33] + chunk(kind, body) + png[33:]
 
 
 def mutate(data: bytes, random: Random, mutate_bytes: MutateBytes) -> bytes:

@@ -7,7 +7,6 @@ import io
 import json
 import math
 import struct
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from rich.console import Console
 from support.images import encode, textured
 
 from fuzz import localization
+from fuzz.images import chunk
 from fuzz.importing import CAMERA, image_of
 from fuzz.laws import check_pose, check_received_camera
 from mapless import names, wire
@@ -45,10 +45,6 @@ PNG = encode(".png", RGB)
 finite = st.floats(allow_nan=False, allow_infinity=False)
 identifiers = st.from_regex(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,20}[A-Za-z0-9_])?", fullmatch=True).filter(str.isascii)
 coefficients = st.floats(-100, 100)
-
-
-def chunk(kind: bytes, body: bytes) -> bytes:
-    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
 
 @st.composite

@@ -352,28 +352,22 @@ class TestTime:
         ((predicted_s, actual_s),) = quota.settled
         assert actual_s == predicted_s > 0
 
-    def test_more_than_admitted_is_computed_only_where_room_is(self) -> None:
-        """As when stronger features are to be tried."""
-        for others, expected in ((0, None), (6, Ending.OK)):
-            toy = Toy()
-            job = toy.admit(stage="refine", client="mine")
-            for i in range(others):
-                toy.admit(client=f"other {i}")
-            again = Step("prepare", "toy", "b", "again")
-            toy.finish(toy.take("host"), Next(again, Fallback(lambda: Done("first"), 100.0)))
-            assert toy.ending_of(job) is expected
-
-    def test_the_only_job_is_computed_whatever_it_costs(self) -> None:
-        """As an idle server admits any cost; with others it would take their room."""
-        for others, expected in ((0, None), (1, Ending.OK)):
-            toy = Toy()
-            toy.scheduler.costs.observe("prepare", "slow", 50.0)
-            job = toy.admit(stage="refine", client="mine", deadline_s=200.0)
-            for _ in range(others):
-                toy.admit(client="other")
-            again = Step("prepare", "slow", "b", "again")
-            toy.finish(toy.take("host"), Next(again, Fallback(lambda: Done("first"), 150.0)))
-            assert toy.ending_of(job) is expected
+    @pytest.mark.parametrize(
+        ("kind", "others", "expected"),
+        [("toy", 0, None), ("toy", 6, Ending.OK), ("slow", 0, None), ("slow", 1, Ending.OK)],
+    )
+    def test_more_than_admitted_is_computed_only_where_room_is(
+        self, kind: str, others: int, expected: Ending | None
+    ) -> None:
+        """As when stronger features are to be tried; the only job is computed whatever it costs, as it is admitted."""
+        toy = Toy()
+        toy.scheduler.costs.observe("prepare", "slow", 50.0)
+        job = toy.admit(stage="refine", client="mine", deadline_s=200.0)
+        for i in range(others):
+            toy.admit(client=f"other {i}")
+        again = Step("prepare", kind, "b", "again")
+        toy.finish(toy.take("host"), Next(again, Fallback(lambda: Done("first"), 150.0)))
+        assert toy.ending_of(job) is expected
 
     @pytest.mark.parametrize(
         ("due_s", "others", "kind"),

@@ -14,18 +14,17 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from support.commands import run
 from support.images import encode, textured
 from support.layouts import write_cameras
 from support.servers import CAMERA, COVARIANCE, RunningServer, pose, serving
 from support.wall import wall
-from typer.testing import CliRunner
 
 from mapless import Camera, Client, LocalizationResult, NewReference, RigidTransform
 from mapless.geometry import rotation_from_vector
 from mapless_server.method.uncertainty.radii import accuracy_from_covariance
 from mapless_server.store import Store
 from mapless_tools.calibrate.claims import Claim, Sample, fit_factors
-from mapless_tools.cli.app import app
 
 COUNT = 12
 OFF_M = np.linspace(0.05, 0.75, COUNT)
@@ -69,9 +68,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def calibrate(server: RunningServer, output: Path, *arguments: object) -> Any:
-    return CliRunner().invoke(
-        app, ["calibrate", *map(str, arguments), "--address", server.address, "--output", str(output)]
-    )
+    return run("calibrate", *arguments, "--address", server.address, "--output", output)
 
 
 def refusal(done: Any, code: int = 2) -> str:
@@ -258,7 +255,7 @@ def test_a_folder_by_itself(tmp_path: Path) -> None:
     """Through a server of its own, with the real method: right answers, and claims that were counted."""
     camera = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
     write_cameras(tmp_path / "walk", wall(camera, 11), camera)
-    done = CliRunner().invoke(app, ["calibrate", str(tmp_path / "walk"), "--output", str(tmp_path / "out")])
+    done = run("calibrate", tmp_path / "walk", "--output", tmp_path / "out")
     assert done.exit_code == 0, done.output
     figures = json.loads((tmp_path / "out/report.json").read_text())
     assert (figures["photographs"], figures["references"], figures["scene"]) == (11, 11, None)

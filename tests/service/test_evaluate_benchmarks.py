@@ -9,33 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
+from support.commands import refusal, run
 from support.images import encode
 from support.wall import Shot, wall
-from typer.testing import CliRunner, Result
 
 from mapless.geometry import Camera
-from mapless_tools.evaluate.cli import evaluate_command
-
-app = typer.Typer()
-app.command()(evaluate_command)
 
 KINECT = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
 """What the reader of 7-Scenes takes, since the layout has no intrinsics."""
 CENTRED = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
-
-
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [*map(str, arguments)])
-
-
-def refusal(*arguments: object) -> str:
-    """What is said of arguments that are wrong: one line, exit code 2, and nothing measured."""
-    done = run(*arguments)
-    assert done.exit_code == 2, done.output
-    assert done.stdout == ""
-    (line,) = (line for line in done.stderr.strip().splitlines() if not line.startswith("reading scenes"))
-    return line
 
 
 def write_pose(file: Path, shot: Shot) -> None:
@@ -109,7 +91,7 @@ def test_a_failed_scene_stops_no_other_and_is_measured_later(chess: Path, tmp_pa
     torn.write_bytes(whole[: len(whole) // 2])
     arguments = (tmp_path / "data", "--protocol", "sparse", "--sparse", 3, "--max-queries", 1, "--worst", 1)
 
-    done = run(*arguments, "--output", output)
+    done = run("evaluate", *arguments, "--output", output)
     assert done.exit_code == 1, done.output
     assert "fire is not complete" in done.stdout
     content = json.loads((output / "evaluation.json").read_text())
@@ -119,7 +101,7 @@ def test_a_failed_scene_stops_no_other_and_is_measured_later(chess: Path, tmp_pa
     written_ns = journal.stat().st_mtime_ns
 
     torn.write_bytes(whole)
-    done = run(*arguments, "--output", output)
+    done = run("evaluate", *arguments, "--output", output)
     assert done.exit_code == 0, done.output
     assert "chess, N=3: storing" not in done.stderr
     assert "fire, N=3: storing" in done.stderr
@@ -137,7 +119,7 @@ def test_measures_every_layout(chess: Path, tmp_path: Path) -> None:
     shutil.copytree(chess, folder / "chess")
     write_12scenes(folder / "apt1" / "kitchen")
     write_cambridge(folder / "ShopFacade")
-    done = run(folder, "--sparse", "3", "--max-queries", 2, "--worst", 1, "--output", output)
+    done = run("evaluate", folder, "--sparse", "3", "--max-queries", 2, "--worst", 1, "--output", output)
     assert done.exit_code == 0, done.output
     content = json.loads((output / "evaluation.json").read_text())
     counts = {"apt1/kitchen": 6, "chess": 5, "ShopFacade": 5}
@@ -165,7 +147,18 @@ def test_takes_the_references_of_a_pairs_file(chess: Path, tmp_path: Path) -> No
     queries = [f"seq-02/frame-{i:06d}.color.png" for i in range(4)]
     pairs.write_text("".join(f"{query} {reference}\n" for query in queries for reference in wanted))
     done = run(
-        chess, "--protocol", "dense", "--pairs", pairs, "--max-queries", 1, "--worst", 0, "--output", tmp_path / "out"
+        "evaluate",
+        chess,
+        "--protocol",
+        "dense",
+        "--pairs",
+        pairs,
+        "--max-queries",
+        1,
+        "--worst",
+        0,
+        "--output",
+        tmp_path / "out",
     )
     assert done.exit_code == 0, done.output
     with (tmp_path / "out" / "queries.csv").open(newline="") as stream:
@@ -196,7 +189,7 @@ def test_takes_the_references_of_a_pairs_file(chess: Path, tmp_path: Path) -> No
 def test_wrong_arguments_are_one_line(chess: Path, tmp_path: Path, arguments: tuple[str, ...], words: str) -> None:
     defaults = {"--sparse": "3", "--output": str(tmp_path)}
     given = dict(zip(arguments[::2], arguments[1::2], strict=True))
-    assert words in refusal(chess, *(part for flag in (defaults | given).items() for part in flag))
+    assert words in refusal("evaluate", chess, *(part for flag in (defaults | given).items() for part in flag))
 
 
 def test_a_broken_scene_is_refused_before_anything_is_measured(chess: Path, tmp_path: Path) -> None:
@@ -205,13 +198,15 @@ def test_a_broken_scene_is_refused_before_anything_is_measured(chess: Path, tmp_
     shutil.copytree(chess, tmp_path / "data" / "chess")
     arguments = (tmp_path / "data", "--sparse", "3", "--output", tmp_path / "out")
     (broken / "TestSplit.txt").unlink()
-    assert "fire has no frame of the test split" in refusal(*arguments)
+    assert "fire has no frame of the test split" in refusal("evaluate", *arguments)
     (broken / "TestSplit.txt").write_text("sequence3\n")
-    assert "seq-03" in refusal(*arguments)
+    assert "seq-03" in refusal("evaluate", *arguments)
     (broken / "TestSplit.txt").write_text("sequence2\n")
     (broken / "seq-02" / "frame-000001.color.png").write_bytes(b"")
-    assert "fire: 1 of 9 frames cannot be used, the first, seq-02/frame-000001" in refusal(*arguments)
+    assert "fire: 1 of 9 frames cannot be used, the first, seq-02/frame-000001" in refusal("evaluate", *arguments)
     pairs = tmp_path / "pairs.txt"
     pairs.write_text("seq-02/frame-000000.color.png seq-01/frame-000099.color.png\n")
-    assert "has no image 'seq-01/frame-000099.color.png'" in refusal(chess, *arguments[1:], "--pairs", pairs)
+    assert "has no image 'seq-01/frame-000099.color.png'" in refusal(
+        "evaluate", chess, *arguments[1:], "--pairs", pairs
+    )
     assert not any((tmp_path / "out" / "runs").iterdir())

@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.commands import refusal, run
 from support.layouts import write_cameras
 from support.wall import wall
-from typer.testing import CliRunner, Result
 
 from mapless.geometry import Camera
-from mapless_tools.cli.app import app
 
 CAMERA = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
 
@@ -30,19 +29,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def command(*arguments: object) -> list[str]:
     return [sys.executable, "-m", "mapless_tools", *map(str, arguments)]
-
-
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [*map(str, arguments)])
-
-
-def refusal(*arguments: object) -> str:
-    """What is said of arguments that are wrong: one line, and exit code 2."""
-    done = run(*arguments)
-    assert done.exit_code == 2
-    assert done.stdout == ""
-    assert len(done.stderr.strip().splitlines()) == 1
-    return done.stderr
 
 
 def test_leaves_one_out(folder: Path, tmp_path: Path) -> None:

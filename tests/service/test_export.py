@@ -10,27 +10,22 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 import pytest
+from support.commands import run
 from support.images import encode, textured
 from support.layouts import CAMERA, assert_same_camera, assert_same_pose, by_name, truth
 from support.planted_damage import damage
 from support.servers import RunningServer, serving
-from typer.testing import CliRunner, Result
 
 from mapless import Client, Datum, NewReference, Scene
 from mapless.geodesy import enu_from_y_up
 from mapless.geometry import Fisheye, RadialTangential
 from mapless_server.security import SceneKey
 from mapless_server.store import Store
-from mapless_tools.cli.app import app
 from mapless_tools.ingest.formats import read_dataset
 from mapless_tools.ingest.formats.writing import LAYOUTS, PosedImage, cameras_files
 
 LENSES = (None, RadialTangential(0.1, -0.2, 0.01, 0.02, 0.3), Fisheye(0.1, 0.2, 0.3, 0.4))
 ENDINGS = (".png", ".jpg", ".webp")
-
-
-def run(server: RunningServer, *arguments: object) -> Result:
-    return CliRunner().invoke(app, [*map(str, arguments), "--address", server.address])
 
 
 @pytest.fixture
@@ -52,7 +47,7 @@ def test_an_export_imports_as_the_same_scene(
     server: RunningServer, client: Client, filled: tuple[str, list[NewReference]], layout: str, tmp_path: Path
 ) -> None:
     scene, references = filled
-    done = run(server, "export", scene, tmp_path / "out", "--format", layout)
+    done = run("export", scene, tmp_path / "out", "--format", layout, "--address", server.address)
     assert done.exit_code == 0, done.output
     frames = by_name(read_dataset(tmp_path / "out"))
     for reference, ending in zip(references, ENDINGS, strict=True):
@@ -62,7 +57,7 @@ def test_an_export_imports_as_the_same_scene(
         assert_same_camera(frame.camera, reference.camera, px=1e-12)
         assert_same_pose(frame.world_from_camera, reference.world_from_camera, 1e-12)
     # Its own importer agrees: there is nothing to add to the scene that it came from.
-    again = run(server, "import", tmp_path / "out", scene, "--skip-check")
+    again = run("import", tmp_path / "out", scene, "--skip-check", "--address", server.address)
     assert again.exit_code == 0, again.output
     assert "0 added, 3 skipped as duplicates, 0 refused" in again.stdout
 
@@ -75,15 +70,15 @@ def test_where_a_scene_is_on_the_earth_goes_along(
     datum = Datum(47.1 / 3, 8.1 / 3, 400.1 / 3, enu_from_y_up(30))
     client.update_scene(scene, datum=datum, down_in_world=(0.01, -1.0, 0.02))
     exported = client.get_scene(scene)
-    assert run(server, "export", scene, tmp_path / "out", "--format", layout).exit_code == 0
+    assert run("export", scene, tmp_path / "out", "--format", layout, "--address", server.address).exit_code == 0
     copy = f"{scene}-copy"
-    done = run(server, "import", tmp_path / "out", copy, "--skip-check")
+    done = run("import", tmp_path / "out", copy, "--skip-check", "--address", server.address)
     assert done.exit_code == 0, done.output
     found = client.get_scene(copy)
     assert (found.datum, found.down_in_world) == (datum, exported.down_in_world)
     # One that is there keeps what is known of it.
     client.update_scene(copy, datum=None)
-    assert run(server, "import", tmp_path / "out", copy, "--skip-check").exit_code == 0
+    assert run("import", tmp_path / "out", copy, "--skip-check", "--address", server.address).exit_code == 0
     assert client.get_scene(copy).datum is None
     client.delete_scene(copy)
 
@@ -114,21 +109,21 @@ def test_a_folder_with_something_in_it_is_not_written_to(
     server: RunningServer, filled: tuple[str, list[NewReference]], tmp_path: Path
 ) -> None:
     (tmp_path / "mine").write_text("precious")
-    done = run(server, "export", filled[0], tmp_path)
+    done = run("export", filled[0], tmp_path, "--address", server.address)
     assert done.exit_code == 2
     assert "is not empty" in done.stderr
     assert [file.name for file in tmp_path.iterdir()] == ["mine"]
 
 
 def test_absent_or_empty_scenes_and_unwritable_layouts(server: RunningServer, client: Client, tmp_path: Path) -> None:
-    done = run(server, "export", "no-such-scene", tmp_path / "a")
+    done = run("export", "no-such-scene", tmp_path / "a", "--address", server.address)
     assert done.exit_code == 1
     assert "no-such-scene" in done.stderr
     scene = f"empty-{time.monotonic_ns()}"
     client.create_scene(scene)
-    done = run(server, "export", scene, tmp_path / "b")
+    done = run("export", scene, tmp_path / "b", "--address", server.address)
     assert (done.exit_code, "has no references" in done.stderr) == (2, True)
-    done = run(server, "export", scene, tmp_path / "c", "--format", "7scenes")
+    done = run("export", scene, tmp_path / "c", "--format", "7scenes", "--address", server.address)
     assert (done.exit_code, "cameras, colmap, kapture, gltf" in done.stderr) == (2, True)
     assert list(tmp_path.iterdir()) == []
 
@@ -142,12 +137,12 @@ def test_damaged_references_are_named_and_the_rest_exported(tmp_path: Path, what
             "s", [NewReference(f"r{i}", encode(".png", textured(seed=i)), CAMERA, truth().poses[i]) for i in range(3)]
         )
         damage(store, SceneKey("s"), "r1", what)
-        done = run(server, "export", "s", tmp_path / "out")
+        done = run("export", "s", tmp_path / "out", "--address", server.address)
         assert done.exit_code == 1
         assert "skipped: reference 'r1' is damaged" in done.stderr
         assert "2 of 3 written, 1 damaged" in done.stderr
         assert {file.name for file in (tmp_path / "out" / "images").iterdir()} == {"r0.png", "r2.png"}
-        again = run(server, "import", tmp_path / "out", "copy", "--skip-check")
+        again = run("import", tmp_path / "out", "copy", "--skip-check", "--address", server.address)
         assert again.exit_code == 0, again.output
         assert "2 added" in again.stdout
         assert [it.reference_id for it in client.list_references("copy")] == ["r0", "r2"]
@@ -160,7 +155,7 @@ def test_where_all_are_damaged_no_folder_is_left_behind(tmp_path: Path) -> None:
         client.add_reference("s", NewReference("r0", encode(".png", textured()), CAMERA, truth().poses[0]))
         damage(store, SceneKey("s"), "r0", "image")
         for _ in range(2):
-            done = run(server, "export", "s", tmp_path / "out")
+            done = run("export", "s", tmp_path / "out", "--address", server.address)
             assert (done.exit_code, "0 of 1 written, 1 damaged" in done.stderr) == (1, True)
 
 
@@ -169,7 +164,7 @@ def test_a_scene_to_look_at_is_one_file(
 ) -> None:
     trimesh = pytest.importorskip("trimesh")
     scene, references = filled
-    done = run(server, "export", scene, tmp_path / "out", "--format", "gltf")
+    done = run("export", scene, tmp_path / "out", "--format", "gltf", "--address", server.address)
     assert done.exit_code == 0, done.output
     (file,) = (tmp_path / "out").iterdir()
     assert file.name == f"{scene}.glb"

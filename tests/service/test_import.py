@@ -14,16 +14,16 @@ from typing import Any, NoReturn
 
 import numpy as np
 import pytest
+from support.commands import run
 from support.images import encode
 from support.layouts import CAMERA, assert_same_camera, assert_same_pose, truth, write_cameras, write_image
 from support.servers import RunningServer
 from support.wall import wall
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from mapless import Client
 from mapless.geometry import Camera
 from mapless_tools.child import ServerFailed
-from mapless_tools.cli.app import app
 from mapless_tools.ingest.formats.writing import LAYOUTS, PosedImage
 
 COUNT = 12
@@ -48,10 +48,6 @@ def folder(tmp_path: Path) -> Path:
 def scene(client: Client) -> str:
     """An id that no scene has."""
     return f"import-{time.monotonic_ns()}"
-
-
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [*map(str, arguments)])
 
 
 def run_import(server: RunningServer, folder: Path, scene: str, *more: object) -> Result:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 import numpy as np
 import psycopg
@@ -14,7 +14,6 @@ import psycopg
 from mapless.geometry import Camera, Distortion, RigidTransform, rotation_from_vector
 from mapless_server.method.views import Features, View
 from mapless_server.store import NewReference, Store, sqlite
-from mapless_server.store.database import Database
 from mapless_server.store.postgresql import PostgresqlDatabase
 from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
 from mapless_server.store.store import DEFAULT_CACHE_BYTES
@@ -25,29 +24,12 @@ EXTRACTOR = "sift"
 DATABASES = ("sqlite", "postgresql")
 
 
-class Place(Protocol):
-    """A database that stores are opened on, and that tests can read and change without them."""
-
-    def open(self, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Store:
-        """A store on it."""
-        ...
-
-    def open_as_is(self) -> Database:
-        """Its database, not migrated."""
-        ...
-
-    def fetch(self, statement: str, *parameters: object) -> list[tuple[Any, ...]]:
-        """Rows of a statement with question marks for its parameters."""
-        ...
-
-    def execute(self, statement: str, *parameters: object) -> None:
-        """Run and commit a statement, which must change something."""
-        ...
-
-
 @dataclass(frozen=True)
 class Folder:
-    """A data folder with SQLite."""
+    """A data folder with SQLite.
+
+    Statements have question marks for their parameters; `execute` commits one, which must change something.
+    """
 
     data_dir: Path
 
@@ -89,6 +71,10 @@ class Shared:
     def execute(self, statement: str, *parameters: object) -> None:
         with psycopg.connect(self.url) as connection:
             assert connection.execute(_in_psycopg(statement), parameters).rowcount != 0, "nothing was changed"
+
+
+Place: TypeAlias = Folder | Shared
+"""A database that stores are opened on, and that tests can read and change without them."""
 
 
 @dataclass
