@@ -38,7 +38,7 @@ from mapless_server.method.two_view.matches import TwoViewMatches
 from mapless_server.method.two_view.pose import band_chance, disc_chance
 from mapless_server.method.two_view.solve import TwoViewOptions, solve_two_view
 from mapless_server.method.views import Features, Matches, PosedView, View
-from mapless_tools.ingest.check.epipolar import sampson_px
+from mapless_tools.ingest.check.errors import sampson_px
 
 TRUE = RigidTransform(rotation_from_vector([0.1, -0.15, 0.05]), np.array([0.3, -0.1, -4.2]))
 CENTRES = ((-1.2, 0.1, -4.0), (1.0, -0.2, -4.4), (0.2, 0.5, -3.6))

@@ -34,9 +34,8 @@ from mapless_tools.calibrate.claims import (
     left_one_out,
 )
 from mapless_tools.calibrate.findings import RightRule, Share, auroc, find, reliability, risk_coverage
-from mapless_tools.calibrate.page import page
 from mapless_tools.calibrate.queries import Outcome, other_world
-from mapless_tools.calibrate.report import CalibrationReport, to_json, worst
+from mapless_tools.calibrate.report import CalibrationReport, page, to_json, worst
 from mapless_tools.calibrate.run import calibration_of
 from mapless_tools.dataset import Dataset
 

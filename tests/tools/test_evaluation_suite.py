@@ -26,10 +26,9 @@ from mapless_tools.dataset import Dataset, Frame, Refusal
 from mapless_tools.evaluate import suite as suite_module
 from mapless_tools.evaluate.averages import groups_of
 from mapless_tools.evaluate.benchmarks import BENCHMARKS, ScenePlace, find_scenes
-from mapless_tools.evaluate.charts import ablation, along_sequence, cumulative, sparsity
 from mapless_tools.evaluate.figures import write_figures
 from mapless_tools.evaluate.metrics import QueryResult
-from mapless_tools.evaluate.page import page
+from mapless_tools.evaluate.page import ablation, along_sequence, cumulative, page, sparsity
 from mapless_tools.evaluate.paper import DENSE
 from mapless_tools.evaluate.pictures import WorstQuery, data_uri, fit_true_poses
 from mapless_tools.evaluate.plan import EvaluationOptions, Method, SuiteOptions, split_scene

@@ -17,9 +17,7 @@ from mapless.geometry import Camera, Quaternion, RigidTransform, rotation_from_v
 from mapless_server.method.views import PosedView, View
 from mapless_tools.dataset import Frame
 from mapless_tools.ingest.check import check_frames
-from mapless_tools.ingest.check.epipolar import consistent_matches
-from mapless_tools.ingest.check.errors import MatchedPair
-from mapless_tools.ingest.check.pairs import more_pairs, pairs_by_order, pairs_by_pose
+from mapless_tools.ingest.check.errors import MatchedPair, consistent_matches, more_pairs, pairs_by_order, pairs_by_pose
 from mapless_tools.ingest.check.verdict import Verdict, judge, suspects_of
 
 OPENGL = np.diag([1.0, -1.0, -1.0])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from support.scenes import SceneOptions, make_scene, random_for
 
-from mapless_tools.ingest.check.epipolar import consistent_matches, pair_error_px, sampson_px
+from mapless_tools.ingest.check.errors import consistent_matches, pair_error_px, sampson_px
 
 
 def test_a_moved_keypoints_error_is_its_displacement() -> None:

@@ -22,8 +22,7 @@ from mapless.answers import Accuracy, Debug, Diagnostics, Hint, Hypothesis, Loca
 from mapless.geometry import Array, Camera, RigidTransform, rotation_from_vector
 from mapless_tools.cli.app import app
 from mapless_tools.view.meshes import ellipsoid, enlargement, rays
-from mapless_tools.view.pictures import INLIER, OVERLAY_PX, colours_at, overlay, read_picture
-from mapless_tools.view.queries import Query
+from mapless_tools.view.queries import INLIER, OVERLAY_PX, Query, colours_at, overlay, read_picture
 from mapless_tools.view.scenery import lay_out, spread_out
 
 CAMERA = Camera(1800, 1350, 1500.0, 1500.0, 899.5, 674.5)

@@ -97,7 +97,7 @@ def _adjusted(
     held = SHARED_CAMERA * usual if intrinsics is None and is_shared else usual
     terms = (query, np.zeros(4), usual, held)
     found = adjusted_estimate(query, structure, matches, used, estimate, problem, bundle, options, terms)
-    if found is not None and found.intrinsics is not None:
+    if found and found.intrinsics and found.intrinsics.contradicted(options.suspicion).any():
         found = recalibrated(query, references, structure, matches, found, options, priors, usual)
     return found and replace(found, covariance=priors.sharpened(found.covariance, found.world_from_camera))
 

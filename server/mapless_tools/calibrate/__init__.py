@@ -2,5 +2,5 @@
 
 A folder's photographs are localized (`queries`); each error beside the radii that were claimed is a `Claim`; from these
 come the factors (`claims`), which a scene keeps and the server multiplies every answer by, and what the report says
-(`findings`, `report`, `page`). Begin reading with `run`.
+(`findings`, `report`). Begin reading with `run`.
 """

@@ -27,9 +27,8 @@ from mapless_tools.progress import Progress, progress_bars
 from mapless_tools.usage import UsageError, usage_errors
 
 from .findings import Findings, RightRule, find
-from .page import page
 from .queries import Outcome, Query, localize, other_world, planned_queries, scene_queries
-from .report import CalibrationReport, print_report, to_json
+from .report import CalibrationReport, page, print_report, to_json
 
 OWN_SCENE = "calibration"
 

@@ -1,16 +1,25 @@
-"""The report as one HTML file, and what its figures are of, for the terminal too."""
+"""The report as one HTML file with its charts, and what its figures are of, for the terminal too."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 
-from mapless_tools.charts import inline_svg
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from mapless_tools.charts import figure_of, inline_svg, new_axes, plot, use_logarithms
 from mapless_tools.pages import render
 
-from .averages import Group, groups_of
-from .charts import ablation, along_sequence, cumulative, sparsity
+from .averages import Average, Group, groups_of
 from .figures import RULES
+from .metrics import QueryResult
+from .paper import DENSE
 from .pictures import EPIPOLAR_PX, WorstQuery
+from .plan import Method, setting_name
 from .suite import SceneWork, Suite
 from .tables import tables_of, text_lines
 
@@ -105,3 +114,131 @@ def _subsampled(suite: Suite) -> list[str]:
         if len(split.queries) < split.test_count:
             left_out.append(f"{scene.place.name}: {len(split.queries)} of {split.test_count} queries, evenly spread")
     return left_out
+
+
+RIVALS = ("ACE", "ACE + GS-CPR", "L3")
+"""Of the paper's figure of sparsity."""
+MAX_POINTS = 400
+"""Of a curve along a sequence; beyond, each point is the worst of several queries."""
+
+
+@dataclass(frozen=True)
+class Measure:
+    """An error that is drawn.
+
+    Attributes:
+        name: "translation error" or "rotation error".
+        unit: of the values.
+        of_query, of_average: the error of one query, and the mean over scenes of the median error.
+        smallest: smaller values are drawn as this one: no ground truth is that good.
+        paper_index: of the value in the paper's medians.
+    """
+
+    name: str
+    unit: str
+    of_query: Callable[[QueryResult], float]
+    of_average: Callable[[Average], float]
+    smallest: float
+    paper_index: int
+
+    @property
+    def label(self) -> str:
+        """Of an axis."""
+        return f"{self.name}, {self.unit}"
+
+
+MEASURES = (
+    Measure(
+        "translation error",
+        "cm",
+        lambda it: 100 * it.translation_error,
+        lambda it: 100 * it.median_translation_m,
+        0.01,
+        0,
+    ),
+    Measure("rotation error", "°", lambda it: it.rotation_error_deg, lambda it: it.median_rotation_deg, 0.001, 1),
+)
+
+
+def cumulative(group: Group) -> list[Figure]:
+    """For the densest and the sparsest setting: the share of all scenes' queries with at most an error."""
+    figures = []
+    for setting in dict.fromkeys((group.settings[0], group.settings[-1])):
+        pools = {
+            method.label: [it for scene in group.scenes for it in group.results(scene, setting, method)]
+            for method in group.methods
+        }
+        for measure in MEASURES if any(pools.values()) else ():
+            axes = new_axes(f"{setting_name(setting)}: queries within an error", measure.label, "queries, %")
+            axes.set_ylim(0, 100)
+            use_logarithms(axes.xaxis)
+            for label, results in pools.items():
+                errors = np.sort([max(measure.of_query(it), measure.smallest) for it in results])
+                localized = errors[np.isfinite(errors)]
+                axes.step(localized, 100 * np.arange(1, len(localized) + 1) / len(errors), where="post", label=label)
+            figures.append(figure_of(axes))
+    return figures
+
+
+def sparsity(group: Group) -> list[Figure]:
+    """Median error averaged over scenes against the number of references, with the paper's curves."""
+    if len(group.settings) < 2:
+        return []
+    methods = {method.label: method for method in group.methods if method.scale == group.methods[0].scale}
+    figures = []
+    for measure in MEASURES:
+        axes = _against_settings(group, measure, f"Sparsity: mean of the scenes' median {measure.name}", methods)
+        for paper in group.benchmark.paper.methods if group.benchmark else ():
+            known = {i: paper.average[s] for i, s in enumerate(group.settings) if s in paper.average}
+            if paper.name in RIVALS and known:
+                medians = [math.inf if it is None else it[measure.paper_index] for it in known.values()]
+                plot(axes, f"{paper.name} (paper)", list(known), medians, marker="o", dotted=True)
+        figures.append(figure_of(axes))
+    return figures
+
+
+def ablation(group: Group) -> list[Figure]:
+    """The same for the strategies of the scale."""
+    last = group.methods[-1].variant
+    methods = {method.scale: method for method in group.methods if method.variant == last}
+    if len(group.settings) < 2 or len(methods) < 2:
+        return []
+    return [
+        figure_of(_against_settings(group, measure, f"Scale, variant {last}: {measure.name}", methods))
+        for measure in MEASURES
+    ]
+
+
+def along_sequence(group: Group, scene: str) -> list[Figure]:
+    """Errors of the first method, query after query, for the densest and the sparsest setting."""
+    method = group.methods[0]
+    settings = dict.fromkeys((group.settings[0], group.settings[-1]))
+    runs = {s: results for s in settings if (results := group.results(scene, s, method))}
+    figures = []
+    for measure in MEASURES if runs else ():
+        stride = max(1, math.ceil(max(map(len, runs.values())) / MAX_POINTS))
+        thinned = f"; the worst of each {stride}" if stride > 1 else ""
+        x_label = f"query, in the order of the sequence{thinned}"
+        axes = new_axes(f"{scene}, {method.label}", x_label, measure.label)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        use_logarithms(axes.yaxis)
+        for setting, results in runs.items():
+            errors = [max(measure.of_query(it), measure.smallest) for it in results]
+            starts = range(0, len(errors), stride)
+            plot(axes, setting_name(setting), starts, [max(errors[i : i + stride]) for i in starts])
+        figures.append(figure_of(axes))
+    return figures
+
+
+def _against_settings(group: Group, measure: Measure, title: str, methods: dict[str, Method]) -> Axes:
+    """A curve for each method, by its label: the mean of the medians, over the settings."""
+    axes = new_axes(title, "references of the scene", measure.label)
+    use_logarithms(axes.yaxis)
+    names = ["all" if setting == DENSE else str(setting) for setting in group.settings]
+    axes.set_xticks(range(len(names)), names)
+    for label, method in methods.items():
+        averages = {i: group.average(setting, method) for i, setting in enumerate(group.settings)}
+        known = {i: max(measure.of_average(it), measure.smallest) for i, it in averages.items() if it is not None}
+        if known:
+            plot(axes, label, list(known), list(known.values()), marker="o")
+    return axes

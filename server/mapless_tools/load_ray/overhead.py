@@ -14,10 +14,9 @@ from mapless_tools.load.report import Check
 from mapless_tools.load.requests import SCENE, photo_request
 from mapless_tools.progress import Progress
 
-from .callers import Scenes
 from .cluster import application, running_cluster
 from .database import VARIABLE, database_url
-from .replacing import NO_OP
+from .replacing import NO_OP, Scenes
 
 MAX_OVERHEAD_MS = 3.0
 THROUGH, DIRECT, PLAIN = "through HAProxy", "replica's own port", "plain server"

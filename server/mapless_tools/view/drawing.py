@@ -12,7 +12,7 @@ from mapless.geometry import Array, Camera, RigidTransform
 
 from .guarded import GuardedViser
 from .meshes import ellipsoid, enlargement, rays
-from .pictures import INLIER, OUTLIER, Picture
+from .queries import INLIER, OUTLIER, Picture
 from .scenery import Scenery
 
 Colour = tuple[int, int, int]

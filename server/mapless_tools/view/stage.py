@@ -17,8 +17,7 @@ from mapless.geometry import Array
 
 from .drawing import DOUBT, OTHER, QUERY, REFERENCE, SELECTED, Drawing
 from .guarded import GuardedViser
-from .pictures import OVERLAY_PX, THUMBNAIL_PX, Picture, overlay, read_picture
-from .queries import Query
+from .queries import OVERLAY_PX, THUMBNAIL_PX, Picture, Query, overlay, read_picture
 from .scenery import Scenery
 
 MAX_QUERIES = 12

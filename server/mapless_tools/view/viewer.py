@@ -18,8 +18,7 @@ from mapless_server.method.options import check_bounds
 
 from .feed import Feed
 from .guarded import GuardedViser
-from .pictures import THUMBNAIL_PX, Picture, colours_at, read_picture
-from .queries import Query
+from .queries import THUMBNAIL_PX, Picture, Query, colours_at, read_picture
 from .scenery import Scenery, lay_out
 from .stage import Stage
 

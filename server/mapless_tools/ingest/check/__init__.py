@@ -4,7 +4,6 @@ Imports the method of `mapless_server`, and nothing of the import itself. Begin 
 """
 
 from .comparing import check_frames
-from .depth import implausible_depth
-from .verdict import Verdict
+from .verdict import Verdict, implausible_depth
 
 __all__ = ["Verdict", "check_frames", "implausible_depth"]

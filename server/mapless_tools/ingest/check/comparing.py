@@ -18,9 +18,7 @@ from mapless_server.settings import available_cores
 from mapless_tools.dataset import Frame
 from mapless_tools.progress import Progress
 
-from .epipolar import consistent_matches
-from .errors import MatchedPair
-from .pairs import Pair, more_pairs, pairs_by_order, pairs_by_pose
+from .errors import MatchedPair, Pair, consistent_matches, more_pairs, pairs_by_order, pairs_by_pose
 from .verdict import Verdict, judge
 
 MAX_SUSPECTED = 12

@@ -1,17 +1,149 @@
-"""Pairs of photographs, their matches, and how far these are from satisfying the poses."""
+"""Which photographs are compared, their matches, and how far these are from satisfying the poses and cameras.
+
+The measure is the Sampson distance from the epipolar constraint, x_first' F x_second = 0: to first order, how far both
+keypoints together must be moved to satisfy it, in pixels. The matches are filtered by a fundamental matrix estimated
+from them alone, not by the poses that they are used to check.
+
+The measure does not depend on scale: poses in feet satisfy it like poses in metres. Nor does it depend on the choice of
+world axes, which changes no relative pose.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
+import poselib
+from numpy.typing import NDArray
 
-from mapless_server.method.views import Matches, PosedView
+from mapless.geometry import Array, RigidTransform
+from mapless_server.method.correspond import fundamental_matrix, mutual_matches
+from mapless_server.method.views import Matches, PosedView, View
 
-from .epipolar import pair_error_px
-from .pairs import Pair
+PAIR_COUNT = 24
+"""Enough that a median over them is settled; their features take seconds."""
+
+MAX_TURN_DEG = 40.0
+"""Beyond it SIFT finds few matches, and the views may share nothing."""
+
+BASELINE_SHARE = 0.05
+"""Of the scene's extent: neighbours in a video stand so close together that almost any pose would fit."""
+
+ORDER_STEPS = (1, 3, 10, 30)
+"""How far apart in the folder's order photographs are compared if their poses do not show which are near."""
+
+Pair = tuple[int, int]
+
+
+def pairs_by_pose(poses: Sequence[RigidTransform], count: int = PAIR_COUNT) -> list[Pair]:
+    """Pairs of neighbours that look the same way, about a good baseline apart; fewer if there are not so many.
+
+    With few photographs each of them is in several pairs.
+    """
+    near = _Neighbours(poses)
+    rounds = (_partner_of_each(near, len(poses), count, rank) for rank in range(3))
+    return _distinct(chain.from_iterable(rounds), count)
+
+
+def more_pairs(poses: Sequence[RigidTransform], reference: int, known: Sequence[Pair], count: int) -> list[Pair]:
+    """Further pairs of one photograph."""
+    near = _Neighbours(poses)
+    candidates = [(min(reference, other), max(reference, other)) for other in near.ranked(reference)]
+    return [pair for pair in candidates if pair not in known][:count]
+
+
+def pairs_by_order(frame_count: int, count: int = PAIR_COUNT) -> list[Pair]:
+    """Pairs of photographs that are near in the folder's order, spread over it."""
+    each = max(1, count // len(ORDER_STEPS))
+    pairs = (
+        (int(first), int(first) + step)
+        for step in ORDER_STEPS
+        if step < frame_count
+        for first in np.linspace(0, frame_count - 1 - step, each).round()
+    )
+    return _distinct(pairs, count)
+
+
+class _Neighbours:
+    """Which photographs are near each other and look the same way."""
+
+    def __init__(self, poses: Sequence[RigidTransform]) -> None:
+        self._centre: Array = np.array([pose.translation for pose in poses])
+        self._ahead: Array = np.array([pose.rotation[:, 2] for pose in poses])
+        extent = 2 * float(np.median(np.linalg.norm(self._centre - np.median(self._centre, axis=0), axis=1)))
+        sample = np.linspace(0, len(poses) - 1, min(len(poses), PAIR_COUNT)).round().astype(int)
+        nearest = [distances.min() for i in sample if len(distances := self._distances(int(i))[1])]
+        self._baseline = max(float(np.median(nearest)) if nearest else 0.0, BASELINE_SHARE * extent)
+
+    def ranked(self, reference: int) -> list[int]:
+        """Those that look the same way, the best baseline first."""
+        others, distances = self._distances(reference)
+        aligned = self._ahead[others] @ self._ahead[reference] > np.cos(np.radians(MAX_TURN_DEG))
+        others, distances = others[aligned], distances[aligned]
+        return [int(i) for i in others[np.argsort(np.abs(np.log(distances / self._baseline)), kind="stable")]]
+
+    def _distances(self, reference: int) -> tuple[NDArray[np.intp], Array]:
+        """Those elsewhere, and how far."""
+        distances = np.linalg.norm(self._centre - self._centre[reference], axis=1)
+        elsewhere = np.flatnonzero(distances > 1e-6)
+        return elsewhere, distances[elsewhere]
+
+
+def _partner_of_each(near: _Neighbours, frame_count: int, count: int, rank: int) -> list[Pair]:
+    anchors = np.linspace(0, frame_count - 1, min(frame_count, count)).round().astype(int)
+    found = ((int(anchor), near.ranked(int(anchor))[rank : rank + 1]) for anchor in anchors)
+    return [(min(anchor, others[0]), max(anchor, others[0])) for anchor, others in found if others]
+
+
+def _distinct(pairs: Iterable[Pair], count: int) -> list[Pair]:
+    return list(dict.fromkeys(pairs))[:count]
+
+
+RATIO = 0.8
+"""Lowe's ratio; strict, since few right matches are better here than many with some wrong ones."""
+
+FUNDAMENTAL_PX = 1.5
+"""Largest distance from the epipolar lines; keypoints are accurate to about a pixel."""
+
+MIN_MATCHES = 24
+"""Fewer inliers are no evidence: any eight matches satisfy some fundamental matrix."""
+
+
+def consistent_matches(first: View, second: View) -> Matches:
+    """Inlier matches of one fundamental matrix, without use of poses; none if they are too few."""
+    matches = mutual_matches(first.features, second.features, RATIO)
+    if len(matches) < MIN_MATCHES:
+        return matches[:0]
+    _, info = poselib.estimate_fundamental(
+        first.features.keypoints[matches[:, 0]].astype(np.float64),
+        second.features.keypoints[matches[:, 1]].astype(np.float64),
+        {"max_epipolar_error": FUNDAMENTAL_PX},
+        {},
+    )
+    agreeing = matches[np.asarray(info["inliers"], bool)]
+    return agreeing if len(agreeing) >= MIN_MATCHES else matches[:0]
+
+
+def sampson_px(first: PosedView, second: PosedView, matches: Matches) -> Array:
+    """Sampson distances (M,) of matches, pixels; NaN without a baseline, where F is not defined."""
+    fundamental = fundamental_matrix(first, second)
+    x_first, x_second = (
+        np.column_stack([view.view.features.keypoints[matches[:, side]], np.ones(len(matches))])
+        for side, view in enumerate((first, second))
+    )
+    lines_first, lines_second = x_second @ fundamental.T, x_first @ fundamental
+    slope = np.sqrt((lines_first[:, :2] ** 2).sum(axis=1) + (lines_second[:, :2] ** 2).sum(axis=1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.abs((x_first * lines_first).sum(axis=1)) / slope)
+
+
+def pair_error_px(first: PosedView, second: PosedView, matches: Matches) -> float:
+    """Median Sampson distance of matches, pixels; NaN without matches or without a baseline."""
+    return float(np.median(sampson_px(first, second, matches))) if len(matches) else float("nan")
+
 
 THRESHOLD_PX = 3.0
 """Of an image whose longer side is 1024 pixels. Good poses give 0.1 (surveyed) to 0.8 px (motion capture, a rolling
