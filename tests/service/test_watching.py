@@ -48,6 +48,15 @@ def watching(stub: LocalizationServiceStub, scene: str = "hall", **arguments: An
     return call
 
 
+def test_confidential_calls_are_not_shown(stub: LocalizationServiceStub) -> None:
+    seen = watching(stub)
+    request = localize_request("hall")
+    request.options.confidential = True
+    stub.Localize(request, timeout=LIMIT_S, metadata=(("x-request-id", "secret"),))
+    stub.Localize(localize_request("hall"), timeout=LIMIT_S, metadata=(("x-request-id", "open"),))
+    assert next(seen).answer.diagnostics.request_id == "open"
+
+
 def test_answers_of_the_watched_scene_alone_arrive_at_once(
     server: RunningServer, stub: LocalizationServiceStub
 ) -> None:

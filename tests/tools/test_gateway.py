@@ -303,6 +303,9 @@ async def test_a_rejection_says_why_and_what_helps(server: RunningServer) -> Non
 
 async def test_large_late_and_many_requests_are_refused(server: RunningServer) -> None:
     large = b'{"id": "' + b"x" * 50_000_000 + b'"}'
+    async with gateway_of(server.address, guard=GuardOptions(max_held_bytes=10_000)) as app:
+        assert [(await ask(app, gpp.request())).status for _ in range(2)] == [503, 503]
+        assert (await requested(app, "POST", "/v1/localize", *form(intrinsics=INTRINSICS))).status == 400
     guard = GuardOptions(max_requests=1, body_s=0.2)
     async with gateway_of(server.address, guard=guard) as app:
         assert (await ask(app, large)).status == 413

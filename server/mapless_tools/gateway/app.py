@@ -160,13 +160,14 @@ class _Handlers:
         """A request of the GeoPose Protocol."""
         geopose.check_version(request.headers.get("accept", ""))
         client, scene = self._client_for(request), self._scene_of(request)
-        asked = await asyncio.to_thread(geopose.read_request, await request.body())
+        body = b"".join([part async for part in request.stream()])  # `request.body()` would keep it
         datum = (await client.get_scene(scene)).datum
         if datum is None:
             raise Failure(
                 f"{scene} has no datum, so its poses have no place on the Earth", 409, reason="NO_DATUM", field="scene"
             )
-        photograph = await asyncio.to_thread(geopose.photograph_of, asked, datum)
+        photograph = await asyncio.to_thread(geopose.read, body, datum)
+        del body
         try:
             answer = await client.localize(
                 photograph.image,

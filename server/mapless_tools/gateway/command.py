@@ -39,19 +39,19 @@ def gateway_command(
     """
     from mapless import MaplessError
     from mapless_server.extras import install_hint
+    from mapless_server.serve.libraries import configure_libraries
     from mapless_server.serve.signals import terminable
     from mapless_server.settings import ConfigError, load_settings
     from mapless_tools.child import ServerFailed
     from mapless_tools.connection import reachable
 
     try:
+        settings = load_settings({}).settings
+        configure_libraries(settings)
+        from .app import GatewayOptions
+        from .guard import GuardOptions
         from .serving import Binding, run
-    except ImportError as error:
-        fail(install_hint(error))
-    from .app import GatewayOptions
-    from .guard import GuardOptions
 
-    try:
         binding = Binding(host, port, tls_certificate, tls_key, insecure)
         guard = GuardOptions(tuple(allow_origin or ()), binding.is_loopback, round(max_body_mib * 2**20), max_requests)
         if pages is not None and not (pages / "index.html").is_file():
@@ -59,11 +59,12 @@ def gateway_command(
                 f"--pages {pages} holds no index.html; in client/web, build it by npm install && npm run build"
             )
         options = GatewayOptions(scene, pages, guard)
-        settings = load_settings({}).settings
         with terminable(), reachable(connection, settings) as (server, connect):
             if not connection.address:
                 print(f"a server was started at {server}", file=sys.stderr)
             run(server, connect, options, binding)
+    except ImportError as error:
+        fail(install_hint(error))
     except (ValueError, ConfigError) as error:
         fail(str(error))
     except (MaplessError, ServerFailed, OSError) as error:

@@ -195,6 +195,11 @@ def check_version(accept: str) -> None:
                 )
 
 
+def read(body: bytes, datum: Datum) -> Photograph:
+    """The photograph of a body for a scene with this datum; Failure names what is wrong, and where."""
+    return photograph_of(read_request(body), datum)
+
+
 def read_request(body: bytes) -> Request:
     """The request of a body; Failure names what is wrong, and where."""
     if sum(map(body.count, (b",", b"[", b"{"))) > _MAX_VALUES:

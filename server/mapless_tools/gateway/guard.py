@@ -24,7 +24,9 @@ class GuardOptions:
         is_loopback: whether it listens on this machine alone. Other names that lead here are then refused: a page
             whose own name was pointed at this machine would count as the gateway's.
         max_body_bytes: of a request. A photograph of 16 MiB, the most that servers take, is 22.4 MB in base64.
-        max_requests: at a time; further ones are refused. With the size, it bounds the memory.
+        max_requests: at a time; further ones are refused.
+        max_held_bytes: of all requests at a time; further ones are refused. It bounds the memory, which is four times
+            as much: the text, the photograph, the call, and its bytes on the way.
         body_s: in which a request has to arrive.
     """
 
@@ -32,10 +34,11 @@ class GuardOptions:
     is_loopback: bool = True
     max_body_bytes: int = 32 * 2**20
     max_requests: int = 32
+    max_held_bytes: int = 96 * 2**20
     body_s: float = 60.0
 
     def __post_init__(self) -> None:
-        for name in ("max_body_bytes", "max_requests", "body_s"):
+        for name in ("max_body_bytes", "max_requests", "max_held_bytes", "body_s"):
             if not (value := getattr(self, name)) > 0:
                 raise ValueError(f"{name} must be above 0, is {value:g}")
         for origin in self.origins:
@@ -51,6 +54,7 @@ class Guard:
     app: ASGIApp
     options: GuardOptions = field(default_factory=GuardOptions)
     _running: int = 0
+    _held_bytes: int = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles a request; anything else passes."""
@@ -64,15 +68,17 @@ class Guard:
             has_begun = True
             await send(message)
 
+        body = _Body(self, receive)
         self._running += 1
         try:
             self._check(scope)
-            await self.app(scope, self._bounded(receive), noting)
+            await self.app(scope, body.receive, noting)
         except Failure as failure:
             if not has_begun:
                 await failure.response()(scope, receive, send)
         finally:
             self._running -= 1
+            self._held_bytes -= body.size
 
     def _check(self, scope: Scope) -> None:
         headers = Headers(scope=scope)
@@ -89,36 +95,54 @@ class Guard:
                 403,
                 reason="FOREIGN_ORIGIN",
             )
-        if int(length if (length := headers.get("content-length", "0")).isdecimal() else 0) > (
-            self.options.max_body_bytes
-        ):
-            raise self._too_large()
+        length = headers.get("content-length", "")
+        self.check_size(int(length) if length.isdecimal() else 0)
         if self._running > self.options.max_requests:
-            raise Failure("too many requests at a time", 503, reason="GATEWAY_BUSY", retry_after_s=1.0)
+            raise _busy("too many requests at a time")
 
-    def _too_large(self) -> Failure:
-        return Failure(
-            f"the request is larger than {self.options.max_body_bytes} bytes", 413, reason="REQUEST_TOO_LARGE"
-        )
+    def check_size(self, size: int) -> None:
+        """Refuses a body of this size."""
+        if size > self.options.max_body_bytes:
+            large = f"the request is larger than {self.options.max_body_bytes} bytes"
+            raise Failure(large, 413, reason="REQUEST_TOO_LARGE")
 
-    def _bounded(self, receive: Receive) -> Receive:
-        """The body, as long as it is small enough and arrives in time."""
-        deadline_s = time.monotonic() + self.options.body_s
-        size, is_complete = 0, False
+    def hold(self, size: int) -> None:
+        """Counts bytes that have arrived."""
+        self._held_bytes += size
+        if self._held_bytes > self.options.max_held_bytes:
+            raise _busy("too large requests at a time")
 
-        async def bounded() -> Message:
-            nonlocal size, is_complete
-            if is_complete:  # what follows is the end of the connection
-                return await receive()
-            try:
-                message = await asyncio.wait_for(receive(), deadline_s - time.monotonic())
-            except asyncio.TimeoutError:
-                late = f"the request did not arrive within {self.options.body_s:g} s"
-                raise Failure(late, 408, reason="REQUEST_LATE") from None
-            size += len(message.get("body", b""))
-            is_complete = not message.get("more_body", False)
-            if size > self.options.max_body_bytes:
-                raise self._too_large()
-            return message
 
-        return bounded
+def _busy(message: str) -> Failure:
+    return Failure(message, 503, reason="GATEWAY_BUSY", retry_after_s=1.0)
+
+
+class _Body:
+    """The body of a request, as long as it is small enough and arrives in time.
+
+    Attributes:
+        size: of what has arrived, bytes.
+    """
+
+    def __init__(self, guard: Guard, receive: Receive) -> None:
+        self._guard = guard
+        self._receive = receive
+        self._deadline_s = time.monotonic() + guard.options.body_s
+        self._is_complete = False
+        self.size = 0
+
+    async def receive(self) -> Message:
+        """The next part; after the last one, the end of the connection."""
+        if self._is_complete:
+            return await self._receive()
+        try:
+            message = await asyncio.wait_for(self._receive(), self._deadline_s - time.monotonic())
+        except asyncio.TimeoutError:
+            late = f"the request did not arrive within {self._guard.options.body_s:g} s"
+            raise Failure(late, 408, reason="REQUEST_LATE") from None
+        size = len(message.get("body", b""))
+        self.size += size
+        self._is_complete = not message.get("more_body", False)
+        self._guard.check_size(self.size)
+        self._guard.hold(size)
+        return message
