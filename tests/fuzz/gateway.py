@@ -56,7 +56,7 @@ class _Client:
     async def get_scene(self, name: str) -> Scene:
         return Scene("hall", 1, 1, datetime(2026, 1, 1, tzinfo=timezone.utc), datum=_DATUM)
 
-    async def localize(self, image: bytes, camera: Camera, scene: str, *, priors: Any, confidential: bool) -> Any:
+    async def localize(self, image: bytes, camera: Camera, scene: str, *, confidential: bool, **_: Any) -> Any:
         assert image
         assert isinstance(camera, Camera)
         assert isinstance(confidential, bool)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import http.client
+import io
 import json
 import socket
 import struct
@@ -166,6 +167,26 @@ async def test_raw_pixels_arrive_as_they_were(
     from mapless_server.images import ImageLimits, decode_image
 
     assert (decode_image(asked[0]["image"], ImageLimits()) == seen[..., :3]).all()
+
+
+async def test_without_intrinsics_those_of_the_exif_count(server: RunningServer, asked: list[dict[str, Any]]) -> None:
+    """As a phone's file has them, sent by the official demo client, which leaves out `params`, too."""
+    from PIL import ExifTags, Image
+
+    exif = Image.Exif()
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 26
+    file = io.BytesIO()
+    Image.open(io.BytesIO(PHOTO)).convert("RGB").save(file, "JPEG", exif=exif)
+    request = gpp.demo_request()
+    reading = request["sensorReadings"]["cameraReadings"][0]
+    reading["imageBytes"] = base64.b64encode(file.getvalue()).decode()
+    del reading["params"]
+    async with gateway_of(server.address) as app:
+        assert (await ask(app, request)).status == 200
+    camera = asked[0]["camera"]
+    assert camera.focal_x_px / np.hypot(96, 64) == pytest.approx(26 / np.hypot(36, 24))
+    assert (camera.principal_x_px, camera.principal_y_px) == (47.5, 31.5)
+    assert asked[0]["intrinsics_uncertainty"].focal_sigma_px == pytest.approx(0.03 * camera.focal_x_px)
 
 
 async def test_positions_and_earlier_responses_become_priors(

@@ -1,6 +1,6 @@
 """A gateway from HTTP to a server: `mapless-server gateway`.
 
-    command > app > geopose  (Open AR Cloud's GeoPose Protocol, version 2)
+    command > app > geopose > messages  (Open AR Cloud's GeoPose Protocol, version 2)
                   > plain    (one photograph as a form)
                   > rpc      (gRPC-Web and Connect, for browsers)
             > guard  (origins, size and number of requests)

@@ -174,6 +174,7 @@ class _Handlers:
                 photograph.camera,
                 scene,
                 priors=photograph.priors,
+                intrinsics_uncertainty=photograph.uncertainty,
                 confidential=photograph.is_confidential,
             )
         except MaplessError as error:

@@ -1,25 +1,26 @@
-"""Open AR Cloud's GeoPose Protocol, version 2: a request to a photograph with priors, an answer to a response.
+"""The GeoPose Protocol: a request to a photograph with priors, an answer to a response.
 
-The protocol has no description for machines; its authority is github.com/OpenArCloud/oscp-geopose-protocol (README.md
-and the Python library) and the schemas of gpp-access. What clients leave out or fill with zeros is taken as unknown.
+What clients leave out or fill with zeros is taken as unknown.
 """
-# ruff: noqa: N815  members carry the names of the protocol
 
 from __future__ import annotations
 
 import base64
 import binascii
+import io
 import math
+import struct
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from PIL import ExifTags, Image
+from pydantic import ValidationError
 
-from mapless import Camera, Datum, GeoPositionPrior, LocalizationResult, PosePrior, Priors
+from mapless import Camera, Datum, GeoPositionPrior, IntrinsicsUncertainty, LocalizationResult, PosePrior, Priors
 from mapless.geodesy import GeoPose, pose_from_geopose
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits
@@ -27,6 +28,7 @@ from mapless_server.images.decode import image_size
 from mapless_tools.ingest.formats.colmap.cameras import PARAMETERS, ColmapCamera
 
 from .failures import Failure
+from .messages import CameraParameters, CameraReading, GeolocationReading, Request, Response
 
 MEDIA_TYPE = "application/vnd.oscp+json;version=2.0"
 CAMERA = "sensorReadings.cameraReadings"
@@ -44,118 +46,12 @@ _UNKNOWN_SIGMA_M = 50.0
 _SIGMAS_OF_68 = 1.5
 """A 68 % radius in the plane, in standard deviations."""
 _MAX_SIGMA_M = 1e4
-
-Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
-Text = Annotated[str, Field(max_length=1000)]
-Ignored = Any
-
-
-class _Message(BaseModel):
-    """Members that are not named are ignored: clients send some of their own."""
-
-    model_config = ConfigDict(extra="ignore")
-
-
-class Position(_Message):
-    """Of a GeoPose: WGS84, degrees and metres above the ellipsoid."""
-
-    lat: Annotated[Number, Field(ge=-90, le=90)]
-    lon: Annotated[Number, Field(ge=-180, le=180)]
-    h: Annotated[Number, Field(ge=-12_000, le=100_000)]
-
-
-class Quaternion(_Message):
-    """Of a GeoPose: turns x forward, y left, z up to east, north, up."""
-
-    x: Number
-    y: Number
-    z: Number
-    w: Number
-
-
-class GeoPoseMessage(_Message):
-    """OGC GeoPose 1.0, Basic-Quaternion."""
-
-    position: Position
-    quaternion: Quaternion
-
-
-class Accuracy(_Message):
-    """Radii that contain the error in 68 % of cases: metres and degrees."""
-
-    position: Number
-    orientation: Number
-
-
-class Response(_Message):
-    """An answer, and one that a request gives back as a prior."""
-
-    id: Text
-    timestamp: Number
-    accuracy: Accuracy
-    type: Text = "geopose"
-    geopose: GeoPoseMessage
-
-
-class CameraParameters(_Message):
-    """COLMAP's model and its parameters; the centre of the top-left pixel is (0.5, 0.5)."""
-
-    model: Text = "UNKNOWN"
-    modelParams: Annotated[list[Number], Field(max_length=20)] = []
-
-
-class Orientation(_Message):
-    """How the device was held; the pose is that of the raster as it is sent."""
-
-    mirrored: bool = False
-
-
-class CameraReading(_Message):
-    """A photograph."""
-
-    timestamp: Number = 0.0
-    sensorId: Text = ""
-    privacy: Ignored = None
-    imageFormat: Text = "JPG"
-    size: Annotated[list[Number], Field(min_length=2, max_length=2)] | None = None
-    imageBytes: str
-    imageOrientation: Orientation | None = None
-    params: CameraParameters | None = None
-
-
-class GeolocationReading(_Message):
-    """A position of a receiver; `heading` and `speed` are ignored."""
-
-    timestamp: Number = 0.0
-    privacy: Ignored = None
-    latitude: Annotated[Number, Field(ge=-90, le=90)]
-    longitude: Annotated[Number, Field(ge=-180, le=180)]
-    altitude: Number | None = None
-    accuracy: Number | None = None
-    altitudeAccuracy: Number | None = None
-
-
-class SensorReadings(_Message):
-    """The photograph and the position are used; readings of other sensors are taken and ignored."""
-
-    cameraReadings: Annotated[list[CameraReading], Field(max_length=100, fail_fast=True)] = []
-    geolocationReadings: Annotated[list[GeolocationReading], Field(max_length=1000, fail_fast=True)] = []
-    wiFiReadings: Ignored = None
-    bluetoothReadings: Ignored = None
-    accelerometerReadings: Ignored = None
-    gyroscopeReadings: Ignored = None
-    magnetometerReadings: Ignored = None
-
-
-class Request(_Message):
-    """One photograph, and what is known of where it was taken."""
-
-    id: Text
-    timestamp: Number
-    type: Literal["geopose"] = "geopose"
-    sensors: Ignored = None
-    sensorReadings: SensorReadings
-    priorPoses: Annotated[list[Response], Field(max_length=1000, fail_fast=True)] = []
+_HEIGHTS_M = (-12_000, 100_000)
+"""Of the interface's positions."""
+_UNKNOWN_MODEL = "UNKNOWN"
+_FILM_DIAGONAL_MM = math.hypot(36, 24)
+_EXIF_FOCAL_SIGMA = 0.03
+"""Relative: whole millimetres of a wide lens, and what cameras crop."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +62,7 @@ class Photograph:
         request_id, timestamp_ms: of the response: those of the request and of the photograph.
         image: the file's bytes.
         camera: that took it.
+        uncertainty: of the camera; None for a calibrated one's.
         priors: what is known of the pose.
         prior_fields: where the request has each prior, by the field of the call.
         is_confidential: whether the photograph serves the answer alone.
@@ -175,6 +72,7 @@ class Photograph:
     timestamp_ms: float
     image: bytes
     camera: Camera
+    uncertainty: IntrinsicsUncertainty | None
     priors: Priors
     prior_fields: dict[str, str]
     is_confidential: bool
@@ -225,7 +123,8 @@ def photograph_of(request: Request, datum: Datum, now_s: float | None = None) ->
     where = f"{CAMERA}[{i}]"
     _check_past(reading.timestamp, now_ms, f"{where}.timestamp")
     taken_ms = reading.timestamp or request.timestamp
-    image, camera = _image_of(reading, where)
+    image, (width_px, height_px) = _image_of(reading, where)
+    camera, uncertainty = _camera_of(reading.params, image, width_px, height_px, f"{where}.params")
     geo, geo_field = _position_prior(readings.geolocationReadings, taken_ms, now_ms)
     pose, pose_field = _pose_prior(request.priorPoses, taken_ms, now_ms, datum)
     return Photograph(
@@ -233,6 +132,7 @@ def photograph_of(request: Request, datum: Datum, now_s: float | None = None) ->
         taken_ms,
         image,
         camera,
+        uncertainty,
         Priors(geo_position=geo, pose=pose),
         {
             "image": f"{where}.imageBytes",
@@ -258,7 +158,8 @@ def response_to(photograph: Photograph, answer: LocalizationResult) -> dict[str,
     }
 
 
-def _image_of(reading: CameraReading, where: str) -> tuple[bytes, Camera]:
+def _image_of(reading: CameraReading, where: str) -> tuple[bytes, tuple[int, int]]:
+    """The file's bytes, and its width and height."""
     text = reading.imageBytes
     if text.startswith("data:"):
         text = text.partition(",")[2]
@@ -281,7 +182,7 @@ def _image_of(reading: CameraReading, where: str) -> tuple[bytes, Camera]:
     if size not in (None, (width_px, height_px)):
         given = "x".join(f"{it:g}" for it in size or ())
         raise Failure(f"the image is {width_px}x{height_px} pixels, not {given}", field=f"{where}.size")
-    return image, _camera_of(reading.params or CameraParameters(), width_px, height_px, f"{where}.params")
+    return image, (width_px, height_px)
 
 
 def _encoded(pixels: bytes, width_px: int, height_px: int, channels: int) -> bytes:
@@ -294,13 +195,25 @@ def _encoded(pixels: bytes, width_px: int, height_px: int, channels: int) -> byt
     return png.tobytes()
 
 
-def _camera_of(given: CameraParameters, width_px: int, height_px: int, where: str) -> Camera:
-    model = given.model.upper()
+def _camera_of(
+    given: CameraParameters | None, image: bytes, width_px: int, height_px: int, where: str
+) -> tuple[Camera, IntrinsicsUncertainty | None]:
+    """The camera of the parameters; without them, of the focal length that the file's EXIF has."""
+    model = given.model.upper() if given is not None else _UNKNOWN_MODEL
+    if given is None or (model.startswith(_UNKNOWN_MODEL) and not given.modelParams):
+        film_mm = _film_focal_mm(image)
+        if film_mm is None:
+            raise Failure(
+                "the camera's intrinsics are needed: one of COLMAP's models and its parameters, or a file whose EXIF "
+                "has the focal length in 35 mm film",
+                field=f"{where}.model",
+            )
+        focal_px = film_mm / _FILM_DIAGONAL_MM * math.hypot(width_px, height_px)
+        centre = ((width_px - 1) / 2, (height_px - 1) / 2)
+        uncertainty = IntrinsicsUncertainty(focal_sigma_px=_EXIF_FOCAL_SIGMA * focal_px)
+        return Camera(width_px, height_px, focal_px, focal_px, *centre), uncertainty
     if model not in PARAMETERS:
-        raise Failure(
-            f"the camera's intrinsics are needed: one of COLMAP's models and its parameters, not {given.model[:40]!a}",
-            field=f"{where}.model",
-        )
+        raise Failure(f"is none of COLMAP's models: {given.model[:40]!a}", field=f"{where}.model")
     names = PARAMETERS[model]
     if len(given.modelParams) != len(names):
         raise Failure(
@@ -308,9 +221,19 @@ def _camera_of(given: CameraParameters, width_px: int, height_px: int, where: st
             field=f"{where}.modelParams",
         )
     try:
-        return ColmapCamera(1, model, width_px, height_px, given.modelParams).camera()
+        return ColmapCamera(1, model, width_px, height_px, given.modelParams).camera(), None
     except ValueError as error:
         raise Failure(str(error), field=where) from None
+
+
+def _film_focal_mm(image: bytes) -> float | None:
+    """The focal length in 35 mm film, if the file's EXIF has one that lenses have."""
+    try:
+        with Image.open(io.BytesIO(image)) as opened:
+            value = float(opened.getexif().get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLengthIn35mmFilm, 0))
+    except (OSError, SyntaxError, ValueError, TypeError, KeyError, struct.error):  # damaged EXIF is as none
+        return None
+    return value if 5 <= value <= 1000 else None
 
 
 def _position_prior(
@@ -330,14 +253,13 @@ def _position_prior(
     accuracy_m = reading.accuracy or 0.0
     sigma_m = accuracy_m / _SIGMAS_OF_68 if accuracy_m > 0 else _UNKNOWN_SIGMA_M
     sigma_m = min(max(math.hypot(sigma_m, _WALK_M_PER_S * age_s), 0.1), _MAX_SIGMA_M)
+    height_m, vertical_sigma_m = reading.altitude, reading.altitudeAccuracy or 0.0
     # Many devices give a height of 0, or one above the sea, and no accuracy of it.
-    knows_height = reading.altitude is not None and (reading.altitudeAccuracy or 0.0) > 0
-    height = (
-        (reading.altitude, min(max(reading.altitudeAccuracy or 0.0, 0.1), _MAX_SIGMA_M))
-        if knows_height and -12_000 <= (reading.altitude or 0.0) <= 100_000
-        else (None, 0.0)
-    )
-    prior = GeoPositionPrior(reading.latitude, reading.longitude, sigma_m, *height)
+    if vertical_sigma_m <= 0 or height_m is None or not _HEIGHTS_M[0] <= height_m <= _HEIGHTS_M[1]:
+        height_m, vertical_sigma_m = None, 0.0
+    else:
+        vertical_sigma_m = min(max(vertical_sigma_m, 0.1), _MAX_SIGMA_M)
+    prior = GeoPositionPrior(reading.latitude, reading.longitude, sigma_m, height_m, vertical_sigma_m)
     return prior, f"sensorReadings.geolocationReadings[{i}]"
 
 

@@ -12,7 +12,7 @@ from pydantic.json_schema import models_json_schema
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server import __version__
 
-from . import geopose
+from . import geopose, messages
 
 _SCHEMAS = "#/components/schemas/"
 _TYPES = {
@@ -49,7 +49,7 @@ _ERRORS = {
 def description() -> dict[str, Any]:
     """The OpenAPI document."""
     _, models = models_json_schema(
-        [(geopose.Request, "validation"), (geopose.Response, "serialization")], ref_template=f"{_SCHEMAS}{{model}}"
+        [(messages.Request, "validation"), (messages.Response, "serialization")], ref_template=f"{_SCHEMAS}{{model}}"
     )
     schemas = {"Error": _error_schema(), **models["$defs"]}
     _add_message(pb.LocalizeRequest.DESCRIPTOR, schemas)
