@@ -62,7 +62,9 @@ def rendered() -> Iterator[View]:
 def of_kind(kind: str, photographs: Sequence[View], weights_dir: Path) -> Vocabulary:
     """The vocabulary of a kind of features."""
     extractor = make_extractor(kind, None if kind == "sift" else find_weights(kind, weights_dir))
-    descriptors = np.concatenate([extractor.extract(*it).features.descriptors for it in photographs[:: EVERY[kind]]])
+    descriptors = np.concatenate(
+        [extractor.extract(*it).features.unit_descriptors() for it in photographs[:: EVERY[kind]]]
+    )
     print(f"{kind}: {len(descriptors)} features", flush=True)
     drawn = np.random.default_rng(0).choice(len(descriptors), min(DESCRIPTORS, len(descriptors)), replace=False)
     return learned(descriptors[np.sort(drawn)])

@@ -279,9 +279,7 @@ def test_a_reference_takes_the_space_that_the_guide_says() -> None:
     """The features of SIFT, and a JPEG of 640x480."""
     (shown,) = re.findall(r"A reference takes about ([\d.]+) MB", (ROOT / "docs/guides/scenes.md").read_text())
     count = SiftOptions().max_keypoints
-    features = Features(
-        np.zeros((count, 2), np.float32), np.zeros((count, 128), np.float32), np.zeros(count, np.float32)
-    )
+    features = Features(np.zeros((count, 2), np.float32), np.zeros((count, 128), np.uint8), np.zeros(count, np.float32))
     view = View(Camera.from_fov(640, 480, 70.0), features)
     photograph = encode(".jpg", textured(640, 480))
     assert (len(encode_view(view)) + len(photograph)) / 1e6 == pytest.approx(float(shown), rel=0.1)

@@ -65,10 +65,11 @@ def misses(keypoints: NDArray[np.floating], centres: Array) -> Array:
 
 
 def assert_is_well_formed(features: Features, dimension: int = 128) -> None:
-    assert features.keypoints.dtype == features.descriptors.dtype == features.sizes_px.dtype == np.float32
+    assert features.keypoints.dtype == features.sizes_px.dtype == np.float32
+    assert features.descriptors.dtype == np.uint8
     assert features.descriptors.shape == (len(features), dimension)
     assert np.isfinite(features.keypoints).all()
-    np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(features.unit_descriptors(), axis=1), 1, atol=1e-5)
 
 
 def test_planted_blobs_are_found_at_their_positions() -> None:

@@ -75,11 +75,12 @@ def edgepoint2(weights: dict[str, Path]) -> EdgePoint2Extractor:
 
 
 def assert_is_well_formed(features: Features, dimension: int) -> None:
-    assert features.keypoints.dtype == features.descriptors.dtype == features.sizes_px.dtype == np.float32
+    assert features.keypoints.dtype == features.sizes_px.dtype == np.float32
+    assert features.descriptors.dtype == np.int8
     assert features.descriptors.shape == (len(features), dimension)
     assert np.isfinite(features.keypoints).all()
     assert (features.sizes_px > 0).all()
-    np.testing.assert_allclose(np.linalg.norm(features.descriptors, axis=1), 1, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(features.unit_descriptors(), axis=1), 1, atol=1e-5)
 
 
 def peaks(random: np.random.Generator, width: int, height: int, step_px: int = 20) -> Array:
@@ -154,6 +155,13 @@ def test_xfeat_keypoints_are_the_peaks_of_the_keypoint_map(
     assert largest_miss_px(view.features.keypoints, centres + SHIFT_PX) < 0.05
 
 
+@pytest.fixture
+def unrounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Descriptors as the network gives them."""
+    monkeypatch.setattr("mapless_server.method.features.image.rounded_descriptors", lambda it: it)
+
+
+@pytest.mark.usefixtures("unrounded")
 def test_xfeat_finds_the_keypoints_that_kornia_finds(xfeat: XfeatExtractor) -> None:
     image = textured(320, 256, seed=3)
     twin = XFeat(top_k=300, detection_threshold=0.001)
@@ -168,6 +176,7 @@ def test_xfeat_finds_the_keypoints_that_kornia_finds(xfeat: XfeatExtractor) -> N
     np.testing.assert_allclose(ours.descriptors[ours_order], theirs["descriptors"].numpy()[order], atol=1e-5)
 
 
+@pytest.mark.usefixtures("unrounded")
 def test_edgepoint2_features_are_read_at_the_peaks_of_the_maps(
     edgepoint2: EdgePoint2Extractor, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -559,7 +559,7 @@ class TestPriority:
         usual = server.background._let_callers_first
         steps = iter(range(1000))
 
-        def sometimes() -> None:
+        def sometimes(_: float = 0.25) -> None:
             usual()
             in_time = next(steps) % 3
             monkeypatch.setattr("mapless_server.scenes.background.CLAIM_S", 60.0 if in_time else 0.0)

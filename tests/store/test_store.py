@@ -580,6 +580,6 @@ class TestDamage:
 
     def test_a_later_format_is_not_misread(self) -> None:
         blob = bytearray(codec.encode_view(view_of(make_reference("a", count=1))))
-        struct.pack_into("<B", blob, 0, codec.VIEW_FORMAT_VERSION + 1)
-        with pytest.raises(codec.Damaged, match="format 2"):
+        struct.pack_into("<B", blob, 0, codec.SMALL_VIEW_FORMAT_VERSION + 1)
+        with pytest.raises(codec.Damaged, match="format 3"):
             codec.decode_view("owner", bytes(blob), codec.sha256_for("owner", bytes(blob)))

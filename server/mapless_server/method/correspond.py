@@ -36,7 +36,7 @@ from .views import Features, Matches, PosedView, View
 _PAIRS_THAT_COUNT = 10
 """For `Matcher.pair_s`, about."""
 
-PAIR_RULE = 1
+PAIR_RULE = 2
 """Version of how two references are matched; to be raised by every change that can change a match."""
 
 
@@ -378,7 +378,7 @@ class Matcher:
 
     def _widened(self, first: PosedView, second: PosedView, strict: Matches) -> Matches:
         """The strict matches, and matches along the epipolar lines of the other keypoints."""
-        similarity = first.view.features.descriptors @ second.view.features.descriptors.T
+        similarity = first.view.features.unit_descriptors() @ second.view.features.unit_descriptors().T
         similarity[epipolar_distances_px(first, second) >= self.options.epipolar_px] = -1.0
         added = best_of_both(similarity, self.options.wide_ratio, self.options.wide_similarity)
         taken = np.isin(added[:, 0], strict[:, 0]) | np.isin(added[:, 1], strict[:, 1])
@@ -444,7 +444,7 @@ def mutual_matches(first: Features, second: Features, ratio: float, either: bool
     """
     if len(first) < 2 or len(second) < 2:
         return np.empty((0, 2), np.int32)
-    return best_of_both(first.descriptors @ second.descriptors.T, ratio, either=either)
+    return best_of_both(first.unit_descriptors() @ second.unit_descriptors().T, ratio, either=either)
 
 
 def best_of_both(

@@ -158,7 +158,7 @@ class Padded:
         descriptors = np.zeros((*shape, views[0].features.descriptors.shape[1]), np.float32)
         for i, (view, count) in enumerate(zip(views, counts, strict=True)):
             positions[i, :count] = normalized_positions(view.features, view.camera)[:count]
-            descriptors[i, :count] = view.features.descriptors[:count]
+            descriptors[i, :count] = view.features.unit_descriptors(slice(count))
         return cls(positions, descriptors, np.arange(shape[1]) < np.array(counts)[:, None])
 
 

@@ -132,13 +132,14 @@ def search(
     point, keypoint = free_points[near["i"]], free_keypoints[near["j"]]
 
     tracks = structure.tracks
-    offsets = np.concatenate([[0], np.cumsum([len(r.view.features) for r in references])])
-    descriptors = np.concatenate([r.view.features.descriptors for r in references])
     length = np.diff(np.append(tracks.starts, len(tracks.point)))[point]
     first = np.cumsum(length) - length  # first row below of each pair
     observation = np.arange(length.sum()) - np.repeat(first - tracks.starts[point], length)
-    theirs = descriptors[offsets[tracks.view[observation]] + tracks.keypoint[observation]]
-    ours = query.features.descriptors[np.repeat(keypoint, length)]
+    ours = query.features.unit_descriptors()[np.repeat(keypoint, length)]
+    theirs = np.empty_like(ours)
+    for view, reference in enumerate(references):
+        seen = np.flatnonzero(tracks.view[observation] == view)
+        theirs[seen] = reference.view.features.unit_descriptors(tracks.keypoint[observation[seen]])
     similarity = np.einsum("od,od->o", theirs, ours)
     best = np.maximum.reduceat(similarity, first) if len(first) else similarity
     good = best > options.min_similarity

@@ -20,12 +20,13 @@ class Features:
 
     Attributes:
         keypoints: (N, 2) float32, x and y in pixels of the view's camera, lens distortion removed.
-        descriptors: (N, D) float32, unit length, so that a product is a cosine.
+        descriptors: (N, D): float32, unit length; or in a quarter of the bytes, int8 of any length, or uint8, a
+            histogram. `unit_descriptors` is what they mean.
         sizes_px: (N,) float32, diameter of the patch that each descriptor describes.
     """
 
     keypoints: NDArray[np.float32]
-    descriptors: NDArray[np.float32]
+    descriptors: NDArray[np.float32] | NDArray[np.int8] | NDArray[np.uint8]
     sizes_px: NDArray[np.float32]
 
     def __post_init__(self) -> None:
@@ -37,6 +38,32 @@ class Features:
 
     def __len__(self) -> int:
         return len(self.keypoints)
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory of the arrays."""
+        return self.keypoints.nbytes + self.descriptors.nbytes + self.sizes_px.nbytes
+
+    def unit_descriptors(self, rows: NDArray[np.intp] | slice = slice(None)) -> NDArray[np.float32]:
+        """Some of the descriptors (R, D), or all; float32, unit length, so that a product is a cosine.
+
+        Of a histogram it is the square root of each number's share (Arandjelovic and Zisserman 2012).
+        """
+        chosen = self.descriptors[rows]
+        if chosen.dtype == np.float32:
+            return np.asarray(chosen, np.float32)
+        numbers = chosen.astype(np.float32)
+        if chosen.dtype == np.uint8:
+            return np.asarray(np.sqrt(numbers / np.maximum(numbers.sum(axis=1, keepdims=True), 1)), np.float32)
+        length = np.sqrt(np.einsum("nd,nd->n", numbers, numbers))
+        return np.asarray(numbers / np.maximum(length, 1)[:, None], np.float32)
+
+
+def rounded_descriptors(descriptors: NDArray[np.floating]) -> NDArray[np.int8]:
+    """Descriptors (N, D) in 8 bits: each is multiplied so that its largest number becomes 127."""
+    finite = np.nan_to_num(descriptors)
+    largest = np.abs(finite).max(axis=1, keepdims=True, initial=np.finfo(np.float32).tiny)
+    return np.asarray(np.rint(finite * (127 / largest.astype(np.float64))), np.int8)
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,6 +22,7 @@ from mapless_server.method.correspond import in_order
 from mapless_server.method.options import StageContext, check_bounds
 from mapless_server.method.views import Matches, PosedView
 from mapless_server.store import Store
+from mapless_server.store.compaction import compact_features
 from mapless_server.store.matching_use import delete_unused, record_use
 from mapless_server.store.pairs import CLAIM_S, Claim, Pair, PairStore, Progress
 
@@ -178,6 +179,9 @@ class BackgroundMatching:
             used.append(self._calibrations.kind)
         record_use(self._store.database, used)
         delete_unused(self._store.database, self._pause)
+        rewritten = set(compact_features(self._store.database, self._pause))
+        if rewritten:
+            self._store.reference_cache.forget(lambda key, _: key in rewritten)
         self._use_is_due_s = time.monotonic() + _USE_IS_RECORDED_S
 
     def _run(self, work: Callable[[], None]) -> None:

@@ -6,7 +6,12 @@ view is one blob:
     byte 0       format version
     bytes 4..8   length of the header, uint32
     header       JSON (camera, count, dimension), padded with spaces so that the arrays are aligned
-    arrays       keypoints (N, 2), sizes (N,), descriptors (N, D), float32
+    arrays       keypoints (N, 2), sizes (N,), descriptors (N, D)
+
+In format 1 the arrays are float32. In format 2 descriptors have 8 bits, keypoints are 24-bit multiples of the header's
+step from its origin, and sizes are float16: 136 bytes a keypoint with 128 numbers instead of 524. The step is a power
+of two, the smallest that spans the photograph: 2^-14 px up to 1024 px. Rounded sizes change the noise of a keypoint by
+at most 0.05 %.
 
 A global descriptor is its numbers as float16: similarities of unit vectors change by less than 0.001. Matches are the
 numbers of their keypoints, int32.
@@ -35,12 +40,13 @@ from mapless_server.method.views import Features, Matches, View
 
 from .records import SceneAttributes, SelfCalibration
 
-VIEW_FORMAT_VERSION = 1
+VIEW_FORMAT_VERSION, SMALL_VIEW_FORMAT_VERSION = 1, 2
 _PREFIX = struct.Struct("<B3xI")
 _ALIGNMENT_BYTES = 16
 _FLOAT32 = np.dtype("<f4")
 _FLOAT16 = np.dtype("<f2")
 _INT32 = np.dtype("<i4")
+_STEPS = 2**24
 
 
 class Damaged(Exception):
@@ -137,24 +143,45 @@ def decode_calibration(owner: str, data: bytes, sha256: str) -> SelfCalibration:
 
 
 def encode_view(view: View) -> bytes:
-    """Processed camera and features as one blob.
+    """Processed camera and features as one blob, of format 2 if descriptors have 8 bits.
 
     Raises:
-        ValueError: an array is not float32 (storing it would round it), or a camera's number is not finite.
+        ValueError: an array is not float32 (storing it would round it), or a number is not finite.
     """
     features = view.features
+    if features.descriptors.dtype.itemsize == 1:
+        return _encode_small_view(view)
     arrays = (features.keypoints, features.sizes_px, features.descriptors)
     if any(array.dtype != np.float32 for array in arrays):
         raise ValueError(f"features must be float32, are {', '.join(str(array.dtype) for array in arrays)}")
-    count, dimension = features.descriptors.shape
-    header = _to_json({"camera": _camera_to_dict(view.camera), "count": count, "dimension": dimension})
+    return _blob(VIEW_FORMAT_VERSION, view, {}, [array.astype(_FLOAT32, copy=False) for array in arrays])
+
+
+def _encode_small_view(view: View) -> bytes:
+    features = view.features
+    keypoints = features.keypoints.astype(np.float64)
+    if not np.isfinite(keypoints).all():
+        raise ValueError("a keypoint's coordinate is not finite")
+    origin = np.floor(keypoints.min(axis=0, initial=0.0))
+    span = float((keypoints - origin).max(initial=1.0))
+    step = 2.0 ** (np.frexp(span)[1] - 24)
+    steps = np.minimum(np.rint((keypoints - origin) / step), _STEPS - 1).astype("<u4")
+    sizes = np.clip(features.sizes_px, 0, np.finfo(_FLOAT16).max).astype(_FLOAT16)
+    kind = "histogram" if features.descriptors.dtype == np.uint8 else "direction"
+    how = {"kind": kind, "origin": origin.tolist(), "step": step}
+    packed = steps.view(np.uint8).reshape(-1, 4)[:, :3]
+    return _blob(SMALL_VIEW_FORMAT_VERSION, view, how, [packed, sizes, features.descriptors])
+
+
+def _blob(version: int, view: View, how: dict[str, Any], arrays: Sequence[NDArray[Any]]) -> bytes:
+    count, dimension = view.features.descriptors.shape
+    header = _to_json({"camera": _camera_to_dict(view.camera), "count": count, "dimension": dimension} | how)
     header += b" " * (-(_PREFIX.size + len(header)) % _ALIGNMENT_BYTES)
-    body = [array.astype(_FLOAT32, copy=False).tobytes() for array in arrays]
-    return b"".join([_PREFIX.pack(VIEW_FORMAT_VERSION, len(header)), header, *body])
+    return b"".join([_PREFIX.pack(version, len(header)), header, *(array.tobytes() for array in arrays)])
 
 
 def decode_view(owner: str, blob: bytes, sha256: str) -> View:
-    """The view that `encode_view` was given; its arrays are read-only and share the blob's memory.
+    """The view that `encode_view` was given, but for what format 2 rounds; read-only arrays that may share the memory.
 
     Raises:
         Damaged: the checksum does not match, or the format is unknown.
@@ -162,15 +189,32 @@ def decode_view(owner: str, blob: bytes, sha256: str) -> View:
     check(owner, blob, sha256, "features")
     with _checked_form("features"):
         version, header_length = _PREFIX.unpack_from(blob)
-        if version != VIEW_FORMAT_VERSION:
+        if version not in (VIEW_FORMAT_VERSION, SMALL_VIEW_FORMAT_VERSION):
             raise Damaged(f"features (format {version} is unknown)")
         offset = _PREFIX.size + header_length
         header = json.loads(blob[_PREFIX.size : offset])
         count, dimension = header["count"], header["dimension"]
+        if version == SMALL_VIEW_FORMAT_VERSION:
+            return View(_camera_from_dict(header["camera"]), _small_features(blob[offset:], header, count, dimension))
         floats = np.frombuffer(blob, _FLOAT32, offset=offset)
         keypoints, sizes_px, descriptors = np.split(floats, [2 * count, 3 * count])
         features = Features(keypoints.reshape(count, 2), descriptors.reshape(count, dimension), sizes_px)
         return View(_camera_from_dict(header["camera"]), features)
+
+
+def _small_features(body: bytes, header: dict[str, Any], count: int, dimension: int) -> Features:
+    if len(body) != count * (8 + dimension):
+        raise ValueError("it has another length than its header says")
+    padded = np.zeros((2 * count, 4), np.uint8)
+    padded[:, :3] = np.frombuffer(body, np.uint8, 6 * count).reshape(-1, 3)
+    steps = padded.view("<u4").reshape(count, 2).astype(np.float64)
+    keypoints = (np.array(header["origin"]) + header["step"] * steps).astype(np.float32)
+    sizes_px = np.frombuffer(body, _FLOAT16, count, 6 * count).astype(np.float32)
+    kind: Any = {"histogram": np.uint8, "direction": np.int8}[header["kind"]]
+    descriptors = np.frombuffer(body, kind, offset=8 * count).reshape(count, dimension).copy()
+    for array in (keypoints, sizes_px, descriptors):
+        array.setflags(write=False)
+    return Features(keypoints, descriptors, sizes_px)
 
 
 def decode_poses(geometries: Sequence[bytes]) -> list[RigidTransform]:

@@ -165,12 +165,16 @@ def rows_by_key(connection: Connection, keys: Sequence[str]) -> dict[str, Row[An
 
 def features_by_key(connection: Connection, keys: Sequence[str], extractor: str) -> dict[str, Row[Any]]:
     """Rows of `reference` joined with `features`, by key, of those that have features of this extractor."""
-    statement: Select[Any] = (
-        select(reference, features.c.extractor, features.c.data, features.c.sha256)
-        .join(features, features.c.reference_key == reference.c.key)
-        .where(features.c.extractor == extractor)
-    )
-    return _by_key(connection, statement, keys)
+    found: dict[str, Row[Any]] = {}
+    for name in rows.feature_names(extractor):
+        lacking = [key for key in keys if key not in found]
+        statement: Select[Any] = (
+            select(reference, features.c.extractor, features.c.data, features.c.sha256)
+            .join(features, features.c.reference_key == reference.c.key)
+            .where(features.c.extractor == name)
+        )
+        found |= _by_key(connection, statement, lacking)
+    return found
 
 
 def find_by_key(connection: Connection, key: str, *columns: ColumnElement[Any]) -> Row[Any]:
@@ -201,7 +205,10 @@ def has_features(connection: Connection, key: str, extractor: str) -> bool:
     """Whether a reference that was not deleted has features of this extractor."""
     column = features.c
     statement = select(column.extractor).join(reference, reference.c.key == column.reference_key)
-    return connection.scalar(statement.where(_exists(key), column.extractor == extractor)) is not None
+    return (
+        connection.scalar(statement.where(_exists(key), column.extractor.in_(rows.feature_names(extractor))))
+        is not None
+    )
 
 
 def has_descriptor(connection: Connection, key: str, name: str) -> bool:

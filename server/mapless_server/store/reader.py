@@ -301,7 +301,9 @@ class StoreReader:
             self._resolved.put((scene_key, names), _Resolved(state, generation, tuple(wanted)), size_bytes)
         for key, row in read.items():
             described[key] = rows.described_reference(row)
-            self._described.put((key, extractor), described[key], len(row.data) + RECORD_BYTES)
+            self._described.put(
+                (key, extractor), described[key], described[key].view.features.size_bytes + RECORD_BYTES
+            )
         if self._last_deletion is not last_deletion:  # these may have been deleted, and dropped from the caches before
             self._described.forget(lambda key, _: key[0] in read)
             self._resolved.forget(lambda key, _: key == (scene_key, names))

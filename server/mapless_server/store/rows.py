@@ -30,6 +30,9 @@ from .records import (
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 _MICROSECOND = timedelta(microseconds=1)
 
+SMALL_FEATURES = "+8bit"
+"""Suffix of the extractor in the table `features`: servers of 0.2.0 do not find these, and so find none damaged."""
+
 
 def time_us(time: datetime) -> int:
     """Microseconds since 1970: databases differ in how they store time zones."""
@@ -137,14 +140,21 @@ def reference_record(row: Row[Any]) -> ReferenceRecord:
     )
 
 
+def feature_names(extractor: str) -> tuple[str, str]:
+    """What an extractor's features are stored as: in 8 bits, and as float32, which 0.2.0 wrote."""
+    return extractor + SMALL_FEATURES, extractor
+
+
 def features_row(key: str, extractor: str, view: View) -> dict[str, Any]:
-    """For the table `features`. Raises ValueError if an array is not float32 or a number not finite."""
+    """For the table `features`. Raises ValueError as `codec.encode_view`."""
     data = codec.encode_view(view)
+    small, large = feature_names(extractor)
+    name = small if view.features.descriptors.dtype.itemsize == 1 else large
     return {
         "reference_key": key,
-        "extractor": extractor,
+        "extractor": name,
         "data": data,
-        "sha256": codec.sha256_for(features_owner(key, extractor), data),
+        "sha256": codec.sha256_for(features_owner(key, name), data),
     }
 
 

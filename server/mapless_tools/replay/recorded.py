@@ -56,9 +56,7 @@ class Blobs:
         view = self._views.get(known)
         if view is None:
             view = self._read_view(tenant, reference, extractor)
-            features = view.features
-            size_bytes = features.keypoints.nbytes + features.descriptors.nbytes + features.sizes_px.nbytes
-            self._views.put(known, view, size_bytes)
+            self._views.put(known, view, view.features.size_bytes)
         return view
 
     def pixels(self, tenant: str, reference: CapturedReference) -> NDArray[np.uint8]:

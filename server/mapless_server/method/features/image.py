@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, Fisheye, RadialTangential, unknown_lens
 
-from ..views import Features, View
+from ..views import Features, View, rounded_descriptors
 
 
 def reduce_image(
@@ -69,19 +69,28 @@ def seen_share(camera: Camera) -> float:
     return float(np.isfinite(undistort_pixels(pixels, camera)).all(axis=1).mean())
 
 
-def view_of(camera: Camera, pixels: Array, descriptors: NDArray[np.float32], sizes_px: NDArray[np.float32]) -> View:
+def view_of(
+    camera: Camera,
+    pixels: Array,
+    descriptors: NDArray[np.float32] | NDArray[np.uint8],
+    sizes_px: NDArray[np.float32],
+) -> View:
     """The view of keypoints found in an image: undistorted, without those that have no undistorted pixel.
+
+    Descriptors are rounded to 8 bits: so are those of stored references, and a query has the same as they.
 
     Args:
         camera: of the image, with its lens distortion.
         pixels: (N, 2) keypoints in the image.
-        descriptors: (N, D), unit length.
+        descriptors: (N, D): float32, or uint8 as in Features.
         sizes_px: (N,), see Features.
     """
+    is_exact = descriptors.dtype == np.uint8
+    rounded = descriptors if is_exact else rounded_descriptors(np.asarray(descriptors, np.float32))
     if not len(pixels):
-        nothing = Features(np.empty((0, 2), np.float32), descriptors, sizes_px)
+        nothing = Features(np.empty((0, 2), np.float32), rounded, sizes_px)
         return View(camera.pinhole(), nothing, distortion=camera.distortion)
     ideal = undistort_pixels(pixels, camera)
     usable = np.isfinite(ideal).all(axis=1)
-    features = Features(ideal[usable].astype(np.float32), descriptors[usable], sizes_px[usable])
+    features = Features(ideal[usable].astype(np.float32), rounded[usable], sizes_px[usable])
     return View(camera.pinhole(), features, distortion=camera.distortion)

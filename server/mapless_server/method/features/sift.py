@@ -37,7 +37,7 @@ class SiftOptions:
 
 @dataclass(frozen=True)
 class SiftExtractor:
-    """SIFT (Lowe 2004) by OpenCV with square-root normalized descriptors (Arandjelovic and Zisserman 2012)."""
+    """SIFT (Lowe 2004) by OpenCV with the histograms of its descriptors, see `Features`."""
 
     options: SiftOptions = field(default_factory=SiftOptions)
 
@@ -59,12 +59,12 @@ class SiftExtractor:
         )
         found, raw = sift.detectAndCompute(reduced, None)
         if not found:
-            return view_of(reduced_camera, np.empty((0, 2)), np.empty((0, 128), np.float32), np.empty(0, np.float32))
+            return view_of(reduced_camera, np.empty((0, 2)), np.empty((0, 128), np.uint8), np.empty(0, np.float32))
         # OpenCV keeps ties of the weakest keypoint, so it may return more than asked for.
         found, raw = found[: self.options.max_keypoints], raw[: self.options.max_keypoints]
         return view_of(
             reduced_camera,
             np.array([k.pt for k in found]),
-            np.sqrt(raw / raw.sum(axis=1, keepdims=True)).astype(np.float32),
+            raw.astype(np.uint8),  # whole numbers
             np.array([k.size for k in found], np.float32),
         )

@@ -59,8 +59,8 @@ def prepare_match(
     votes = np.concatenate([np.empty((0, 2), np.intp), *(m + [0, offset] for m, offset in matches)])
     row = row_of[votes[:, 1]]
     return MatchInputs(
-        np.concatenate([r.view.features.descriptors for r in references]),
-        query.features.descriptors,
+        np.concatenate([r.view.features.unit_descriptors() for r in references]),
+        query.features.unit_descriptors(),
         query.features.keypoints.astype(np.float64),
         row[row >= 0],
         votes[row >= 0, 0],

@@ -136,7 +136,7 @@ class VladDescriptor:
         Raises:
             ValueError: the features are of another kind than the vocabulary.
         """
-        descriptors = view.features.descriptors
+        descriptors = view.features.unit_descriptors()
         if not len(descriptors):
             return np.zeros(DIMENSION, np.float32)
         vocabulary = dataless(descriptors.shape[1]) if self._vocabulary is None else self._vocabulary
