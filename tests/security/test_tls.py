@@ -17,7 +17,7 @@ from typing import Any
 import grpc
 import pytest
 from cryptography.hazmat.primitives.serialization import BestAvailableEncryption, Encoding, PrivateFormat
-from support.certificates import DAY, Pair, authority, signed
+from support.certificates import DAY, Pair, authority, options_of, signed
 
 from mapless import Client, ConnectOptions, MaplessError, Unavailable
 from mapless.__main__ import main
@@ -59,15 +59,7 @@ class Serving:
     health_metadata: dict[str, str]
 
     def options(self, client: Pair | None = None, root: Pair | None = AUTHORITY, **more: Any) -> ConnectOptions:
-        return ConnectOptions(
-            timeout_s=10,
-            max_attempts=1,
-            tls=True,
-            root_certificates=root.certificate_pem if root else None,
-            client_certificate=client.certificate_pem if client else None,
-            client_key=client.key_pem if client else None,
-            **more,
-        )
+        return options_of(client, root, **more)
 
     def who_am_i(self, options: ConnectOptions) -> str:
         with options.channel(f"localhost:{self.port}") as channel:
@@ -351,14 +343,14 @@ class TestCommand:
     def health(self, server: Serving, flags: dict[str, str]) -> int:
         arguments = [part for flag in flags.items() for part in flag]
         with pytest.raises(SystemExit) as caught:
-            main(["--address", f"localhost:{server.port}", "--timeout", "5", *arguments, "health"])
+            main(["--address", f"localhost:{server.port}", "--timeout", "5", *arguments, "health", "--text"])
         return int(caught.value.code or 0)
 
     def test_the_command_sends_certificates_and_token(
         self, server: Serving, flags: dict[str, str], capsys: pytest.CaptureFixture[str]
     ) -> None:
         assert self.health(server, flags | {"--client-id": "r7"}) == 0
-        assert capsys.readouterr().out.splitlines()[0] == "SERVING"
+        assert capsys.readouterr().out.splitlines()[0].split() == ["server", "SERVING"]
         assert server.health_metadata["authorization"] == "Bearer mapless_x"
         assert server.health_metadata["x-client-id"] == "r7"
 

@@ -15,7 +15,7 @@ import grpc
 import pytest
 from google.protobuf.message import Message
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
-from support.certificates import Pair, authority, signed
+from support.certificates import authority, options_of, signed
 from support.requests import requests_of_all, requests_on
 from support.servers import CAMERA, PHOTO, RunningServer, failure_of, localize_request, pose, serving
 from support.waiting import wait_until
@@ -230,49 +230,37 @@ def refusal_of_upload(client: Client, reference_id: str) -> ResourceExhausted | 
     return None
 
 
-class TestEncryption:
-    def options(self, root: Pair, client: Pair | None = None, token: str | None = None) -> ConnectOptions:
-        return ConnectOptions(
-            timeout_s=LIMIT_S,
-            max_attempts=1,
-            tls=True,
-            root_certificates=root.certificate_pem,
-            client_certificate=client.certificate_pem if client else None,
-            client_key=client.key_pem if client else None,
-            token=token,
-        )
+def test_the_server_reloads_its_files_and_needs_both_proofs(tmp_path: Path) -> None:
+    root, new_root = authority(), authority("new")
+    paths: dict[str, Any] = {
+        name: tmp_path / name for name in ("tls_certificate", "tls_key", "tls_client_ca", "tokens_file")
+    }
+    signed(root, "server").write(paths["tls_certificate"], paths["tls_key"])
+    paths["tls_client_ca"].write_bytes(root.certificate_pem)
+    token = create_token(paths["tokens_file"], "robot", "acme", "write", None)
+    robot = signed(root, "robot-7")
 
-    def test_the_server_reloads_its_files_and_needs_both_proofs(self, tmp_path: Path) -> None:
-        root, new_root = authority(), authority("new")
-        paths: dict[str, Any] = {
-            name: tmp_path / name for name in ("tls_certificate", "tls_key", "tls_client_ca", "tokens_file")
-        }
-        signed(root, "server").write(paths["tls_certificate"], paths["tls_key"])
-        paths["tls_client_ca"].write_bytes(root.certificate_pem)
-        token = create_token(paths["tokens_file"], "robot", "acme", "write", None)
-        robot = signed(root, "robot-7")
+    def attempt(options: ConnectOptions) -> str:
+        with Client(address, options) as client:
+            return client.create_scene(f"s{time.monotonic_ns()}").scene_id[:1]
 
-        def attempt(options: ConnectOptions) -> str:
-            with Client(address, options) as client:
-                return client.create_scene(f"s{time.monotonic_ns()}").scene_id[:1]
+    with serving(tmp_path / "data", **paths) as server:
+        address = server.address.replace("127.0.0.1", "localhost")
+        assert attempt(options_of(robot, root, token=token)) == "s"
+        with pytest.raises(Unauthenticated):
+            attempt(options_of(robot, root))
+        with pytest.raises(Unavailable):
+            attempt(options_of(None, root, token=token))
+        with pytest.raises(Unavailable):
+            attempt(options_of(robot, new_root, token=token))
+        signed(new_root, "server").write(paths["tls_certificate"], paths["tls_key"])
 
-        with serving(tmp_path / "data", **paths) as server:
-            address = server.address.replace("127.0.0.1", "localhost")
-            assert attempt(self.options(root, robot, token)) == "s"
-            with pytest.raises(Unauthenticated):
-                attempt(self.options(root, robot))
-            with pytest.raises(Unavailable):
-                attempt(self.options(root, None, token))
-            with pytest.raises(Unavailable):
-                attempt(self.options(new_root, robot, token))
-            signed(new_root, "server").write(paths["tls_certificate"], paths["tls_key"])
+        def sees_the_new_one() -> bool:
+            try:
+                return attempt(options_of(robot, new_root, token=token)) == "s"
+            except Unavailable:
+                return False
 
-            def sees_the_new_one() -> bool:
-                try:
-                    return attempt(self.options(new_root, robot, token)) == "s"
-                except Unavailable:
-                    return False
-
-            wait_until(sees_the_new_one)
-            with pytest.raises(Unavailable):
-                attempt(self.options(root, robot, token))
+        wait_until(sees_the_new_one)
+        with pytest.raises(Unavailable):
+            attempt(options_of(robot, root, token=token))

@@ -66,39 +66,37 @@ def test_what_is_used_by_any_server_is_kept(store: Store, place: Place, monkeypa
     assert place.fetch("SELECT matching FROM matching_use") == [(OURS,)]
 
 
-def test_deleted_pairs_are_made_again(store: Store, place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def unused(store: Store, monkeypatch: pytest.MonkeyPatch) -> Store:
+    """The store when only one of the two ways has been used of late."""
     let_pass(monkeypatch, KEPT_S + 1)
     record_use(store.database, [OURS])
-    delete_unused(store.database, nothing)
-    record_use(store.database, [THEIRS])
-    assert match_all(store, OURS) == 0
-    assert match_all(store, THEIRS) == 3
+    return store
+
+
+def test_deleted_pairs_are_made_again(unused: Store, place: Place) -> None:
+    delete_unused(unused.database, nothing)
+    record_use(unused.database, [THEIRS])
+    assert match_all(unused, OURS) == 0
+    assert match_all(unused, THEIRS) == 3
     assert count_pairs(place) == {OURS: 3, THEIRS: 3}
 
 
-def test_a_server_that_comes_back_meanwhile_stops_it(
-    store: Store, place: Place, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    let_pass(monkeypatch, KEPT_S + 1)
-    record_use(store.database, [OURS])
+def test_a_server_that_comes_back_meanwhile_stops_it(unused: Store, place: Place) -> None:
     calls = list[None]()
 
     def second_portion() -> None:
         calls.append(None)
         if len(calls) == 2:
-            record_use(store.database, [THEIRS])
+            record_use(unused.database, [THEIRS])
 
-    delete_unused(store.database, second_portion)
+    delete_unused(unused.database, second_portion)
     assert len(calls) == 2
     assert place.fetch("SELECT count(*) FROM reference_matching WHERE matching = ?", THEIRS) == [(1,)]
-    assert match_all(store, THEIRS) > 0
+    assert match_all(unused, THEIRS) > 0
 
 
-def test_a_deletion_that_was_interrupted_is_completed(
-    store: Store, place: Place, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    let_pass(monkeypatch, KEPT_S + 1)
-    record_use(store.database, [OURS])
+def test_a_deletion_that_was_interrupted_is_completed(unused: Store, place: Place) -> None:
     calls = list[None]()
 
     def end() -> None:
@@ -107,8 +105,8 @@ def test_a_deletion_that_was_interrupted_is_completed(
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        delete_unused(store.database, end)
+        delete_unused(unused.database, end)
     assert place.fetch("SELECT count(*) FROM reference_matching WHERE matching = ?", THEIRS) == [(1,)]
-    delete_unused(store.database, nothing)
+    delete_unused(unused.database, nothing)
     assert place.fetch("SELECT count(*) FROM reference_matching WHERE matching = ?", THEIRS) == [(0,)]
     assert count_pairs(place) == {OURS: 3}

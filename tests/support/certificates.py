@@ -6,12 +6,15 @@ import ipaddress
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
+from typing import Any
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 from cryptography.x509.oid import NameOID
+
+from mapless import ConnectOptions
 
 DAY = timedelta(days=1)
 
@@ -34,6 +37,19 @@ class Pair:
     def write(self, certificate: Path, key: Path) -> None:
         certificate.write_bytes(self.certificate_pem)
         key.write_bytes(self.key_pem)
+
+
+def options_of(client: Pair | None = None, root: Pair | None = None, **more: Any) -> ConnectOptions:
+    """Of a client with this certificate that trusts this root, and tries once."""
+    return ConnectOptions(
+        timeout_s=10,
+        max_attempts=1,
+        tls=True,
+        root_certificates=root.certificate_pem if root else None,
+        client_certificate=client.certificate_pem if client else None,
+        client_key=client.key_pem if client else None,
+        **more,
+    )
 
 
 def authority(name: str = "authority") -> Pair:
