@@ -25,9 +25,15 @@ class Answer:
 
 
 async def requested(
-    app: ASGIApp, method: str, path: str, body: bytes = b"", headers: Mapping[str, str] | None = None, parts: int = 1
+    app: ASGIApp,
+    method: str,
+    path: str,
+    body: bytes = b"",
+    headers: Mapping[str, str] | None = None,
+    parts: int = 1,
+    stays_s: float | None = None,
 ) -> Answer:
-    """The answer to a request whose body comes in so many parts."""
+    """The answer to a request whose body comes in parts; the client stays for a time, or until it is answered."""
     named = {"host": "127.0.0.1:8080", "content-length": str(len(body)), **(headers or {})}
     scope: Any = {
         "type": "http",
@@ -49,7 +55,8 @@ async def requested(
 
     async def receive() -> Any:
         if not waiting:
-            await asyncio.Event().wait()  # the client stays until it is answered
+            await (asyncio.Event().wait() if stays_s is None else asyncio.sleep(stays_s))
+            return {"type": "http.disconnect"}
         part = waiting.pop(0)
         return {"type": "http.request", "body": part, "more_body": bool(waiting)}
 

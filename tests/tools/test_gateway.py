@@ -353,6 +353,26 @@ async def test_large_late_and_many_requests_are_refused(server: RunningServer) -
         assert (await ask(app, gpp.request())).status == 200
 
 
+async def test_the_call_of_a_caller_that_leaves_is_cancelled(server: RunningServer) -> None:
+    def cancelled() -> float:
+        return server.value("grpc_server_handled_total", grpc_code="CANCELLED")
+
+    before = cancelled()
+    async with gateway_of(server.address) as app:
+        with server.method.held():
+            body = json.dumps(gpp.request()).encode()
+            await requested(app, "POST", "/geopose", body, GPP_HEADERS, stays_s=0.2)
+            await requested(app, "POST", "/v1/localize", *form(image=PHOTO, intrinsics=INTRINSICS), stays_s=0.2)
+            await requested(
+                app, "POST", LOCALIZE, frame(localize_request("hall").SerializeToString()), GRPC_WEB, stays_s=0.2
+            )
+            for _ in range(100):
+                await asyncio.sleep(0.05)
+                if cancelled() == before + 3:
+                    break
+    assert cancelled() == before + 3
+
+
 async def test_pages_of_foreign_origins_may_not_call(server: RunningServer) -> None:
     asking = {"access-control-request-method": "POST", "access-control-request-headers": "content-type,x-grpc-web"}
     async with gateway_of(server.address) as app:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import dataclass, field
 from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
@@ -44,7 +44,7 @@ _SENT_HEADERS = (
 """What browsers may send besides what they may always."""
 _READ_HEADERS = ("grpc-message", "grpc-status", "grpc-status-details-bin", "retry-after", "x-request-id")
 _PREFLIGHT_S = 7200
-Handler = Callable[[Request], Awaitable[Response]]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ class _Handlers:
         photograph = await asyncio.to_thread(geopose.read, body, datum)
         del body
         try:
-            answer = await client.localize(
+            localizing = client.localize(
                 photograph.image,
                 photograph.camera,
                 scene,
@@ -177,6 +177,7 @@ class _Handlers:
                 intrinsics_uncertainty=photograph.uncertainty,
                 confidential=photograph.is_confidential,
             )
+            answer = await _while_connected(request, localizing)
         except MaplessError as error:
             name, dot, rest = (error.field or "").partition(".")
             raise of_server(error, photograph.prior_fields.get(name, name) + dot + rest) from None
@@ -191,7 +192,8 @@ class _Handlers:
         """A photograph as a form."""
         client = self._client_for(request)
         asked = await plain.read_form(request.headers, request.stream(), self.options.scene)
-        return JSONResponse(await asyncio.to_thread(plain.to_json, await client.run(_localized(asked))))
+        response = await _while_connected(request, client.run(_localized(asked)))
+        return JSONResponse(await asyncio.to_thread(plain.to_json, response))
 
     async def description(self, request: Request) -> Response:
         """What is served, for programs."""
@@ -200,6 +202,27 @@ class _Handlers:
     async def page(self, request: Request) -> Response:
         """What is served, for people."""
         return HTMLResponse(openapi.page())
+
+
+async def _while_connected(request: Request, work: Coroutine[Any, Any, T]) -> T:
+    """The result of a call, which is cancelled when its caller leaves, with `ClientDisconnect`."""
+    task = asyncio.ensure_future(work)
+
+    async def watch() -> None:
+        while (await request.receive())["type"] != "http.disconnect":
+            pass
+        task.cancel()
+
+    watching = asyncio.ensure_future(watch())
+    try:
+        return await task
+    except asyncio.CancelledError:
+        if watching.done():
+            raise ClientDisconnect from None
+        task.cancel()
+        raise
+    finally:
+        watching.cancel()
 
 
 def _localized(request: pb.LocalizeRequest) -> Exchange[pb.LocalizeResponse]:
