@@ -17,7 +17,16 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from safetensors.torch import save_file
-from support.parity_rule import SMALL_MAPANYTHING, images, mapanything_weights, network_without_weights, ruled_network
+from support.parity_rule import (
+    SMALL_MAPANYTHING,
+    deviation,
+    existing,
+    images,
+    mapanything_weights,
+    network_without_weights,
+    ruled_network,
+)
+from support.parity_rule import full_network as make_full_network
 from torch import Tensor
 
 from mapless_server.networks.checkpoint import load_strictly
@@ -53,14 +62,6 @@ def small_network() -> MapAnything:
     network = ruled_network("mapanything")
     assert isinstance(network, MapAnything)
     return network
-
-
-def existing(path: Path) -> Path:
-    if not path.exists():
-        pytest.skip(
-            f"needs the fixtures of the official network, {path} is absent (TEST_MAPANYTHING names another place)"
-        )
-    return path
 
 
 def fixture(case: str) -> Fixture:
@@ -133,12 +134,6 @@ def check(network: MapAnything, case: Fixture) -> None:
         assert deviation(output.camera_poses, case["camera_poses"]) <= POSE_TOLERANCE
 
 
-def deviation(found: Tensor, expected: NDArray[Any]) -> float:
-    """Largest difference as a share of the largest value."""
-    assert found.shape == expected.shape
-    return float(np.abs(found.numpy() - expected).max() / np.abs(expected).max())
-
-
 # The official output
 
 
@@ -163,16 +158,10 @@ def test_networks_have_the_official_entries_under_all_their_names(small: bool, f
 
 @pytest.fixture(scope="module")
 def full_network(tmp_path_factory: pytest.TempPathFactory) -> MapAnything:
-    """Loaded strictly from a checkpoint made by the rule."""
     existing(BESIDE)
-    network = network_without_weights("mapanything", small=False)
+    network = make_full_network("mapanything", tmp_path_factory.mktemp("full"))
     assert isinstance(network, MapAnything)
-    file = tmp_path_factory.mktemp("full") / "model.safetensors"
-    state = network.state_dict()
-    save_file({key: torch.from_numpy(mapanything_weights(key, it.shape)) for key, it in state.items()}, file)
-    load_strictly(network, file)
-    file.unlink()
-    return network.eval().requires_grad_(False)
+    return network
 
 
 @pytest.mark.nightly

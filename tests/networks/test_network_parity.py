@@ -15,10 +15,9 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from safetensors.torch import save_file
-from support.parity_rule import images, network_without_weights, ruled_network, weights
+from support.parity_rule import deviation, existing, images, network_without_weights, ruled_network, weights
+from support.parity_rule import full_network as make_full_network
 
-from mapless_server.networks.checkpoint import load_strictly
 from mapless_server.networks.conditions import normalize_poses
 from mapless_server.networks.network import Network, NetworkOutput, patch_grid
 from mapless_server.networks.pi import UNUSED
@@ -72,14 +71,8 @@ def test_full_networks_have_the_official_entries(name: str) -> None:
 
 @pytest.fixture(scope="module")
 def full_network(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Network:
-    """Full-size, loaded strictly from a checkpoint made by the rule."""
     existing(BESIDE)
-    network = network_without_weights(request.param, small=False)
-    file = tmp_path_factory.mktemp("full") / "model.safetensors"
-    save_file({k: torch.from_numpy(weights(k, v.shape)) for k, v in network.state_dict().items()}, file)
-    load_strictly(network, file)
-    file.unlink()
-    return network.eval().requires_grad_(False)
+    return make_full_network(request.param, tmp_path_factory.mktemp("full"))
 
 
 @pytest.mark.nightly
@@ -91,12 +84,6 @@ def test_a_full_network_has_the_official_output(case: str, full_network: Network
 
 def network_of(case: str) -> str:
     return case.split("_")[0]
-
-
-def existing(path: Path) -> Path:
-    if not path.exists():
-        pytest.skip(f"needs the fixtures of the official networks, {path} is absent (TEST_PARITY names another place)")
-    return path
 
 
 def fixture(folder: Path, case: str) -> dict[str, NDArray[Any]]:
@@ -119,11 +106,6 @@ def check(network: Network, case: dict[str, NDArray[Any]]) -> None:
         assert deviation(values, case[name]) <= TOLERANCE, name
     if "metric" in case:
         assert deviation(metric(network, torch.from_numpy(given), case), case["metric"]) <= METRIC_TOLERANCE
-
-
-def deviation(found: torch.Tensor, expected: NDArray[Any]) -> float:
-    """Largest difference as a share of the largest value."""
-    return float(np.abs(found.numpy() - expected).max() / np.abs(expected).max())
 
 
 @torch.no_grad()

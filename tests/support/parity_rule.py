@@ -10,11 +10,17 @@ import hashlib
 import math
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 import torch
 from numpy.typing import NDArray
+from safetensors.torch import save_file
+from torch import Tensor
 
+from mapless_server.networks.checkpoint import load_strictly
 from mapless_server.networks.mapanything import MapAnything, MapAnythingSizes
 from mapless_server.networks.network import IMAGE_MEAN, IMAGE_STD, Network
 from mapless_server.networks.pi import Sizes
@@ -146,3 +152,29 @@ def ruled_network(name: str, small: bool = True) -> Network:
     state = {key: torch.from_numpy(rule(key, value.shape)) for key, value in network.state_dict().items()}
     network.load_state_dict(state, assign=True)
     return network.eval().requires_grad_(False)
+
+
+def full_network(name: str, folder: Path) -> Network:
+    """Full-size, loaded strictly from a checkpoint made by the rule."""
+    network, rule = (
+        network_without_weights(name, small=False),
+        mapanything_weights if name == "mapanything" else weights,
+    )
+    file = folder / "model.safetensors"
+    save_file({key: torch.from_numpy(rule(key, it.shape)) for key, it in network.state_dict().items()}, file)
+    load_strictly(network, file)
+    file.unlink()
+    return network.eval().requires_grad_(False)
+
+
+def existing(path: Path) -> Path:
+    """A fixture beside the repository, or where TEST_PARITY or TEST_MAPANYTHING says; skips the test without it."""
+    if not path.exists():
+        pytest.skip(f"needs the fixtures of the official networks (TEST_PARITY, TEST_MAPANYTHING): {path} is absent")
+    return path
+
+
+def deviation(found: Tensor, expected: NDArray[Any]) -> float:
+    """Largest difference as a share of the largest value."""
+    assert found.shape == expected.shape
+    return float(np.abs(found.numpy() - expected).max() / np.abs(expected).max())
