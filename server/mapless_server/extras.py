@@ -13,6 +13,7 @@ _EXTRA_OF = {
     "PIL": "networks",
     "python_multipart": "gateway",
     "starlette": "gateway",
+    "rosbags": "tools",
     "torch": "networks",
     "transformers": "superpoint",
     "uvicorn": "gateway",

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import typer.main
 from prometheus_client import generate_latest
+from support.bags import compressed, info
 from support.documents import PAGES, ROOT, anchors, blocks, commands, prose, shell
 from support.images import encode, textured
 from support.servers import pose, serving
@@ -174,6 +175,9 @@ def test_the_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
             "rig_from_right": pose(0.5),
             "tracked": pose(0.0),
             "walk": [("a.jpg", pose(0.0)), ("b.jpg", pose(1.0))],
+            "lookup": lambda target, source, stamp_ns: RigidTransform.identity(),
+            "image_message": compressed(1_800_000_000_000_000_000, photo),
+            "info_message": info(Camera(1600, 1067, 1437.2, 1440.1, 791.8, 524.3)),
         }
         run(first.replace("localhost:50051", server.address), known)
         assert capsys.readouterr().out.startswith("[ 0.  2. -1.] 0.")

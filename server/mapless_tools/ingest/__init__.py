@@ -15,5 +15,6 @@ FORMATS = {
     "tum": "tum",
     "arkit": "arkit",
     "kapture": "kapture",
+    "rosbag": "rosbag",
 }
 """Layouts that can be read: each name, and the module of `formats` that reads it. Here, where --help has it quickly."""

@@ -11,6 +11,16 @@ import typer
 from typer.core import TyperCommand
 
 from mapless_server.serve.command import fail
+from mapless_tools.bags.flags import (
+    BodyFrame,
+    BodyFromCamera,
+    CameraTopic,
+    ImageTopic,
+    MaxPoseGap,
+    PoseTopic,
+    WorldFrame,
+    bag_options,
+)
 from mapless_tools.connection import Connection, Scene, with_connection_flags
 
 from . import FORMATS
@@ -50,7 +60,7 @@ class ImportCommand(TyperCommand):
 
 @with_connection_flags
 def import_command(
-    folder: Annotated[Path, typer.Argument(help="Folder with photographs and their poses.")],
+    folder: Annotated[Path, typer.Argument(help="Folder with photographs and their poses, or a robot's recording.")],
     scene: Scene,
     format: Annotated[str, typer.Option(help=f"Layout of the folder: {FORMAT_NAMES}.")] = "auto",
     images: Annotated[Path | None, typer.Option(help="Folder of a COLMAP model's images.")] = None,
@@ -60,6 +70,19 @@ def import_command(
     intrinsics: Annotated[
         str, typer.Option(help="fx,fy,cx,cy in pixels, for layouts without; (0, 0) is the first pixel's centre.")
     ] = "",
+    image_topic: ImageTopic = "",
+    camera_topic: CameraTopic = "",
+    pose_topic: PoseTopic = "",
+    world_frame: WorldFrame = "",
+    body_frame: BodyFrame = "",
+    body_from_camera: BodyFromCamera = "",
+    max_pose_gap: MaxPoseGap = 0.15,
+    keyframe_distance: Annotated[
+        float, typer.Option(help="Of a recording: metres from one keyframe to the next; 0: all images.")
+    ] = 0.3,
+    keyframe_angle: Annotated[
+        float, typer.Option(help="Of a recording: degrees from one keyframe to the next; 0: all images.")
+    ] = 15.0,
     scale: Annotated[
         float | None, typer.Option(help="Metres per unit of the folder, where that is not the metre.")
     ] = None,
@@ -82,18 +105,29 @@ def import_command(
     *,
     connection: Connection,
 ) -> None:
-    """Store the posed photographs of a folder as references of a scene; run it again to go on where it was cut off."""
+    """Store the posed photographs of a folder, or keyframes of a recording, as references of a scene.
+
+    Run it again to go on where it was cut off.
+    """
     from mapless_server.settings import ConfigError
 
-    from .formats import ReadOptions
+    from .formats import KeyframeOptions, ReadOptions
     from .importing import ImportOptions, run_import
     from .metres import MetreOptions
     from .upload import UploadOptions
 
+    bag = (image_topic, camera_topic, pose_topic, world_frame, body_frame, body_from_camera, max_pose_gap)
     try:
+        read = ReadOptions(
+            images=images,
+            ground_truth=ground_truth,
+            intrinsics=_intrinsics(intrinsics),
+            bag=bag_options(*bag),
+            keyframes=KeyframeOptions(keyframe_distance, keyframe_angle),
+        )
         options = ImportOptions(
             format=format,
-            read=ReadOptions(images=images, ground_truth=ground_truth, intrinsics=_intrinsics(intrinsics)),
+            read=read,
             metres=MetreOptions(scale, tuple(map(_known_distance, distance or ())), align),
             split=split,
             stride=stride,

@@ -11,12 +11,13 @@ import importlib
 from pathlib import Path
 from types import ModuleType
 
+from mapless_tools.bags import SUFFIXES, is_recording
 from mapless_tools.dataset import Dataset, printable
 
 from .. import FORMATS
-from .options import Intrinsics, ReadOptions
+from .options import Intrinsics, KeyframeOptions, ReadOptions
 
-__all__ = ["Intrinsics", "ReadOptions", "fits", "read_dataset", "recognize"]
+__all__ = ["Intrinsics", "KeyframeOptions", "ReadOptions", "fits", "read_dataset", "recognize"]
 
 
 def recognize(path: Path) -> str:
@@ -25,8 +26,7 @@ def recognize(path: Path) -> str:
     Raises:
         ValueError: it has none that is known, or several; the message names them.
     """
-    if not path.is_dir():
-        raise ValueError(f"{path} is not a folder")
+    _check_there(path)
     found = [name for name in FORMATS if fits(path, name)]
     if not found:
         raise ValueError(f"{path} has no layout that is known ({', '.join(FORMATS)}); name one with --format")
@@ -44,7 +44,8 @@ def read_dataset(path: Path, format: str = "auto", options: ReadOptions | None =
     """Read the posed photographs of a folder.
 
     Args:
-        path: the folder (`7scenes`: a scene; `12scenes`: a room; `colmap`: a model, or what holds one).
+        path: the folder (`7scenes`: a scene; `12scenes`: a room; `colmap`: a model, or what holds one), or a file of
+            `rosbag`.
         format: one of FORMATS, or "auto" to recognize it; `Dataset.format` is then its name.
         options: see ReadOptions.
 
@@ -56,14 +57,18 @@ def read_dataset(path: Path, format: str = "auto", options: ReadOptions | None =
     """
     if format != "auto" and format not in FORMATS:
         raise ValueError(f"format must be auto or one of {', '.join(FORMATS)}, not {format!r}")
-    if not path.is_dir():
-        raise ValueError(f"{path} is not a folder")
+    _check_there(path)
     module = _module(recognize(path) if format == "auto" else format)
     try:
         dataset: Dataset = module.read(path, options or ReadOptions())
     except ValueError as error:
         raise ValueError(printable(str(error))) from error
     return dataset
+
+
+def _check_there(path: Path) -> None:
+    if not (path.is_dir() or is_recording(path)):
+        raise ValueError(f"{path} is not a folder, nor a recording ({', '.join(SUFFIXES)})")
 
 
 def _module(name: str) -> ModuleType:

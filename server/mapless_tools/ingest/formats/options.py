@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from mapless.geometry import Camera
+from mapless_tools.bags.options import BagOptions
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,31 @@ class Intrinsics:
 
 
 @dataclass(frozen=True)
+class KeyframeOptions:
+    """Which images of a recording are taken: the sharpest of some, each time the camera has moved or turned.
+
+    Attributes:
+        distance_m: from the last one. A tenth of the depth of a room: neighbours share most of what they show.
+        angle_deg: likewise; a third of a narrow lens's field of view.
+    """
+
+    distance_m: float = 0.3
+    angle_deg: float = 15.0
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.distance_m < np.inf and 0 <= self.angle_deg <= 180):
+            raise ValueError(
+                "keyframes: the distance must be 0 m or more and the angle 0 to 180 degrees, they are "
+                f"{self.distance_m:g} and {self.angle_deg:g}"
+            )
+
+    @property
+    def takes_all(self) -> bool:
+        """Whether every image is a keyframe."""
+        return self.distance_m == 0 or self.angle_deg == 0
+
+
+@dataclass(frozen=True)
 class ReadOptions:
     """Options of reading.
 
@@ -34,9 +62,13 @@ class ReadOptions:
         images: folder of the images where that of the layout is not the usual one; only for `colmap`.
         ground_truth: poses to take instead of the layout's own: a file or folder of SfM pseudo ground truth, for
             `7scenes` and `12scenes`.
-        intrinsics: for layouts without them (`7scenes`, `tum`); None for the layout's usual ones.
+        intrinsics: for layouts without them (`7scenes`, `tum`, recordings); None for the layout's usual ones.
+        bag: where a recording holds what; only for `rosbag`.
+        keyframes: which images of a recording are taken; only for `rosbag`.
     """
 
     images: Path | None = None
     ground_truth: Path | None = None
     intrinsics: Intrinsics | None = None
+    bag: BagOptions = field(default_factory=BagOptions)
+    keyframes: KeyframeOptions = field(default_factory=KeyframeOptions)

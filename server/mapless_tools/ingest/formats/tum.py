@@ -13,10 +13,9 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
-from mapless.geometry import Array, Camera, RadialTangential, RigidTransform
+from mapless.geometry import Array, Camera, RadialTangential
+from mapless_tools.bags.trajectory import Trajectory
 from mapless_tools.dataset import Dataset, finite_numbers
 
 from .collecting import Collector, read_text, size_of
@@ -42,7 +41,12 @@ def read(path: Path, options: ReadOptions) -> Dataset:
     """Reads it; see `read_dataset`."""
     collector = Collector(path)
     lens = _lens(path) if options.intrinsics is None else None
-    trajectory = _Trajectory(path / "groundtruth.txt")
+    file = path / "groundtruth.txt"
+    rows = [_row(file, number, words) for number, words in _lines(file)]
+    try:
+        trajectory = Trajectory(rows, MAX_GAP_S)
+    except ValueError as error:
+        raise ValueError(f"{file} {error}") from error
     for number, words in _lines(path / "rgb.txt"):
         with collector.attempt(f"rgb.txt:{number} ({words[-1]})"):
             if len(words) != 2:
@@ -83,30 +87,3 @@ def _row(file: Path, number: int, words: list[str]) -> Array:
     except ValueError as error:
         raise ValueError(f"{file}:{number}: {error}") from error
     return row
-
-
-class _Trajectory:
-    """Poses by time."""
-
-    def __init__(self, file: Path) -> None:
-        rows = [_row(file, number, words) for number, words in _lines(file)]
-        if len(rows) < 2:
-            raise ValueError(f"{file} holds fewer than two poses")
-        table: Array = np.array(rows)
-        _, order = np.unique(table[:, 0], return_index=True)
-        table = table[order]
-        self._time_s: NDArray[np.float64] = table[:, 0]
-        self._position = table[:, 1:4]
-        self._slerp = Slerp(self._time_s, Rotation.from_quat(table[:, 4:]))
-
-    def at(self, time_s: float) -> RigidTransform:
-        """The pose at a time; ValueError if none is near."""
-        after = int(np.searchsorted(self._time_s, time_s))
-        before = after if after < len(self._time_s) and self._time_s[after] == time_s else after - 1
-        if before < 0 or after >= len(self._time_s):
-            raise ValueError("pose: its time lies outside the ground truth's")
-        gap_s = max(time_s - self._time_s[before], self._time_s[after] - time_s)
-        if gap_s > MAX_GAP_S:
-            raise ValueError(f"pose: the ground truth has none within {1000 * MAX_GAP_S:g} ms, only {1000 * gap_s:.0f}")
-        position = np.array([np.interp(time_s, self._time_s, axis) for axis in self._position.T])
-        return RigidTransform(self._slerp(time_s).as_matrix(), position)

@@ -1,0 +1,258 @@
+"""One image of a robot after the other: its prior, the call, and what is published of the answer."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from mapless.answers import LocalizationResult, Rejected
+from mapless.client import Client
+from mapless.errors import MaplessError
+from mapless.geometry import Array, RigidTransform, rotation_angle_deg
+from mapless.priors import PosePrior, Priors
+
+from .cameras import RosCamera
+from .poses import pose_of_body, stamp_ns_of, time_of, transform_from_pose
+
+Lookup = Callable[[str, str, int], RigidTransform]
+"""target_from_source of two frames at a stamp, nanoseconds; LookupError if tf does not know it."""
+
+LOCALIZED, NOT_LOCALIZED, FAILED = "OK", "WARN", "ERROR"
+"""Levels of an outcome, named as those of diagnostic_msgs/DiagnosticStatus."""
+
+UNSTATED_SIGMA_M, UNSTATED_SIGMA_RAD = 1.0, 0.2
+"""Of an initial pose's variances that are 0, as rviz leaves those of height, roll and pitch."""
+
+LEAST_SIGMA_M, LEAST_SIGMA_RAD = 0.02, 0.01
+"""Added to a guess that odometry has moved: clocks and extrinsics are never exact."""
+
+ODOMETRY_DRIFT = 0.1
+"""Standard deviation of odometry, as a share of the way and the angle: wheels slip."""
+
+SPEED_M_S, TURN_RAD_S, GUESS_LIFE_S = 1.5, 1.5, 5.0
+"""Without odometry: how fast a robot may have moved since, and how long its last pose says anything."""
+
+
+@dataclass(frozen=True)
+class LocalizerOptions:
+    """Options of a robot's localizer.
+
+    Attributes:
+        scene: the scene to localize in.
+        map_frame: the scene's world, as tf names it.
+        odom_frame: the frame of the odometry, where it has one: then map > odom is computed; empty for none.
+        base_frame: the frame whose pose is published; empty for the camera's own.
+        rate_hz: images localized a second, at most; 0 for those only that are asked for.
+        use_last_pose: whether the last answer, moved by the odometry, is a prior of the next. Then errors of successive
+            answers have a common part, which a filter that takes them as independent does not know.
+        coverage: see `Client.localize`.
+        timeout_s: deadline of a call.
+    """
+
+    scene: str
+    map_frame: str = "map"
+    odom_frame: str = "odom"
+    base_frame: str = "base_link"
+    rate_hz: float = 1.0
+    use_last_pose: bool = False
+    coverage: float = 0.0
+    timeout_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        if not self.scene:
+            raise ValueError("scene is empty: name the scene to localize in")
+        if not self.map_frame or self.map_frame in (self.odom_frame, self.base_frame):
+            raise ValueError(f"map_frame must differ from odom_frame and base_frame, and is {self.map_frame!r}")
+        if not 0 <= self.rate_hz <= 1000:
+            raise ValueError(f"rate must be 0 to 1000 images a second, is {self.rate_hz:g}")
+        if not self.timeout_s > 0:
+            raise ValueError(f"timeout must be above 0 s, is {self.timeout_s:g}")
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What became of an image.
+
+    Attributes:
+        stamp_ns: when it was taken.
+        level: `LOCALIZED`, `NOT_LOCALIZED` or `FAILED`.
+        message: for a person; begins with the reason of a rejection or an error.
+        values: for programs and people, by name.
+        frame: the frame whose pose it is.
+        map_from_body: its pose in the map; None if not localized.
+        covariance: (6, 6) of that pose, ROS's order, metres and radians about the map's fixed axes.
+        tf_edge: child frame and map_from_child of what tf is told: the odometry's, or without one the body's; None if
+            not localized, or if the odometry is not known at that time.
+    """
+
+    stamp_ns: int
+    level: str
+    message: str
+    values: Mapping[str, str] = field(default_factory=dict)
+    frame: str = ""
+    map_from_body: RigidTransform | None = None
+    covariance: Array | None = None
+    tf_edge: tuple[str, RigidTransform] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Guess:
+    """A pose of the body that was true at a time, and where odometry was then."""
+
+    map_from_body: RigidTransform
+    covariance: Array
+    stamp_ns: int
+    odom_from_body: RigidTransform | None
+
+
+class Localizer:
+    """Localizes images of a robot. `guess` may be called from another thread than the rest."""
+
+    def __init__(self, client: Client, options: LocalizerOptions, lookup: Lookup) -> None:
+        self._client = client
+        self._options = options
+        self._lookup = lookup
+        self._lock = threading.Lock()
+        self._guess: _Guess | None = None
+        self._last_ns: int | None = None
+
+    def is_due(self, stamp_ns: int) -> bool:
+        """Whether the rate has come round to an image of this time; also when time has jumped back."""
+        if not self._options.rate_hz:
+            return False
+        since_ns = None if self._last_ns is None else stamp_ns - self._last_ns
+        # Half a frame early is nearer to the rate than a whole one late; cameras jitter.
+        return since_ns is None or since_ns < 0 or since_ns >= 0.95e9 / self._options.rate_hz
+
+    def guess(self, message: Any, now_ns: int) -> None:
+        """Takes a geometry_msgs/PoseWithCovarianceStamped of the base in the map, as of /initialpose, as a prior.
+
+        Raises:
+            ValueError: it is given in another frame, or its numbers are none of a pose.
+        """
+        frame = message.header.frame_id.lstrip("/")
+        if frame != self._options.map_frame:
+            raise ValueError(f"the initial pose is given in frame {frame!r}, not in {self._options.map_frame!r}")
+        map_from_base = transform_from_pose(message.pose.pose)
+        covariance = np.array(message.pose.covariance, float).reshape(6, 6)
+        if not np.isfinite(covariance).all() or (np.diag(covariance) < 0).any():
+            raise ValueError("the covariance of the initial pose is none: not finite, or a variance below 0")
+        unstated = np.repeat([UNSTATED_SIGMA_M, UNSTATED_SIGMA_RAD], 3) ** 2
+        covariance = covariance + np.diag(np.where(np.diag(covariance) == 0, unstated, 0.0))
+        stamp_ns = stamp_ns_of(message.header.stamp) or now_ns
+        with self._lock:
+            self._guess = _Guess(
+                map_from_base, covariance, stamp_ns, self._odometry(self._options.base_frame, stamp_ns)
+            )
+
+    def localize(self, message: Any, camera: RosCamera) -> Outcome:
+        """Localizes a sensor_msgs/Image or CompressedImage; what fails is an outcome, too."""
+        stamp_ns = self._last_ns = stamp_ns_of(message.header.stamp)
+        camera_frame = message.header.frame_id.lstrip("/")
+        body = self._options.base_frame or camera_frame
+        try:
+            body_from_camera = self._lookup(body, camera_frame, stamp_ns) if body != camera_frame else None
+            extrinsics = body_from_camera or RigidTransform.identity()
+            odom_from_body = self._odometry(body, stamp_ns)
+            prior = self._prior(stamp_ns, odom_from_body, extrinsics)
+            answer = self._client.localize(
+                camera.photo(message),
+                camera.camera,
+                self._options.scene,
+                priors=Priors(pose=prior),
+                coverage=self._options.coverage,
+                capture_time=time_of(stamp_ns),
+                timeout_s=self._options.timeout_s,
+            )
+        except LookupError as error:
+            return Outcome(stamp_ns, FAILED, f"tf: {error}", frame=body)
+        except (MaplessError, ValueError) as error:
+            return Outcome(stamp_ns, FAILED, str(error), frame=body)
+        return self._outcome(answer, stamp_ns, body, extrinsics, odom_from_body)
+
+    def _outcome(
+        self,
+        answer: LocalizationResult | Rejected,
+        stamp_ns: int,
+        body: str,
+        body_from_camera: RigidTransform,
+        odom_from_body: RigidTransform | None,
+    ) -> Outcome:
+        values = _values(answer)
+        if isinstance(answer, Rejected):
+            return Outcome(stamp_ns, NOT_LOCALIZED, f"{answer.reason}: {answer.message}", values, body)
+        if answer.arbitrary_unit:
+            text = "the scene's unit of length is arbitrary: its poses are none of a robot"
+            return Outcome(stamp_ns, FAILED, text, values, body)
+        if answer.covariance is None:
+            return Outcome(stamp_ns, NOT_LOCALIZED, "a pose without covariance is not published", values, body)
+        pose, covariance = pose_of_body(answer.world_from_camera, answer.covariance, body_from_camera)
+        with self._lock:
+            self._guess = _Guess(pose, covariance, stamp_ns, odom_from_body) if self._options.use_last_pose else None
+        message = "localized"
+        if any(check.conflict for check in answer.prior_checks):
+            message += "; the photograph contradicts the initial or last pose, which was not used"
+        edge: tuple[str, RigidTransform] | None = (body, pose)
+        if self._options.odom_frame:
+            edge = None
+            if odom_from_body is not None:
+                edge = (self._options.odom_frame, pose.compose(odom_from_body.inverse()))
+            else:
+                message += f"; tf does not know {self._options.odom_frame} > {body} at that time"
+        return Outcome(stamp_ns, LOCALIZED, message, values, body, pose, covariance, edge)
+
+    def _odometry(self, body: str, stamp_ns: int) -> RigidTransform | None:
+        """odom_from_body; None without odometry, or where it does not reach."""
+        if not self._options.odom_frame:
+            return None
+        try:
+            return self._lookup(self._options.odom_frame, body, stamp_ns)
+        except LookupError:
+            return None
+
+    def _prior(
+        self, stamp_ns: int, odom_from_body: RigidTransform | None, body_from_camera: RigidTransform
+    ) -> PosePrior | None:
+        """The guess, moved to now by odometry, with what that adds to its covariance; of the camera."""
+        with self._lock:
+            guess = self._guess
+        if guess is None:
+            return None
+        if odom_from_body is not None and guess.odom_from_body is not None:
+            moved = guess.odom_from_body.inverse().compose(odom_from_body)
+            way_m, turn_rad = math.hypot(*moved.translation), math.radians(rotation_angle_deg(moved.rotation))
+            sigmas = (LEAST_SIGMA_M + ODOMETRY_DRIFT * way_m, LEAST_SIGMA_RAD + ODOMETRY_DRIFT * turn_rad)
+        else:
+            moved, since_s = RigidTransform.identity(), abs(stamp_ns - guess.stamp_ns) / 1e9
+            if since_s > GUESS_LIFE_S:
+                return None
+            sigmas = (LEAST_SIGMA_M + SPEED_M_S * since_s, LEAST_SIGMA_RAD + TURN_RAD_S * since_s)
+        covariance = guess.covariance + np.diag(np.repeat(sigmas, 3) ** 2)
+        return PosePrior(*pose_of_body(guess.map_from_body.compose(moved), covariance, body_from_camera.inverse()))
+
+
+def _values(answer: LocalizationResult | Rejected) -> dict[str, str]:
+    """What diagnostics show of an answer."""
+    about = answer.diagnostics
+    values = {"request_id": about.request_id, "server_s": f"{about.total_s:.3f}", "queue_s": f"{about.queue_s:.3f}"}
+    values["references"] = " ".join(it.name.rpartition("/")[2] for it in about.references)
+    if isinstance(answer, Rejected):
+        values["reason"] = answer.reason
+        if answer.hint is not None:
+            values |= {"stage": answer.hint.stage, "advice": answer.hint.advice, "hint": answer.hint.message}
+        return values
+    values |= {"inliers": str(answer.inlier_count), "matches": str(answer.match_count)}
+    if answer.trust is not None:
+        values["trust"] = f"{answer.trust:.3f}"
+    if answer.accuracy is not None:
+        values["position_95_m"] = f"{answer.accuracy.position_95_m:.4f}"
+        values["rotation_95_deg"] = f"{answer.accuracy.rotation_95_deg:.4f}"
+        values["calibration"] = answer.accuracy.calibration
+    for check in answer.prior_checks:
+        values["prior"] = "contradicted" if check.conflict else "used" if check.used else "agrees, and adds nothing"
+    return values

@@ -1,0 +1,146 @@
+"""Messages of a recording: a folder of rosbag2, or one file of its (.mcap, .db3).
+
+Standard messages are the same in every version of ROS 2, so they are read by the definitions of one version, whatever
+those in the recording are: many recordings have none, or some that cannot be read of messages that are not needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+
+from . import storages
+
+MAX_JUMP_BACK_NS = 500_000_000
+"""How much earlier a stamp may be than one before it: messages of several threads are a little out of order."""
+
+
+class Recording:
+    """A recording, open until its block is left.
+
+    Attributes:
+        path: of the folder or file.
+        types: of the messages of each topic that has any, "sensor_msgs/msg/Image".
+        counts: how many those are.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """ValueError if it cannot be opened; names the file."""
+        self.path = path
+        self._typestore = get_typestore(Stores.ROS2_HUMBLE)
+        self._stack = ExitStack()
+        with self._named():
+            self._reader = self._stack.enter_context(Reader(_openable(path)))
+            connections = [it for it in self._reader.connections if it.msgcount]
+            self._connections = connections
+        self.types = {it.topic: it.msgtype for it in connections}
+        self.counts = {name: sum(it.msgcount for it in connections if it.topic == name) for name in self.types}
+
+    def __enter__(self) -> Recording:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+    def topics(self, *types: str) -> list[str]:
+        """Topics whose messages have one of these types."""
+        return sorted(name for name, kind in self.types.items() if kind in types)
+
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
+        """Topic, time of recording in nanoseconds, and message, of these topics in the order of recording.
+
+        Raises:
+            ValueError: the recording is damaged; names the topic, the message and the time.
+        """
+        connections = [it for it in self._connections if it.topic in topics]
+        if not connections:
+            return
+        seen = dict.fromkeys(topics, 0)
+        where = "before its first message"
+        with self._named():
+            stream = self._reader.messages(connections)
+        while True:
+            with self._named(f"after {where}" if any(seen.values()) else where):
+                found = next(stream, None)
+            if found is None:
+                break
+            connection, time_ns, data = found
+            seen[connection.topic] += 1
+            where = f"message {seen[connection.topic]} of {connection.topic}, recorded at {seconds(time_ns)}"
+            with self._named(where):
+                message = self._typestore.deserialize_cdr(data, connection.msgtype)
+            yield connection.topic, time_ns, message
+        for topic in topics:
+            if seen[topic] < self.counts.get(topic, 0):
+                raise ValueError(
+                    f"{self.path} is damaged: it holds {seen[topic]} of {self.counts[topic]} messages of {topic}"
+                )
+
+    @contextmanager
+    def _named(self, where: str = "") -> Iterator[None]:
+        """Errors of the library, which are of any kind where bytes are damaged, as one that names the file."""
+        try:
+            yield
+        except Exception as error:
+            place = f" {where}" if where else ""
+            hint = "; `mcap recover` saves what can be read of a truncated file" if _is_mcap(self.path) else ""
+            what = str(error) or type(error).__name__
+            raise ValueError(f"{self.path} cannot be read{place}: {what}{hint}") from error
+
+
+def stamp_of(message: Any, previous_ns: int | None, what: str) -> int:
+    """The stamp of a message's header, nanoseconds; `previous_ns` is the latest one before it.
+
+    Raises:
+        ValueError: there is none, or time jumps back; names `what` it is.
+    """
+    stamp_ns = int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)
+    if not stamp_ns:
+        raise ValueError(f"{what} has no time: header.stamp is 0")
+    if previous_ns is not None and stamp_ns < previous_ns - MAX_JUMP_BACK_NS:
+        back_s = (previous_ns - stamp_ns) / 1e9
+        raise ValueError(
+            f"{what}: time jumps back by {back_s:.3f} s, from {seconds(previous_ns)} to {seconds(stamp_ns)}; cut the "
+            "recording there"
+        )
+    return stamp_ns
+
+
+def seconds(time_ns: int) -> str:
+    """A time as tools for recordings print it."""
+    return f"{time_ns // 1_000_000_000}.{time_ns % 1_000_000_000:09d} s"
+
+
+def _openable(path: Path) -> Path:
+    """The folder, or its only file where the recorder did not come to write metadata.yaml."""
+    files = [path] if path.is_file() else storages(path)
+    for file in files:
+        _check_whole(file)
+    if path.is_file() or (path / "metadata.yaml").is_file():
+        return path
+    if len(files) != 1:
+        raise ValueError(f"no metadata.yaml beside {len(files)} files; `ros2 bag reindex` writes it")
+    return files[0]
+
+
+def _check_whole(file: Path) -> None:
+    """ValueError of an SQLite file that is shorter than it says: the missing pages would be read as zeros."""
+    with file.open("rb") as stream:
+        head = stream.read(100)
+    if head.startswith(b"SQLite format 3\0"):
+        page_bytes = int.from_bytes(head[16:18], "big")
+        expected = int.from_bytes(head[28:32], "big") * (65536 if page_bytes == 1 else page_bytes)
+        if (size := file.stat().st_size) < expected:
+            raise ValueError(f"{file.name} is truncated: {size} of {expected} bytes; `sqlite3 .recover` saves a part")
+
+
+def _is_mcap(path: Path) -> bool:
+    return path.suffix == ".mcap" or (path.is_dir() and any(path.glob("*.mcap")))

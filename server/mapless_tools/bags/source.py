@@ -1,0 +1,300 @@
+"""What a recording holds of one camera: its intrinsics, its images, and the frames that lead from them to the world."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from mapless.geometry import Quaternion, RigidTransform
+from mapless.ros import RosCamera, camera_from_info, transform_from_message, transform_from_pose
+from mapless.ros.images import ENCODINGS
+
+from .options import BagOptions
+from .recording import Recording, seconds, stamp_of
+from .trajectory import Edge, FrameTree, Trajectory
+
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+ODOMETRY, TRANSFORM, TF = "nav_msgs/msg/Odometry", "geometry_msgs/msg/TransformStamped", "tf2_msgs/msg/TFMessage"
+POSES = (ODOMETRY, TRANSFORM, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+TF_TOPIC, STATIC_TF_TOPIC = "/tf", "/tf_static"
+RECTIFIED = "image_rect"
+"""How topics of rectified images begin, after their namespace; P of their CameraInfo is theirs then."""
+
+
+@dataclass(frozen=True, eq=False)
+class Images:
+    """The images of one camera of a recording.
+
+    Attributes:
+        recording: where they are.
+        topic: theirs.
+        frame: of the camera; what its messages say.
+        camera: its intrinsics; None if the recording has none.
+        begin_ns: the time from which times in seconds are counted.
+    """
+
+    recording: Recording
+    topic: str
+    frame: str
+    camera: RosCamera | None
+    camera_topic: str
+    begin_ns: int
+
+    def __iter__(self) -> Iterator[tuple[int, int, Any]]:
+        """Stamp, time of recording, both in nanoseconds, and message; ValueError where time jumps back."""
+        previous_ns: int | None = None
+        for number, (_, time_ns, message) in enumerate(self.recording.messages([self.topic]), 1):
+            what = f"{self.recording.path}: message {number} of {self.topic}, recorded at {seconds(time_ns)}"
+            stamp_ns = stamp_of(message, previous_ns, what)
+            previous_ns = max(stamp_ns, previous_ns or 0)
+            yield stamp_ns, time_ns, message
+
+    def time_s(self, stamp_ns: int) -> float:
+        """A stamp as the trajectories count; exact to nanoseconds, which a double of the epoch is not."""
+        return (stamp_ns - self.begin_ns) / 1e9
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """The frames of a recording.
+
+    Attributes:
+        tree: of all frames.
+        topic: where the poses are from.
+        world, body: frames of these poses.
+    """
+
+    tree: FrameTree
+    topic: str
+    world: str
+    body: str
+
+
+def open_images(recording: Recording, options: BagOptions) -> Images:
+    """The images of the options' topic, or of the only one there is; ValueError says what is missing or ambiguous."""
+    topic = _image_topic(recording, options.image_topic)
+    first = next(recording.messages([topic]))[2]
+    camera_topic = _camera_topic(recording, topic, options.camera_topic)
+    camera = _camera(recording, camera_topic, topic) if camera_topic else None
+    frame = first.header.frame_id.lstrip("/") or "(unnamed camera)"
+    return Images(recording, topic, frame, camera, camera_topic, stamp_of(first, None, f"the first message of {topic}"))
+
+
+def open_poses(images: Images, options: BagOptions) -> Poses:
+    """Poses of the options' topic, or of the only one there is, and the frames that lead from the camera to them.
+
+    Raises:
+        ValueError: there is none, there are several, or nothing leads there; says which flag helps.
+    """
+    recording = images.recording
+    topic = _pose_topic(recording, options)
+    static = _transforms(images, [STATIC_TF_TOPIC], options)
+    edges = static | _transforms(images, [TF_TOPIC], options) if TF_TOPIC in recording.types else dict(static)
+    world, body = options.world_frame, options.body_frame
+    if topic != TF_TOPIC:
+        named_world, named_body, trajectory = _poses(images, topic, options)
+        world, body = world or named_world, body or named_body
+        body = body or _unnamed_body(images, topic, static, options)
+        edges[body] = Edge(world, trajectory)
+    tree = FrameTree(_with_extrinsics(edges, images, body, options))
+    world = world or tree.lineage(images.frame)[-1]
+    _check_chain(tree, images, topic, world, body)
+    return Poses(tree, topic, world, body)
+
+
+def _unnamed_body(images: Images, topic: str, static: dict[str, Edge], options: BagOptions) -> str:
+    """The frame of poses that do not name theirs: what carries the camera."""
+    if options.body_from_camera is not None:
+        return "(body)"
+    if images.frame in static:
+        return FrameTree(static).lineage(images.frame)[-1]
+    raise ValueError(
+        f"{images.recording.path}: poses of {topic} do not name the frame they are of, and {STATIC_TF_TOPIC} does not "
+        f"have the camera's, {images.frame!r}; give --body-frame or --body-from-camera"
+    )
+
+
+def _with_extrinsics(edges: dict[str, Edge], images: Images, body: str, options: BagOptions) -> dict[str, Edge]:
+    if options.body_from_camera is None:
+        return edges
+    if not body:
+        raise ValueError("--body-from-camera with poses of /tf takes --body-frame, too")
+    return edges | {images.frame: Edge(body, options.body_from_camera)}
+
+
+def _check_chain(tree: FrameTree, images: Images, topic: str, world: str, body: str) -> None:
+    lineage = tree.lineage(images.frame)
+    path = images.recording.path
+    if world not in lineage:
+        known = " > ".join(reversed(lineage))
+        target = f"{body!r}, whose poses {topic} has" if body else repr(world)
+        raise ValueError(
+            f"{path}: no transform leads from the camera's frame {images.frame!r} to {target}; known is {known}; give "
+            "--body-from-camera"
+        )
+    chain = lineage[: lineage.index(world)]
+    if not any(isinstance(tree.edges[frame].pose, Trajectory) for frame in chain):
+        raise ValueError(f"{path}: {topic} does not move the camera: {' > '.join(reversed(lineage))} stands still")
+
+
+def _image_topic(recording: Recording, given: str) -> str:
+    known = recording.topics(*IMAGES)
+    if given:
+        if given not in known:
+            raise ValueError(f"{recording.path} has no images on {given!r}, but on {_listed(known)}")
+        return given
+    if len(known) > 1:
+        shown = [it for it in known if not (it.endswith("/compressed") and it.removesuffix("/compressed") in known)]
+        known = [it for it in shown if _shows_photographs(recording, it)] or shown
+    if len(known) != 1:
+        what = f"images on {_listed(known)}: choose with --image-topic" if known else "no topic of images"
+        raise ValueError(f"{recording.path} has {what}")
+    return known[0]
+
+
+def _shows_photographs(recording: Recording, topic: str) -> bool:
+    """Whether a topic shows no depths, by its first message."""
+    message = next(recording.messages([topic]))[2]
+    return message.encoding in ENCODINGS if hasattr(message, "encoding") else "compressedDepth" not in message.format
+
+
+def _camera_topic(recording: Recording, image_topic: str, given: str) -> str:
+    known = recording.topics(CAMERA_INFO)
+    if given:
+        if given not in known:
+            raise ValueError(f"{recording.path} has no CameraInfo on {given!r}, but on {_listed(known)}")
+        return given
+    namespace = image_topic.removesuffix("/compressed").rpartition("/")[0]
+    beside = f"{namespace}/camera_info"
+    if beside in known or len(known) < 2:
+        return beside if beside in known else next(iter(known), "")
+    what = f"CameraInfo on {_listed(known)}, none beside {image_topic}: choose with --camera-topic"
+    raise ValueError(f"{recording.path} has {what}")
+
+
+def _camera(recording: Recording, topic: str, image_topic: str) -> RosCamera:
+    """The camera of all CameraInfo messages; ValueError if they differ."""
+    is_rectified = image_topic.removesuffix("/compressed").rpartition("/")[2].startswith(RECTIFIED)
+    known: tuple[Any, ...] | None = None
+    camera: RosCamera | None = None
+    for _, time_ns, message in recording.messages([topic]):
+        matrices = (it.tobytes() for it in (message.k, message.d, message.p))
+        state = (message.width, message.height, message.distortion_model, *matrices)
+        if known is None:
+            try:
+                known, camera = state, camera_from_info(message, is_rectified)
+            except ValueError as error:
+                raise ValueError(f"{recording.path}: {topic}: {error}") from error
+        if state != known:
+            raise ValueError(f"{recording.path}: {topic} changes at {seconds(time_ns)}: a camera must stay as it is")
+    assert camera is not None  # topics without messages are left out
+    return camera
+
+
+def _pose_topic(recording: Recording, options: BagOptions) -> str:
+    known = recording.topics(*POSES)
+    has_tf = recording.types.get(TF_TOPIC) == TF
+    if options.pose_topic:
+        if options.pose_topic not in (*known, *([TF_TOPIC] if has_tf else [])):
+            raise ValueError(f"{recording.path} has no poses on {options.pose_topic!r}, but on {_listed(known)}")
+        return options.pose_topic
+    if has_tf and (options.world_frame or not known):
+        return TF_TOPIC
+    if len(known) != 1:
+        what = f"poses on {_listed(known)}: choose with --pose-topic" if known else "no poses: neither a topic nor /tf"
+        raise ValueError(f"{recording.path} has {what}")
+    return known[0]
+
+
+@dataclass
+class _Rows:
+    """Poses of a child frame as they are read: eight doubles each, whatever number there is."""
+
+    parent: str
+    table: array[float] = field(default_factory=lambda: array("d"))
+    previous_ns: int | None = None
+
+    def add(self, time_s: float, pose: RigidTransform) -> None:
+        """A pose."""
+        q = pose.quaternion()
+        self.table.extend([time_s, *pose.translation.tolist(), q.x, q.y, q.z, q.w])
+
+    def trajectory(self, max_gap_s: float) -> Trajectory:
+        """Of all; ValueError of fewer than two."""
+        return Trajectory(np.frombuffer(self.table).reshape(-1, 8), max_gap_s)
+
+
+def _transforms(images: Images, topics: list[str], options: BagOptions) -> dict[str, Edge]:
+    """Edges by child frame of all TFMessages; a frame that is known at one time only stands still."""
+    rows: dict[str, _Rows] = {}
+    is_static = topics == [STATIC_TF_TOPIC]
+    for topic, time_ns, message in images.recording.messages([it for it in topics if it in images.recording.types]):
+        for transform in message.transforms:
+            child, parent = transform.child_frame_id.lstrip("/"), transform.header.frame_id.lstrip("/")
+            what = f"{images.recording.path}: {topic}, {parent} > {child}, recorded at {seconds(time_ns)}"
+            found = rows.setdefault(child, _Rows(parent))
+            if found.parent != parent:
+                raise ValueError(f"{what}: was {found.parent} > {child} before: a frame has one parent")
+            stamp_ns = time_ns if is_static else stamp_of(transform, found.previous_ns, what)
+            found.previous_ns = max(stamp_ns, found.previous_ns or 0)
+            try:
+                found.add(images.time_s(stamp_ns), transform_from_message(transform.transform))
+            except ValueError as error:
+                raise ValueError(f"{what}: {error}") from error
+    return {child: Edge(it.parent, _static(it) if is_static else _moving(it, options)) for child, it in rows.items()}
+
+
+def _static(rows: _Rows) -> RigidTransform:
+    """The last one counts, as in ROS."""
+    return _pose_of(rows, -1)
+
+
+def _moving(rows: _Rows, options: BagOptions) -> RigidTransform | Trajectory:
+    times = rows.table[::8]
+    return _pose_of(rows, 0) if min(times) == max(times) else rows.trajectory(options.max_pose_gap_s)
+
+
+def _pose_of(rows: _Rows, index: int) -> RigidTransform:
+    x, y, z, *quaternion = np.frombuffer(rows.table).reshape(-1, 8)[index, 1:].tolist()
+    return RigidTransform(Quaternion(*quaternion).matrix(), np.array([x, y, z]))
+
+
+def _poses(images: Images, topic: str, options: BagOptions) -> tuple[str, str, Trajectory]:
+    """World frame, body frame (empty if the messages do not name it) and poses of a topic."""
+    recording = images.recording
+    rows: _Rows | None = None
+    body = ""
+    for number, (_, time_ns, message) in enumerate(recording.messages([topic]), 1):
+        what = f"{recording.path}: message {number} of {topic}, recorded at {seconds(time_ns)}"
+        frame, child = message.header.frame_id.lstrip("/"), getattr(message, "child_frame_id", "").lstrip("/")
+        if rows is None:
+            rows, body = _Rows(frame), child
+        if (frame, child) != (rows.parent, body):
+            raise ValueError(f"{what}: is of {frame} > {child}, those before of {rows.parent} > {body}")
+        stamp_ns = stamp_of(message, rows.previous_ns, what)
+        rows.previous_ns = max(stamp_ns, rows.previous_ns or 0)
+        try:
+            rows.add(images.time_s(stamp_ns), _pose(message))
+        except ValueError as error:
+            raise ValueError(f"{what}: {error}") from error
+    assert rows is not None  # topics without messages are left out
+    try:
+        return rows.parent or "world", body, rows.trajectory(options.max_pose_gap_s)
+    except ValueError as error:
+        raise ValueError(f"{recording.path}: {topic} {error}") from error
+
+
+def _pose(message: Any) -> RigidTransform:
+    if hasattr(message, "transform"):
+        return transform_from_message(message.transform)
+    pose = message.pose
+    return transform_from_pose(pose.pose if hasattr(pose, "pose") else pose)
+
+
+def _listed(topics: list[str]) -> str:
+    return ", ".join(topics) or "none"

@@ -1,0 +1,169 @@
+"""Recordings of ROS 2: a folder of rosbag2, or one of its files (.mcap, .db3).
+
+Keyframes are taken from the images of one camera: whenever it has moved or turned far enough since the last one, the
+sharpest of the next few images. They are written to a folder of their own, which is removed when the process ends;
+JPEGs and PNGs as they are, others as PNGs. Poses are those of Odometry, PoseStamped or tf, interpolated, and moved to
+the camera by /tf_static. The recording is read twice, as a stream: what stays in memory is the poses and one message.
+"""
+
+from __future__ import annotations
+
+import atexit
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import cv2
+import numpy as np
+
+from mapless.geometry import RigidTransform, rotation_angle_deg
+from mapless.ros import RosCamera, pixels_from_image
+from mapless_tools.bags import is_recording
+from mapless_tools.dataset import Dataset
+
+from .collecting import Collector
+from .options import Intrinsics, KeyframeOptions, ReadOptions
+from .writing import image_name
+
+CANDIDATES = 5
+"""Images of which the sharpest becomes a keyframe; at 30 Hz, a sixth of a second."""
+
+SLACK = 0.2
+"""Of the distance and the angle: the candidates are no farther from the first of them."""
+
+
+def fits(path: Path) -> bool:
+    """Whether a path has this layout."""
+    return is_recording(path)
+
+
+def read(path: Path, options: ReadOptions) -> Dataset:
+    """Reads it; see `read_dataset`."""
+    from mapless_tools.bags.recording import Recording
+    from mapless_tools.bags.source import open_images, open_poses
+
+    with Recording(path) as recording:
+        images = open_images(recording, options.bag)
+        poses = open_poses(images, options.bag)
+        folder = TemporaryDirectory(prefix="mapless-keyframes-")
+        atexit.register(folder.cleanup)
+        collector = Collector(Path(folder.name))
+        camera = images.camera if options.intrinsics is None else None
+        if camera is None and options.intrinsics is None:
+            raise ValueError(f"{path} has no CameraInfo for the images of {images.topic}; give --intrinsics")
+        found, unposed = 0, _Unposed(collector)
+
+        def posed() -> Iterator[tuple[int, Any, RigidTransform]]:
+            nonlocal found
+            for stamp_ns, _, message in images:
+                found += 1
+                time_s = images.time_s(stamp_ns)
+                try:
+                    pose = poses.tree.lookup(poses.world, images.frame, time_s)
+                except ValueError as error:
+                    unposed.add(found, time_s, str(error))
+                    continue
+                unposed.end()
+                yield stamp_ns, message, pose
+
+        prefix = images.topic.strip("/")
+        for stamp_ns, message, pose in keyframes(posed(), options.keyframes):
+            with collector.attempt(f"{images.topic} at {images.time_s(stamp_ns):.3f} s"):
+                known = camera or _given(options.intrinsics, message)
+                photo = known.photo(message, lossless=True)
+                name = image_name(str(stamp_ns), photo)
+                (collector.folder / name).write_bytes(photo)
+                collector.add(name, known.camera, pose, name=f"{prefix}/{stamp_ns}")
+        unposed.end()
+    collector.notes.append(
+        f"{len(collector.frames)} keyframes of {found} images on {images.topic} (frame {images.frame}, "
+        f"{images.camera_topic if camera else '--intrinsics'}), poses of {poses.topic} in frame {poses.world}"
+    )
+    if camera is not None and camera.undistortion is not None:
+        collector.notes.append(
+            "the lens is rational_polynomial, which mapless does not have: images are undistorted to a pinhole"
+        )
+    name = path.resolve().name
+    return collector.dataset(name, "rosbag", metric=True, source=f"recording {name}", ground_truth=poses.topic)
+
+
+@dataclass
+class _Unposed:
+    """Images in a row without a pose, which are refused together: a gap of poses concerns hundreds."""
+
+    collector: Collector
+    first: int = 0
+    last: int = 0
+    begin_s: float = 0.0
+    end_s: float = 0.0
+    reason: str = ""
+
+    def add(self, number: int, time_s: float, reason: str) -> None:
+        """An image; number and time are of the recording."""
+        if not self.first:
+            self.first, self.begin_s, self.reason = number, time_s, reason
+        self.last, self.end_s = number, time_s
+
+    def end(self) -> None:
+        """Refuses those there are."""
+        if self.first:
+            which = f"images {self.first} to {self.last}, {self.begin_s:.3f} to {self.end_s:.3f} s after the first"
+            with self.collector.attempt(which):
+                raise ValueError(self.reason)
+        self.first = 0
+
+
+def keyframes(
+    images: Iterator[tuple[int, Any, RigidTransform]], options: KeyframeOptions
+) -> Iterator[tuple[int, Any, RigidTransform]]:
+    """Those of the images, with time and pose, that are far enough from the one before, and the sharpest around.
+
+    An image that cannot be decoded is taken only where there is no other.
+    """
+    if options.takes_all:
+        yield from images
+        return
+    last: RigidTransform | None = None
+    begin: RigidTransform | None = None
+    best: tuple[int, Any, RigidTransform] | None = None
+    sharpest, count = -1.0, 0
+    for image in images:
+        pose = image[2]
+        if best is not None and begin is not None and (count == CANDIDATES or _is_far(begin, pose, options, SLACK)):
+            yield best
+            last, best, begin = best[2], None, None
+        if best is None and last is not None and not _is_far(last, pose, options):
+            continue
+        if best is None:
+            begin, sharpest, count = pose, -1.0, 0
+        count += 1
+        if (sharpness := sharpness_of(image[1])) > sharpest or best is None:
+            best, sharpest = image, sharpness
+    if best is not None:
+        yield best
+
+
+def sharpness_of(message: Any) -> float:
+    """Variance of the Laplacian of an image at half its size; 0 of one that cannot be decoded."""
+    try:
+        pixels = pixels_from_image(message)
+    except ValueError:
+        return 0.0
+    grey = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+    half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return float(cv2.Laplacian(half, cv2.CV_32F).var())
+
+
+def _is_far(before: RigidTransform, now: RigidTransform, options: KeyframeOptions, share: float = 1.0) -> bool:
+    moved = before.inverse().compose(now)
+    is_away = bool(np.linalg.norm(moved.translation) >= share * options.distance_m)
+    return is_away or rotation_angle_deg(moved.rotation) >= share * options.angle_deg
+
+
+def _given(intrinsics: Intrinsics | None, message: Any) -> RosCamera:
+    """The camera that a person gives, for an image of this size."""
+    assert intrinsics is not None
+    height, width = pixels_from_image(message).shape[:2]
+    return RosCamera(intrinsics.camera(width, height))

@@ -1,0 +1,193 @@
+"""A robot's localizer without ROS and without a server: answers and odometry are planted."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from support.bags import BASE_FROM_CAMERA, at, drive, image, pose_with_covariance
+from support.images import textured
+from support.servers import CAMERA
+
+from mapless import Rejected, RigidTransform, Unavailable
+from mapless.geometry import rotation_angle_deg, rotation_from_vector
+from mapless.ros import Localizer, LocalizerOptions, RosCamera, pose_of_body
+
+MAP_FROM_ODOM = RigidTransform(rotation_from_vector([0.0, 0.0, 1.2]), np.array([5.0, -3.0, 0.1]))
+COVARIANCE = np.diag([1e-4, 2e-4, 3e-4, 1e-6, 2e-6, 3e-6])
+
+
+class PlantedClient:
+    """Answers with the true pose, or what is planted; keeps what it was given."""
+
+    def __init__(self) -> None:
+        self.priors: list[Any] = []
+        self.plant: Any = None
+
+    def localize(self, photo: bytes, camera: Any, scene: str, *, priors: Any, capture_time: Any, **_: Any) -> Any:
+        self.priors.append(priors.pose)
+        if isinstance(self.plant, Exception):
+            raise self.plant
+        about = SimpleNamespace(request_id="r", total_s=0.2, queue_s=0.0, references=())
+        if self.plant is not None:
+            return Rejected(**({"diagnostics": about} | self.plant))
+        time_s = capture_time.timestamp() - at(0) / 1e9
+        pose = MAP_FROM_ODOM.compose(drive(time_s)).compose(BASE_FROM_CAMERA)
+        return SimpleNamespace(
+            world_from_camera=pose,
+            covariance=COVARIANCE,
+            diagnostics=about,
+            prior_checks=(),
+            arbitrary_unit=False,
+            accuracy=None,
+            trust=0.5,
+            inlier_count=9,
+            match_count=10,
+        )
+
+
+def lookup(target: str, source: str, stamp_ns: int) -> RigidTransform:
+    """tf: the drive as odometry for ten seconds, and the camera on the base."""
+    time_s = (stamp_ns - at(0)) / 1e9
+    if (target, source) == ("base_link", "camera"):
+        return BASE_FROM_CAMERA
+    if (target, source) == ("odom", "base_link") and 0 <= time_s <= 10:
+        return drive(time_s)
+    raise LookupError(f"no {target} > {source} at {time_s:g} s")
+
+
+def shot(time_s: float, frame: str = "/camera") -> Any:
+    return image(at(time_s), textured(), "rgb8", frame)
+
+
+@pytest.fixture
+def client() -> PlantedClient:
+    return PlantedClient()
+
+
+def make(client: Any, **options: Any) -> Localizer:
+    return Localizer(client, LocalizerOptions("hall", **options), lookup)
+
+
+def test_map_to_odom_is_the_planted_one(client: PlantedClient) -> None:
+    outcome = make(client).localize(shot(2.0), RosCamera(CAMERA))
+    assert (outcome.level, outcome.message, outcome.frame, outcome.stamp_ns) == (
+        "OK",
+        "localized",
+        "base_link",
+        at(2.0),
+    )
+    assert outcome.map_from_body is not None
+    assert outcome.covariance is not None
+    assert outcome.tf_edge is not None
+    np.testing.assert_allclose(outcome.map_from_body.matrix(), MAP_FROM_ODOM.compose(drive(2.0)).matrix(), atol=2e-6)
+    assert outcome.tf_edge[0] == "odom"
+    np.testing.assert_allclose(outcome.tf_edge[1].matrix(), MAP_FROM_ODOM.matrix(), atol=5e-6)
+    _, covariance = pose_of_body(
+        MAP_FROM_ODOM.compose(drive(2.0)).compose(BASE_FROM_CAMERA), COVARIANCE, BASE_FROM_CAMERA
+    )
+    np.testing.assert_allclose(outcome.covariance, covariance, rtol=1e-4, atol=1e-12)
+
+
+def test_without_odometry_tf_gets_the_body(client: PlantedClient) -> None:
+    outcome = make(client, odom_frame="").localize(shot(2.0), RosCamera(CAMERA))
+    assert outcome.tf_edge is not None
+    assert outcome.tf_edge[0] == "base_link"
+    camera = make(client, odom_frame="", base_frame="").localize(shot(2.0), RosCamera(CAMERA))
+    assert camera.tf_edge is not None
+    assert camera.tf_edge[0] == "camera"
+    late = make(client).localize(shot(11.0), RosCamera(CAMERA))
+    assert (late.level, late.tf_edge) == ("OK", None)
+    assert "tf does not know odom > base_link" in late.message
+
+
+def test_failures_are_outcomes(client: PlantedClient) -> None:
+    localizer = make(client)
+    client.plant = {"reason": "LOW_OVERLAP", "message": "3 of 20 matches"}
+    rejected = localizer.localize(shot(1.0), RosCamera(CAMERA))
+    assert (rejected.level, rejected.message) == ("WARN", "LOW_OVERLAP: 3 of 20 matches")
+    assert rejected.values["reason"] == "LOW_OVERLAP"
+    client.plant = Unavailable("UNAVAILABLE", "no server")
+    assert localizer.localize(shot(1.0), RosCamera(CAMERA)).level == "ERROR"
+    assert "tf: no base_link > other" in localizer.localize(shot(1.0, "other"), RosCamera(CAMERA)).message
+    wrong = shot(1.0)
+    wrong.encoding = "32FC1"
+    assert "'32FC1' is none of" in localizer.localize(wrong, RosCamera(CAMERA)).message
+
+
+def test_an_initial_pose_is_moved_by_odometry_until_an_image_is_localized(client: PlantedClient) -> None:
+    localizer = make(client)
+    given = MAP_FROM_ODOM.compose(drive(1.0))
+    localizer.guess(pose_with_covariance(at(1.0), "/map", given, np.diag([0.25, 0.25, 0, 0, 0, 0.07])), 0)
+    client.plant = {"reason": "LOW_OVERLAP", "message": "dark"}
+    localizer.localize(shot(2.0), RosCamera(CAMERA))
+    client.plant = None
+    localizer.localize(shot(4.0), RosCamera(CAMERA))
+    localizer.localize(shot(5.0), RosCamera(CAMERA))
+    first, second, third = client.priors
+    for prior, time_s in ((first, 2.0), (second, 4.0)):
+        true = MAP_FROM_ODOM.compose(drive(time_s)).compose(BASE_FROM_CAMERA)
+        np.testing.assert_allclose(prior.world_from_camera.matrix(), true.matrix(), atol=1e-6)
+        assert (np.linalg.eigvalsh(prior.covariance) > 0).all()
+    assert np.trace(second.covariance) > np.trace(first.covariance)
+    assert first.covariance[2, 2] > 1.0  # what rviz does not state is not known
+    assert third is None
+
+
+def test_the_last_pose_is_a_prior_only_where_asked(client: PlantedClient) -> None:
+    localizer = make(client, use_last_pose=True)
+    localizer.localize(shot(1.0), RosCamera(CAMERA))
+    localizer.localize(shot(3.0), RosCamera(CAMERA))
+    assert client.priors[0] is None
+    moved = client.priors[1].world_from_camera
+    true = MAP_FROM_ODOM.compose(drive(3.0)).compose(BASE_FROM_CAMERA)
+    assert np.linalg.norm(moved.translation - true.translation) < 1e-5
+    assert rotation_angle_deg(moved.rotation @ true.rotation.T) < 1e-3
+
+
+def test_a_guess_without_odometry_fades_and_ends(client: PlantedClient) -> None:
+    localizer = make(client, odom_frame="", use_last_pose=True)
+    for time_s in (0.0, 1.0, 7.0):
+        localizer.localize(shot(time_s), RosCamera(CAMERA))
+    none, faded, ended = client.priors
+    assert none is None
+    assert ended is None
+    assert faded.covariance[0, 0] > 1.5**2
+
+
+def test_an_initial_pose_that_is_none_is_named(client: PlantedClient) -> None:
+    localizer = make(client)
+    with pytest.raises(ValueError, match="frame 'odom', not in 'map'"):
+        localizer.guess(pose_with_covariance(1, "odom", drive(0)), 0)
+    with pytest.raises(ValueError, match="a variance below 0"):
+        localizer.guess(pose_with_covariance(1, "map", drive(0), -np.eye(6)), 0)
+
+
+def test_the_rate_bears_jitter_and_time_that_jumps_back(client: PlantedClient) -> None:
+    localizer = make(client, rate_hz=2.0)
+    times = [0.0, 0.1, 0.49, 0.6, 0.98, 0.2]
+    due = []
+    for time_s in times:
+        due.append(localizer.is_due(at(time_s)))
+        if due[-1]:
+            localizer.localize(shot(time_s), RosCamera(CAMERA))
+    assert due == [True, False, True, False, True, True]
+    assert not make(client, rate_hz=0.0).is_due(at(0))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"map_frame": "odom"}, "map_frame"),
+        ({"rate_hz": -1.0}, "rate"),
+        ({"rate_hz": float("nan")}, "rate"),
+        ({"timeout_s": 0.0}, "timeout"),
+    ],
+)
+def test_options_that_cannot_be_are_named(wrong: dict[str, Any], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        LocalizerOptions("hall", **wrong)
+    with pytest.raises(ValueError, match="scene is empty"):
+        LocalizerOptions("")
