@@ -25,9 +25,9 @@ from mapless_server.method.pipeline import Pipeline, StageOptions
 from mapless_server.method.priors.known import NO_PRIORS, Priors
 from mapless_server.method.results import Support
 from mapless_server.method.views import PosedView, View
-from mapless_server.scenes.retrieval.ranking import choose_references
 from mapless_tools.dataset import Frame, read_folder
 from mapless_tools.evaluate.metrics import pose_error
+from mapless_tools.evaluate.references import choose_references
 
 RIGHT_SHARE, RIGHT_M, RIGHT_DEG = 0.05, 0.25, 5.0
 """An answer is wrong that is off by a larger share of the distance to what the photograph shows, by more degrees or,

@@ -10,7 +10,8 @@ from support.scenes import CAMERA, SceneOptions, make_scene, random_for, unit_ro
 
 from mapless.geometry import Array, RigidTransform
 from mapless_server.method.views import Features, PosedView, View
-from mapless_server.scenes.retrieval.ranking import RetrieveOptions, choose_references, spread_choice
+from mapless_server.scenes.retrieval.ranking import RetrieveOptions, spread_choice
+from mapless_tools.evaluate.references import choose_references
 
 LINE = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [1.0, 0, 0], [1.1, 0, 0]])
 

@@ -7,10 +7,20 @@ services use. `protection` and `tls` are imported by name: a store needs keys of
 
 from .access import ENDLESS_METHODS, METHOD_ROLES, OPEN_METHODS, Authenticator, certificate_name
 from .binding import assess_binding, is_loopback
-from .errors import SecurityError
-from .principal import DEFAULT_TENANT, Principal, Role
 from .rate import RateLimiter
-from .tenancy import KEY_SEPARATOR, SceneKey, check_tenant, end_of_keys, key_of, scene_id_of, tenant_of
+from .reloading import SecurityError
+from .tenancy import (
+    DEFAULT_TENANT,
+    KEY_SEPARATOR,
+    Principal,
+    Role,
+    SceneKey,
+    check_tenant,
+    end_of_keys,
+    key_of,
+    scene_id_of,
+    tenant_of,
+)
 from .tokens import Tokens, create_token, read_tokens, revoke_token, sha256_of
 
 __all__ = [

@@ -7,7 +7,7 @@ from datetime import datetime, timezone
 
 from mapless_server.errors import PermissionDenied, Unauthenticated
 
-from .principal import Principal, Role
+from .tenancy import Principal, Role
 from .tokens import Tokens
 
 METHOD_ROLES: Mapping[str, Role] = {

@@ -9,9 +9,8 @@ from mapless_server.settings import Settings
 
 from .access import Authenticator
 from .binding import assess_binding
-from .errors import SecurityError
 from .rate import RateLimiter
-from .reloading import Refreshable, Reloading
+from .reloading import Refreshable, Reloading, SecurityError
 from .tls import Tls, TlsFiles
 from .tokens import Tokens, read_tokens
 

@@ -9,8 +9,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
-from .errors import SecurityError
-
 log = logging.getLogger(__name__)
 
 CHECK_INTERVAL_S = 1.0
@@ -18,6 +16,10 @@ CHECK_INTERVAL_S = 1.0
 
 T = TypeVar("T")
 Stamp = tuple[tuple[int, int, int, int], ...]
+
+
+class SecurityError(Exception):
+    """A file cannot be used, or a token cannot be created; the message is one sentence for the operator."""
 
 
 class Refreshable(Protocol):

@@ -1,4 +1,4 @@
-"""Keys of scenes: below the services, a scene's key holds its tenant. Only this module makes and reads keys.
+"""Callers, and keys of scenes, which hold a scene's tenant below the services. Only this module makes and reads keys.
 
 The store and its caches use keys only, so that a scene of another tenant does not exist for a caller. Callers use ids,
 and never see keys.
@@ -6,11 +6,41 @@ and never see keys.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from enum import IntEnum
 from typing import NewType
 
 from mapless.names import check_id
 
-from .principal import DEFAULT_TENANT
+DEFAULT_TENANT = "default"
+"""The tenant of all scenes on a server without tokens."""
+
+
+class Role(IntEnum):
+    """The rights of a caller; each role includes those before it."""
+
+    READ = 1
+    """Read scenes and references."""
+    LOCALIZE = 2
+    """Localize photographs."""
+    WRITE = 3
+    """Create and delete scenes and references."""
+
+
+@dataclass(frozen=True)
+class Principal:
+    """A caller.
+
+    Attributes:
+        tenant: whose scenes it can access.
+        role: its rights on them.
+        name: of its token or certificate, for the log; empty without either.
+    """
+
+    tenant: str = DEFAULT_TENANT
+    role: Role = Role.WRITE
+    name: str = ""
+
 
 SceneKey = NewType("SceneKey", str)
 """The id of a scene of the default tenant, as in stores without tenants; "tenant/scene" for all others.

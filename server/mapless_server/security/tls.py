@@ -16,8 +16,7 @@ from cryptography import x509
 from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_private_key
 
-from .errors import SecurityError
-from .reloading import Reloading, read_file
+from .reloading import Reloading, SecurityError, read_file
 
 
 @dataclass(frozen=True)

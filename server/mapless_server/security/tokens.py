@@ -26,9 +26,8 @@ from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field
 
 from mapless.names import check_id
 
-from .errors import SecurityError
-from .principal import DEFAULT_TENANT, Role
-from .reloading import read_file
+from .reloading import SecurityError, read_file
+from .tenancy import DEFAULT_TENANT, Role
 
 PREFIX = "mapless_"
 """First characters of every token, by which scanners for leaked secrets find it."""

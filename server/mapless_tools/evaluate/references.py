@@ -10,11 +10,11 @@ from typing import TypeVar
 
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, decode_image, image_size
-from mapless_server.method.correspond import OPTIONS
+from mapless_server.method.correspond import OPTIONS, CorrespondOptions, mutual_matches
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.views import PosedView, View
 from mapless_server.networks.weights import WeightsError
-from mapless_server.scenes.retrieval.ranking import choose_references
+from mapless_server.scenes.retrieval.ranking import spread_choice
 from mapless_server.serve.assembly import image_limits, make_first_features
 from mapless_server.settings import Settings, available_cores
 from mapless_tools.dataset import Dataset, Frame
@@ -81,12 +81,23 @@ def check_images(frames: Iterable[Frame], limits: ImageLimits) -> None:
             )
 
 
+def choose_references(
+    query: View,
+    candidates: Sequence[PosedView],
+    count: int,
+    ratio: float = CorrespondOptions.query_ratio,
+) -> list[int]:
+    """Indices of at most `count` candidates, in the order of choice, the most similar first; `ratio`: the features'."""
+    matches = [len(mutual_matches(query.features, c.view.features, ratio)) for c in candidates]
+    return spread_choice(matches, [c.world_from_camera.translation for c in candidates], count)
+
+
 def rank_by_matches(
     queries: Sequence[Frame], references: Sequence[Frame], k: int, matcher: Matcher, progress: Progress
 ) -> tuple[PlannedQuery, ...]:
     """The queries, each with those k references, itself excepted, that share the most feature matches with it.
 
-    The true poses are not looked at. The ranking is the server's own (`retrieve`), done here because a query that is
+    The true poses are not looked at. The ranking is the server's own, done here because a query that is
     left out must not be offered itself.
 
     Raises:

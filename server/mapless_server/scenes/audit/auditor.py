@@ -22,8 +22,7 @@ from mapless_server.method.views import PosedView
 from mapless_server.store import LruCache
 
 from .change import SAME_VIEWPOINT, Change, ChangeOptions, find_change
-from .comparison import Comparison, compare, pose_difference
-from .duplicates import Likeness, likeness
+from .comparison import Comparison, Likeness, compare, likeness, pose_difference
 from .finder import ReferenceFinder
 from .neighbourhood import PairMatches
 from .options import AuditOptions

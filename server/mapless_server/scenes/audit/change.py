@@ -21,8 +21,7 @@ from mapless_server.method.results import PointMatches
 from mapless_server.method.views import PosedView
 
 from .comparison import Comparison
-from .neighbourhood import Neighbourhood
-from .visibility import VisibilityOptions, Visible, visible_points
+from .neighbourhood import Neighbourhood, VisibilityOptions, Visible, visible_points
 
 
 @dataclass(frozen=True)

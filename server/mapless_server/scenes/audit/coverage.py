@@ -20,9 +20,8 @@ from mapless_server.method.structure import StructureOptions
 from mapless_server.method.uncertainty.radii import accuracy_from_covariance
 
 from .finder import ReferenceFinder
-from .neighbourhood import Neighbourhood, PairMatches, build_neighbourhood
+from .neighbourhood import Neighbourhood, PairMatches, VisibilityOptions, Visible, build_neighbourhood, visible_points
 from .verdict import Coverage, CoverageVerdict
-from .visibility import VisibilityOptions, Visible, visible_points
 
 
 @dataclass(frozen=True)

@@ -12,16 +12,14 @@ the photographs and the references' poses only, never the query's pose.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapless.geometry import Array, RigidTransform
-from mapless_server.method.correspond import CorrespondOptions, mutual_matches
 from mapless_server.method.options import check_bounds
-from mapless_server.method.views import PosedView, View
 
 from .descriptor import Vector
 from .index import Entries, Rows
@@ -229,21 +227,6 @@ class RetrieveOptions:
     def __post_init__(self) -> None:
         check_bounds(self, "apart_m", at_least=0)
         check_bounds(self, "nearby_weight", at_least=0, at_most=1)
-
-
-def choose_references(
-    query: View,
-    candidates: Sequence[PosedView],
-    count: int,
-    options: RetrieveOptions | None = None,
-    ratio: float = CorrespondOptions.query_ratio,
-) -> list[int]:
-    """Indices of at most `count` candidates, in the order of choice, the most similar first.
-
-    `ratio` is the extractor's: `CorrespondOptions.query_ratio`.
-    """
-    matches = [len(mutual_matches(query.features, c.view.features, ratio)) for c in candidates]
-    return spread_choice(matches, [c.world_from_camera.translation for c in candidates], count, options)
 
 
 def spread_choice(
