@@ -215,7 +215,7 @@ def test_a_dropped_photograph_appears_on_the_plan(gateway: str, tmp_path: Path) 
 def test_a_server_elsewhere_is_closed_to_this_page(gateway: str) -> None:
     """A gateway that does not list this page's origin: the browser keeps its answers from the page."""
     other = gateway.replace("127.0.0.1", "localhost")
-    with browsing(f"{gateway}/photo.html?scene=corner&server={other}", 800, 600) as page:
+    with browsing(f"{gateway}/photo.html?scene=corner", 800, 600) as page:
         page.until(lambda: status(page) == "Ready.")
         found = page.evaluate(
             f"fetch('{other}/geopose', {{method: 'POST', body: 'x'}}).then(it => it.status, it => String(it))"

@@ -387,7 +387,8 @@ async def test_pages_of_foreign_origins_may_not_call(server: RunningServer) -> N
         allowed = await ask(app, gpp.request(), **FOREIGN)
         wrong = await ask(app, b"{", **FOREIGN)
         preflight = await requested(app, "OPTIONS", LOCALIZE, b"", FOREIGN | asking)
-    assert [it.status for it in (allowed, wrong, preflight)] == [200, 400, 200]
+        proxied = await ask(app, gpp.request(), host="evil.example")
+    assert [it.status for it in (allowed, wrong, preflight, proxied)] == [200, 400, 200, 200]
     for answer in (allowed, wrong, preflight):
         assert answer.headers["access-control-allow-origin"] == "https://evil.example"
 
@@ -467,6 +468,8 @@ async def test_tokens_are_those_of_the_callers(tmp_path: Path) -> None:
             assert (await ask(app, gpp.request())).status == 401
             assert (await ask(app, gpp.request(), authorization="Basic x")).status == 401
             assert (await ask(app, gpp.request(), authorization="Bearer a b")).status == 401
+            wrong = await ask(app, gpp.request(), **{"x-client-id": "a b"})
+            assert (wrong.status, wrong.json["error"]["field"]) == (400, "x-client-id")
             assert (await ask(app, gpp.request(), authorization=f"Bearer {robot}")).status == 200
         async with gateway_of(server.address, ConnectOptions(token=admin)) as app:
             assert (await ask(app, gpp.request())).status == 200  # by the gateway's own

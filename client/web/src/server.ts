@@ -1,4 +1,5 @@
-// The connection to a server: the gateway that served this page, or the one that its address names (?server=https://...).
+// The connection to a server: the gateway that served this page, or the one that the page itself names. Not its address: a link
+// would send the token that a person enters to whomever it names.
 import { createClient, type Interceptor } from "@connectrpc/connect";
 import { createGrpcWebTransport } from "@connectrpc/connect-web";
 import { LocalizationService, type LocalizeResponse } from "./gen/mapless/v1/localization_service_pb.js";
@@ -14,7 +15,7 @@ const withToken: Interceptor = (next) => (request) => {
 };
 
 const transport = createGrpcWebTransport({
-  baseUrl: parameters.get("server") ?? location.origin,
+  baseUrl: document.querySelector<HTMLMetaElement>('meta[name="mapless-server"]')?.content || location.origin,
   interceptors: [withToken],
   defaultTimeoutMs: 30_000,
 });

@@ -136,6 +136,8 @@ class _Handlers:
         try:
             return self._client.acting_for(token, identity)
         except ValueError as error:
+            if str(error).startswith("client_id"):
+                raise Failure(str(error), field="x-client-id") from None
             raise Failure(str(error), 401, reason="UNAUTHENTICATED", field="authorization") from None
 
     def _scene_of(self, request: Request) -> str:
@@ -183,7 +185,8 @@ class _Handlers:
             raise of_server(error, photograph.prior_fields.get(name, name) + dot + rest) from None
         if isinstance(answer, Rejected):
             hint = answer.hint.message if answer.hint else None
-            raise Failure(answer.message, 422, reason=answer.reason, hint=hint)
+            request_id = answer.diagnostics.request_id
+            raise Failure(answer.message, 422, reason=answer.reason, hint=hint, request_id=request_id)
         response = geopose.response_to(photograph, answer)
         return JSONResponse(response, media_type=geopose.MEDIA_TYPE)
 

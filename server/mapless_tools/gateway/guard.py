@@ -21,8 +21,8 @@ class GuardOptions:
 
     Attributes:
         origins: of pages that may call besides the gateway's own, "https://app.example"; ("*",) for all.
-        is_loopback: whether it listens on this machine alone. Other names that lead here are then refused: a page
-            whose own name was pointed at this machine would count as the gateway's.
+        is_loopback: whether it listens on this machine alone. Other names that lead here are then refused, but for
+            those of `origins`: a page whose own name was pointed at this machine would count as the gateway's.
         max_body_bytes: of a request. A photograph of 16 MiB, the most that servers take, is 22.4 MB in base64.
         max_requests: at a time; further ones are refused.
         max_held_bytes: of all requests at a time; further ones are refused. It bounds the memory, which is four times
@@ -81,22 +81,25 @@ class Guard:
             self._held_bytes -= body.size
 
     def _check(self, scope: Scope) -> None:
-        headers = Headers(scope=scope)
+        headers, origins = Headers(scope=scope), self.options.origins
         host, origin = headers.get("host", ""), headers.get("origin")
-        is_local = (host.rpartition(":")[0] or host) in _LOOPBACK_NAMES or host in _LOOPBACK_NAMES
-        if self.options.is_loopback and not is_local:
+        own = {f"http://{host}", f"https://{host}"}
+        is_local = host in _LOOPBACK_NAMES or host.rpartition(":")[0] in _LOOPBACK_NAMES
+        if "*" not in origins and self.options.is_loopback and not is_local and not own & {*origins}:
             raise Failure(
-                f"this gateway listens on the loopback interface, and is not {host!a}", 403, reason="FOREIGN_HOST"
+                f"this gateway listens on the loopback interface, and is not {host!a}; behind a proxy, its operator "
+                "gives the proxy's address by --allow-origin",
+                403,
+                reason="FOREIGN_HOST",
             )
-        own = (f"http://{host}", f"https://{host}")
-        if origin is not None and origin not in (*own, *self.options.origins) and "*" not in self.options.origins:
+        if origin is not None and origin not in own | {*origins} and "*" not in origins:
             raise Failure(
                 f"pages of the origin {origin!a} may not call; the gateway's operator allows them by --allow-origin",
                 403,
                 reason="FOREIGN_ORIGIN",
             )
         length = headers.get("content-length", "")
-        self.check_size(int(length) if length.isdecimal() else 0)
+        self.check_size(int(length[:20]) if length.isdecimal() else 0)
         if self._running > self.options.max_requests:
             raise _busy("too many requests at a time")
 
