@@ -25,6 +25,7 @@ OUTSIDE = {
     "BENCHMARKS.md": "benchmarks/index.md",
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
+    "client/cpp/README.md": "guides/cpp.md",
     "client/unity/README.md": "guides/unity.md",
     "deploy/envoy/README.md": "operation/envoy.md",
     "deploy/ray/README.md": "operation/ray.md",

@@ -1,8 +1,7 @@
-"""The protos in other languages: names that collide with no generated member, C++ and Java that compile, no break."""
+"""The protos in other languages: names that collide with no generated member, Java that compiles, no break."""
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 import sys
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from google.protobuf.descriptor import Descriptor
+from support.compilers import needs, run
 
 from mapless.v1 import geometry_pb2, localization_service_pb2, reference_service_pb2
 
@@ -102,48 +102,6 @@ def test_nothing_that_was_released_is_broken(tmp_path: Path) -> None:
     changed = tmp_path / "proto" / "mapless" / "v1" / "geometry.proto"
     changed.write_text(changed.read_text().replace("focal_x_px = 3", "focal_length_px = 3"))
     assert "changed name from" in breaking(tmp_path)
-
-
-def needs(*programs: str | Path) -> None:
-    """Skips without the programs, or fails where TEST_PROTOC asks for them."""
-    missing = [str(it) for it in programs if not (it.exists() if isinstance(it, Path) else shutil.which(it))]
-    if missing and os.environ.get("TEST_PROTOC") == "required":
-        pytest.fail(f"not installed: {', '.join(missing)}")
-    if missing:
-        pytest.skip(f"not installed: {', '.join(missing)}")
-
-
-def run(*command: str | Path, folder: Path) -> None:
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stdout + done.stderr
-
-
-CPP_PROGRAM = """
-#include <grpcpp/grpcpp.h>
-#include <mapless/v1/localization_service.grpc.pb.h>
-#include <mapless/v1/reference_service.grpc.pb.h>
-int main() {
-  mapless::v1::RetrieveReferencesResponse response;
-  response.set_retrieval("vlad-1");
-  auto stub = mapless::v1::LocalizationService::NewStub(
-      grpc::CreateChannel("localhost:50051", grpc::InsecureChannelCredentials()));
-  return response.retrieval().size() == 6 && stub ? 0 : 1;
-}
-"""
-
-
-@pytest.mark.nightly
-def test_generated_cpp_compiles(tmp_path: Path) -> None:
-    """Some 20 seconds: messages and services, and a program that includes both."""
-    plugin = shutil.which("grpc_cpp_plugin") or "grpc_cpp_plugin"
-    needs("protoc", "g++", plugin)
-    generated = ("--cpp_out", str(tmp_path), "--grpc_out", str(tmp_path), f"--plugin=protoc-gen-grpc={plugin}")
-    run("protoc", "-I", str(PROTO), *generated, *PROTOS, folder=tmp_path)
-    (tmp_path / "program.cc").write_text(CPP_PROGRAM)
-    sources = [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.cc")]
-    assert len(sources) == 2 * len(PROTOS) + 1
-    for source in sources:
-        run("g++", "-std=c++17", "-fsyntax-only", "-I.", source, folder=tmp_path)
 
 
 @pytest.mark.nightly

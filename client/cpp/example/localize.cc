@@ -1,0 +1,71 @@
+// Localizes a photograph: localize ADDRESS SCENE PHOTO WIDTH HEIGHT FX FY CX CY. MAPLESS_TOKEN has the token, MAPLESS_CA the file of
+// the authority that signed the server's certificate; with it the connection is encrypted.
+//
+// Exit codes as those of the command `mapless`: 0 localized, 1 the call failed, 2 wrong usage, 3 not localized.
+#include <mapless/client.h>
+
+#include <cstdio>
+#include <cstdlib>
+
+namespace {
+
+void Print(const mapless::v1::LocalizeResponse& answer) {
+  const auto& found = answer.localization();
+  const auto& position = found.world_from_camera().translation_m();
+  const auto& q = found.world_from_camera().rotation();
+  std::printf("position  %.3f %.3f %.3f m", position.x(), position.y(), position.z());
+  if (found.has_accuracy()) std::printf("   within %.1f cm (95 %%)", 100 * found.accuracy().position_95_m());
+  std::printf("\nrotation  x %.4f y %.4f z %.4f w %.4f\n", q.x(), q.y(), q.z(), q.w());
+}
+
+int Run(char** arguments) {
+  mapless::ConnectOptions options;
+  options.address = arguments[1];
+  if (const char* token = std::getenv("MAPLESS_TOKEN")) options.token = token;
+  if (const char* authority = std::getenv("MAPLESS_CA")) {
+    options.tls = true;
+    options.root_certificates = mapless::ReadFile(authority);
+  }
+  const mapless::Client client(options);
+
+  mapless::v1::LocalizeRequest request;
+  request.set_scene(std::string("scenes/") + arguments[2]);
+  request.set_image(mapless::ReadFile(arguments[3]));
+  double numbers[6];
+  for (int i = 0; i < 6; ++i) numbers[i] = std::stod(arguments[4 + i]);
+  *request.mutable_intrinsics() = mapless::Pinhole(static_cast<int>(numbers[0]), static_cast<int>(numbers[1]), numbers[2],
+                                                   numbers[3], numbers[4], numbers[5]);
+  const auto answer = client.LocalizeProgressively(request, [](const mapless::v1::LocalizeResponse& coarse) {
+    std::puts("coarse pose, the refined one follows");
+    Print(coarse);
+  });
+  if (!answer.has_localization()) {
+    const auto& rejection = answer.rejection();
+    std::printf("not localized: %s: %s\n", mapless::ReasonOf(rejection).c_str(), rejection.message().c_str());
+    return 3;
+  }
+  std::printf("localized, %d of %d matches agree\n", answer.localization().inlier_count(), answer.localization().match_count());
+  Print(answer);
+  return 0;
+}
+
+}  // namespace
+
+int main(int count, char** arguments) {
+  if (count != 10) {
+    std::fprintf(stderr, "usage: localize ADDRESS SCENE PHOTO WIDTH HEIGHT FX FY CX CY\n");
+    return 2;
+  }
+  try {
+    return Run(arguments);
+  } catch (const mapless::Unavailable& error) {
+    std::fprintf(stderr, "the server cannot be reached: %s\n", error.message.c_str());
+    return 1;
+  } catch (const mapless::Error& error) {
+    std::fprintf(stderr, "%s%s%s\n", error.what(), error.field.empty() ? "" : ", field ", error.field.c_str());
+    return 1;
+  } catch (const std::exception& error) {
+    std::fprintf(stderr, "%s\n", error.what());
+    return 2;
+  }
+}
