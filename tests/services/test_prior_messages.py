@@ -14,11 +14,7 @@ from mapless.geometry import Quaternion
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless.wire import FieldError
-from mapless_server.services.messages.priors import (
-    UNKNOWN_HEIGHT_SIGMA_M,
-    needs_attributes,
-    priors_from_message,
-)
+from mapless_server.services.messages.queries import UNKNOWN_HEIGHT_SIGMA_M, needs_attributes, priors_from_message
 from mapless_server.store import SceneAttributes
 
 NOTHING = SceneAttributes()

@@ -33,8 +33,7 @@ from .messages.groups import (
     session_from_rig_from_message,
     session_poses_from_message,
 )
-from .messages.priors import needs_attributes
-from .messages.queries import query_from_message, scene_key_from_name
+from .messages.queries import needs_attributes, query_from_message, scene_key_from_name
 from .watching import Watcher, Watchers
 
 FutureCoarseAnswer = asyncio.Future[pb.LocalizeResponse]

@@ -40,7 +40,7 @@ class SelfCalibration:
         kind: of the answers that it holds for, see `calibration_kind`.
         generation: of the scene when its references were read.
         answer_count: n, number of references whose answers it is from; 0: too few, and the rest is as without it.
-        position_factor, rotation_factor: of radii at the usual gap (`method.uncertainty.gap`), 0.01 to 1000.
+        position_factor, rotation_factor: of radii at the usual gap (see `viewpoint_gap`), 0.01 to 1000.
         reference_noise_m, reference_noise_deg: errors of the references' own poses, not exceeded in 68 % of cases: no
             answer is free of them.
         trust_quantiles: of the generic trust of right answers, at the levels of `method.trust.judge`; empty: unknown.

@@ -31,13 +31,13 @@ from .answers import (
     geo_pose_to_message,
     rejection_to_message,
 )
-from .priors import priors_from_message
 from .queries import (
     MAX_CANDIDATES,
     MAX_REFERENCES,
     enum_to_message,
     options_from_message,
     photo_from_message,
+    priors_from_message,
     reference_count_from_message,
     reference_ids_from_names,
 )

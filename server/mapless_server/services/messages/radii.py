@@ -103,7 +103,7 @@ def reported_radii(
         covariance: (6, 6) of the method.
         conditions: what computed the answer.
         attributes: of the scene.
-        gap: of the answer, see `method.uncertainty.gap`; None if unknown.
+        gap: of the answer, see `method.uncertainty.radii.viewpoint_gap`; None if unknown.
     """
     measured = attributes.calibration
     if measured is not None and measured.is_of(*astuple(conditions)):
