@@ -28,12 +28,13 @@ class Recording:
         path: of the folder or file.
         types: of the messages of each topic that has any, "sensor_msgs/msg/Image".
         counts: how many those are.
+        typestore: of the classes of its messages.
     """
 
     def __init__(self, path: Path) -> None:
         """ValueError if it cannot be opened; names the file."""
         self.path = path
-        self._typestore = get_typestore(Stores.ROS2_HUMBLE)
+        self.typestore = get_typestore(Stores.ROS2_HUMBLE)
         self._stack = ExitStack()
         with self._named():
             self._reader = self._stack.enter_context(Reader(_openable(path)))
@@ -76,7 +77,7 @@ class Recording:
             seen[connection.topic] += 1
             where = f"message {seen[connection.topic]} of {connection.topic}, recorded at {seconds(time_ns)}"
             with self._named(where):
-                message = self._typestore.deserialize_cdr(data, connection.msgtype)
+                message = self.typestore.deserialize_cdr(data, connection.msgtype)
             yield connection.topic, time_ns, message
         for topic in topics:
             if seen[topic] < self.counts.get(topic, 0):

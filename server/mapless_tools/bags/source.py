@@ -107,6 +107,12 @@ def open_poses(images: Images, options: BagOptions) -> Poses:
     return Poses(tree, topic, world, body)
 
 
+def static_tree(images: Images, options: BagOptions) -> FrameTree:
+    """The frames of a recording without poses."""
+    edges = _transforms(images, [STATIC_TF_TOPIC], options)
+    return FrameTree(_with_extrinsics(edges, images, options.body_frame, options))
+
+
 def _unnamed_body(images: Images, topic: str, static: dict[str, Edge], options: BagOptions) -> str:
     """The frame of poses that do not name theirs: what carries the camera."""
     if options.body_from_camera is not None:
@@ -123,7 +129,7 @@ def _with_extrinsics(edges: dict[str, Edge], images: Images, body: str, options:
     if options.body_from_camera is None:
         return edges
     if not body:
-        raise ValueError("--body-from-camera with poses of /tf takes --body-frame, too")
+        raise ValueError("--body-from-camera takes --body-frame, too, where no topic of poses names the body")
     return edges | {images.frame: Edge(body, options.body_from_camera)}
 
 

@@ -17,6 +17,7 @@ from mapless_tools.evaluate.cli import evaluate_command
 from mapless_tools.gateway.command import gateway_command
 from mapless_tools.ingest.command import ImportCommand, export_command, import_command
 from mapless_tools.load.command import load_app
+from mapless_tools.replay.bag_command import replay_bag_command
 from mapless_tools.replay.command import replay_command
 from mapless_tools.view.command import view_command
 
@@ -77,6 +78,7 @@ _add_tool("audit", audit_command)
 _add_tool("calibrate", calibrate_command)
 _add_tool("evaluate", evaluate_command)
 _add_tool("replay", replay_command)
+_add_tool("replay-bag", replay_bag_command)
 _add_tool("view", view_command, extra="view")
 _add_tool("gateway", gateway_command, extra="gateway")
 _add_tool("demo", demo_command)
