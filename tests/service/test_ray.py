@@ -66,8 +66,7 @@ nightly = pytest.mark.nightly("ray")
 DATA = Path(os.environ.get("TEST_DATA", Path(__file__).parents[3] / "shared" / "data"))
 LIMIT_S = 60.0
 SCENES = [f"scene-{i}" for i in range(16)]
-ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1") | {"OPENBLAS_CORETYPE": "Haswell"}
-"""And the same kernels, which a plain server chooses itself (see `serve.libraries`)."""
+ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
 AT_ONCE: dict[str, Any] = {"rolling_update_percentage": 1.0}
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
-from pathlib import Path
 
 from mapless_server.settings import Settings
 
@@ -27,31 +26,10 @@ def configure_libraries(settings: Settings) -> None:
         "OPENCV_LOG_LEVEL": "SILENT",
         "GRPC_VERBOSITY": "NONE",
     }
-    if hides_avx512(_cpu_description()):
-        environment["OPENBLAS_CORETYPE"] = "SkylakeX"
     for name, value in environment.items():
         os.environ.setdefault(name, value)
     if "GLIBC_TUNABLES" not in os.environ and not any(name.startswith("MALLOC_") for name in os.environ):
         _share_one_heap()
-
-
-def hides_avx512(cpu: str) -> bool:
-    """Whether OpenBLAS would not use the AVX-512 of a processor, described as in Linux's /proc/cpuinfo.
-
-    It takes AMD's for older ones that have none: products of descriptors take half the time with its kernels for
-    Intel's, and differ in the last digits.
-    """
-    needed = {"avx512f", "avx512cd", "avx512bw", "avx512dq", "avx512vl"}
-    fields = dict(line.split(":", 1) for line in cpu.split("\n\n")[0].replace("\t", "").splitlines() if ":" in line)
-    return "AuthenticAMD" in fields.get("vendor_id", "") and needed <= set(fields.get("flags", "").split())
-
-
-def _cpu_description() -> str:
-    """Empty where the system has none."""
-    try:
-        return Path("/proc/cpuinfo").read_text()
-    except OSError:
-        return ""
 
 
 def _share_one_heap() -> None:

@@ -40,7 +40,6 @@ def circumstances_of(settings: Settings, tiers: Sequence[Tier]) -> dict[str, str
         "processor": f"{cpu_model()}, {platform.machine()}",
         "python": platform.python_version(),
         "blas_threads": os.environ.get("OPENBLAS_NUM_THREADS", ""),
-        "blas_core": os.environ.get("OPENBLAS_CORETYPE", ""),
         **{name: str(getattr(settings, name)) for name in DECISIVE_SETTINGS},
         **{name: _version_of(name) for name in PACKAGES},
     }
