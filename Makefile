@@ -14,7 +14,7 @@ PROTO_VENV  := $(VENV)/proto-tools
 # processes compiles all that it imports: a server takes 3.0 s of processor time to start instead of 1.3.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup test nightly weights lint format proto released demo bench bench-gpu load load-ray fuzz docs clean
+.PHONY: help setup test nightly weights lint format proto released demo bench bench-turns bench-gpu load load-ray fuzz docs clean
 
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -80,6 +80,9 @@ demo: setup  ## Localize photographs end to end; DATA=folder for real ones
 
 bench: setup  ## Measure accuracy and latency on the real scenes; DATA=folder with the scenes
 	$(BIN)/mapless-server bench $(if $(DATA),'$(DATA)',../shared/data)
+
+bench-turns: setup  ## Compare what a query costs two commits, by turns in one run: BEFORE=commit AFTER=commit (or the working tree)
+	$(BIN)/python -m mapless_tools.bench.turns '$(BEFORE)' '$(AFTER)' $(if $(DATA),--data '$(DATA)') $(ARGS)
 
 bench-gpu: setup  ## Measure the networks and whole queries on a CUDA device; without one, what a CPU can measure
 	$(BIN)/mapless-server bench-network $(ARGS)

@@ -1,0 +1,144 @@
+"""Two commits in one run, by turns: `python -m mapless_tools.bench.turns BEFORE [AFTER] --data FOLDER`.
+
+Times of two runs differ by more than a change of the code does, so a server of each commit is measured at the same
+time: both have the same references, and localize each photograph one after the other, in the order A B B A. What is
+compared is processor time, which other programs on the machine change least; ratios are geometric means over the
+photographs, with 95 % intervals by bootstrap over these.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from mapless import Client, LocalizationResult
+from mapless.geometry import Array
+from mapless_server.serve.signals import terminable
+from mapless_tools.child import CONNECT, ChildServer, child_server
+from mapless_tools.dataset import Dataset, Frame, read_folder
+from mapless_tools.evaluate.plan import EvaluationOptions, split_frames
+from mapless_tools.evaluate.run import SCENE, store_references
+
+TURNS = (0, 1, 1, 0)
+RESAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What one photograph cost.
+
+    Attributes:
+        processor_s: (2, T) of the server process of each commit, its calls in order.
+        wall_s: (2, T) as the client sees it.
+        apart_m: distance of the two commits' positions; None if one of them has none.
+    """
+
+    processor_s: Array
+    wall_s: Array
+    apart_m: float | None
+
+
+def main(
+    before: Annotated[str, typer.Argument(help="A commit, in the repository of the current folder.")],
+    after: Annotated[str, typer.Argument(help="Another one; default: the working tree.")] = "",
+    data: Annotated[Path, typer.Option(help="Folder with photographs and poses.")] = Path("../shared/data"),
+    scene: Annotated[str, typer.Option(help="Folder in it.")] = "7scenes-redkitchen-seq01-first600",
+    references: Annotated[int, typer.Option(min=2, help="Photographs that are stored.")] = 30,
+    photographs: Annotated[int, typer.Option(min=2, help="Photographs that are localized.")] = 20,
+    rounds: Annotated[int, typer.Option(min=1, help="Times that each is localized A B B A.")] = 1,
+) -> None:
+    """Compare what a warm query costs two commits; settings are those of the environment (MAPLESS_...)."""
+    dataset = read_folder(data / scene)
+    with terminable(), ExitStack() as stack:
+        servers = [stack.enter_context(_server(commit)) for commit in (before, after)]
+        measured = measure(servers, dataset, EvaluationOptions(references, photographs), rounds)
+    print("\n".join(report(measured, (before, after or "working tree"))))
+
+
+@contextmanager
+def _server(commit: str) -> Iterator[ChildServer]:
+    """A server of a commit; of the working tree where it is empty. Nothing is computed in the background."""
+    environment = {"MAPLESS_BACKGROUND_MATCHING": "false"}
+    with tempfile.TemporaryDirectory(prefix="mapless-turns-") as folder, ExitStack() as stack:
+        tree = Path.cwd()
+        if commit:
+            tree = Path(folder) / "tree"
+            subprocess.run(["git", "worktree", "add", "--quiet", "--detach", str(tree), commit], check=True)
+            stack.callback(subprocess.run, ["git", "worktree", "remove", "--force", str(tree)], check=False)
+        environment["PYTHONPATH"] = f"{tree / 'client'}:{tree / 'server'}"
+        with child_server(Path(folder) / "data", environment=environment) as server:
+            yield server
+
+
+def measure(
+    servers: Sequence[ChildServer], dataset: Dataset, options: EvaluationOptions, rounds: int
+) -> list[Measured]:
+    """Localizes photographs on two servers by turns, after each once on both; the servers choose the references."""
+    split = split_frames(len(dataset.frames), options)
+    with ExitStack() as stack:
+        clients = [stack.enter_context(Client(server.address, CONNECT)) for server in servers]
+        for client in clients:
+            store_references(client, SCENE, [dataset.frames[i] for i in split.references], lambda *_: None)
+        measured = []
+        for frame in (dataset.frames[i] for i in split.queries):
+            positions = [_call(client, server, frame)[2] for client, server in zip(clients, servers, strict=True)]
+            found: list[list[tuple[float, float]]] = [[], []]
+            for side in TURNS * rounds:
+                found[side].append(_call(clients[side], servers[side], frame)[:2])
+            times = np.moveaxis(np.array(found), 2, 0)
+            both = [it for it in positions if it is not None]
+            apart_m = float(np.linalg.norm(both[0] - both[1])) if len(both) == 2 else None
+            measured.append(Measured(times[0], times[1], apart_m))
+    return measured
+
+
+def _call(client: Client, server: ChildServer, frame: Frame) -> tuple[float, float, Array | None]:
+    """Processor time of the server, time of the call, and the position found."""
+    image = frame.image_path.read_bytes()
+    begin_cpu_s, begin_s = _processor_s(server.process_id), time.perf_counter()
+    answer = client.localize(image, frame.camera, SCENE)
+    wall_s, cpu_s = time.perf_counter() - begin_s, _processor_s(server.process_id) - begin_cpu_s
+    position = answer.world_from_camera.translation if isinstance(answer, LocalizationResult) else None
+    return cpu_s, wall_s, position
+
+
+def _processor_s(process_id: int) -> float:
+    """Processor time of another process, to the nanosecond: its clock, as clock_getcpuclockid names it on Linux."""
+    return time.clock_gettime((~process_id << 3) | 2)
+
+
+def report(measured: Sequence[Measured], names: tuple[str, str]) -> list[str]:
+    """Lines in Markdown."""
+    lines = [f"{len(measured)} photographs, {names[0]} and {names[1]} by turns (A B B A), medians in ms.", ""]
+    lines += ["| | before | after | ratio | 95 % |", "|---|---|---|---|---|"]
+    for what, times in {
+        "processor time": np.array([it.processor_s for it in measured]),
+        "time of a call": np.array([it.wall_s for it in measured]),
+    }.items():
+        a, b = 1e3 * np.median(times, axis=(0, 2))
+        ratio, low, high = ratio_with_interval(times.mean(axis=2))
+        lines.append(f"| {what} | {a:.1f} | {b:.1f} | {ratio:.3f} | {low:.3f} to {high:.3f} |")
+    apart = [it.apart_m for it in measured if it.apart_m is not None]
+    most = f", at most {max(apart):.2g} (unit of the scene) apart" if apart else ""
+    return [*lines, "", f"Localized by both: {len(apart)}{most}."]
+
+
+def ratio_with_interval(times: Array) -> tuple[float, float, float]:
+    """Geometric mean of after / before of times (N, 2), and its 95 % interval by bootstrap over the rows."""
+    logs = np.log(times[:, 1] / times[:, 0])
+    drawn = np.random.default_rng(0).integers(len(logs), size=(RESAMPLES, len(logs)))
+    low, high = np.quantile(logs[drawn].mean(axis=1), [0.025, 0.975])
+    return float(np.exp(logs.mean())), float(np.exp(low)), float(np.exp(high))
+
+
+if __name__ == "__main__":
+    typer.run(main)

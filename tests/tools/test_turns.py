@@ -1,0 +1,33 @@
+"""Two servers by turns: what is reported of their times."""
+
+from __future__ import annotations
+
+import os
+import time
+
+import numpy as np
+import pytest
+
+from mapless_tools.bench.turns import Measured, _processor_s, ratio_with_interval, report
+
+
+def test_a_planted_ratio_lies_in_its_interval() -> None:
+    random = np.random.default_rng(1)
+    before = random.uniform(0.1, 0.3, 40)
+    ratio, low, high = ratio_with_interval(np.stack([before, 0.8 * before * random.normal(1, 0.05, 40)], axis=1))
+    assert low < 0.8 < high
+    assert low < ratio < high
+    assert high - low < 0.05
+
+
+def test_a_rejected_photograph_counts_for_the_time_alone() -> None:
+    times = np.array([[0.2, 0.2], [0.1, 0.1]])
+    lines = report([Measured(times, times, 1e-9), Measured(times, times, None)], ("a", "b"))
+    assert "| processor time | 200.0 | 100.0 | 0.500 | 0.500 to 0.500 |" in lines
+    assert lines[-1] == "Localized by both: 1, at most 1e-09 (unit of the scene) apart."
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="needs Linux's clocks")
+def test_the_clock_of_a_process_is_its_own() -> None:
+    begin_s = _processor_s(os.getpid())
+    assert begin_s == pytest.approx(time.process_time(), abs=0.05)
