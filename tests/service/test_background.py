@@ -11,6 +11,7 @@ from pathlib import Path
 
 import grpc
 import pytest
+from support.messages import essence
 from support.planted_damage import damage
 from support.servers import listening
 from support.stores import Folder
@@ -57,10 +58,7 @@ def _answer(stub: LocalizationServiceStub, index: int) -> bytes:
     request = pb.LocalizeRequest(scene="scenes/room", image=photograph.data, intrinsics=intrinsics)
     request.options.include_debug = True
     request.options.ignore_calibration = True  # which is made at some time after the matches
-    answer = stub.Localize(request, timeout=60)
-    for field in ("request_id", "stages", "queue_duration", "total_duration"):
-        answer.diagnostics.ClearField(field)
-    return bytes(answer.SerializeToString(deterministic=True))
+    return essence(stub.Localize(request, timeout=60))
 
 
 @contextmanager

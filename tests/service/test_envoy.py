@@ -7,7 +7,7 @@ import ssl
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent import futures
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
@@ -25,6 +25,7 @@ from support.certificates import authority, signed
 from support.clients import hosted
 from support.documents import blocks
 from support.envoys import ENVOY, Gateway, configured, fetched, gateway, program
+from support.fronts import FAILING_CALLS, assert_fails_alike
 from support.postgres import shared_cluster
 from support.programs import gated
 from support.servers import CAMERA, PHOTO, RunningServer, localize_request, pose, serving
@@ -37,7 +38,6 @@ from mapless import (
     LocalizationResult,
     MaplessError,
     NewReference,
-    NotFound,
     ResourceExhausted,
     Unavailable,
     wire,
@@ -183,26 +183,11 @@ def channel_to(running: Gateway) -> Iterator[grpc.Channel]:
 # What callers get is the server's
 
 
-def failing_calls() -> dict[str, tuple[type[MaplessError], Callable[[Client], Any]]]:
-    return {
-        "unknown scene": (NotFound, lambda client: client.localize(PHOTO, CAMERA, "nowhere")),
-        "unknown reference": (NotFound, lambda client: client.localize(PHOTO, CAMERA, SCENES[0], ("r", "lost"))),
-        "bad image": (InvalidArgument, lambda client: client.localize(b"no image", CAMERA, SCENES[0])),
-        "bad camera": (InvalidArgument, lambda client: client.localize(PHOTO, replace(CAMERA, width_px=97), SCENES[0])),
-        "bad name": (InvalidArgument, lambda client: client.get_scene("no name")),
-    }
-
-
-@pytest.mark.parametrize("what", failing_calls())
+@pytest.mark.parametrize("what", FAILING_CALLS)
 def test_errors_pass_with_all_their_details(fleet: Fleet, what: str) -> None:
-    expected, call = failing_calls()[what]
-    with Client(fleet.servers[0].address) as direct, pytest.raises(expected) as here:
-        call(direct)
-    with pytest.raises(expected) as there:
-        call(fleet.client)
-    for name in ("code", "reason", "message", "field", "retry_after_s"):
-        assert getattr(there.value, name) == getattr(here.value, name)
-    assert len(there.value.request_id) == 36  # the gateway's own, by which its log and the server's go together
+    with Client(fleet.servers[0].address) as direct:
+        failure = assert_fails_alike(what, SCENES[0], direct, fleet.client)
+    assert len(failure.request_id) == 36  # the gateway's own, by which its log and the server's go together
 
 
 def test_a_refusal_has_a_retry_delay(url: str, fleet: Fleet, tmp_path: Path) -> None:

@@ -24,7 +24,9 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 from pydantic import SecretStr
 from support import corner
+from support.fronts import FAILING_CALLS, assert_fails_alike
 from support.images import encode
+from support.messages import essence
 from support.postgres import Cluster as Database
 from support.postgres import require
 from support.servers import CAMERA, PHOTO, localize_request, pose, serving
@@ -34,7 +36,6 @@ from mapless import (
     Client,
     ConnectOptions,
     DeadlineExceeded,
-    InvalidArgument,
     LocalizationResult,
     MaplessError,
     NewReference,
@@ -145,14 +146,6 @@ def answered_twice(address: str, request: bytes) -> tuple[bool, bytes]:
     return bool(coarse), essence(final.answer)
 
 
-def essence(answer: pb.LocalizeResponse) -> bytes:
-    """All of it that is not time or the call's own name."""
-    assert answer.diagnostics.request_id
-    for own in ("request_id", "stages", "queue_duration", "total_duration"):
-        answer.diagnostics.ClearField(own)
-    return bytes(answer.SerializeToString(deterministic=True))
-
-
 @pytest.mark.parametrize("make_place", [rendered, pytest.param(photographed, marks=nightly)])
 def test_answers_are_those_of_the_plain_server_bit_for_bit(
     url: str, real: Cluster, make_place: Callable[[], Place]
@@ -254,15 +247,6 @@ def who(client: Client, scene: str) -> int:
     return answer.inlier_count
 
 
-FAILING: dict[str, tuple[type[MaplessError], Callable[[Client], Any]]] = {
-    "unknown scene": (NotFound, lambda client: client.localize(PHOTO, CAMERA, "nowhere")),
-    "unknown reference": (NotFound, lambda client: client.localize(PHOTO, CAMERA, SCENES[0], ("r", "lost"))),
-    "bad image": (InvalidArgument, lambda client: client.localize(b"no image", CAMERA, SCENES[0])),
-    "bad camera": (InvalidArgument, lambda client: client.localize(PHOTO, replace(CAMERA, width_px=97), SCENES[0])),
-    "bad name": (InvalidArgument, lambda client: client.get_scene("no name")),
-}
-
-
 @nightly
 def test_errors_are_those_of_the_plain_server_with_details(url: str, guarded: Guarded, tmp_path: Path) -> None:
     with (
@@ -270,14 +254,8 @@ def test_errors_are_those_of_the_plain_server_with_details(url: str, guarded: Gu
         Client(plain.address, guarded.options()) as direct,
         guarded.client() as through,
     ):
-        for what, (expected, call) in FAILING.items():
-            with pytest.raises(expected) as here:
-                call(direct)
-            with pytest.raises(expected) as there:
-                call(through)
-            for name in ("code", "reason", "message", "field", "retry_after_s"):
-                assert getattr(there.value, name) == getattr(here.value, name), what
-            assert there.value.request_id
+        for failing in FAILING_CALLS:
+            assert_fails_alike(failing, SCENES[0], direct, through)
 
 
 @nightly

@@ -7,6 +7,8 @@ from typing import Any
 
 from google.protobuf.message import Message
 
+from mapless.v1 import localization_service_pb2 as pb
+
 
 def set_field(message: Message, path: str, value: Any) -> None:
     """Sets one: a number or bytes, a message that is copied, a list that is appended, or None, which clears it."""
@@ -22,3 +24,14 @@ def set_field(message: Message, path: str, value: Any) -> None:
         getattr(target, last).extend(value)
     else:
         setattr(target, last, value)
+
+
+def essence(answer: pb.LocalizeResponse, with_stages: bool = False) -> bytes:
+    """All of an answer but its times and the name of the call; with the names of its stages where that is asked for."""
+    kept = pb.LocalizeResponse()
+    kept.CopyFrom(answer)
+    for name in ("request_id", "queue_duration", "total_duration", *([] if with_stages else ["stages"])):
+        kept.diagnostics.ClearField(name)
+    for stage in kept.diagnostics.stages:
+        stage.ClearField("duration")
+    return bytes(kept.SerializeToString(deterministic=True))
