@@ -1,8 +1,10 @@
-// Where a photograph was taken, for Unity: one call, axes and stale answers taken care of. See the README beside this.
+// Where a photograph was taken, for Unity: every call of the interface; axes and stale answers are taken care of. See
+// the README beside this.
 //
 // Needs Google.Protobuf, Grpc.Net.Client and YetAnotherHttpHandler, and the messages that protoc makes of mapless's protos.
 
 using System;
+using System.Collections.Generic;
 using System.Net.Http;
 using System.Threading;
 using System.Threading.Tasks;
@@ -62,15 +64,54 @@ namespace Mapless
     /// <summary>A connection to a mapless server. Use one for all calls, from any thread.</summary>
     public sealed class MaplessClient : IDisposable
     {
+        private const string LocalizationService = "mapless.v1.LocalizationService";
+        private const string ReferenceService = "mapless.v1.ReferenceService";
+
         // What a generated stub would hold; by hand it takes no gRPC plugin for protoc.
         private static readonly Method<LocalizeRequest, LocalizeResponse> LocalizeMethod =
-            new Method<LocalizeRequest, LocalizeResponse>(
-                MethodType.Unary,
-                "mapless.v1.LocalizationService",
-                "Localize",
-                Marshallers.Create(message => message.ToByteArray(), LocalizeRequest.Parser.ParseFrom),
-                Marshallers.Create(message => message.ToByteArray(), LocalizeResponse.Parser.ParseFrom));
+            MethodOf(LocalizationService, "Localize", LocalizeRequest.Parser, LocalizeResponse.Parser);
+        private static readonly Method<LocalizeRigRequest, LocalizeRigResponse> LocalizeRigMethod =
+            MethodOf(LocalizationService, "LocalizeRig", LocalizeRigRequest.Parser, LocalizeRigResponse.Parser);
+        private static readonly Method<LocalizeSequenceRequest, LocalizeSequenceResponse> LocalizeSequenceMethod =
+            MethodOf(LocalizationService, "LocalizeSequence", LocalizeSequenceRequest.Parser, LocalizeSequenceResponse.Parser);
+        private static readonly Method<CreateSceneRequest, CreateSceneResponse> CreateSceneMethod =
+            MethodOf(ReferenceService, "CreateScene", CreateSceneRequest.Parser, CreateSceneResponse.Parser);
+        private static readonly Method<GetSceneRequest, GetSceneResponse> GetSceneMethod =
+            MethodOf(ReferenceService, "GetScene", GetSceneRequest.Parser, GetSceneResponse.Parser);
+        private static readonly Method<UpdateSceneRequest, UpdateSceneResponse> UpdateSceneMethod =
+            MethodOf(ReferenceService, "UpdateScene", UpdateSceneRequest.Parser, UpdateSceneResponse.Parser);
+        private static readonly Method<ListScenesRequest, ListScenesResponse> ListScenesMethod =
+            MethodOf(ReferenceService, "ListScenes", ListScenesRequest.Parser, ListScenesResponse.Parser);
+        private static readonly Method<DeleteSceneRequest, DeleteSceneResponse> DeleteSceneMethod =
+            MethodOf(ReferenceService, "DeleteScene", DeleteSceneRequest.Parser, DeleteSceneResponse.Parser);
+        private static readonly Method<CreateReferenceRequest, CreateReferenceResponse> CreateReferenceMethod =
+            MethodOf(ReferenceService, "CreateReference", CreateReferenceRequest.Parser, CreateReferenceResponse.Parser);
+        private static readonly Method<BatchCreateReferencesRequest, BatchCreateReferencesResponse> BatchCreateReferencesMethod =
+            MethodOf(ReferenceService, "BatchCreateReferences", BatchCreateReferencesRequest.Parser, BatchCreateReferencesResponse.Parser);
+        private static readonly Method<GetReferenceRequest, GetReferenceResponse> GetReferenceMethod =
+            MethodOf(ReferenceService, "GetReference", GetReferenceRequest.Parser, GetReferenceResponse.Parser);
+        private static readonly Method<ListReferencesRequest, ListReferencesResponse> ListReferencesMethod =
+            MethodOf(ReferenceService, "ListReferences", ListReferencesRequest.Parser, ListReferencesResponse.Parser);
+        private static readonly Method<DeleteReferenceRequest, DeleteReferenceResponse> DeleteReferenceMethod =
+            MethodOf(ReferenceService, "DeleteReference", DeleteReferenceRequest.Parser, DeleteReferenceResponse.Parser);
+        private static readonly Method<RetrieveReferencesRequest, RetrieveReferencesResponse> RetrieveReferencesMethod =
+            MethodOf(ReferenceService, "RetrieveReferences", RetrieveReferencesRequest.Parser, RetrieveReferencesResponse.Parser);
+        private static readonly Method<AuditSceneRequest, AuditSceneResponse> AuditSceneMethod =
+            MethodOf(ReferenceService, "AuditScene", AuditSceneRequest.Parser, AuditSceneResponse.Parser);
+        private static readonly Method<CheckCoverageRequest, CheckCoverageResponse> CheckCoverageMethod =
+            MethodOf(ReferenceService, "CheckCoverage", CheckCoverageRequest.Parser, CheckCoverageResponse.Parser);
+        private static readonly Method<LocalizeRequest, LocalizeProgressivelyResponse> LocalizeProgressivelyMethod =
+            MethodOf(
+                LocalizationService, "LocalizeProgressively", LocalizeRequest.Parser, LocalizeProgressivelyResponse.Parser,
+                MethodType.ServerStreaming);
+        // grpc.health.v1 in messages that Protobuf has: a text in field 1, and a number in field 1 of the answer.
+        private static readonly Method<StringValue, UInt32Value> CheckMethod =
+            MethodOf("grpc.health.v1.Health", "Check", StringValue.Parser, UInt32Value.Parser);
 
+        private const uint Serving = 1;
+        private const int PageSize = 1000;
+        private const int BatchCount = 32;
+        private const int BatchBytes = 8 * 1024 * 1024;
         private const int MaxMessageBytes = 32 * 1024 * 1024;
 
         private readonly GrpcChannel channel;
@@ -134,17 +175,252 @@ namespace Mapless
                 SessionFromCamera = ToMessage(sensorPose),
                 Options = new LocalizeOptions { Axes = Axes.Unity },
             };
-            // By the scene, a load balancer finds the server that has it in memory.
-            var ofCall = new Metadata { { "x-mapless-scene", scene } };
+            return new MaplessAnswer(await LocalizeAsync(request, timeout, cancellation).ConfigureAwait(true));
+        }
+
+        /// <summary>
+        /// As LocalizeAsync, with all options of the request: priors, references, several axes. The calls below are likewise those
+        /// of the interface, whose comments say what their messages mean. All throw RpcException.
+        /// </summary>
+        public Task<LocalizeResponse> LocalizeAsync(
+            LocalizeRequest request, TimeSpan timeout, CancellationToken cancellation = default)
+        {
+            return CallAsync(LocalizeMethod, request, request.Scene, timeout, cancellation);
+        }
+
+        /// <summary>As LocalizeAsync; a coarse pose may come before the answer, in the caller's context.</summary>
+        public async Task<LocalizeResponse> LocalizeProgressivelyAsync(
+            LocalizeRequest request,
+            Action<MaplessAnswer> onCoarse,
+            TimeSpan timeout,
+            CancellationToken cancellation = default)
+        {
+            CallOptions options = OptionsOf(request.Scene, timeout, cancellation);
+            using (var call = invoker.AsyncServerStreamingCall(LocalizeProgressivelyMethod, null, options, request))
+            {
+                while (await call.ResponseStream.MoveNext(cancellation).ConfigureAwait(true))
+                {
+                    LocalizeProgressivelyResponse message = call.ResponseStream.Current;
+                    if (message.IsFinal)
+                    {
+                        return message.Answer;
+                    }
+                    onCoarse?.Invoke(new MaplessAnswer(message.Answer));
+                }
+            }
+            throw new RpcException(new Status(StatusCode.Internal, "the stream ended before the answer"));
+        }
+
+        /// <summary>Photographs of several cameras of one moment.</summary>
+        public Task<LocalizeRigResponse> LocalizeRigAsync(
+            LocalizeRigRequest request, TimeSpan timeout, CancellationToken cancellation = default)
+        {
+            return CallAsync(LocalizeRigMethod, request, request.Scene, timeout, cancellation);
+        }
+
+        /// <summary>Photographs of a walk, with tracked poses.</summary>
+        public Task<LocalizeSequenceResponse> LocalizeSequenceAsync(
+            LocalizeSequenceRequest request, TimeSpan timeout, CancellationToken cancellation = default)
+        {
+            return CallAsync(LocalizeSequenceMethod, request, request.Scene, timeout, cancellation);
+        }
+
+        /// <summary>Whether the server takes calls; false while it starts or drains.</summary>
+        public async Task<bool> IsServingAsync(TimeSpan timeout, CancellationToken cancellation = default)
+        {
+            var answer = await CallAsync(CheckMethod, new StringValue(), null, timeout, cancellation).ConfigureAwait(true);
+            return answer.Value == Serving;
+        }
+
+        /// <summary>Creates a scene.</summary>
+        public async Task<Scene> CreateSceneAsync(
+            CreateSceneRequest request, TimeSpan timeout, CancellationToken cancellation = default)
+        {
+            string scene = "scenes/" + request.SceneId;
+            return (await CallAsync(CreateSceneMethod, request, scene, timeout, cancellation).ConfigureAwait(true)).Scene;
+        }
+
+        /// <summary>A scene, "scenes/hall".</summary>
+        public async Task<Scene> GetSceneAsync(string scene, TimeSpan timeout, CancellationToken cancellation = default)
+        {
+            var request = new GetSceneRequest { Name = scene };
+            return (await CallAsync(GetSceneMethod, request, scene, timeout, cancellation).ConfigureAwait(true)).Scene;
+        }
+
+        /// <summary>Changes properties of a scene; the answer has what contradicts them.</summary>
+        public Task<UpdateSceneResponse> UpdateSceneAsync(
+            UpdateSceneRequest request, TimeSpan timeout, CancellationToken cancellation = default)
+        {
+            return CallAsync(UpdateSceneMethod, request, request.Scene.Name, timeout, cancellation);
+        }
+
+        /// <summary>All scenes; the timeout is that of each page.</summary>
+        public async Task<List<Scene>> ListScenesAsync(TimeSpan timeout, CancellationToken cancellation = default)
+        {
+            var scenes = new List<Scene>();
+            var request = new ListScenesRequest { PageSize = PageSize };
+            do
+            {
+                var page = await CallAsync(ListScenesMethod, request, null, timeout, cancellation).ConfigureAwait(true);
+                scenes.AddRange(page.Scenes);
+                request.PageToken = page.NextPageToken;
+            }
+            while (request.PageToken.Length > 0);
+            return scenes;
+        }
+
+        /// <summary>Deletes a scene and its references.</summary>
+        public Task DeleteSceneAsync(string scene, TimeSpan timeout, CancellationToken cancellation = default)
+        {
+            var request = new DeleteSceneRequest { Name = scene };
+            return CallAsync(DeleteSceneMethod, request, scene, timeout, cancellation);
+        }
+
+        /// <summary>Stores a photograph with its intrinsics and pose.</summary>
+        public Task<CreateReferenceResponse> CreateReferenceAsync(
+            CreateReferenceRequest request, TimeSpan timeout, CancellationToken cancellation = default)
+        {
+            return CallAsync(CreateReferenceMethod, request, request.Scene, timeout, cancellation);
+        }
+
+        /// <summary>Stores many, in messages of about 8 MB; each is stored whole or not at all.</summary>
+        /// <param name="scene">"scenes/hall".</param>
+        /// <param name="references">Without their scene.</param>
+        /// <param name="timeout">Of each message: its features are computed before it returns; minutes.</param>
+        /// <param name="onProgress">Gets the number stored so far.</param>
+        /// <param name="cancellation">Ends it; what is stored remains.</param>
+        public async Task<List<Reference>> AddReferencesAsync(
+            string scene,
+            IEnumerable<CreateReferenceRequest> references,
+            TimeSpan timeout,
+            Action<int> onProgress = null,
+            CancellationToken cancellation = default)
+        {
+            var stored = new List<Reference>();
+            var batch = new BatchCreateReferencesRequest { Scene = scene };
+            var left = new Queue<CreateReferenceRequest>(references);
+            while (left.Count > 0)
+            {
+                batch.Requests.Add(left.Dequeue());
+                bool isFull = left.Count == 0 || batch.Requests.Count == BatchCount
+                    || batch.CalculateSize() + left.Peek().CalculateSize() > BatchBytes;
+                if (isFull)
+                {
+                    var done = await CallAsync(BatchCreateReferencesMethod, batch, scene, timeout, cancellation)
+                        .ConfigureAwait(true);
+                    stored.AddRange(done.References);
+                    onProgress?.Invoke(stored.Count);
+                    batch.Requests.Clear();
+                }
+            }
+            return stored;
+        }
+
+        /// <summary>A reference, "scenes/hall/references/a".</summary>
+        public async Task<Reference> GetReferenceAsync(
+            string reference, bool includeImage, TimeSpan timeout, CancellationToken cancellation = default)
+        {
+            var request = new GetReferenceRequest { Name = reference, IncludeImage = includeImage };
+            var answer = await CallAsync(GetReferenceMethod, request, SceneOf(reference), timeout, cancellation)
+                .ConfigureAwait(true);
+            return answer.Reference;
+        }
+
+        /// <summary>All references of a scene, without photographs; the timeout is that of each page.</summary>
+        public async Task<List<Reference>> ListReferencesAsync(
+            string scene, TimeSpan timeout, CancellationToken cancellation = default)
+        {
+            var references = new List<Reference>();
+            var request = new ListReferencesRequest { Scene = scene, PageSize = PageSize };
+            do
+            {
+                var page = await CallAsync(ListReferencesMethod, request, scene, timeout, cancellation).ConfigureAwait(true);
+                references.AddRange(page.References);
+                request.PageToken = page.NextPageToken;
+            }
+            while (request.PageToken.Length > 0);
+            return references;
+        }
+
+        /// <summary>Deletes a reference.</summary>
+        public Task DeleteReferenceAsync(string reference, TimeSpan timeout, CancellationToken cancellation = default)
+        {
+            var request = new DeleteReferenceRequest { Name = reference };
+            return CallAsync(DeleteReferenceMethod, request, SceneOf(reference), timeout, cancellation);
+        }
+
+        /// <summary>The references that a photograph resembles.</summary>
+        public Task<RetrieveReferencesResponse> RetrieveReferencesAsync(
+            RetrieveReferencesRequest request, TimeSpan timeout, CancellationToken cancellation = default)
+        {
+            return CallAsync(RetrieveReferencesMethod, request, request.Scene, timeout, cancellation);
+        }
+
+        /// <summary>One page of an audit; NextPageToken of the answer is for the next request.</summary>
+        public Task<AuditSceneResponse> AuditSceneAsync(
+            AuditSceneRequest request, TimeSpan timeout, CancellationToken cancellation = default)
+        {
+            return CallAsync(AuditSceneMethod, request, request.Scene, timeout, cancellation);
+        }
+
+        /// <summary>Whether a photograph at a pose would be localized.</summary>
+        public Task<CheckCoverageResponse> CheckCoverageAsync(
+            CheckCoverageRequest request, TimeSpan timeout, CancellationToken cancellation = default)
+        {
+            return CallAsync(CheckCoverageMethod, request, request.Scene, timeout, cancellation);
+        }
+
+        private async Task<TResponse> CallAsync<TRequest, TResponse>(
+            Method<TRequest, TResponse> method,
+            TRequest request,
+            string scene,
+            TimeSpan timeout,
+            CancellationToken cancellation)
+            where TRequest : class
+            where TResponse : class
+        {
+            CallOptions options = OptionsOf(scene, timeout, cancellation);
+            using (var call = invoker.AsyncUnaryCall(method, null, options, request))
+            {
+                return await call.ResponseAsync.ConfigureAwait(true);
+            }
+        }
+
+        private CallOptions OptionsOf(string scene, TimeSpan timeout, CancellationToken cancellation)
+        {
+            var ofCall = new Metadata();
+            if (!string.IsNullOrEmpty(scene))
+            {
+                ofCall.Add("x-mapless-scene", scene); // by it, a load balancer finds the server that has it in memory
+            }
             foreach (Metadata.Entry header in headers)
             {
                 ofCall.Add(header);
             }
-            var options = new CallOptions(ofCall, DateTime.UtcNow + timeout, cancellation);
-            using (var call = invoker.AsyncUnaryCall(LocalizeMethod, null, options, request))
-            {
-                return new MaplessAnswer(await call.ResponseAsync.ConfigureAwait(true));
-            }
+            return new CallOptions(ofCall, DateTime.UtcNow + timeout, cancellation);
+        }
+
+        private static string SceneOf(string reference)
+        {
+            int end = reference.IndexOf("/references/", StringComparison.Ordinal);
+            return end < 0 ? null : reference.Substring(0, end);
+        }
+
+        private static Method<TRequest, TResponse> MethodOf<TRequest, TResponse>(
+            string service,
+            string name,
+            MessageParser<TRequest> requests,
+            MessageParser<TResponse> responses,
+            MethodType type = MethodType.Unary)
+            where TRequest : class, IMessage<TRequest>
+            where TResponse : class, IMessage<TResponse>
+        {
+            return new Method<TRequest, TResponse>(
+                type,
+                service,
+                name,
+                Marshallers.Create(message => message.ToByteArray(), requests.ParseFrom),
+                Marshallers.Create(message => message.ToByteArray(), responses.ParseFrom));
         }
 
         /// <summary>

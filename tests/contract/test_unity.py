@@ -1,4 +1,4 @@
-"""The C# for Unity names fields, enum values and the method as the protos have them."""
+"""The C# for Unity names fields, enum values and methods as the protos have them, and has all but one of these."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from mapless.v1 import geometry_pb2, localization_service_pb2
+from mapless.v1 import geometry_pb2, localization_service_pb2, reference_service_pb2
 
 ROOT = Path(__file__).parents[2]
 UNITY = ROOT / "client" / "unity"
 SOURCE = (UNITY / "MaplessClient.cs").read_text()
-MODULES: tuple[Any, ...] = (geometry_pb2, localization_service_pb2)
+MODULES: tuple[Any, ...] = (geometry_pb2, localization_service_pb2, reference_service_pb2)
 MESSAGES = {name: it for module in MODULES for name, it in module.DESCRIPTOR.message_types_by_name.items()}
 
 
@@ -52,11 +52,28 @@ def test_what_is_read_exists() -> None:
             message = field.message_type
 
 
-def test_the_method_and_the_axes_exist() -> None:
-    service, method = re.findall(r'MethodType\.Unary,\s*"([\w.]+)",\s*"(\w+)"', SOURCE)[0]
-    found = localization_service_pb2.DESCRIPTOR.services_by_name["LocalizationService"]
-    assert service == found.full_name
-    assert found.methods_by_name[method].input_type.name == "LocalizeRequest"
+def test_every_method_but_the_viewers_is_called() -> None:
+    """Each is written out with the types of its request and answer."""
+    declared = r"Method<(\w+), (\w+)> (\w+)Method =\s+"
+    made = r"MethodOf\(\s*(\w+Service), \"(\w+)\",\s+(\w+)\.Parser, (\w+)\.Parser"
+    written = re.findall(declared + made, SOURCE)
+    found = set()
+    for request, answer, constant, service, method, *parsers in written:
+        assert (constant, parsers) == (method, [request, answer])
+        found.add((service, method, request, answer))
+    expected = {
+        (service.name, it.name, it.input_type.name, it.output_type.name)
+        for module in MODULES
+        for service in module.DESCRIPTOR.services_by_name.values()
+        for it in service.methods
+    }
+    assert expected - found == {("LocalizationService", "WatchQueries", "WatchQueriesRequest", "WatchQueriesResponse")}
+    assert found <= expected
+    for _, method, _, _ in found:
+        assert re.search(rf"(CallAsync|AsyncServerStreamingCall)\({method}Method", SOURCE), method
+
+
+def test_the_axes_exist() -> None:
     (axes,) = re.findall(r"Axes = Axes\.(\w+)", SOURCE)
     known: Any = localization_service_pb2.Axes
     assert f"AXES_{axes.upper()}" in {*known.keys()}
