@@ -6,17 +6,18 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import grpc
 import pytest
 from support.certificates import authority, signed
-from support.clients import failing, status
+from support.clients import hosted
 from support.compilers import needs, run
-from support.servers import PHOTO, make_scene, serving
+from support.servers import PHOTO, make_scene, pose, serving
 
-from mapless import Client
+from mapless import Client, wire
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.security import create_token
 
@@ -97,15 +98,38 @@ def test_the_cpp_example_with_tls_and_a_token(localize: Callable[..., tuple[int,
         assert localize(server.address, MAPLESS_TOKEN=token)[1].startswith("the server cannot be reached: ")
 
 
+class Newer(grpc.GenericRpcHandler):
+    """Away twice; then a coarse pose, and an answer with a value and a field that are newer than the client."""
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+
+    def service(self, details: Any) -> Any:
+        self.calls.append(details.method)
+        return grpc.unary_stream_rpc_method_handler(self.answers)
+
+    def answers(self, _: bytes, context: Any) -> Iterator[bytes]:
+        if len(self.calls) < 3:
+            context.abort(grpc.StatusCode.UNAVAILABLE, "away")
+        coarse = pb.LocalizeResponse(
+            localization=pb.Localization(world_from_camera=wire.transform_to_message(pose(4.0)))
+        )
+        yield pb.LocalizeProgressivelyResponse(answer=coarse).SerializeToString()
+        rejection = pb.Rejection(message="of tomorrow", reason=77)  # type: ignore[arg-type]
+        answer = pb.LocalizeResponse(rejection=rejection).SerializeToString() + b"\xf2\x3f\x03new"  # field 1022
+        yield b"\x0a" + bytes([len(answer)]) + answer + b"\x10\x01"
+
+
 @nightly
 def test_the_cpp_client_repeats_and_reads_newer_answers(localize: Callable[..., tuple[int, str]]) -> None:
-    """A server is away twice and then answers with a value and a field that are newer than the client's protos."""
-    rejection = pb.Rejection(message="of tomorrow", reason=77)  # type: ignore[arg-type]
-    answer = pb.LocalizeResponse(rejection=rejection).SerializeToString() + b"\xf2\x3f\x03new"  # field 1022
-    progressive = pb.LocalizeProgressivelyResponse.FromString(b"\x0a" + bytes([len(answer)]) + answer + b"\x10\x01")
-    with failing([status("UNAVAILABLE")] * 2, lambda *_: progressive.SerializeToString(), False) as (address, server):
-        assert localize(address) == (3, "not localized: 77: of tomorrow\n")
-    assert server.methods == ["LocalizeProgressively"] * 3
+    handler = Newer()
+    with hosted(handler) as address:
+        code, printed = localize(address)
+    first, position, _, last = printed.splitlines()
+    assert (code, first) == (3, "coarse pose, the refined one follows")
+    assert position.startswith("position  4.000 2.000 -1.000 m")
+    assert last == "not localized: 77: of tomorrow"
+    assert handler.calls == ["/mapless.v1.LocalizationService/LocalizeProgressively"] * 3
 
 
 def test_the_cpp_client_has_the_packages_version() -> None:
