@@ -21,7 +21,7 @@ from pydantic import (
     model_validator,
 )
 
-from mapless_server.method.choices import AUTO, BACKENDS, BEST_VARIANTS, FEATURES
+from mapless_server.method.choices import AUTO, BACKENDS, BEST_VARIANTS, FEATURES, NETWORKS, OFF, STORED
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -79,6 +79,8 @@ class Settings(BaseModel):
     """Device of networks: auto, cpu, cuda or cuda:N."""
     weights_dir: Path = Field(default_factory=default_weights_dir)
     """Folder of the networks' weights."""
+    reference_depth: str = Field(default=OFF, json_schema_extra={"enum": [OFF, STORED, *NETWORKS]})
+    """Depth kept with references, for the backend geometric: off, stored (made by other servers), or a network."""
     compiled_views: int = Field(default=0, ge=0, le=65)
     """Photographs of a query, itself included, that a network is compiled for at the start, at least 3; 0: none."""
     query_rays: bool = True
@@ -158,7 +160,7 @@ class Settings(BaseModel):
     log_format: Literal["json", "text"] = "json"
     """One JSON object a line, or plain text."""
 
-    @field_validator("backend", "features", "retrieval")
+    @field_validator("backend", "features", "retrieval", "reference_depth")
     @classmethod
     def _check_choice(cls, value: str, info: ValidationInfo) -> str:
         allowed = allowed_words(str(info.field_name))

@@ -36,10 +36,12 @@ class Tier:
         extractor: finds them.
         pipeline: its matcher caches matches of these features, so no other tier may have the same one. Tiers may
             share a reconstructor.
+        uses_depths: whether its references come with the depths that are kept with them.
     """
 
     extractor: FeatureExtractor
     pipeline: Pipeline
+    uses_depths: bool = False
 
     @property
     def features(self) -> str:
@@ -54,7 +56,8 @@ class Tier:
     @property
     def kind(self) -> str:
         """Of its answers, see `calibration_kind`."""
-        return calibration_kind(self.features, self.backend, __version__)
+        backend = f"{self.backend}+depth" if self.uses_depths else self.backend
+        return calibration_kind(self.features, backend, __version__)
 
     @property
     def weights_sha256(self) -> str:

@@ -16,6 +16,7 @@ intrinsics                   errors of the query's intrinsics, and the evidence 
 results                      scale, structure, matches, pose estimate and its support: data between stages
 scale_equations, scale       metric scale, initial pose
 observations, structure      metric points
+kept_depth                   (ours) points from depths that are kept with the references
 match                        2D-3D matches of the query
 pnp                          pose and inliers
 resection                    pose and focal length from fixed points

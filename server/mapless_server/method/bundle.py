@@ -27,7 +27,7 @@ from .arrays import apply_columns, columns, symmetric_products, take
 from .observations import Observations
 from .optimize import cauchy_cost, cauchy_weight, solve_step
 from .priors.known import NO_PRIORS, Priors
-from .results import Structure
+from .results import DepthPlanes, Structure
 from .structure import observe
 from .tracks import Tracks
 from .views import PosedView
@@ -111,6 +111,8 @@ class BundleProblem:
             standard deviations; I = 0 if they are no unknowns.
         intrinsics_information: (I,) inverse variances of the prior on these errors.
         intrinsics_offset: (I,) errors of the intrinsics that are removed already; the prior's mean is minus these.
+        planes: near which the points lie by kept depths, at the references' given poses: that these move by millimetres
+            does not matter to depths known to centimetres.
     """
 
     observations: Observations
@@ -123,11 +125,13 @@ class BundleProblem:
     keypoint_motion: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))
     intrinsics_information: Array = field(default_factory=lambda: np.zeros(0))
     intrinsics_offset: Array = field(default_factory=lambda: np.zeros(0))
+    planes: DepthPlanes | None = None
 
     @cached_property
     def by_view(self) -> ViewColumns:
         """The observations sorted by view, in columns."""
-        return ViewColumns.of(self.observations, self.view, len(self.given.rotation) + 1, self.keypoint_motion)
+        view_count = len(self.given.rotation) + 1
+        return ViewColumns.of(self.observations, self.view, view_count, self.keypoint_motion, self.planes)
 
     @property
     def query_rows(self) -> slice:
@@ -149,6 +153,8 @@ class BundleProblem:
             prior += float(self.intrinsics_information @ (bundle.intrinsics + self.intrinsics_offset) ** 2)
         if self.priors:
             prior += self.prior_weight * self.priors.cost(bundle.world_from_query)
+        if self.by_view.planes is not None:
+            prior += self.by_view.planes.cost(bundle.points)
         return cauchy_cost(squared, self.loss_scale_sigma) + prior
 
     def linearize(self, bundle: Bundle) -> NormalEquations:
@@ -197,6 +203,7 @@ class ViewColumns:
         focal, offset: (2, O) as in `observations.Columns`.
         sums: (P, O): a product with it sums over the observations of each point.
         by_intrinsics: (2, I, O_q) derivative of the last view's residuals by errors of its intrinsics.
+        planes: of the points, if any have kept depths.
     """
 
     point: NDArray[np.intp]
@@ -206,10 +213,17 @@ class ViewColumns:
     offset: Array
     sums: Any
     by_intrinsics: Array
+    planes: DepthPlanes | None = None
 
     @staticmethod
-    def of(observations: Observations, view: NDArray[np.intp], view_count: int, keypoint_motion: Array) -> ViewColumns:
-        """From rows and the view (O,) of each; `keypoint_motion` as in BundleProblem."""
+    def of(
+        observations: Observations,
+        view: NDArray[np.intp],
+        view_count: int,
+        keypoint_motion: Array,
+        planes: DepthPlanes | None = None,
+    ) -> ViewColumns:
+        """From rows and the view (O,) of each; `keypoint_motion` and `planes` as in BundleProblem."""
         order = np.argsort(view, kind="stable")
         sigma_px = observations.sigma_px[order, None]
         return ViewColumns._sorted(
@@ -219,6 +233,7 @@ class ViewColumns:
             columns((observations.principal_px - observations.pixel)[order] / sigma_px),
             np.ascontiguousarray(np.moveaxis(keypoint_motion, 0, 2)),
             view_count,
+            planes,
         )
 
     @staticmethod
@@ -229,12 +244,14 @@ class ViewColumns:
         offset: Array,
         by_intrinsics: Array,
         view_count: int,
+        planes: DepthPlanes | None,
     ) -> ViewColumns:
         """From columns that are sorted by view."""
         parts = itertools.pairwise(np.searchsorted(view, np.arange(view_count + 1)).tolist())
         count = len(point)
         sums = csr_array((np.ones(count), (point, np.arange(count))), shape=(int(point.max(initial=-1)) + 1, count))
-        return ViewColumns(point, view, tuple(slice(*part) for part in parts), focal, offset, sums, by_intrinsics)
+        slices = tuple(slice(*part) for part in parts)
+        return ViewColumns(point, view, slices, focal, offset, sums, by_intrinsics, planes)
 
     def of_points(self, chosen: NDArray[np.bool_]) -> ViewColumns:
         """The observations of some of the points (P,), which are numbered anew."""
@@ -244,7 +261,7 @@ class ViewColumns:
             self.by_intrinsics[:, :, kept[self.parts[-1]]] if self.by_intrinsics.size else self.by_intrinsics
         )
         columns = self.focal[:, kept], self.offset[:, kept], by_intrinsics
-        return ViewColumns._sorted(point, view, *columns, len(self.parts))
+        return ViewColumns._sorted(point, view, *columns, len(self.parts), self.planes and self.planes[chosen])
 
     def in_camera(self, poses: Poses, x_in_world: Array) -> Array:
         """(3, O) in the cameras' frames, from points (3, P)."""
@@ -296,14 +313,19 @@ class ViewColumns:
                 weighted_x, weighted_y = np.concatenate([weighted_pose[:, :, part], weighted_intrinsics], axis=1)
             blocks.append(weighted_x @ x.T + weighted_y @ y.T)
             gradients.append(weighted_x @ residual[0, part] + weighted_y @ residual[1, part])
-        point_block = symmetric_products(weighted_point, by_point)
-        point_gradient = (weighted_point * residual[:, None]).sum(axis=0)
+        point_block = np.stack([self.sums @ row for row in symmetric_products(weighted_point, by_point)])
+        point_gradient = np.stack([self.sums @ row for row in (weighted_point * residual[:, None]).sum(axis=0)])
+        if self.planes is not None:
+            normal = self.planes.normal.T
+            weighted = normal * self.planes.information
+            point_block += symmetric_products(weighted[None], normal[None])
+            point_gradient += weighted * self.planes.distance(bundle.points)
         return NormalEquations(
             self,
             block_diag(*blocks),
             np.concatenate(gradients),
-            np.stack([self.sums @ row for row in point_block]),
-            np.stack([self.sums @ row for row in point_gradient]),
+            point_block,
+            point_gradient,
             np.einsum("kao,kbo->abo", weighted_pose, by_point),
             np.einsum("kao,kbo->abo", weighted_intrinsics, by_point[:, :, last])
             if self.by_intrinsics.size

@@ -16,6 +16,9 @@ use. `auto` looks for them in this order: the paper's method and figures are pi^
 
 BACKENDS = ("geometric", *NETWORKS)
 
+OFF, STORED = "off", "stored"
+"""Settings of the depth kept with references: none is made or used; that is used which other servers make."""
+
 AUTO = "auto"
 """The setting that chooses by device and weights."""
 

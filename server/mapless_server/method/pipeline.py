@@ -18,6 +18,7 @@ from .answer import Answer, Localization, shifted
 from .coarse import Bucket, Outcome, Reconstructor, Request, reconstruct_one
 from .coarse.geometric import GeometricReconstructor
 from .correspond import Correspondences, Matcher
+from .kept_depth import with_kept_depths
 from .match import PAPER_MATCH, MatchOptions, match_points
 from .one_reference import OneReferenceOptions
 from .options import LocalizeOptions, StageContext, Variant
@@ -319,6 +320,8 @@ def structure_and_matches(coarse: Coarse, scale: MetricScale) -> tuple[Structure
     references, correspondences = prepared.references, prepared.correspondences
     with prepared.context.stage("structure"):
         structure = build_structure(reconstruction, scale, references, correspondences, prepared.structure_options)
+        if prepared.options.variant is Variant.BEST:
+            structure = with_kept_depths(structure, references, correspondences)
     with prepared.context.stage("match"):
         initial, options = scale.world_from_query, prepared.match_options
         prior_pose = prepared.priors.pose.world_from_camera if prepared.priors.pose else None

@@ -86,7 +86,8 @@ def pose_problem(
     observations, start, depth_m = bundle_of(tracks, views, structure, chosen)
     given = start.poses[:-1]
     free = np.zeros((6 * len(references),) * 2)
-    problem = BundleProblem(observations, tracks.view, given, free, options.loss_scale_sigma)
+    planes = structure.planes[chosen] if structure.planes is not None else None
+    problem = BundleProblem(observations, tracks.view, given, free, options.loss_scale_sigma, planes=planes)
     centres = np.array([it.world_from_camera.translation for it in references])
     observing = np.unique(tracks.view)[:-1]  # the last is the query
     focal_px = float(np.median([references[i].view.camera.focal_x_px for i in observing]))

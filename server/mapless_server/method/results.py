@@ -85,6 +85,37 @@ class KeypointNoise:
 
 
 @dataclass(frozen=True, eq=False)
+class DepthPlanes:
+    """What kept depths say of P points: each lies near a plane, normal . x = offset.
+
+    Attributes:
+        normal: (P, 3) unit vectors, world.
+        offset: (P,) metres.
+        information: (P,) inverse variance of the distance from the plane; 0 where nothing is known.
+    """
+
+    normal: Array
+    offset: Array
+    information: Array
+
+    def __getitem__(self, points: NDArray[np.bool_] | NDArray[np.intp]) -> DepthPlanes:
+        return DepthPlanes(self.normal[points], self.offset[points], self.information[points])
+
+    def and_last(self, others: DepthPlanes) -> DepthPlanes:
+        """With those of further points."""
+        pairs = ((getattr(self, name), getattr(others, name)) for name in ("normal", "offset", "information"))
+        return DepthPlanes(*map(np.concatenate, pairs))
+
+    def cost(self, x_in_world: Array) -> float:
+        """Sum over the points (P, 3) of their squared distances, in standard deviations."""
+        return float(self.information @ self.distance(x_in_world) ** 2)
+
+    def distance(self, x_in_world: Array) -> Array:
+        """(P,) of points (P, 3) beyond their planes."""
+        return np.asarray((self.normal * x_in_world).sum(axis=1) - self.offset)
+
+
+@dataclass(frozen=True, eq=False)
 class Structure:
     """Points and their tracks.
 
@@ -92,11 +123,20 @@ class Structure:
         x_in_world: (P, 3) metres.
         tracks: observations of these points by the references, in the order of the points.
         noise: noise of the keypoints, estimated from the residuals.
+        planes: of the points, where references have kept depths; points that a single reference observes are last.
     """
 
     x_in_world: Array
     tracks: Tracks
     noise: KeypointNoise
+    planes: DepthPlanes | None = None
+
+    @property
+    def triangulated(self) -> NDArray[np.bool_]:
+        """(P,) which points several references observe."""
+        if self.planes is None:
+            return np.ones(len(self.x_in_world), bool)
+        return np.bincount(self.tracks.point, minlength=len(self.x_in_world)) > 1
 
 
 @dataclass(frozen=True, eq=False)

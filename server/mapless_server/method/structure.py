@@ -105,7 +105,19 @@ def build_structure(
     """
     tracks = tracks_of(references, correspondences, options)
     start = predicted_points(reconstruction, scale, references, tracks)
-    refined = refine_points(observe(tracks, references, options.first_noise), start, options)
+    return _refined(observe(tracks, references, options.first_noise), start, options)
+
+
+def triangulated_structure(
+    references: Sequence[PosedView], correspondences: Correspondences, options: StructureOptions
+) -> Structure:
+    """The same from the references' poses alone."""
+    observations = observe(tracks_of(references, correspondences, options), references, options.first_noise)
+    return _refined(observations, triangulate(observations), options)
+
+
+def _refined(observations: Observations, start: Array, options: StructureOptions) -> Structure:
+    refined = refine_points(observations, start, options)
     noise = replace(refined.noise, level_px=float(refined.noise.level_px))
     left = refined.observations.tracks
     assert isinstance(left, Tracks)

@@ -107,6 +107,45 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
+class KeypointDepths:
+    """Depths that are kept with a reference, at its keypoints.
+
+    Attributes:
+        depth: (N,) float32, in the unit of its pose, along the viewing direction; NaN where nothing is kept.
+        relative_sigma: standard deviation of a depth, as a share of it, above 0.
+    """
+
+    depth: NDArray[np.float32]
+    relative_sigma: float
+
+
+@dataclass(frozen=True, eq=False)
+class KeptDepth:
+    """The depth that is kept with a reference.
+
+    Attributes:
+        camera: pinhole, in pixels of the map; the reference's own, moved and scaled along the axes.
+        depth: (H, W) float32, in the unit of its pose, along the viewing direction; NaN where nothing is kept.
+        relative_sigma: standard deviation of a depth, as a share of it, above 0.
+    """
+
+    camera: Camera
+    depth: NDArray[np.float32]
+    relative_sigma: float
+
+    def __post_init__(self) -> None:
+        if self.depth.shape != (self.camera.height_px, self.camera.width_px):
+            raise ValueError(f"a depth map {self.depth.shape} does not fit its camera")
+        if not 0 < self.relative_sigma < np.inf:
+            raise ValueError(f"relative_sigma must be above 0, is {self.relative_sigma}")
+
+    def at_keypoints(self, view: View) -> KeypointDepths:
+        """The same at the keypoints of the reference, nearest neighbour."""
+        rows, columns, inside = map_cells(self.camera, view.features.keypoints, view.camera)
+        return KeypointDepths(np.where(inside, self.depth[rows, columns], np.float32(np.nan)), self.relative_sigma)
+
+
+@dataclass(frozen=True, eq=False)
 class PosedView:
     """A reference as the method uses it.
 
@@ -116,12 +155,14 @@ class PosedView:
         name: "scenes/{scene}/references/{reference}".
         view: camera and features.
         world_from_camera: its pose, metric.
+        depths: kept with it, if any.
     """
 
     key: str
     name: str
     view: View
     world_from_camera: RigidTransform
+    depths: KeypointDepths | None = None
 
 
 @dataclass(frozen=True, eq=False)

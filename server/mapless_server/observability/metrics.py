@@ -258,6 +258,29 @@ class Metrics(Observer, PairObserver):
         """So many references wait to be matched in the background."""
         self._background_waiting.set(count)
 
+    def depths_looked_up(self, stored: int, absent: int, damaged: int) -> None:
+        """A query looked for the depths of references."""
+        for result, count in zip(LOOKED_UP, (stored, absent, damaged), strict=True):
+            self._depth_lookups(result).inc(count)
+
+    def depth_lookup_failed(self) -> None:
+        """A query could not look for the depths of references."""
+        self._depth_failures.inc()
+
+    def depths_made(self, kept: int, dropped: int, seconds: float) -> None:
+        """A network has predicted the depths of references, and some of them were kept."""
+        self._depths("kept").inc(kept)
+        self._depths("dropped").inc(dropped)
+        self._depth_seconds.inc(seconds)
+
+    def depth_failed(self) -> None:
+        """Making the depth of a reference failed."""
+        self._depth_failures.inc()
+
+    def depths_wait(self, count: int) -> None:
+        """So many references wait for a network to predict their depth."""
+        self._depth_waiting.set(count)
+
     def scene_calibrated(self, cpu_seconds: float) -> None:
         """References of a scene were localized against the others, and what they say was stored."""
         self._calibrations.inc()
@@ -397,6 +420,19 @@ class Metrics(Observer, PairObserver):
         )
         self._background_waiting = gauge(
             "mapless_background_waiting", "References that wait to be matched in the background, as last counted."
+        )
+        depth_lookups = counter("mapless_stored_depths", "Depths of references that queries looked for.", ["result"])
+        self._depth_lookups = _Children(depth_lookups, [(result,) for result in LOOKED_UP])
+        depths = counter(
+            "mapless_depths", "Depths of references that a network predicted, kept or dropped.", ["result"]
+        )
+        self._depths = _Children(depths, [("kept",), ("dropped",)])
+        self._depth_seconds = counter("mapless_depth_seconds", "Time that this took.")
+        self._depth_failures = counter(
+            "mapless_depth_failures", "Failures of making depths, or of looking for them; each is tried again."
+        )
+        self._depth_waiting = gauge(
+            "mapless_depth_waiting", "References that wait for a network to predict their depth, as last counted."
         )
         self._calibrations = counter("mapless_calibrations", "Scenes that were calibrated from their references.")
         self._calibration_seconds = counter(

@@ -27,6 +27,7 @@ from mapless_server.store.matching_use import delete_unused, record_use
 from mapless_server.store.pairs import CLAIM_S, Claim, Pair, PairStore, Progress
 
 from .calibration.calibrations import SceneCalibrations
+from .depth.scene_depths import SceneDepths
 from .indexes import SceneIndexes
 from .library import Closed, ReferenceLibrary, load_usable
 from .pair_observer import PairObserver
@@ -44,6 +45,7 @@ _CACHE_BYTES = 64 * 2**20
 _WAITING_IS_COUNTED_S = 30.0
 _USE_IS_RECORDED_S = 3600.0
 _LOOK_S = 0.01
+_LONGEST_END_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,7 @@ class BackgroundMatching:
         observer: PairObserver,
         options: BackgroundOptions | None = None,
         calibrations: SceneCalibrations | None = None,
+        depths: SceneDepths | None = None,
     ) -> None:
         """Nothing is matched before `start`, or `match_waiting`.
 
@@ -101,6 +104,7 @@ class BackgroundMatching:
             observer: receives the events.
             options: see there.
             calibrations: of scenes, made when all references are matched; None makes none.
+            depths: of references, made before the calibrations, whose photographs use them; None makes none.
         """
         self._store = store
         self._pairs = PairStore(store.database)
@@ -109,6 +113,7 @@ class BackgroundMatching:
         self._is_idle = is_idle
         self._observer = observer
         self._calibrations = calibrations
+        self._depths = depths
         self.options = options or BackgroundOptions()
         self._progress = {matching.name: Progress() for matching in matchings}
         self._closing = threading.Event()
@@ -132,16 +137,26 @@ class BackgroundMatching:
         self._thread.start()
 
     def close(self) -> None:
-        """Ends the thread after its current pair; what it has made is stored."""
+        """Ends the thread after its current pair; what it has made is stored.
+
+        A network that predicts depths on a CPU takes minutes: it is waited for only for a time, and stores nothing.
+        """
         self._closing.set()
-        if self._thread is not None:
-            self._thread.join()
+        if self._thread is None:
+            return
+        self._thread.join(None if self._depths is None else _LONGEST_END_S)
+        if self._thread.is_alive() and self._depths is not None:
+            self._depths.abandon()
 
     def _match_and_calibrate(self) -> None:
-        """Calibrates the waiting scenes; before each, the references that were added meanwhile are matched."""
+        """Makes waiting depths, then calibrates waiting scenes; before each, new references are matched."""
         self.match_waiting()
-        while self._calibrate_next():
+        while self._make_next_depth() or self._calibrate_next():
             self.match_waiting()
+
+    def _make_next_depth(self) -> bool:
+        self._step_begin_s = time.monotonic()
+        return self._depths is not None and self._depths.make_next(self._wait_for_callers)
 
     def _calibrate_next(self) -> bool:
         self._step_begin_s = time.monotonic()
@@ -171,12 +186,16 @@ class BackgroundMatching:
             damaged = finder.take_damaged(matching.name)
             if damaged:
                 self._pairs.discard(matching.name, damaged)
+        if self._depths is not None:
+            self._depths.maintain()
         if time.monotonic() < self._use_is_due_s:
             return
         used = [matching.name for matching in self._matchings]
         if self._calibrations is not None:
             self._calibrations.maintain()
             used.append(self._calibrations.kind)
+        if self._depths is not None:
+            used += self._depths.kinds
         record_use(self._store.database, used)
         delete_unused(self._store.database, self._pause)
         rewritten = set(compact_features(self._store.database, self._pause))

@@ -26,6 +26,8 @@ from mapless_server.method.views import Photograph, PosedView
 from mapless_server.security import SceneKey
 from mapless_server.store import DescribedReference, ReferenceRecord, SceneAttributes, Store
 
+from .depth.finder import DepthFinder
+
 log = logging.getLogger(__name__)
 
 STORED_IMAGES = ImageLimits(max_bytes=2**31, max_pixels=2**30, min_side_px=1, max_side_px=2**20)
@@ -81,8 +83,10 @@ class ReferenceLibrary:
         locks: of what threads are computing, by the reference's key and the name of the extractor or descriptor.
     """
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: Store, depths: DepthFinder | None = None) -> None:
+        """`depths` adds those that are kept with references; None adds none."""
         self._store = store
+        self._depths = depths
         self.locks = KeyedLocks()
         self._background = ThreadPoolExecutor(1, "describe")
         self._scheduled: set[tuple[str, str]] = set()
@@ -117,7 +121,10 @@ class ReferenceLibrary:
         while True:
             snapshot = self._store.load_references(scene_key, reference_ids, extractor.name)
             if not snapshot.undescribed:
-                return snapshot.generation, tuple(map(self._posed_view, snapshot.references))
+                views = tuple(map(self._posed_view, snapshot.references))
+                if self._depths is not None:
+                    views = self._depths.with_depths(views, extractor.name)
+                return snapshot.generation, views
             if not waits:
                 self._describe_later(snapshot.undescribed, extractor)
                 raise FeaturesMissing

@@ -24,6 +24,21 @@ class PairObserver:
     def references_wait(self, count: int) -> None:
         """So many references wait to be matched in the background."""
 
+    def depths_looked_up(self, stored: int, absent: int, damaged: int) -> None:
+        """A query looked for the depths of references; it does without those that are absent or damaged."""
+
+    def depth_lookup_failed(self) -> None:
+        """A query could not look for the depths of references, and does without them."""
+
+    def depths_made(self, kept: int, dropped: int, seconds: float) -> None:
+        """A network has predicted the depths of references; some were found wrong, or could not be checked."""
+
+    def depth_failed(self) -> None:
+        """Making the depth of a reference failed; it is tried again."""
+
+    def depths_wait(self, count: int) -> None:
+        """So many references wait for a network to predict their depth."""
+
     def scene_calibrated(self, cpu_seconds: float) -> None:
         """References of a scene were localized against the others, and what they say was stored."""
 

@@ -17,7 +17,8 @@ from mapless_server.engine.references import References
 from mapless_server.engine.stages import Method
 from mapless_server.extras import install_hint
 from mapless_server.images import ImageLimits
-from mapless_server.method.choices import AUTO, BEST_VARIANTS
+from mapless_server.method.choices import AUTO, BEST_VARIANTS, OFF, STORED
+from mapless_server.method.coarse import Reconstructor
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.correspond import Matcher, make_matcher
 from mapless_server.method.features import FeatureExtractor, make_extractor
@@ -31,6 +32,9 @@ from mapless_server.scenes.audit.scene_auditor import AuditTools
 from mapless_server.scenes.background import BackgroundMatching
 from mapless_server.scenes.calibration.calibrations import SceneCalibrations
 from mapless_server.scenes.calibration.calibrator import Calibrator
+from mapless_server.scenes.depth.finder import DepthFinder
+from mapless_server.scenes.depth.maker import DepthMaker
+from mapless_server.scenes.depth.scene_depths import SceneDepths
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.scenes.pair_observer import PairObserver
@@ -40,6 +44,7 @@ from mapless_server.scheduling import Observer, Quota, WorkQueueOptions
 from mapless_server.security import RateLimiter
 from mapless_server.settings import Settings, available_cores
 from mapless_server.store import Store, StoreError
+from mapless_server.store.depths import depth_kind
 from mapless_server.store.pairs import PairStore
 
 log = logging.getLogger(__name__)
@@ -113,7 +118,9 @@ def make_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateL
     try:
         tiers = make_tiers(settings)
         descriptor = make_descriptor(settings, tiers[0].extractor)
-        return engine_over(store, tiers, engine_options(settings), metrics, quota, None, descriptor, metrics)
+        network = make_depth_network(settings, tiers)
+        options = engine_options(settings)
+        return engine_over(store, tiers, options, metrics, quota, None, descriptor, metrics, network)
     except (ImportError, WeightsMissing) as error:
         raise StartupError(what_is_missing(error)) from error
     except (ValueError, WeightsError) as error:
@@ -129,6 +136,7 @@ def engine_over(
     method: Method | None = None,
     descriptor: GlobalDescriptor | None = None,
     pair_observer: PairObserver | None = None,
+    depth_network: Reconstructor | None = None,
 ) -> QueueEngine:
     """An engine and the references in memory that it reads.
 
@@ -140,7 +148,8 @@ def engine_over(
         quota: likewise.
         method: likewise.
         descriptor: for choosing references; None makes one of the first tier's features.
-        pair_observer: of matches of references.
+        pair_observer: of matches and depths of references.
+        depth_network: makes the depths that are kept with references; None makes none.
 
     Raises:
         ValueError: no tier, two with the same extractor or matcher, or a descriptor of other features.
@@ -149,18 +158,32 @@ def engine_over(
     extractors = [tier.extractor for tier in tiers]
     first = extractors[0]
     descriptor = descriptor or VladDescriptor.of(first)
-    library = ReferenceLibrary(store)
+    observed = pair_observer or PairObserver()
+    depths = None
+    if depth_network is not None or any(tier.uses_depths for tier in tiers):
+        kind = None if depth_network is None else depth_kind(depth_network.name, depth_network.weights_sha256)
+        depths = DepthFinder(store.database, observed, kind)
+    library = ReferenceLibrary(store, depths if any(tier.uses_depths for tier in tiers) else None)
     indexes = SceneIndexes(store, library, descriptor, first, options.index_cache_bytes)
     pairs = PairMatches(tiers[0].pipeline.matcher.options.reference_ratio, CACHED_AUDIT_PAIRS)
     audit_tools = AuditTools(library, indexes, descriptor, first, pairs)
     references = References(library, indexes, descriptor, extractors, audit_tools, options.image_limits)
     engine = QueueEngine(tiers, references, options, observer, quota, method)
-    engine.background = _background_matching(store, indexes, engine, pair_observer or PairObserver())
+    maker = None
+    if depth_network is not None:
+        maker = DepthMaker(indexes, first, tiers[0].pipeline.matcher, depth_network)
+    made = None if depths is None else SceneDepths(store, depths, maker, observed)
+    engine.background = _background_matching(store, indexes, engine, observed, made, depths)
     return engine
 
 
 def _background_matching(
-    store: Store, indexes: SceneIndexes, engine: QueueEngine, observer: PairObserver
+    store: Store,
+    indexes: SceneIndexes,
+    engine: QueueEngine,
+    observer: PairObserver,
+    made: SceneDepths | None,
+    depths: DepthFinder | None,
 ) -> BackgroundMatching:
     """Matching for the queries of each tier, the first one first; from now on, queries look for its results."""
     pairs, matchings, strong = PairStore(store.database), dict[Matching, PairFinder](), dict[Matching, PairFinder]()
@@ -179,7 +202,8 @@ def _background_matching(
         matchings | strong,
         lambda: engine.queue.job_count == 0,
         observer,
-        calibrations=SceneCalibrations(store, calibrator, observer),
+        calibrations=SceneCalibrations(store, calibrator, observer, depths if first.uses_depths else None),
+        depths=made,
     )
 
 
@@ -223,7 +247,21 @@ def make_tiers(settings: Settings) -> tuple[Tier, ...]:
         compiled_views=settings.compiled_views,
         query_rays=settings.query_rays,
     )
-    return tuple(Tier(extractor, Pipeline(reconstructor, matchers[name])) for name, extractor in extractors.items())
+    uses_depths = settings.reference_depth != OFF and reconstructor.uses_correspondences
+    return tuple(
+        Tier(extractor, Pipeline(reconstructor, matchers[name]), uses_depths) for name, extractor in extractors.items()
+    )
+
+
+def make_depth_network(settings: Settings, tiers: Sequence[Tier]) -> Reconstructor | None:
+    """The network that makes the depths kept with references; None if none does. Errors as `make_tiers`."""
+    name = settings.reference_depth
+    if name in (OFF, STORED):
+        return None
+    reconstructor = tiers[0].pipeline.reconstructor
+    if reconstructor.name == name:
+        return reconstructor
+    return make_reconstructor(name, settings.weights_dir, device_for(settings), answers_queries=False)
 
 
 def make_descriptor(settings: Settings, extractor: FeatureExtractor) -> GlobalDescriptor:
@@ -261,7 +299,8 @@ def device_for(settings: Settings) -> str:
 
     Without networks it is the CPU: looking for others would import torch, a third of the server's memory.
     """
-    if settings.device == "auto" and settings.backend == "geometric" and not _wants_networks(settings):
+    needs_none = settings.backend == "geometric" and settings.reference_depth in (OFF, STORED)
+    if settings.device == "auto" and needs_none and not _wants_networks(settings):
         return "cpu"
     return choose_device(settings.device)
 

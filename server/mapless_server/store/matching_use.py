@@ -1,6 +1,6 @@
 """Which matchings have use: the pairs of those that no server has used for long are deleted.
 
-Kinds of self-calibrations are recorded likewise, and deleted with the matchings.
+Kinds of self-calibrations and of kept depths are recorded likewise, and deleted with the matchings.
 
 Servers with other settings may share a database, and a server that is stopped is started again; so a matching is kept
 for `KEPT_S` after a server last recorded that it uses it. Should a server of other features come later than that, its
@@ -17,7 +17,7 @@ from sqlalchemy import Connection, delete, or_, select, update
 
 from . import queries
 from .database import Database
-from .tables import matching_use, reference_matching, reference_pair, scene_calibration
+from .tables import matching_use, reference_depth, reference_matching, reference_pair, scene_calibration
 
 log = logging.getLogger(__name__)
 
@@ -60,11 +60,15 @@ def _delete_portion(connection: Connection, name: str, limit_us: int) -> bool:
     some = select(progress.reference_key).where(progress.matching == name).limit(_REFERENCES_AT_A_TIME)
     keys = list(connection.scalars(some))
     if not keys:
+        # Of references that were not claimed.
+        connection.execute(delete(reference_depth).where(reference_depth.c.kind == name))
         connection.execute(delete(scene_calibration).where(scene_calibration.c.kind == name))
         connection.execute(delete(matching_use).where(is_it))
         return False
     of_them = or_(pair.first_key.in_(keys), pair.second_key.in_(keys))
     connection.execute(delete(reference_pair).where(pair.matching == name, of_them))
+    depth = reference_depth.c
+    connection.execute(delete(reference_depth).where(depth.kind == name, depth.reference_key.in_(keys)))
     connection.execute(delete(reference_matching).where(progress.matching == name, progress.reference_key.in_(keys)))
     return True
 

@@ -74,9 +74,10 @@ class Claim:
 class PairStore:
     """Matches of pairs in a store's database; thread-safe. Errors are those of `Store`."""
 
-    def __init__(self, database: Database) -> None:
-        """`database` is that of the references."""
+    def __init__(self, database: Database, claim_s: float = CLAIM_S) -> None:
+        """`database` is that of the references; a claim ends by itself after `claim_s`."""
         self._database = database
+        self._claim_s = claim_s
 
     def load(self, matching: str, pairs: Collection[Pair]) -> dict[Pair, Matches | None]:
         """The matches of those of these pairs that are stored; None for damaged ones."""
@@ -106,8 +107,9 @@ class PairStore:
                     return Claim(SceneKey(row.scene_id), row.reference_id, row.key)
 
     def _claim(self, matching: str, key: str) -> bool:
-        column, now_us = reference_matching.c, _now_us()
-        row = {"reference_key": key, "matching": matching, "due_time_us": now_us + round(CLAIM_S * _MICROSECONDS)}
+        column, begin_us = reference_matching.c, _now_us()
+        until_us = begin_us + round(self._claim_s * _MICROSECONDS)
+        row = {"reference_key": key, "matching": matching, "due_time_us": until_us}
         with self._database.write() as connection:
             try:
                 queries.lock_reference(connection, key)
@@ -115,7 +117,7 @@ class PairStore:
                 return False
             is_free = (
                 update(reference_matching)
-                .where(column.reference_key == key, column.matching == matching, column.due_time_us <= now_us)
+                .where(column.reference_key == key, column.matching == matching, column.due_time_us <= begin_us)
                 .values(due_time_us=row["due_time_us"])
             )
             return connection.execute(is_free).rowcount == 1 or queries.insert_new(connection, reference_matching, row)

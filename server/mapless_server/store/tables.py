@@ -17,7 +17,7 @@ from sqlalchemy import (
     text,
 )
 
-SCHEMA_VERSION = 6
+SCHEMA_VERSION = 7
 
 metadata = MetaData()
 
@@ -140,6 +140,16 @@ reference_matching = Table(
     Column("due_time_us", BigInteger),
     Column("failure_count", Integer, nullable=False, server_default=_NONE_YET),
     Index("reference_matching_by_due_time", "matching", "due_time_us"),
+)
+
+# Depth that is kept with references, see depths.py; which references are done is in reference_matching.
+reference_depth = Table(
+    "reference_depth",
+    metadata,
+    Column("reference_key", _Key, ForeignKey("reference.key", ondelete="CASCADE"), primary_key=True),
+    Column("kind", _Matching, primary_key=True),
+    Column("data", LargeBinary, nullable=False),  # see codec.py
+    Column("sha256", _Sha256, nullable=False),
 )
 
 # When a server last had use for a matching, to within an hour.

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform, Similarity
 
 from ..correspond import Correspondences
+from ..kept_depth import with_kept_depths
 from ..match import vote
 from ..observations import FIRST_GUESS, adjust_points, triangulate
 from ..options import check_bounds
@@ -89,6 +90,7 @@ class GeometricReconstructor:
         if rejection:
             return rejection
         structure = self._triangulate(references, correspondences)
+        structure = with_kept_depths(structure, references, correspondences)
         if not len(structure.x_in_world):
             return Rejection(
                 RejectionReason.NO_USABLE_REFERENCES, "the references share no points that could be triangulated"

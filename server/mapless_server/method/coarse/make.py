@@ -32,6 +32,7 @@ def make_reconstructor(
     options: NetworkOptions | None = None,
     compiled_views: int = 0,
     query_rays: bool = True,
+    answers_queries: bool = True,
 ) -> Reconstructor:
     """The backend that a setting names.
 
@@ -46,6 +47,7 @@ def make_reconstructor(
         compiled_views: number of views, the query included, for which a network is compiled, which takes minutes; for
             photographs of 4:3, landscape or portrait. 0 compiles nothing. Other queries are computed uncompiled.
         query_rays: see NetworkOptions.
+        answers_queries: whether queries wait for it, so that a CPU is worth a warning.
 
     Raises:
         ValueError: unknown name.
@@ -59,6 +61,8 @@ def make_reconstructor(
         backend = _choose(weights_dir, device)
     if backend == "geometric":
         return GeometricReconstructor()
+    if device == "cpu" and answers_queries:
+        log.warning("backend %s on the CPU: minutes for a query, so calls need longer deadlines", backend)
     return _load(backend, find_weights(backend, weights_dir), device, options, compiled_views, query_rays)
 
 
@@ -103,8 +107,6 @@ def _load(
 
     options = replace(options or NetworkOptions(), query_rays=query_rays)
 
-    if device == "cpu":
-        log.warning("backend %s on the CPU: minutes for a query, so calls need longer deadlines", backend)
     known = named(backend)
     with torch.device("meta"):
         network = known.network_class()()

@@ -19,12 +19,11 @@ from mapless.geometry import Array, RigidTransform
 from ..adjust import adjust_pose
 from ..correspond import Correspondences
 from ..match import MatchOptions, match_points, vote
-from ..observations import triangulate
 from ..options import check_bounds
 from ..perturbation import reprojection_errors_px
 from ..pose_problem import AdjustOptions
 from ..results import PointMatches, PoseEstimate, PoseStage, Structure, Support, TwoViewSupport
-from ..structure import StructureOptions, observe, refine_points, tracks_of
+from ..structure import StructureOptions, triangulated_structure
 from ..tracks import Tracks
 from ..views import PosedView, View
 from .matches import TwoViewMatches
@@ -77,7 +76,7 @@ def solve_two_view(
         adjust_options: of the adjustment.
         options: of this one.
     """
-    structure = _triangulated(references, correspondences, structure_options)
+    structure = triangulated_structure(references, correspondences, structure_options)
     matches = vote(structure, [len(it.view.features) for it in references], correspondences)
     two_view = TwoViewMatches.of(query, references, correspondences.query_matches)
     evidence = Evidence(query, references, two_view, structure.x_in_world[matches.point], matches.keypoint)
@@ -167,18 +166,6 @@ class _Problem:
         found = self.at(estimate.world_from_camera)
         kept = replace(estimate, inliers=found.inliers, errors_px=found.errors_px)
         return replace(found, estimate=kept)
-
-
-def _triangulated(
-    references: Sequence[PosedView], correspondences: Correspondences, options: StructureOptions
-) -> Structure:
-    """The structure, from the references' poses alone."""
-    observations = observe(tracks_of(references, correspondences, options), references, options.first_noise)
-    refined = refine_points(observations, triangulate(observations), options)
-    tracks = refined.observations.tracks
-    assert isinstance(tracks, Tracks)
-    noise = replace(refined.noise, level_px=float(refined.noise.level_px))
-    return Structure(refined.x_in_world[refined.trusted], tracks.select(refined.trusted), noise)
 
 
 def _with_points(structure: Structure, support: TwoViewSupport, used: NDArray[np.bool_]) -> Structure:

@@ -22,6 +22,7 @@ from mapless_server.store.calibrations import (
     renew,
 )
 
+from ..depth.finder import DepthFinder
 from ..library import Closed, ReferenceLibrary
 from ..pair_observer import PairObserver
 from .calibrator import Calibrator
@@ -43,8 +44,11 @@ class _Lost(Exception):
 class SceneCalibrations:
     """Calibrates scenes of a store; of one thread."""
 
-    def __init__(self, store: Store, calibrator: Calibrator, observer: PairObserver) -> None:
-        """`observer` receives the events."""
+    def __init__(
+        self, store: Store, calibrator: Calibrator, observer: PairObserver, depths: DepthFinder | None = None
+    ) -> None:
+        """`observer` receives the events; `depths` are those that queries use."""
+        self._depths = depths
         self._store = store
         self._calibrator = calibrator
         self._observer = observer
@@ -106,7 +110,7 @@ class SceneCalibrations:
     def _localize_references(self, claim: CalibrationClaim, pause: Callable[[], None]) -> SelfCalibration:
         newest = list_newest(self._store.database, claim.scene_key, self._calibrator.options.sample)
         # Of its own, so that references that queries use stay in memory.
-        with closing(ReferenceLibrary(self._store.uncached(_CACHE_BYTES))) as library:
+        with closing(ReferenceLibrary(self._store.uncached(_CACHE_BYTES), self._depths)) as library:
             return self._calibrator.calibrate(claim.scene_key, library, newest, pause)
 
     def _report_failure(self, claim: CalibrationClaim, error: Exception) -> None:

@@ -1,0 +1,158 @@
+"""Depth kept with the references: points where nothing can be triangulated, and better ones where little can.
+
+A network has predicted the depth of each reference once, when it was added (see `scenes.depth`). A keypoint with depth
+d and relative standard deviation s, of a camera at C with the viewing direction z, then has its point near the plane
+
+    z . (x - C) = d,    with the standard deviation    s d.
+
+A triangulated point is moved by what its plane says, each weighted by its information, unless the two contradict each
+other. A keypoint that the photograph matches, and no other reference, becomes a point at its depth, which one reference
+observes. Its error is along the ray, so it moves the photograph's keypoint along the epipolar line; the final
+adjustment knows that, since it keeps the planes (see `bundle`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array
+
+from .correspond import Correspondences
+from .options import check_bounds
+from .results import DepthPlanes, Structure
+from .structure import observe
+from .tracks import Tracks, keypoint_offsets, keypoint_rays
+from .views import PosedView
+
+
+@dataclass(frozen=True)
+class KeptDepthOptions:
+    """Options of using kept depths.
+
+    Attributes:
+        max_contradiction: a depth that is farther from its triangulated point, in standard deviations of both, is
+            wrong: it is at an edge, or the keypoint shows a reflection.
+    """
+
+    max_contradiction: float = 3.0
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "max_contradiction", above=0)
+
+
+def with_kept_depths(
+    structure: Structure,
+    references: Sequence[PosedView],
+    correspondences: Correspondences,
+    options: KeptDepthOptions | None = None,
+) -> Structure:
+    """A structure with the points that kept depths give, after those that are triangulated.
+
+    Args:
+        structure: triangulated; possibly without points.
+        references: in the order of its tracks; those without depths add nothing.
+        correspondences: of the query with each reference.
+        options: see there.
+
+    Returns:
+        The structure with its `planes`; the same if no reference has depths.
+    """
+    if all(reference.depths is None for reference in references):
+        return structure
+    known = _KnownDepths.of(references)
+    triangulated = _combined(structure, references, known, options or KeptDepthOptions())
+    return _with_single(triangulated, references, correspondences, known)
+
+
+@dataclass(frozen=True, eq=False)
+class _KnownDepths:
+    """Of the N keypoints of all references.
+
+    Attributes:
+        offsets: (K + 1,) of each reference's keypoints.
+        centre, ray, axis: (N, 3) camera centre, viewing ray of depth 1 and viewing direction, world.
+        depth, sigma: (N,) in the unit of the poses; NaN where unknown.
+    """
+
+    offsets: NDArray[np.intp]
+    centre: Array
+    ray: Array
+    axis: Array
+    depth: Array
+    sigma: Array
+
+    @staticmethod
+    def of(references: Sequence[PosedView]) -> _KnownDepths:
+        offsets = keypoint_offsets(references)
+        counts = np.diff(offsets)
+        depth, sigma = np.full(offsets[-1], np.nan), np.full(offsets[-1], np.nan)
+        for reference, start, end in zip(references, offsets[:-1], offsets[1:], strict=True):
+            if reference.depths is not None:
+                depth[start:end] = reference.depths.depth
+                sigma[start:end] = reference.depths.depth * reference.depths.relative_sigma
+        axis = np.repeat([it.world_from_camera.rotation[:, 2] for it in references], counts, axis=0)
+        return _KnownDepths(offsets, *keypoint_rays(references), axis, depth, sigma)
+
+    def planes(self, rows: NDArray[np.intp]) -> DepthPlanes:
+        """Of the points that these keypoints show, all with a depth."""
+        normal = self.axis[rows]
+        offset = (normal * self.centre[rows]).sum(axis=1) + self.depth[rows]
+        return DepthPlanes(normal, offset, self.sigma[rows] ** -2.0)
+
+
+def _combined(
+    structure: Structure, references: Sequence[PosedView], known: _KnownDepths, options: KeptDepthOptions
+) -> Structure:
+    """The triangulated points, moved by the most precise depth of each that does not contradict it."""
+    tracks, count = structure.tracks, len(structure.x_in_world)
+    none = DepthPlanes(np.zeros((count, 3)), np.zeros(count), np.zeros(count))
+    row = known.offsets[tracks.view] + tracks.keypoint
+    order = np.lexsort((known.sigma[row], tracks.point))  # NaN is last
+    best = row[order[np.unique(tracks.point[order], return_index=True)[1]]] if count else row
+    has_depth = np.isfinite(known.depth[best])
+    if not has_depth.any():
+        return replace(structure, planes=none)
+    chosen, planes = np.flatnonzero(has_depth), known.planes(best[has_depth])
+    kept = tracks.select(has_depth)
+    x = structure.x_in_world[chosen]
+    _, by_point = observe(kept, references, structure.noise).linearized(x)
+    information = kept.sum_by_point(np.einsum("oai,oaj->oij", by_point, by_point))
+    covariance = np.linalg.pinv(information, hermitian=True)
+    across = np.einsum("pij,pj->pi", covariance, planes.normal)
+    variance = (across * planes.normal).sum(axis=1) + 1 / planes.information
+    off = planes.offset - (planes.normal * x).sum(axis=1)
+    agrees = off**2 <= options.max_contradiction**2 * variance
+    moved = structure.x_in_world.copy()
+    moved[chosen[agrees]] += (across * (off / variance)[:, None])[agrees]
+    for name in ("normal", "offset", "information"):
+        getattr(none, name)[chosen[agrees]] = getattr(planes, name)[agrees]
+    return replace(structure, x_in_world=moved, planes=none)
+
+
+def _with_single(
+    structure: Structure, references: Sequence[PosedView], correspondences: Correspondences, known: _KnownDepths
+) -> Structure:
+    """With a point for each keypoint that the query matches, that has a depth and observes no point."""
+    tracks, count = structure.tracks, len(structure.x_in_world)
+    matched = zip(correspondences.query_matches, known.offsets[:-1], strict=True)
+    rows = np.unique(np.concatenate([pairs[:, 1] + start for pairs, start in matched]))
+    rows = np.setdiff1d(rows[np.isfinite(known.depth[rows])], known.offsets[tracks.view] + tracks.keypoint)
+    if not len(rows):
+        return structure
+    view = np.searchsorted(known.offsets, rows, side="right") - 1
+    points = known.centre[rows] + known.ray[rows] * known.depth[rows, None]
+    assert structure.planes is not None
+    return replace(
+        structure,
+        x_in_world=np.concatenate([structure.x_in_world, points]),
+        tracks=Tracks(
+            np.concatenate([tracks.point, count + np.arange(len(rows))]),
+            np.concatenate([tracks.view, view]),
+            np.concatenate([tracks.keypoint, rows - known.offsets[view]]),
+        ),
+        planes=structure.planes.and_last(known.planes(rows)),
+    )

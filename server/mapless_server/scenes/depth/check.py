@@ -1,0 +1,181 @@
+"""What is kept of the depths that a network predicts for references: what agrees with their poses.
+
+The network sees references whose poses are known, and one more photograph, whose pose is known too but not given. Its
+depths are compared with three things that it did not make:
+
+    the pose of that photograph    the network has understood the place if it finds it about where it is;
+    triangulated points            of each reference, matched with others: their median gives the reference's scale,
+                                   and their spread the standard deviation of its depths;
+    the other references           a pixel that lies in front of what others see there, more often than on it, is wrong:
+                                   they look through it. One behind is hidden from them, which says nothing.
+
+A reference is dropped whole that has too few triangulated points, whose depths disagree with them, or most of whose
+pixels are wrong. Pixels at edges of depth are dropped, because a keypoint there may belong to either side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, RigidTransform, rotation_angle_deg
+from mapless_server.method.correspond import Correspondences
+from mapless_server.method.options import check_bounds
+from mapless_server.method.results import MetricScale, Structure
+from mapless_server.method.structure import StructureOptions, triangulated_structure
+from mapless_server.method.views import KeptDepth, PosedView, ReconstructedView, Reconstruction, map_cells
+
+
+@dataclass(frozen=True)
+class DepthCheckOptions:
+    """Options of the check.
+
+    Attributes:
+        max_off, max_off_deg: largest error of the predicted pose that was not given: of its position as a share of the
+            median depth, and of its rotation. Networks are better by far where they understand a place.
+        min_parallax_deg: of triangulated points: at 2 degrees a keypoint's error of half a pixel, at a focal length of
+            500 px, is 3 % of the depth.
+        min_points: fewest triangulated points of a reference.
+        max_scale: largest factor between a reference's scale and that of all together.
+        max_sigma: largest standard deviation of depths, relative: beyond, they place no point better than matches do.
+        min_sigma: the least that is believed.
+        agreeing_sigma: depths of two references that differ by less, in their standard deviations, are of one surface.
+        max_wrong: largest share of wrong pixels, of those that another reference sees.
+        max_step: largest factor between the depths of neighbouring pixels that are of one surface.
+        min_confidence: of the network, below which nothing is kept.
+    """
+
+    max_off: float = 0.1
+    max_off_deg: float = 5.0
+    min_parallax_deg: float = 2.0
+    min_points: int = 20
+    max_scale: float = 1.25
+    max_sigma: float = 0.1
+    min_sigma: float = 0.01
+    agreeing_sigma: float = 3.0
+    max_wrong: float = 0.3
+    max_step: float = 1.1
+    min_confidence: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "max_off max_off_deg min_parallax_deg agreeing_sigma", above=0)
+        check_bounds(self, "min_points", at_least=3)
+        check_bounds(self, "max_scale max_step", above=1)
+        check_bounds(self, "max_sigma", at_least=self.min_sigma)
+        check_bounds(self, "min_sigma max_wrong", above=0, at_most=1)
+        check_bounds(self, "min_confidence", at_least=0, at_most=1)
+
+
+def checked_depths(
+    reconstruction: Reconstruction,
+    scale: MetricScale,
+    references: Sequence[PosedView],
+    world_from_query: RigidTransform,
+    correspondences: Correspondences,
+    options: DepthCheckOptions,
+) -> list[KeptDepth | None]:
+    """What is kept of each reference's predicted depths.
+
+    Args:
+        reconstruction: of the references and the photograph whose pose was not given.
+        scale: its metric scale.
+        references: with their poses.
+        world_from_query: the pose that was not given.
+        correspondences: matches of the references with one another.
+        options: see there.
+
+    Returns:
+        For each reference its depth, or None if nothing is kept.
+    """
+    structure = triangulated_structure(
+        references, correspondences, StructureOptions(min_parallax_deg=options.min_parallax_deg)
+    )
+    off = scale.world_from_query.translation - world_from_query.translation
+    off_deg = rotation_angle_deg(scale.world_from_query.rotation.T @ world_from_query.rotation)
+    depths = [
+        _scaled(view, scale.metres_per_unit, reference, _seen(structure, index), structure, options)
+        for index, (view, reference) in enumerate(zip(reconstruction.references, references, strict=True))
+    ]
+    known = [float(np.nanmedian(it.depth)) for it in depths if it is not None]
+    if not known or np.linalg.norm(off) > options.max_off * np.median(known) or off_deg > options.max_off_deg:
+        return [None] * len(references)
+    return [_confirmed(index, depths, references, options) for index in range(len(references))]
+
+
+def _seen(structure: Structure, index: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The points that a reference observes, and its keypoints."""
+    rows = structure.tracks.view == index
+    return structure.tracks.point[rows], structure.tracks.keypoint[rows]
+
+
+def _scaled(
+    view: ReconstructedView,
+    metres_per_unit: float,
+    reference: PosedView,
+    seen: tuple[NDArray[np.intp], NDArray[np.intp]],
+    structure: Structure,
+    options: DepthCheckOptions,
+) -> KeptDepth | None:
+    """A reference's depth in the scale of its triangulated points; None if it disagrees with them."""
+    point, keypoint = seen
+    predicted = metres_per_unit * view.point_map[..., 2].astype(np.float64)
+    usable = np.isfinite(predicted) & (predicted > 0) & (view.confidence >= options.min_confidence)
+    depth = np.where(usable, predicted, np.nan)
+    depth[~_is_smooth(depth, options.max_step)] = np.nan
+    at_points = KeptDepth(view.camera, depth.astype(np.float32), 1.0).at_keypoints(reference.view).depth[keypoint]
+    triangulated = reference.world_from_camera.inverse().apply(structure.x_in_world[point])[:, 2]
+    ratio = np.log(triangulated / at_points)
+    ratio = ratio[np.isfinite(ratio)]
+    if len(ratio) < options.min_points:
+        return None
+    middle = float(np.median(ratio))
+    sigma = max(options.min_sigma, 1.4826 * float(np.median(np.abs(ratio - middle))))
+    if abs(middle) > np.log(options.max_scale) or sigma > options.max_sigma:
+        return None
+    return KeptDepth(view.camera, (depth * np.exp(middle)).astype(np.float32), sigma)
+
+
+def _is_smooth(depth: Array, max_step: float) -> NDArray[np.bool_]:
+    """(H, W): whether a pixel and its neighbours are of one surface."""
+    known = np.isfinite(depth)
+    around = np.ones((3, 3), np.uint8)
+    nearest = cv2.erode(np.where(known, depth, np.inf), around)
+    farthest = cv2.dilate(np.where(known, depth, 0.0), around)
+    return np.asarray(known & (farthest <= max_step**2 * nearest))
+
+
+def _confirmed(
+    index: int, depths: Sequence[KeptDepth | None], references: Sequence[PosedView], options: DepthCheckOptions
+) -> KeptDepth | None:
+    """A reference's depth without the pixels that others look through; None if these are too many."""
+    kept = depths[index]
+    if kept is None:
+        return None
+    known = np.isfinite(kept.depth)
+    rows, columns = np.nonzero(known)
+    rays = kept.camera.rays(np.stack([columns, rows], axis=1).astype(np.float64))
+    x_in_world = references[index].world_from_camera.apply(rays / rays[:, 2:] * kept.depth[known, None])
+    votes, is_seen = np.zeros(len(rows), int), np.zeros(len(rows), bool)
+    for other, reference in zip(depths, references, strict=True):
+        if other is None or other is kept:
+            continue
+        x_in_camera = reference.world_from_camera.inverse().apply(x_in_world)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pixels = np.where(x_in_camera[:, 2:] > 0, other.camera.project(x_in_camera), -2.0)
+        row, column, inside = map_cells(other.camera, pixels, other.camera)
+        there = np.where(inside, other.depth[row, column], np.nan)
+        off = np.log(np.where(inside, x_in_camera[:, 2], np.nan) / there)
+        limit = options.agreeing_sigma * np.hypot(kept.relative_sigma, other.relative_sigma)
+        votes += (np.abs(off) <= limit).astype(int) - (off < -limit)
+        is_seen |= np.abs(off) <= limit
+        is_seen |= off < -limit
+    is_wrong = votes < 0
+    if not is_seen.any() or is_wrong.sum() > options.max_wrong * is_seen.sum():
+        return None
+    depth = kept.depth.copy()
+    depth[rows[is_wrong], columns[is_wrong]] = np.nan
+    return KeptDepth(kept.camera, depth, kept.relative_sigma)

@@ -1,0 +1,64 @@
+"""What queries find of the depths that are kept with references."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+
+from mapless_server.method.views import KeypointDepths, PosedView
+from mapless_server.store import LruCache
+from mapless_server.store.database import Database
+from mapless_server.store.depths import load_depths
+
+from ..pair_observer import PairObserver
+
+log = logging.getLogger(__name__)
+
+_CACHE_BYTES = 32 * 2**20
+"""Depths at the keypoints of some 4000 references with 2000 keypoints each."""
+
+
+class DepthFinder:
+    """Adds kept depths to loaded references; thread-safe."""
+
+    def __init__(self, database: Database, observer: PairObserver, kind: str | None = None) -> None:
+        """`kind` is that of the depths; None takes any of today's version, whichever server has made them."""
+        self._database = database
+        self._observer = observer
+        self._kind = kind
+        self._cache: LruCache[KeypointDepths] = LruCache(_CACHE_BYTES)
+        self._damaged: set[tuple[str, str]] = set()
+        self._guard = threading.Lock()
+
+    def with_depths(self, references: Sequence[PosedView], extractor: str) -> tuple[PosedView, ...]:
+        """The references with the depths that are kept at their keypoints, which are this extractor's; never raises."""
+        found = {it.key: self._cache.get((it.key, extractor)) for it in references}
+        missing = [it for it in references if found[it.key] is None]
+        if missing:
+            try:
+                found |= self._read(missing, extractor)
+            except Exception as error:  # the query can do without
+                log.warning("kept depths cannot be read, and are not used: %s", error)
+                self._observer.depth_lookup_failed()
+        return tuple(it if found[it.key] is None else replace(it, depths=found[it.key]) for it in references)
+
+    def _read(self, references: Sequence[PosedView], extractor: str) -> dict[str, KeypointDepths]:
+        stored = load_depths(self._database, [it.key for it in references], self._kind)
+        if stored.damaged:
+            log.error("%d damaged depths of references are not used, and made again", len(stored.damaged))
+            with self._guard:
+                self._damaged |= stored.damaged
+        found = {it.key: stored.depths[it.key].at_keypoints(it.view) for it in references if it.key in stored.depths}
+        for key, depths in found.items():
+            self._cache.put((key, extractor), depths, depths.depth.nbytes)
+        damaged_count = len({key for _, key in stored.damaged} - found.keys())
+        self._observer.depths_looked_up(len(found), len(references) - len(found) - damaged_count, damaged_count)
+        return found
+
+    def take_damaged(self) -> frozenset[tuple[str, str]]:
+        """Kinds and keys of those that were found damaged since the last call."""
+        with self._guard:
+            damaged, self._damaged = frozenset(self._damaged), set()
+        return damaged

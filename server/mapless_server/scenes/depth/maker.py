@@ -1,0 +1,153 @@
+"""Depths of a reference and its neighbours, by a network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+from mapless_server.errors import DataLoss, NotFound, RequestError
+from mapless_server.method.coarse import Reconstructor, Request
+from mapless_server.method.context import StageContext
+from mapless_server.method.correspond import Matcher
+from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.options import check_bounds
+from mapless_server.method.rejection import Rejection
+from mapless_server.method.retrieve import spread_choice
+from mapless_server.method.scale import estimate_scale
+from mapless_server.method.views import KeptDepth, PosedView, Reconstruction
+from mapless_server.security import SceneKey
+from mapless_server.store.depths import depth_kind
+
+from ..indexes import SceneIndexes
+from ..library import ReferenceLibrary, load_usable
+from ..retrieval.ranking import RankOptions, Selection, rank_references
+from .check import DepthCheckOptions, checked_depths
+
+_AS_QUERIES_CHOOSE = RankOptions(nearby_weight=1.0)
+"""That of `engine.stages`."""
+
+
+@dataclass(frozen=True)
+class DepthMakerOptions:
+    """Options of making depths.
+
+    Attributes:
+        neighbours: references that the network sees beside the one that is wanted, at most; as many as in a query of
+            ten references cost half of its memory.
+        shortlist: so many times the neighbours are matched with it, and the best taken.
+        check: of what is kept.
+    """
+
+    neighbours: int = 7
+    shortlist: int = 2
+    check: DepthCheckOptions = field(default_factory=DepthCheckOptions)
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "neighbours", at_least=2)
+        check_bounds(self, "shortlist", at_least=1)
+
+
+class DepthMaker:
+    """Makes and checks depths with one network, of references with one extractor's features."""
+
+    def __init__(
+        self,
+        indexes: SceneIndexes,
+        extractor: FeatureExtractor,
+        matcher: Matcher,
+        network: Reconstructor,
+        options: DepthMakerOptions | None = None,
+    ) -> None:
+        """`matcher` is that of the extractor's features."""
+        self._indexes = indexes
+        self._extractor = extractor
+        self._matcher = matcher
+        self._network = network
+        self.options = options or DepthMakerOptions()
+
+    @property
+    def kind(self) -> str:
+        """Of the depths."""
+        return depth_kind(self._network.name, self._network.weights_sha256)
+
+    def make(
+        self, scene_key: SceneKey, library: ReferenceLibrary, reference_id: str, check: Callable[[], None]
+    ) -> dict[str, KeptDepth | None]:
+        """Depths of a reference and those of its neighbours that the network sees with it, by key.
+
+        None is for what is not kept. Nothing is returned of a reference that has fewer than two neighbours that share
+        matches with it.
+
+        Args:
+            scene_key: of the scene.
+            library: loads its references.
+            reference_id: of the reference.
+            check: called between the steps; may raise, which ends it.
+
+        Raises:
+            NotFound: the reference or the scene was deleted.
+            DataLoss: the reference is damaged.
+            Exception: of the network.
+        """
+        context = StageContext(check)
+        _, (subject,) = library.load(scene_key, [reference_id], self._extractor, context)
+        neighbours = self._neighbours(scene_key, library, subject, reference_id, context)
+        if len(neighbours) < 2:
+            return {}
+        origin = subject.world_from_camera.translation
+        query, *others = neighbours
+        given = [replace(it, world_from_camera=it.world_from_camera.shifted(-origin)) for it in (subject, *others)]
+        correspondences = self._matcher.correspond(query.view, (subject, *others), False, check)
+        is_metric = not library.attributes(scene_key).arbitrary_unit
+        request = Request(query.view, given, correspondences, is_metric=is_metric)
+        (outcome,) = self._network.reconstruct_many([request])
+        check()
+        if isinstance(outcome, Exception):
+            raise outcome
+        nothing = dict.fromkeys(it.key for it in given)
+        if isinstance(outcome, Rejection):
+            return nothing
+        reconstruction = outcome if isinstance(outcome, Reconstruction) else outcome.fetch()
+        scale = estimate_scale(reconstruction, given, correspondences)
+        if isinstance(scale, Rejection):
+            return nothing
+        true_pose = query.world_from_camera.shifted(-origin)
+        depths = checked_depths(reconstruction, scale, given, true_pose, correspondences, self.options.check)
+        return dict(zip(nothing, depths, strict=True))
+
+    def _neighbours(
+        self,
+        scene_key: SceneKey,
+        library: ReferenceLibrary,
+        subject: PosedView,
+        reference_id: str,
+        context: StageContext,
+    ) -> list[PosedView]:
+        """The references that share most matches with one, from different places, the best first."""
+        entries = self._indexes.entries(scene_key, context)
+        if reference_id not in entries:
+            raise NotFound("the reference was deleted")
+        (row,) = entries.rows([reference_id])
+        count = self.options.neighbours
+        selection = Selection(self.options.shortlist * count + 1, options=_AS_QUERIES_CHOOSE)
+        ranked = rank_references(entries, entries.vector(row), selection)
+        wanted = [it.reference_id for it in ranked if it.key != subject.key]
+        others = self._load_usable(scene_key, library, wanted, context)
+        matches = [self._matcher.match_references(subject, other) for other in others]
+        context.check()
+        sharing = [i for i, found in enumerate(matches) if len(found) >= self.options.check.min_points]
+        centres = [others[i].world_from_camera.translation for i in sharing]
+        return [others[sharing[i]] for i in spread_choice([len(matches[i]) for i in sharing], centres, count)]
+
+    def _load_usable(
+        self, scene_key: SceneKey, library: ReferenceLibrary, wanted: Sequence[str], context: StageContext
+    ) -> tuple[PosedView, ...]:
+        """Those that exist and are not damaged."""
+
+        def report(damaged_id: str, error: RequestError) -> None:
+            if isinstance(error, DataLoss):
+                self._indexes.report_damaged(scene_key, damaged_id, error)
+
+        return load_usable(
+            lambda ids: library.load(scene_key, ids, self._extractor, context), wanted, (DataLoss, NotFound), report
+        )[1]

@@ -1,0 +1,23 @@
+"""Expand: depth that is kept with references."""
+
+from __future__ import annotations
+
+import sqlalchemy as sa
+from alembic import op
+
+from mapless_server.store.migrations import write_version
+
+revision = "7"
+down_revision = "6"
+
+
+def upgrade() -> None:
+    """Adds a table that servers of revision 6 ignore; its rows go with the references that those delete."""
+    op.create_table(
+        "reference_depth",
+        sa.Column("reference_key", sa.String(32), sa.ForeignKey("reference.key", ondelete="CASCADE"), primary_key=True),
+        sa.Column("kind", sa.String(255), primary_key=True),
+        sa.Column("data", sa.LargeBinary(), nullable=False),
+        sa.Column("sha256", sa.String(64), nullable=False),
+    )
+    write_version(op.get_bind(), 7)

@@ -1,0 +1,197 @@
+"""Depths kept with references: where they put points, how they combine with triangulation, what they gain."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.scenes import SceneOptions, make_scene, random_for
+
+from mapless.geometry import Array
+from mapless_server.method.answer import Localization
+from mapless_server.method.bundle import BundleProblem, bundle_of
+from mapless_server.method.correspond import Correspondences, Matcher
+from mapless_server.method.kept_depth import with_kept_depths
+from mapless_server.method.localize import localize
+from mapless_server.method.options import LocalizeOptions, Variant
+from mapless_server.method.pipeline import Pipeline
+from mapless_server.method.results import DepthPlanes, Structure
+from mapless_server.method.structure import StructureOptions, triangulated_structure
+from mapless_server.method.structure import observe as observations_of
+from mapless_server.method.tracks import Tracks
+from mapless_server.method.views import Features, KeptDepth, KeypointDepths, PosedView
+
+SCENE = make_scene(random_for("kept depth"), SceneOptions(point_count=500, reference_count=3, baseline_m=0.8))
+SIGMA = 0.02
+
+
+def true_depth(index: int) -> Array:
+    """(N,) at the keypoints of a reference; NaN where they show no point."""
+    points, pose = SCENE.reference_points[index], SCENE.references[index].world_from_camera
+    depth = pose.inverse().apply(SCENE.x_in_world[points])[:, 2]
+    return np.where(points >= 0, depth, np.nan)
+
+
+def with_depths(index: int, noise: float = SIGMA, seed: int = 0, factor: float = 1.0) -> PosedView:
+    """A reference with its true depths, each with an error."""
+    depth = true_depth(index)
+    error = np.random.default_rng(seed).normal(0.0, noise, len(depth)) if noise else 0.0
+    depths = KeypointDepths((factor * depth * np.exp(error)).astype(np.float32), max(noise, 1e-3))
+    return replace(SCENE.references[index], depths=depths)
+
+
+def matched(references: tuple[PosedView, ...]) -> tuple[Structure, Correspondences]:
+    correspondences = Matcher().correspond(SCENE.query, references)
+    return triangulated_structure(references, correspondences, StructureOptions()), correspondences
+
+
+def point_numbers(structure: Structure, references: tuple[PosedView, ...]) -> Array:
+    """The scene's point that each point of a structure is, by its first observation; -1 for none."""
+    tracks, index = structure.tracks, [SCENE.references.index(replace_depths(it)) for it in references]
+    first = tracks.starts
+    views, keypoints = tracks.view[first], tracks.keypoint[first]
+    return np.array([SCENE.reference_points[index[v]][k] for v, k in zip(views, keypoints, strict=True)])
+
+
+def replace_depths(reference: PosedView) -> PosedView:
+    return next(it for it in SCENE.references if it.key == reference.key)
+
+
+def test_without_depths_the_structure_is_the_same_object() -> None:
+    structure, correspondences = matched(SCENE.references)
+    assert with_kept_depths(structure, SCENE.references, correspondences) is structure
+
+
+def test_a_keypoint_that_only_the_query_matches_gets_a_point() -> None:
+    references = (with_depths(0, noise=0.0),)
+    nothing = np.empty(0, np.intp)
+    structure = Structure(np.empty((0, 3)), Tracks(nothing, nothing, nothing), StructureOptions().first_noise)
+    correspondences = Matcher().correspond(SCENE.query, references)
+    found = with_kept_depths(structure, references, correspondences)
+    assert len(found.x_in_world) > 200
+    assert not found.triangulated.any()
+    numbers = point_numbers(found, references)
+    off = np.linalg.norm(found.x_in_world - SCENE.x_in_world[numbers], axis=1)
+    assert np.quantile(off, 0.99) < 0.02, "half a pixel at four metres is a few millimetres"
+
+
+def test_triangulated_points_come_first_and_single_ones_are_matched() -> None:
+    references = tuple(with_depths(i) for i in range(3))
+    structure, correspondences = matched(references)
+    found = with_kept_depths(structure, references, correspondences)
+    count = len(structure.x_in_world)
+    assert found.triangulated[:count].all()
+    assert not found.triangulated[count:].any()
+    single = found.tracks.select(~found.triangulated)
+    of_query = [set(it[:, 1].tolist()) for it in correspondences.query_matches]
+    assert all(k in of_query[v] for v, k in zip(single.view, single.keypoint, strict=True))
+    pairs = list(zip(found.tracks.view.tolist(), found.tracks.keypoint.tolist(), strict=True))
+    assert len(set(pairs)) == len(pairs), "no keypoint observes two points"
+
+
+def test_a_triangulated_point_moves_by_what_its_depth_knows() -> None:
+    """Along the plane's normal it is the mean of both, weighted by their information."""
+    references = (with_depths(0), *SCENE.references[1:])
+    structure, correspondences = matched(references)
+    found = with_kept_depths(structure, references, correspondences)
+    assert found.planes is not None
+    used = np.flatnonzero(found.planes.information[: len(structure.x_in_world)])
+    _, jacobian = observations_of(structure.tracks, references, structure.noise).linearized(structure.x_in_world)
+    information = structure.tracks.sum_by_point(np.swapaxes(jacobian, 1, 2) @ jacobian)
+    for point in used[:20]:
+        plane = found.planes.information[point] * np.outer(found.planes.normal[point], found.planes.normal[point])
+        wanted = np.linalg.solve(
+            information[point] + plane,
+            information[point] @ structure.x_in_world[point]
+            + found.planes.information[point] * found.planes.offset[point] * found.planes.normal[point],
+        )
+        assert found.x_in_world[point] == pytest.approx(wanted, abs=1e-6)
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.4])
+def test_depths_that_contradict_triangulation_are_not_used(factor: float) -> None:
+    references = (with_depths(0, factor=factor), *SCENE.references[1:])
+    structure, correspondences = matched(references)
+    found = with_kept_depths(structure, references, correspondences)
+    assert found.planes is not None
+    count = len(structure.x_in_world)
+    assert (found.planes.information[:count] > 0).mean() < 0.02
+    moved = (found.x_in_world[:count] != structure.x_in_world).any(axis=1)
+    assert moved.mean() < 0.02
+
+
+def test_planes_are_in_the_normal_equations_as_in_the_cost() -> None:
+    references = tuple(with_depths(i) for i in range(3))
+    structure, correspondences = matched(references)
+    found = with_kept_depths(structure, references, correspondences)
+    chosen = np.arange(len(found.x_in_world))
+    observations, start, _ = bundle_of(found.tracks, references, found, chosen)
+    assert found.planes is not None
+    given = start.poses[:-1]
+    problem = BundleProblem(observations, found.tracks.view, given, np.zeros((12, 12)), 1e6, planes=found.planes)
+    start = start.moved(np.zeros((3, 6)), np.random.default_rng(0).normal(0, 0.05, start.points.shape))
+    equations, step = problem.linearize(start), 1e-6
+    for point in (0, len(chosen) - 1):
+        for axis in range(3):
+            change = np.zeros((len(chosen), 3))
+            change[point, axis] = step
+            ahead, behind = (problem.cost(start.moved(np.zeros((3, 6)), sign * change)) for sign in (1, -1))
+            assert 2 * equations.point_gradient[axis, point] == pytest.approx((ahead - behind) / (2 * step), rel=1e-3)
+
+
+def test_references_that_share_nothing_give_points_by_their_depths() -> None:
+    """Without depths the pose is from matches with the references themselves, or there is none."""
+    parts = []
+    for index, reference in enumerate(SCENE.references):
+        kept = np.flatnonzero(SCENE.reference_points[index] % 3 == index)
+        view, depths = reference.view, with_depths(index).depths
+        assert depths is not None
+        arrays = view.features.keypoints[kept], view.features.descriptors[kept], view.features.sizes_px[kept]
+        view = replace(view, features=Features(*arrays))
+        parts.append(replace(reference, view=view, depths=replace(depths, depth=depths.depth[kept])))
+    answers = {
+        has_depths: localize(
+            SCENE.query, [it if has_depths else replace(it, depths=None) for it in parts], Pipeline(), LocalizeOptions()
+        )
+        for has_depths in (False, True)
+    }
+    alone = answers[False]
+    assert not isinstance(alone.outcome, Localization) or (alone.support and alone.support.two_view is not None)
+    outcome, support = answers[True].outcome, answers[True].support
+    assert isinstance(outcome, Localization)
+    assert support is not None
+    assert support.two_view is None
+    assert np.linalg.norm(outcome.world_from_camera.translation - SCENE.world_from_query.translation) < 0.02
+
+
+@pytest.mark.parametrize("variant", [Variant.COARSE, Variant.NO_STRUCTURE, Variant.FULL])
+def test_the_papers_variants_use_no_depths_in_their_points(variant: Variant) -> None:
+    references = tuple(with_depths(i) for i in range(3))
+    answer = localize(SCENE.query, references, Pipeline(), LocalizeOptions(variant=variant))
+    assert answer.support is None or answer.support.structure.planes is None
+
+
+def test_depths_are_read_at_the_keypoints_nearest_pixel() -> None:
+    camera = SCENE.query.camera
+    depth = np.full((camera.height_px // 2, camera.width_px // 2), np.nan, np.float32)
+    column, row = np.rint((SCENE.query.features.keypoints[0] - 0.5) / 2).astype(int)
+    depth[row, column] = 3.0
+    kept = KeptDepth(camera.resized(camera.width_px // 2, camera.height_px // 2), depth, 0.02)
+    found = kept.at_keypoints(SCENE.query)
+    assert found.depth[0] == 3.0
+    assert np.isnan(found.depth).sum() >= len(found.depth) - 5
+
+
+def test_a_map_of_another_size_than_its_camera_is_an_error() -> None:
+    with pytest.raises(ValueError, match="does not fit"):
+        KeptDepth(SCENE.query.camera, np.ones((2, 2), np.float32), 0.02)
+    with pytest.raises(ValueError, match="relative_sigma"):
+        KeptDepth(SCENE.query.camera.resized(2, 2), np.ones((2, 2), np.float32), 0.0)
+
+
+def test_distances_from_planes_are_signed_and_weighted() -> None:
+    planes = DepthPlanes(np.array([[0.0, 0.0, 1.0]] * 2), np.array([2.0, 1.0]), np.array([4.0, 0.0]))
+    points = np.array([[5.0, 5.0, 2.5], [0.0, 0.0, 9.0]])
+    assert planes.distance(points) == pytest.approx([0.5, 8.0])
+    assert planes.cost(points) == pytest.approx(4 * 0.25)
