@@ -80,7 +80,7 @@ class Settings(BaseModel):
     weights_dir: Path = Field(default_factory=default_weights_dir)
     """Folder of the networks' weights."""
     reference_depth: str = Field(default=OFF, json_schema_extra={"enum": [OFF, STORED, *NETWORKS]})
-    """Depth kept with references, for the backend geometric: off, stored (made by other servers), or a network."""
+    """Depth kept with references, for the backend geometric: off, stored (others make it), or the network that does."""
     compiled_views: int = Field(default=0, ge=0, le=65)
     """Photographs of a query, itself included, that a network is compiled for at the start, at least 3; 0: none."""
     query_rays: bool = True

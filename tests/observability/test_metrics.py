@@ -34,13 +34,14 @@ FAMILIES = {
     ("counter", ""): (
         "mapless_background_pairs_total mapless_background_cpu_seconds_total mapless_background_failures_total "
         "mapless_calibrations_total mapless_calibration_cpu_seconds_total mapless_calibration_failures_total "
+        "mapless_depth_seconds_total mapless_depth_failures_total "
         "mapless_stored_pairs_failures_total mapless_captured_total mapless_admitted_total "
         "mapless_admitted_cost_seconds_total mapless_reference_cache_hits_total "
         "mapless_reference_cache_misses_total mapless_reference_cache_evictions_total "
         "mapless_token_cache_misses_total mapless_token_cache_evictions_total mapless_gpu_oom_total "
         "mapless_fatal_total mapless_store_errors_total"
     ),
-    ("counter", "result"): "mapless_stored_pairs_total",
+    ("counter", "result"): "mapless_stored_pairs_total mapless_stored_depths_total mapless_depths_total",
     ("counter", "reason"): "mapless_capture_dropped_total mapless_admission_rejected_total",
     ("counter", "grpc_method grpc_service"): "grpc_server_started_total",
     ("counter", "grpc_code grpc_method grpc_service"): "grpc_server_handled_total",
@@ -50,7 +51,7 @@ FAMILIES = {
     ("counter", "tier"): "mapless_token_cache_hits_total",
     ("counter", "outcome"): "mapless_answers_total",
     ("gauge", ""): (
-        "mapless_background_waiting mapless_calibration_waiting mapless_capture_bytes mapless_capture_enabled "
+        "mapless_background_waiting mapless_calibration_waiting mapless_depth_waiting mapless_capture_bytes mapless_capture_enabled "
         "mapless_python_allocated_blocks mapless_reference_cache_bytes mapless_retrieval_index_bytes "
         "mapless_scheduler_heartbeat_timestamp_seconds mapless_health_serving "
         "mapless_tls_certificate_expiry_timestamp_seconds mapless_warmup_seconds"

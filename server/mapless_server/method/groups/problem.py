@@ -230,9 +230,9 @@ class GroupProblem(Generic[S]):
         observations = replace(observations, sigma_px=observations.sigma_px * np.sqrt(shared.times(part)))
         references = np.array([self._index(it) for it in source.references])
         free = np.zeros((6 * len(references),) * 2)
-        problem = BundleProblem(
-            observations, part.tracks.view, start.poses[:-1], free, self.options.adjust.loss_scale_sigma
-        )
+        planes = None if structure.planes is None else structure.planes[part.chosen]
+        scale_sigma = self.options.adjust.loss_scale_sigma
+        problem = BundleProblem(observations, part.tracks.view, start.poses[:-1], free, scale_sigma, planes=planes)
         return ImageBlock(source.image, problem, references, float(structure.noise.level_px), depth_m)
 
     def _index(self, reference: PosedView) -> int:

@@ -101,7 +101,10 @@ def checked_depths(
         for index, (view, reference) in enumerate(zip(reconstruction.references, references, strict=True))
     ]
     known = [float(np.nanmedian(it.depth)) for it in depths if it is not None]
-    if not known or np.linalg.norm(off) > options.max_off * np.median(known) or off_deg > options.max_off_deg:
+    if not known:
+        return [None] * len(references)
+    is_found = np.linalg.norm(off) <= options.max_off * np.median(known) and off_deg <= options.max_off_deg
+    if not is_found:  # also if it is NaN
         return [None] * len(references)
     return [_confirmed(index, depths, references, options) for index in range(len(references))]
 
@@ -145,7 +148,7 @@ def _is_smooth(depth: Array, max_step: float) -> NDArray[np.bool_]:
     around = np.ones((3, 3), np.uint8)
     nearest = cv2.erode(np.where(known, depth, np.inf), around)
     farthest = cv2.dilate(np.where(known, depth, 0.0), around)
-    return np.asarray(known & (farthest <= max_step**2 * nearest))
+    return np.asarray(known & (farthest / max_step**2 <= nearest))
 
 
 def _confirmed(
