@@ -51,9 +51,9 @@ FAMILIES = {
     ("counter", "tier"): "mapless_token_cache_hits_total",
     ("counter", "outcome"): "mapless_answers_total",
     ("gauge", ""): (
-        "mapless_background_waiting mapless_calibration_waiting mapless_depth_waiting mapless_capture_bytes mapless_capture_enabled "
-        "mapless_python_allocated_blocks mapless_reference_cache_bytes mapless_retrieval_index_bytes "
-        "mapless_scheduler_heartbeat_timestamp_seconds mapless_health_serving "
+        "mapless_background_waiting mapless_calibration_waiting mapless_depth_waiting mapless_capture_bytes "
+        "mapless_capture_enabled mapless_python_allocated_blocks mapless_reference_cache_bytes "
+        "mapless_retrieval_index_bytes mapless_scheduler_heartbeat_timestamp_seconds mapless_health_serving "
         "mapless_tls_certificate_expiry_timestamp_seconds mapless_warmup_seconds"
     ),
     ("gauge", "stage"): "mapless_queue_depth mapless_queue_cost_seconds mapless_inflight",

@@ -7,12 +7,10 @@ from dataclasses import dataclass, field, replace
 
 from mapless_server.errors import DataLoss, NotFound, RequestError
 from mapless_server.method.coarse import Reconstructor, Request
-from mapless_server.method.context import StageContext
 from mapless_server.method.correspond import Matcher
 from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.options import check_bounds
+from mapless_server.method.options import StageContext, check_bounds
 from mapless_server.method.rejection import Rejection
-from mapless_server.method.retrieve import spread_choice
 from mapless_server.method.scale import estimate_scale
 from mapless_server.method.views import KeptDepth, PosedView, Reconstruction
 from mapless_server.security import SceneKey
@@ -20,7 +18,7 @@ from mapless_server.store.depths import depth_kind
 
 from ..indexes import SceneIndexes
 from ..library import ReferenceLibrary, load_usable
-from ..retrieval.ranking import RankOptions, Selection, rank_references
+from ..retrieval.ranking import RankOptions, Selection, rank_references, spread_choice
 from .check import DepthCheckOptions, checked_depths
 
 _AS_QUERIES_CHOOSE = RankOptions(nearby_weight=1.0)
