@@ -105,7 +105,7 @@ def _check_address(session: _Session) -> _Result:
     if "" in answers:
         return OK, f"{found[answers.index('')][4][0]} port {port} accepts connections", ""
     refused = "; ".join(f"{it[4][0]}: {answer}" for it, answer in zip(found, answers, strict=True))
-    advice = f"start the server (mapless-server serve), or correct --address (host:port); is port {port} open in firewalls?"
+    advice = f"start the server (mapless-server serve), or correct --address (host:port); is port {port} open?"
     return WRONG, f"nothing answers at {session.address} ({refused})", advice
 
 
