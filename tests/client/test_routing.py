@@ -5,13 +5,12 @@ from __future__ import annotations
 import re
 from typing import Any
 
-import grpc
 import pytest
 from google.protobuf import empty_pb2
 from google.protobuf.message import Message
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.clients import Connect, awaiting, hosted
+from support.clients import Connect, Recording, awaiting, hosted
 
 from mapless import Client, ConnectOptions, names
 from mapless.errors import MaplessError
@@ -76,25 +75,9 @@ def test_malformed_names_have_no_routing_header(scene: str) -> None:
     assert scene_metadata(localization_pb.LocalizeRequest(scene=scene)) == ()
 
 
-class Recording(grpc.GenericRpcHandler):
-    """Refuses every call, and keeps its metadata."""
-
-    def __init__(self) -> None:
-        self.seen: list[dict[str, str]] = []
-
-    def service(self, details: Any) -> Any:
-        self.seen.append(dict(details.invocation_metadata))
-
-        def refuse(_: bytes, context: grpc.ServicerContext) -> bytes:
-            context.abort(grpc.StatusCode.NOT_FOUND, "nothing here")
-            raise AssertionError
-
-        return grpc.unary_unary_rpc_method_handler(refuse)
-
-
 @pytest.mark.parametrize("connect", [Client, awaiting], ids=["blocking", "asyncio"])
 def test_clients_send_it_beside_what_they_always_send(connect: Connect) -> None:
-    recording = Recording()
+    recording = Recording(refuses=True)
     options = ConnectOptions(token="t", client_id="robot-7")
     with hosted(recording) as address, connect(address, options) as client:
         for call in (
@@ -106,5 +89,11 @@ def test_clients_send_it_beside_what_they_always_send(connect: Connect) -> None:
         ):
             with pytest.raises(MaplessError):
                 call()
-    assert [it.get(SCENE_KEY) for it in recording.seen] == ["scenes/kitchen", "scenes/hall", "scenes/a.b", None, None]
-    assert all((it["authorization"], it["x-client-id"]) == ("Bearer t", "robot-7") for it in recording.seen)
+    assert [it.get(SCENE_KEY) for it in recording.metadata] == [
+        "scenes/kitchen",
+        "scenes/hall",
+        "scenes/a.b",
+        None,
+        None,
+    ]
+    assert all((it["authorization"], it["x-client-id"]) == ("Bearer t", "robot-7") for it in recording.metadata)

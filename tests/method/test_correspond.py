@@ -9,6 +9,7 @@ from itertools import combinations, product
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.pair_matchings import AnyRatio
 from support.planted import same_points
 from support.scenes import CAMERA, SceneOptions, make_scene, random_for, unit_rows
 
@@ -317,19 +318,6 @@ def test_stored_pairs_are_used_and_give_the_same(wide: bool, matched_pairs: list
     assert matching == matcher.matching(wide)
     assert {tuple(sorted(key)) for key in keys} == set(keys)
     assert len(matched_pairs) == 2 + 2 * 4  # the two that are not stored, and the query's twice
-
-
-class AnyRatio:
-    """A pair matching: nearest neighbours without a ratio."""
-
-    name = "any-ratio"
-
-    def __init__(self) -> None:
-        self.seen: list[tuple[View, View]] = []
-
-    def match_one(self, first: View, second: View, pause: Callable[[], None] = lambda: None) -> Matches:
-        self.seen.append((first, second))
-        return mutual_matches(first.features, second.features, 1.0)
 
 
 class FullShelf(Shelf):

@@ -16,6 +16,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from support.pair_matchings import AnyRatio
 from support.planted_damage import damage
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 from support.servers import StandInDescriptor, StandInExtractor
@@ -219,16 +220,6 @@ class TestResults:
             np.testing.assert_array_equal(matches, Matcher().match_pair(*in_order(first, second)))
 
 
-class AnyRatio:
-    """A pair matching: nearest neighbours without a ratio."""
-
-    name = "any-ratio"
-
-    def match_one(self, first: View, second: View, pause: Callable[[], None] = lambda: None) -> Matches:
-        pause()
-        return correspond.mutual_matches(first.features, second.features, 1.0)
-
-
 class NeverCalled(AnyRatio):
     def match_one(self, first: View, second: View, pause: Callable[[], None] = lambda: None) -> Matches:
         raise AssertionError
@@ -238,6 +229,7 @@ class Halfway(AnyRatio):
     """Pauses once in each pair; a caller comes before that."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.is_busy, self.is_resumed = threading.Event(), threading.Event()
 
     def match_one(self, first: View, second: View, pause: Callable[[], None] = lambda: None) -> Matches:

@@ -6,6 +6,7 @@ gone.
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -26,6 +27,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from sqlalchemy import Connection
 from support.disks import fail, failing_disk, mount, small_disk
 from support.images import encode
+from support.planted_damage import lose_page_with
 from support.servers import CAMERA, PHOTO, StandInMethod, pose, serving
 from support.waiting import wait_until
 
@@ -55,7 +57,6 @@ from mapless_server.store.verification import verify
 
 ONCE = ConnectOptions(max_attempts=1, timeout_s=30)
 LARGE = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
-PAGE_BYTES = 4096
 
 
 def large_photo(seed: int) -> bytes:
@@ -222,8 +223,8 @@ class TestDisk:
                 wait_until(lambda: health_of(client) == (True, True, False))
                 with pytest.raises(SystemExit) as caught:
                     main(["--address", client.address, "health"])
-            expected = "SERVING\nLocalizationService SERVING\nReferenceService NOT_SERVING\n"
-            assert (caught.value.code, capsys.readouterr().out) == (0, expected)
+            expected = {"server": "SERVING", "LocalizationService": "SERVING", "ReferenceService": "NOT_SERVING"}
+            assert (caught.value.code, json.loads(capsys.readouterr().out)) == (0, expected)
 
     def serves_queries_alone(self, client: HealthClient) -> None:
         assert is_answered(client)
@@ -292,14 +293,8 @@ class TestDisk:
 
 class TestDamagedPages:
     def damage(self, folder: Path, photo: bytes) -> None:
-        """Zeroes a page in the middle of a photograph: its link to the next page is gone, too."""
-        path = folder / DATABASE_FILE
-        content = path.read_bytes()
-        at = content.find(photo[100_000:100_016])
-        assert at > 0
-        with path.open("r+b") as file:
-            file.seek(at // PAGE_BYTES * PAGE_BYTES)
-            file.write(bytes(PAGE_BYTES))
+        """In the middle of a photograph."""
+        lose_page_with(folder / DATABASE_FILE, photo[100_000:100_016])
 
     def test_a_bad_sector_costs_the_reference_stored_there(self, tmp_path: Path) -> None:
         with served(tmp_path) as client:

@@ -22,7 +22,7 @@ import yaml  # type: ignore[import-untyped]
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from support import envoys
 from support.certificates import authority, signed
-from support.clients import hosted
+from support.clients import Recording, hosted
 from support.documents import blocks
 from support.envoys import ENVOY, Gateway, configured, fetched, gateway, program
 from support.fronts import FAILING_CALLS, assert_fails_alike
@@ -369,27 +369,8 @@ def test_the_servers_limit_of_messages_is_the_limit(fleet: Fleet, size_mib: int,
     assert (there.message, there.retry_after_s) == (here.message, here.retry_after_s)
 
 
-class Echo(grpc.GenericRpcHandler):
-    """A server that keeps the metadata of its calls."""
-
-    def __init__(self) -> None:
-        self.metadata: list[dict[str, str]] = []
-        self.remaining_s: list[float] = []
-
-    def service(self, details: Any) -> Any:
-        if not details.method.startswith("/mapless.v1."):
-            return None
-        self.metadata.append(dict(details.invocation_metadata))
-
-        def answer(_: bytes, context: grpc.ServicerContext) -> bytes:
-            self.remaining_s.append(context.time_remaining())
-            return b""
-
-        return grpc.unary_unary_rpc_method_handler(answer)
-
-
 def test_servers_get_the_callers_metadata_and_address(tmp_path: Path) -> None:
-    echo = Echo()
+    echo = Recording()
     service = health.HealthServicer()
     service.set("mapless.v1.LocalizationService", health_pb2.HealthCheckResponse.SERVING)
     add = partial(health_pb2_grpc.add_HealthServicer_to_server, service)

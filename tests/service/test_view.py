@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import cv2
@@ -16,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from support.chromium import Page, browsing, needs_chromium
 from support.corner import CAMERA, photograph, pose
+from support.gateways import running_command
 
 from mapless import Client, ConnectOptions, LocalizationResult, NewReference
 from mapless_tools.child import child_server
@@ -25,25 +22,11 @@ pytest.importorskip("viser", reason="needs the extra view")
 REFERENCES = [f"reference-{i}" for i in range(6)]
 YELLOW, GREEN = (255, 190, 60), (46, 230, 166)
 TOP_PX = 220
-ANNOUNCEMENT = "mapless-server view is on "
 
 
-@contextmanager
-def view(address: str, scene: str) -> Iterator[str]:
+def view(address: str, scene: str) -> AbstractContextManager[str]:
     """The address of a viewer of its own."""
-    arguments = ["view", scene, "--address", address, "--no-open", "--port", "0", "--seeds", "2"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "mapless_tools", *arguments], stdout=subprocess.PIPE, text=True, env=dict(os.environ)
-    )
-    assert process.stdout is not None
-    try:
-        line = process.stdout.readline()
-        assert line.startswith(ANNOUNCEMENT), line
-        yield line.removeprefix(ANNOUNCEMENT).strip()
-    finally:
-        process.terminate()
-        assert process.wait(30) == 128 + 15
-        process.stdout.close()
+    return running_command("view", scene, "--address", address, "--no-open", "--seeds", "2")
 
 
 def like(picture: NDArray[np.uint8], colour: tuple[int, int, int], within: int = 60) -> NDArray[np.bool_]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from support.planted_damage import lose_page_with
 from support.stores import EXTRACTOR, Folder, faults_of, make_reference, view_of
 
 from mapless_server.errors import AlreadyExists, DataLoss, NotFound
@@ -17,7 +18,6 @@ from mapless_server.store.sqlite import DATABASE_FILE
 
 SCENE = SceneKey("office")
 IDS = ["a", "b", "c"]
-PAGE_BYTES = 4096
 MADE = {it: make_reference(it, seed, count=100, dimension=6000) for seed, it in enumerate(IDS)}
 
 
@@ -30,15 +30,6 @@ def folder(tmp_path: Path) -> Folder:
     return folder
 
 
-def lose_page_with(folder: Folder, content: bytes) -> None:
-    path = folder.data_dir / DATABASE_FILE
-    at = path.read_bytes().find(content)
-    assert at > 0
-    with path.open("r+b") as file:
-        file.seek(at // PAGE_BYTES * PAGE_BYTES)
-        file.write(bytes(PAGE_BYTES))
-
-
 def lose(folder: Folder, what: str, reference_id: str) -> None:
     made = MADE[reference_id]
     stored = {
@@ -46,7 +37,7 @@ def lose(folder: Folder, what: str, reference_id: str) -> None:
         "features": view_of(made).features.descriptors.tobytes()[20_000:20_016],
         "descriptor": made.descriptors["vlad"].astype("float16").tobytes()[6000:6016],
     }
-    lose_page_with(folder, stored[what])
+    lose_page_with(folder.data_dir / DATABASE_FILE, stored[what])
 
 
 def test_lost_features_name_their_reference_and_others_load(folder: Folder) -> None:
@@ -120,7 +111,7 @@ def test_a_scene_with_lost_pages_can_be_deleted(
 def test_a_lost_table_of_references_names_no_reference(folder: Folder) -> None:
     with folder.open() as store:
         key = store.get_reference(SCENE, "a").key
-    lose_page_with(folder, f"{key}office".encode())
+    lose_page_with(folder.data_dir / DATABASE_FILE, f"{key}office".encode())
     with folder.open() as store, pytest.raises(DataLoss, match="the store is damaged"):
         store.load_references(SCENE, IDS, EXTRACTOR)
     assert any(fault.startswith("database: ") for fault in faults_of(folder))

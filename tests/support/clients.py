@@ -122,6 +122,28 @@ def status(code: str, retry_after_s: float | None = None) -> grpc.Status:
     return _Status(grpc.StatusCode[code], [retry] if retry_after_s is not None else [])
 
 
+class Recording(grpc.GenericRpcHandler):
+    """Answers the interface's calls with nothing, or refuses them, and keeps their metadata."""
+
+    def __init__(self, refuses: bool = False) -> None:
+        self.refuses = refuses
+        self.metadata: list[dict[str, str]] = []
+        self.remaining_s: list[float] = []
+
+    def service(self, handler_call_details: Any) -> Any:
+        if not handler_call_details.method.startswith("/mapless.v1."):
+            return None
+        self.metadata.append(dict(handler_call_details.invocation_metadata))
+
+        def answer(_: bytes, context: grpc.ServicerContext) -> bytes:
+            self.remaining_s.append(context.time_remaining())
+            if self.refuses:
+                context.abort(grpc.StatusCode.NOT_FOUND, "nothing here")
+            return b""
+
+        return grpc.unary_unary_rpc_method_handler(answer)
+
+
 def _serves_nothing_else(_: Any) -> None:
     pass
 

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
+from support.evaluations import query_result
 from support.images import encode, textured
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
@@ -30,23 +31,8 @@ from mapless_tools.evaluate.run import Evaluation
 
 
 def result(translation: float, rotation_deg: float = 0.01, latency_ms: float = 100.0) -> QueryResult:
-    missed = math.isinf(translation)
-    return QueryResult(
-        name="q",
-        references=("a", "b"),
-        translation_error=translation,
-        rotation_error_deg=math.inf if missed else rotation_deg,
-        reference_distance=2.0,
-        position_68=None if missed else 0.01,
-        inlier_count=0 if missed else 100,
-        match_count=0 if missed else 200,
-        rejection="LOW_OVERLAP" if missed else "",
-        message="2 of [8] matches" if missed else "",
-        latency_ms=latency_ms,
-        stage_ms={"decode": 10.0, "pnp": 30.0},
-        backend="geometric",
-        features="sift",
-    )
+    own = {"reference_distance": 2.0, "latency_ms": latency_ms, "stage_ms": {"decode": 10.0, "pnp": 30.0}}
+    return query_result("q", translation, rotation_deg, (100, 200), "2 of [8] matches", **own)
 
 
 def evaluation(*results: QueryResult, metric: bool = True, references: int | None = None) -> Evaluation:

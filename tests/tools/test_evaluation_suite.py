@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from support.evaluations import query_result
 from support.images import textured
 
 from mapless import Internal
@@ -51,25 +52,9 @@ def dataset(train: int = 40, test: int = 9, **fields: Any) -> Dataset:
 
 
 def result(name: str, translation_m: float, rotation_deg: float = 0.5) -> QueryResult:
-    missed = math.isinf(translation_m)
-    return QueryResult(
-        name=name,
-        references=("r0", "r1"),
-        translation_error=translation_m,
-        rotation_error_deg=math.inf if missed else rotation_deg,
-        reference_distance=math.inf if missed else 1.0,
-        position_68=None if missed else 0.01,
-        inlier_count=0 if missed else 30,
-        match_count=0 if missed else 40,
-        rejection="LOW_OVERLAP" if missed else "",
-        message="<b>none</b>" if missed else "",
-        latency_ms=100.0,
-        stage_ms={"decode": 1.0, "pnp": 3.0},
-        backend="geometric",
-        features="sift",
-        best_reference="" if missed else "r1",
-        pose=None if missed else (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0),
-    )
+    pose = None if math.isinf(translation_m) else (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)
+    best = "r1" if pose else ""
+    return query_result(name, translation_m, rotation_deg, (30, 40), "<b>none</b>", best_reference=best, pose=pose)
 
 
 def suite(medians_m: dict[str, float], options: SuiteOptions | None = None, layout: str = "7scenes") -> Suite:

@@ -1,0 +1,28 @@
+"""Planted results of evaluated queries."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from mapless_tools.evaluate.metrics import QueryResult
+
+
+def query_result(
+    name: str, translation: float, rotation_deg: float, inliers: tuple[int, int], message: str, **fields: Any
+) -> QueryResult:
+    """With such errors, and so many inliers of so many matches; one that missed where the first error is infinite."""
+    missed = math.isinf(translation)
+    common: dict[str, Any] = {"references": ("r0", "r1"), "reference_distance": 1.0, "latency_ms": 100.0}
+    common |= {"stage_ms": {"decode": 1.0, "pnp": 3.0}, "backend": "geometric", "features": "sift"}
+    return QueryResult(
+        name=name,
+        translation_error=translation,
+        rotation_error_deg=math.inf if missed else rotation_deg,
+        position_68=None if missed else 0.01,
+        inlier_count=0 if missed else inliers[0],
+        match_count=0 if missed else inliers[1],
+        rejection="LOW_OVERLAP" if missed else "",
+        message=message if missed else "",
+        **(common | fields),
+    )
