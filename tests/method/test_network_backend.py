@@ -46,7 +46,7 @@ from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstr
 from mapless_server.method.coarse.token_cache import TokenCacheOptions
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.views import PosedView, Reconstruction, View
-from mapless_server.networks import mapanything, pi3, pi3x
+from mapless_server.networks import mapanything, pi3
 from mapless_server.networks.conditions import normalize_poses
 from mapless_server.networks.mapanything import MapAnything
 from mapless_server.networks.network import NetworkOutput
@@ -539,7 +539,7 @@ def test_pi3x_normalizes_by_the_references_alone(monkeypatch: pytest.MonkeyPatch
     posed = torch.tensor([[True, True, True, False]])
 
     misled = runner.reconstruct(tokens, (4, 5), 3, poses, posed).local_points[0].numpy()
-    monkeypatch.setattr(pi3x, "normalize_poses", _normalize_without_the_last)
+    monkeypatch.setattr(pi3, "normalize_poses", _normalize_without_the_last)
     plain = runner.reconstruct(tokens, (4, 5), 3, poses, posed).local_points[0].numpy()
     np.testing.assert_allclose(ours, plain, atol=5e-5 * float(np.abs(plain).max()))
     assert np.abs(misled - plain).max() > 1e-3 * float(np.abs(plain).max())

@@ -24,8 +24,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
 from mapless_server.method.views import View
-from mapless_server.networks.megaloc import Backbone, MegaLoc, signed_groups
-from mapless_server.networks.salad import Salad, transport
+from mapless_server.networks.megaloc import Backbone, MegaLoc, Salad, signed_groups, transport
 from mapless_server.networks.weights import CheckpointError, named
 from mapless_server.networks.weights.install import add
 from mapless_server.scenes import GlobalDescriptor

@@ -20,8 +20,7 @@ from support.parity_rule import full_network as make_full_network
 
 from mapless_server.networks.conditions import normalize_poses
 from mapless_server.networks.network import Network, NetworkOutput, patch_grid
-from mapless_server.networks.pi import UNUSED
-from mapless_server.networks.pi3x import Pi3X
+from mapless_server.networks.pi3 import UNUSED, Pi3X
 
 HERE = Path(__file__).parents[1] / "fixtures" / "networks"
 BESIDE = Path(os.environ.get("TEST_PARITY") or Path(__file__).parents[3] / "shared" / "pi3parity")

@@ -15,9 +15,7 @@ from torch._dynamo.utils import counters
 from mapless_server.networks.blocks import Attention, flash_attention
 from mapless_server.networks.mapanything import MapAnything, MapAnythingSizes
 from mapless_server.networks.network import Network, NetworkOutput
-from mapless_server.networks.pi import Sizes
-from mapless_server.networks.pi3 import Pi3
-from mapless_server.networks.pi3x import Pi3X
+from mapless_server.networks.pi3 import Pi3, Pi3X, Sizes
 from mapless_server.networks.runner import CompiledShape, NetworkRunner, RunnerOptions, UnsuitableDevice
 
 GRID = (2, 3)

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from mapless_server.networks.blocks import rope_table
 from mapless_server.networks.conditions import invert_poses, normalize_poses
+from mapless_server.networks.heads import nearest_rotation
 from mapless_server.networks.network import Network, NetworkOutput, patch_grid
-from mapless_server.networks.pi3x import Pi3X
-from mapless_server.networks.rotation import nearest_rotation
+from mapless_server.networks.pi3 import Pi3X
 
 GRID = (4, 5)
 

@@ -23,9 +23,7 @@ from torch import Tensor
 from mapless_server.networks.checkpoint import load_strictly
 from mapless_server.networks.mapanything import MapAnything, MapAnythingSizes
 from mapless_server.networks.network import IMAGE_MEAN, IMAGE_STD, Network
-from mapless_server.networks.pi import Sizes
-from mapless_server.networks.pi3 import Pi3
-from mapless_server.networks.pi3x import Pi3X
+from mapless_server.networks.pi3 import Pi3, Pi3X, Sizes
 
 SMALL_PI3 = Sizes(64, 4, encoder_depth=3, decoder_depth=4, head_depth=2, camera_width=32)
 SMALL_PI3X = Sizes(64, 4, 3, 10, 2, 32, (64, 32, 16), 8, metric_width=32, metric_heads=2, metric_depth=2)

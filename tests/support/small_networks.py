@@ -14,9 +14,7 @@ from mapless_server.method.coarse.grids import GridOptions
 from mapless_server.method.views import Features, Photograph, PosedView, View
 from mapless_server.networks.mapanything import MapAnything, MapAnythingSizes
 from mapless_server.networks.network import Network
-from mapless_server.networks.pi import Sizes
-from mapless_server.networks.pi3 import Pi3
-from mapless_server.networks.pi3x import Pi3X
+from mapless_server.networks.pi3 import Pi3, Pi3X, Sizes
 from mapless_server.networks.runner import NetworkRunner
 from support.images import textured
 

@@ -20,7 +20,7 @@ from mapless_server.method.coarse import reconstruct_one
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.method.views import Features, Reconstruction, View
-from mapless_server.networks.pi import PiNetwork, Sizes
+from mapless_server.networks.pi3 import PiNetwork, Sizes
 from mapless_tools.bench_network import host
 from mapless_tools.bench_network.command import bench_network
 from mapless_tools.bench_network.forward import Forward, max_difference, with_low_precision_stream

@@ -15,10 +15,8 @@ Pi3 and Pi3X:
 
     decoder.py     blocks within views and over the scene in turn
     heads.py       poses, points and confidence from decoded tokens
-    rotation.py    the nearest rotation
     conditions.py  the further input of Pi3X: rays, poses
-    pi.py          the common part of both
-    pi3.py, pi3x.py
+    pi3.py         both
 
 MapAnything:
 
@@ -28,8 +26,7 @@ MapAnything:
 
 A network for retrieval, which computes one vector for a whole image:
 
-    megaloc.py     MegaLoc (Berton and Masone 2025): DINOv2, SALAD, a linear layer
-    salad.py       tokens to one vector by optimal transport
+    megaloc.py     MegaLoc (Berton and Masone 2025): DINOv2, SALAD (tokens to one vector), a linear layer
 
 Networks of local features and of their matching:
 

@@ -18,7 +18,7 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from mapless_server.networks.blocks import Attention
 from mapless_server.networks.network import Network, NetworkOutput
-from mapless_server.networks.pi import PiNetwork
+from mapless_server.networks.pi3 import PiNetwork
 
 from .device import median_s
 from .operations import ATTENTION_EFFICIENCY, Rates

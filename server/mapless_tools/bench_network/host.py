@@ -11,7 +11,7 @@ from torch import Tensor
 from mapless_server.method.choices import NETWORKS
 from mapless_server.networks.mapanything import MapAnythingSizes
 from mapless_server.networks.network import Network, NetworkOutput
-from mapless_server.networks.pi import PiNetwork, Sizes
+from mapless_server.networks.pi3 import PiNetwork, Sizes
 from mapless_server.networks.runner import CompiledShape, NetworkRunner, RunnerOptions
 
 from .device import CACHED, median_s

@@ -10,9 +10,7 @@ from torch import Tensor
 from mapless_server.networks.encoder import PATCH_PX
 from mapless_server.networks.mapanything import MapAnything, MapAnythingSizes
 from mapless_server.networks.network import Network, NetworkOutput
-from mapless_server.networks.pi import Sizes
-from mapless_server.networks.pi3 import Pi3
-from mapless_server.networks.pi3x import Pi3X
+from mapless_server.networks.pi3 import Pi3, Pi3X, Sizes
 
 from .operations import Operations, count_operations
 

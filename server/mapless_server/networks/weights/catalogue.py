@@ -195,7 +195,7 @@ CATALOGUE = (
         HubFile("yyfz233/Pi3X", "bb1deea4d7423de5b30691739cb451a3f57dc1d5"),
         5_440_325_620,
         "69972d6e1c4492cb4d737a84fe940e357087d81c52f5c9b7c160b49c1f41669a",
-        "mapless_server.networks.pi3x:Pi3X",
+        "mapless_server.networks.pi3:Pi3X",
     ),
     Weights(
         "mapanything",
