@@ -12,7 +12,9 @@ from support.images import textured
 from support.servers import CAMERA
 
 from mapless import Rejected, RigidTransform, Unavailable
-from mapless.geometry import rotation_angle_deg, rotation_from_vector
+from mapless.answers import Accuracy
+from mapless.geometry import Similarity, rotation_angle_deg, rotation_from_vector
+from mapless.groups import ImageReport, SequenceFrame, SequenceLocalization
 from mapless.ros import Localizer, LocalizerOptions, RosCamera, pose_of_body
 
 MAP_FROM_ODOM = RigidTransform(rotation_from_vector([0.0, 0.0, 1.2]), np.array([5.0, -3.0, 0.1]))
@@ -177,9 +179,46 @@ def test_the_rate_bears_jitter_and_time_that_jumps_back(client: PlantedClient) -
     assert not make(client, rate_hz=0.0).is_due(at(0))
 
 
+def test_a_rejected_image_is_localized_with_those_before(client: PlantedClient) -> None:
+    """Only after one that is rejected alone, with the odometry of each camera, and not across a jump of time."""
+    sent: list[list[SequenceFrame]] = []
+
+    def localize_sequence(frames: list[SequenceFrame], scene: str, **_: Any) -> Any:
+        sent.append(frames)
+        poses = tuple(MAP_FROM_ODOM.compose(it.session_from_camera) for it in frames)
+        about = SimpleNamespace(request_id="s", total_s=0.5, queue_s=0.0, references=())
+        report = ImageReport(5, 9, "LOW_OVERLAP", about)  # type: ignore[arg-type]
+        accuracy = Accuracy(0.01, 0.02, 0.1, 0.2, False)
+        world_from_session = Similarity(1.0, np.eye(3), np.zeros(3))
+        reports = (report,) * len(frames)
+        return SequenceLocalization(world_from_session, 0.0, poses, COVARIANCE, accuracy, 9, 10, 0.5, reports, "OPENCV")
+
+    client.localize_sequence = localize_sequence  # type: ignore[attr-defined]
+    localizer = make(client, sequence_length=3)
+    outcomes = []
+    for number, rejected in enumerate([True, False, False, False, True]):
+        client.plant = {"reason": "LOW_OVERLAP", "message": "dark"} if rejected else None
+        outcomes.append(localizer.localize(shot(float(number)), RosCamera(CAMERA)))
+    assert [it.level for it in outcomes] == ["WARN", "OK", "OK", "OK", "OK"]
+    (frames,) = sent
+    assert outcomes[-1].message == "localized by the last 3 images"
+    assert (outcomes[-1].values["images"], outcomes[-1].values["position_95_m"]) == ("3", "0.0200")
+    for frame, time_s in zip(frames, (2.0, 3.0, 4.0), strict=True):
+        np.testing.assert_allclose(
+            frame.session_from_camera.matrix(), drive(time_s).compose(BASE_FROM_CAMERA).matrix(), atol=1e-6
+        )
+    found = outcomes[-1].map_from_body
+    assert found is not None
+    np.testing.assert_allclose(found.matrix(), MAP_FROM_ODOM.compose(drive(4.0)).matrix(), atol=1e-6)
+    assert localizer.localize(shot(1.0), RosCamera(CAMERA)).level == "WARN"
+    assert len(sent) == 1
+
+
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
+        ({"sequence_length": 1}, "sequence_length must be 0 or 2 to 16 images, is 1"),
+        ({"sequence_length": 4, "odom_frame": ""}, "sequence_length needs odom_frame"),
         ({"map_frame": "odom"}, "map_frame"),
         ({"rate_hz": -1.0}, "rate"),
         ({"rate_hz": float("nan")}, "rate"),

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 import threading
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from mapless.answers import LocalizationResult, Rejected
+from mapless.answers import LocalizationResult, PriorCheck, Rejected
 from mapless.client import Client
 from mapless.errors import MaplessError
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
+from mapless.groups import SequenceFrame, SequenceLocalization
 from mapless.priors import PosePrior, Priors
 
 from .cameras import RosCamera
@@ -21,6 +23,8 @@ from .poses import pose_of_body, stamp_ns_of, time_of, transform_from_pose
 
 Lookup = Callable[[str, str, int], RigidTransform]
 """target_from_source of two frames at a stamp, nanoseconds; LookupError if tf does not know it."""
+
+_Answer = LocalizationResult | SequenceLocalization | Rejected
 
 LOCALIZED, NOT_LOCALIZED, FAILED = "OK", "WARN", "ERROR"
 """Levels of an outcome, named as those of diagnostic_msgs/DiagnosticStatus."""
@@ -52,6 +56,8 @@ class LocalizerOptions:
             answers have a common part, which a filter that takes them as independent does not know.
         coverage: see `Client.localize`.
         timeout_s: deadline of a call.
+        sequence_length: where an image alone is rejected, it is localized together with those before it, so many at
+            most, and the odometry between them; 2 to 16, or 0 for never. It takes as long as all of them.
     """
 
     scene: str
@@ -62,6 +68,7 @@ class LocalizerOptions:
     use_last_pose: bool = False
     coverage: float = 0.0
     timeout_s: float = 5.0
+    sequence_length: int = 0
 
     def __post_init__(self) -> None:
         if not self.scene:
@@ -72,6 +79,10 @@ class LocalizerOptions:
             raise ValueError(f"rate must be 0 to 1000 images a second, is {self.rate_hz:g}")
         if not self.timeout_s > 0:
             raise ValueError(f"timeout must be above 0 s, is {self.timeout_s:g}")
+        if self.sequence_length not in (0, *range(2, 17)):
+            raise ValueError(f"sequence_length must be 0 or 2 to 16 images, is {self.sequence_length}")
+        if self.sequence_length and not self.odom_frame:
+            raise ValueError("sequence_length needs odom_frame: sequences are images with the odometry between them")
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +131,7 @@ class Localizer:
         self._lock = threading.Lock()
         self._guess: _Guess | None = None
         self._last_ns: int | None = None
+        self._recent: deque[SequenceFrame] = deque(maxlen=options.sequence_length)
 
     def is_due(self, stamp_ns: int) -> bool:
         """Whether the rate has come round to an image of this time; also when time has jumped back."""
@@ -152,23 +164,36 @@ class Localizer:
 
     def localize(self, message: Any, camera: RosCamera) -> Outcome:
         """Localizes a sensor_msgs/Image or CompressedImage; what fails is an outcome, too."""
-        stamp_ns = self._last_ns = stamp_ns_of(message.header.stamp)
+        stamp_ns = stamp_ns_of(message.header.stamp)
+        if self._last_ns is not None and stamp_ns < self._last_ns:
+            self._recent.clear()
+        self._last_ns = stamp_ns
         camera_frame = message.header.frame_id.lstrip("/")
         body = self._options.base_frame or camera_frame
         try:
             body_from_camera = self._lookup(body, camera_frame, stamp_ns) if body != camera_frame else None
             extrinsics = body_from_camera or RigidTransform.identity()
             odom_from_body = self._odometry(body, stamp_ns)
-            prior = self._prior(stamp_ns, odom_from_body, extrinsics)
-            answer = self._client.localize(
-                camera.photo(message),
+            priors = Priors(pose=self._prior(stamp_ns, odom_from_body, extrinsics))
+            photo = camera.photo(message)
+            coverage, timeout_s = self._options.coverage, self._options.timeout_s
+            answer: _Answer = self._client.localize(
+                photo,
                 camera.camera,
                 self._options.scene,
-                priors=Priors(pose=prior),
-                coverage=self._options.coverage,
+                priors=priors,
+                coverage=coverage,
                 capture_time=time_of(stamp_ns),
-                timeout_s=self._options.timeout_s,
+                timeout_s=timeout_s,
             )
+            if self._options.sequence_length and odom_from_body is not None:
+                tracked = odom_from_body.compose(extrinsics)
+                self._recent.append(SequenceFrame(photo, camera.camera, tracked, time_of(stamp_ns), priors=priors))
+                if isinstance(answer, Rejected) and len(self._recent) > 1:
+                    together = self._client.localize_sequence(
+                        list(self._recent), self._options.scene, coverage=coverage, timeout_s=timeout_s
+                    )
+                    answer = together if isinstance(together, SequenceLocalization) else answer
         except LookupError as error:
             return Outcome(stamp_ns, FAILED, f"tf: {error}", frame=body)
         except (MaplessError, ValueError) as error:
@@ -177,7 +202,7 @@ class Localizer:
 
     def _outcome(
         self,
-        answer: LocalizationResult | Rejected,
+        answer: _Answer,
         stamp_ns: int,
         body: str,
         body_from_camera: RigidTransform,
@@ -189,13 +214,15 @@ class Localizer:
         if answer.arbitrary_unit:
             text = "the scene's unit of length is arbitrary: its poses are none of a robot"
             return Outcome(stamp_ns, FAILED, text, values, body)
-        if answer.covariance is None:
+        if answer.covariance is None or not np.isfinite(answer.covariance).all():
             return Outcome(stamp_ns, NOT_LOCALIZED, "a pose without covariance is not published", values, body)
-        pose, covariance = pose_of_body(answer.world_from_camera, answer.covariance, body_from_camera)
+        message, map_from_camera, checks = "localized", answer.world_from_camera, _prior_checks(answer)
+        if isinstance(map_from_camera, tuple):
+            message, map_from_camera = f"localized by the last {len(map_from_camera)} images", map_from_camera[-1]
+        pose, covariance = pose_of_body(map_from_camera, answer.covariance, body_from_camera)
         with self._lock:
             self._guess = _Guess(pose, covariance, stamp_ns, odom_from_body) if self._options.use_last_pose else None
-        message = "localized"
-        if any(check.conflict for check in answer.prior_checks):
+        if any(check.conflict for check in checks):
             message += "; the photograph contradicts the initial or last pose, which was not used"
         edge: tuple[str, RigidTransform] | None = (body, pose)
         if self._options.odom_frame:
@@ -236,9 +263,14 @@ class Localizer:
         return PosePrior(*pose_of_body(guess.map_from_body.compose(moved), covariance, body_from_camera.inverse()))
 
 
-def _values(answer: LocalizationResult | Rejected) -> dict[str, str]:
-    """What diagnostics show of an answer."""
-    about = answer.diagnostics
+def _prior_checks(answer: LocalizationResult | SequenceLocalization) -> tuple[PriorCheck, ...]:
+    """Of the newest image."""
+    return answer.images[-1].prior_checks if isinstance(answer, SequenceLocalization) else answer.prior_checks
+
+
+def _values(answer: _Answer) -> dict[str, str]:
+    """What diagnostics show of an answer; of a sequence, of its newest image."""
+    about = answer.images[-1].diagnostics if isinstance(answer, SequenceLocalization) else answer.diagnostics
     values = {"request_id": about.request_id, "server_s": f"{about.total_s:.3f}", "queue_s": f"{about.queue_s:.3f}"}
     values["references"] = " ".join(it.name.rpartition("/")[2] for it in about.references)
     if isinstance(answer, Rejected):
@@ -247,12 +279,14 @@ def _values(answer: LocalizationResult | Rejected) -> dict[str, str]:
             values |= {"stage": answer.hint.stage, "advice": answer.hint.advice, "hint": answer.hint.message}
         return values
     values |= {"inliers": str(answer.inlier_count), "matches": str(answer.match_count)}
+    if isinstance(answer, SequenceLocalization):
+        values |= {"images": str(len(answer.images)), "jumps": str(len(answer.jumps))}
     if answer.trust is not None:
         values["trust"] = f"{answer.trust:.3f}"
     if answer.accuracy is not None:
         values["position_95_m"] = f"{answer.accuracy.position_95_m:.4f}"
         values["rotation_95_deg"] = f"{answer.accuracy.rotation_95_deg:.4f}"
         values["calibration"] = answer.accuracy.calibration
-    for check in answer.prior_checks:
+    for check in _prior_checks(answer):
         values["prior"] = "contradicted" if check.conflict else "used" if check.used else "agrees, and adds nothing"
     return values

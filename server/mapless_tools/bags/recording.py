@@ -20,6 +20,12 @@ from . import storages
 MAX_JUMP_BACK_NS = 500_000_000
 """How much earlier a stamp may be than one before it: messages of several threads are a little out of order."""
 
+_HINTS = (
+    ("end magic", ": it is truncated; `mcap recover` saves what can be read"),
+    ("Profile is not ros2", ": only recordings of ROS 2 are read"),
+)
+"""What to say after a message of the library that has a text."""
+
 
 class Recording:
     """A recording, open until its block is left.
@@ -92,8 +98,8 @@ class Recording:
             yield
         except Exception as error:
             place = f" {where}" if where else ""
-            hint = "; `mcap recover` saves what can be read of a truncated file" if _is_mcap(self.path) else ""
-            what = str(error) or type(error).__name__
+            what = str(error).rstrip(".") or type(error).__name__
+            hint = next((hint for part, hint in _HINTS if part in what), "")
             raise ValueError(f"{self.path} cannot be read{place}: {what}{hint}") from error
 
 
@@ -141,7 +147,3 @@ def _check_whole(file: Path) -> None:
         expected = int.from_bytes(head[28:32], "big") * (65536 if page_bytes == 1 else page_bytes)
         if (size := file.stat().st_size) < expected:
             raise ValueError(f"{file.name} is truncated: {size} of {expected} bytes; `sqlite3 .recover` saves a part")
-
-
-def _is_mcap(path: Path) -> bool:
-    return path.suffix == ".mcap" or (path.is_dir() and any(path.glob("*.mcap")))

@@ -100,7 +100,7 @@ def open_poses(images: Images, options: BagOptions) -> Poses:
         named_world, named_body, trajectory = _poses(images, topic, options)
         world, body = world or named_world, body or named_body
         body = body or _unnamed_body(images, topic, static, options)
-        edges[body] = Edge(world, trajectory)
+        edges[body] = Edge(named_world, trajectory)
     tree = FrameTree(_with_extrinsics(edges, images, body, options))
     world = world or tree.lineage(images.frame)[-1]
     _check_chain(tree, images, topic, world, body)
@@ -138,7 +138,7 @@ def _check_chain(tree: FrameTree, images: Images, topic: str, world: str, body: 
     path = images.recording.path
     if world not in lineage:
         known = " > ".join(reversed(lineage))
-        target = f"{body!r}, whose poses {topic} has" if body else repr(world)
+        target = f"{body!r}, whose poses {topic} has" if body and body not in lineage else repr(world)
         raise ValueError(
             f"{path}: no transform leads from the camera's frame {images.frame!r} to {target}; known is {known}; give "
             "--body-from-camera"

@@ -31,6 +31,9 @@ def replay_bag_command(
     use_last_pose: Annotated[
         bool, typer.Option("--use-last-pose", help="The last answer, moved by the odometry, is a prior of the next.")
     ] = False,
+    sequence_length: Annotated[
+        int, typer.Option(help="Localize an image that is rejected alone with so many, 2 to 16, by the odometry.")
+    ] = 0,
     map_frame: Annotated[str, typer.Option(help="Name of the scene's world in what is written.")] = "map",
     odom_frame: Annotated[str, typer.Option(help="Frame of the odometry; default: that of the poses.")] = "",
     base_frame: Annotated[str, typer.Option(help="Frame whose pose is written; default: that of the poses.")] = "",
@@ -81,7 +84,7 @@ def replay_bag_command(
         given = read_camera(camera) if camera else None
         found = bag_options(*bag)
         with terminable(), connected(connection, settings) as client, progress_bars() as progress:
-            report = replay_bag(recording, out, client, found, options, given, progress)
+            report = replay_bag(recording, out, client, found, options, given, progress, sequence_length)
     except (ValueError, ConfigError) as error:
         fail(str(error))
     except (MaplessError, ServerFailed, OSError) as error:

@@ -91,6 +91,7 @@ def replay_bag(
     options: LocalizerOptions,
     camera: Camera | None,
     progress: Progress,
+    sequence_length: int = 0,
 ) -> BagReport:
     """Localizes a recording; `out` is whole however it ends, with what was computed until then.
 
@@ -103,6 +104,7 @@ def replay_bag(
             takes every image.
         camera: for a recording without CameraInfo.
         progress: called with how far it is.
+        sequence_length: see LocalizerOptions, which can have it only where the recording has odometry.
 
     Raises:
         ValueError: the recording or the options cannot be used; nothing is written then.
@@ -118,7 +120,7 @@ def replay_bag(
             raise ValueError(f"{path} has no CameraInfo for the images of {images.topic}; give --camera")
         poses = _poses(images, bag)
         tree = static_tree(images, bag) if poses is None else poses.tree
-        options = _with_frames(options, images, poses)
+        options = replace(_with_frames(options, images, poses), sequence_length=sequence_length)
         client.get_scene(options.scene)
         report = BagReport()
         writer = stack.enter_context(_Output(out, recording, options))

@@ -38,6 +38,7 @@ PARAMETERS: dict[str, Any] = {
     "use_initial_guess": False,
     "coverage": 0.0,
     "timeout": 5.0,
+    "sequence_length": 0,
     "compressed": False,
     "rectified": False,
     "publish_tf": True,
@@ -64,6 +65,7 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
             use_last_pose=self._given["use_initial_guess"],
             coverage=self._given["coverage"],
             timeout_s=self._given["timeout"],
+            sequence_length=self._given["sequence_length"],
         )
         self._client = mapless.Client(self._given["address"], self._connect_options())
         self._tf = tf2_ros.Buffer()
