@@ -145,19 +145,19 @@ std::string Sentence(const grpc::Status& status) {
 
 }  // namespace
 
-Error::Error(const grpc::Status& status, const std::string& request_id)
+Error::Error(const grpc::Status& status, const std::string& id)
     : std::runtime_error(Sentence(status)),
       code(status.error_code()),
       reason(NameOf(status.error_code())),
       message(status.error_message()),
-      request_id(request_id) {
+      request_id(id) {
   const client::Status details = DetailsOf(status);
   if (client::ErrorInfo info; Unpack(details, "ErrorInfo", &info)) {
     reason = info.reason();
     if (const auto it = info.metadata().find("field"); it != info.metadata().end()) field = it->second;
   }
   if (client::ResourceInfo info; Unpack(details, "ResourceInfo", &info)) resource = info.resource_name();
-  if (client::RequestInfo info; Unpack(details, "RequestInfo", &info)) this->request_id = info.request_id();
+  if (client::RequestInfo info; Unpack(details, "RequestInfo", &info)) request_id = info.request_id();
   if (client::RetryInfo info; Unpack(details, "RetryInfo", &info)) {
     retry_after = std::chrono::milliseconds(info.retry_delay().seconds() * 1'000 + info.retry_delay().nanos() / 1'000'000);
   }

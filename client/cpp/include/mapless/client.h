@@ -49,8 +49,8 @@ struct ConnectOptions {
 // A call that failed. Its class says how; `reason` is for programs, stable, UPPER_SNAKE_CASE.
 class Error : public std::runtime_error {
  public:
-  // Of a status that is not OK. `details` are those of the trailers, in which google.rpc.Status is serialized.
-  Error(const grpc::Status& status, const std::string& request_id);
+  // Of a status that is not OK, with the details of google.rpc; `id` is the call's, where they have none.
+  Error(const grpc::Status& status, const std::string& id);
 
   grpc::StatusCode code;
   std::string reason;
