@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _source_of(error: MaplessError, parsed: argparse.Namespace) -> str:
-    """The file that has the wrong field of a request, "photo.jpg: "; empty if it is not one of a single file."""
+    """Returns the file with the wrong field of a request, "photo.jpg: "; empty if no single file has it."""
     for part in (error.field or "").split("."):
         source = getattr(parsed, _SOURCES.get(part, ""), None)
         if source is not None and Path(source).is_file():

@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 
 def _awaited(call: Callable[P, Exchange[T]]) -> Callable[Concatenate[Client, P], Coroutine[Any, Any, T]]:
-    """The coroutine that executes a call, with the call's parameters, result and docstring."""
+    """Makes the coroutine method that executes a call, with the call's parameters, result and docstring."""
 
     @wraps(call)
     async def method(self: Client, /, *arguments: P.args, **named: P.kwargs) -> T:
@@ -42,7 +42,7 @@ def _awaited(call: Callable[P, Exchange[T]]) -> Callable[Concatenate[Client, P],
 
 
 def _paged(call: Callable[P, Pages[T]]) -> Callable[Concatenate[Client, P], AsyncIterator[T]]:
-    """The method that iterates over a list and fetches its pages when needed."""
+    """Makes the method that iterates over a list and fetches its pages when needed."""
 
     @wraps(call)
     async def method(self: Client, /, *arguments: P.args, **named: P.kwargs) -> AsyncIterator[T]:
@@ -58,7 +58,7 @@ def _paged(call: Callable[P, Pages[T]]) -> Callable[Concatenate[Client, P], Asyn
 
 
 def _followed(call: Callable[P, Exchange[T]]) -> Callable[Concatenate[Client, P], AsyncIterator[T]]:
-    """The method that yields a call's early answers and its final answer."""
+    """Makes the method that yields a call's early answers and its final answer."""
 
     @wraps(call)
     def method(self: Client, /, *arguments: P.args, **named: P.kwargs) -> AsyncIterator[T]:
@@ -70,12 +70,12 @@ def _followed(call: Callable[P, Exchange[T]]) -> Callable[Concatenate[Client, P]
 class Client:
     """A connection to a mapless server within the running event loop; close it or use it as a context manager.
 
-    As `mapless.Client`, except that lists are read with `async for`. Cancelling a task also cancels its call on the
-    server.
+    It has the methods of `mapless.Client`, but lists are read with `async for`. Cancelling a task also cancels its call
+    on the server.
     """
 
     def __init__(self, address: str, options: ConnectOptions | None = None) -> None:
-        """Connects with the first call, which reports a server that cannot be reached.
+        """Makes a client; the first call connects, and fails if the server cannot be reached.
 
         Args:
             address: "host:port".
@@ -101,7 +101,7 @@ class Client:
     def acting_for(self, token: str | None, client_id: str = "") -> Client:
         """A client on the same connection with another token and client id, for programs that serve several users.
 
-        It ends with this client.
+        Closing this client also ends the returned one.
 
         Raises:
             ValueError: see `ConnectOptions`.

@@ -19,13 +19,13 @@ from .wire import optional
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Radii: errors not exceeded in 68 and 95 % of cases.
+    """Radii of a pose: errors that are not exceeded in 68 and 95 % of cases.
 
     Attributes:
         position_68_m, position_95_m, rotation_68_deg, rotation_95_deg: the radii.
         calibrated: whether they were measured in this scene on photographs with known poses.
         calibration: "GENERIC", "SELF" (by the scene's references) or "MEASURED".
-        sample_size: of references that were localized against the others, or of photographs measured.
+        sample_size: number of references that were localized against the others ("SELF"), or of photographs measured.
     """
 
     position_68_m: float
@@ -38,7 +38,7 @@ class Accuracy:
 
     @property
     def calibrated_by(self) -> str:
-        """What the radii were calibrated by, in words."""
+        """What the radii were calibrated by, as a phrase for a person."""
         if self.calibration == "SELF":
             return f"by {self.sample_size} references"
         if self.calibrated:
@@ -48,9 +48,9 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class ReferenceUse:
-    """Contribution of one reference: matches with the photograph, and inliers of the pose.
+    """What one reference contributes: its matches with the photograph, and how many of them are inliers of the pose.
 
-    `similarity` to the photograph, -1 to 1, if the server chose the reference; else 0.
+    `similarity` is the cosine similarity to the photograph, -1 to 1, if the server chose the reference; else 0.
     """
 
     name: str
@@ -76,7 +76,7 @@ class ScaleEstimate:
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """Inputs, software and times of an answer.
+    """What an answer was computed from, by what software, and in what time.
 
     Attributes:
         request_id: identifies the call in the server's log.
@@ -116,7 +116,7 @@ class FramedPose:
         axes: name of the axes.
         world_from_camera: both frames in these axes.
         covariance: (6, 6) in these axes, order x y z rx ry rz; None if not estimated.
-        world_from_session: puts whatever the device tracks into the world; None if no `session_from_camera` was sent.
+        world_from_session: transform from the device's session to the world; None if no `session_from_camera` was sent.
     """
 
     axes: str
@@ -146,12 +146,12 @@ class PriorCheck:
 
 @dataclass(frozen=True)
 class IntrinsicsCheck:
-    """What a photograph's matches say of one parameter of its intrinsics.
+    """Comparison of one intrinsic parameter with the value that the photograph's matches give.
 
     Attributes:
         parameter: "FOCAL_LENGTH" (along x), "PRINCIPAL_X", "PRINCIPAL_Y" or "K1".
-        given: its value in the request, pixels of the photograph or the coefficient.
-        estimated: its value by the photograph alone.
+        given: its value in the request; pixels of the photograph, no unit for K1.
+        estimated: its value estimated from the photograph alone.
         estimated_sigma: standard deviation of the estimated value.
         given_sigma: standard deviation of the given value.
         conflict: whether they differ by more than both allow; the answer is then a rejection.
@@ -227,7 +227,7 @@ class LocalizationResult:
         geo_pose: the same pose on the Earth; None unless the scene has a datum.
         prior_checks: how the answer compares with each soft prior.
         intrinsics_checks: what the photograph says of each parameter of its intrinsics; empty if it was not asked.
-        arbitrary_unit: whether its lengths are in the scene's own, arbitrary unit, where these names say metres.
+        arbitrary_unit: whether lengths are in the scene's own, arbitrary unit, also where a name says metres.
         scale_source: what its lengths rest on: "REFERENCES", or "NETWORK" for a single reference.
         pose_stage: "REFINED" or "INITIAL"; "COARSE" for an unverified pose, either of a call with `allow_coarse` that
             ran out of time, or the first of `localize_progressively`.
@@ -296,7 +296,7 @@ class Rejected:
 
 
 def answer_from_message(message: pb.LocalizeResponse) -> LocalizationResult | Rejected:
-    """Answer of a message."""
+    """Converts the answer of a call from its message."""
     common: dict[str, Any] = {
         "diagnostics": diagnostics_from_message(message.diagnostics),
         "capture_time": optional(message, "capture_time", wire.time_from_message),
@@ -325,7 +325,7 @@ def answer_from_message(message: pb.LocalizeResponse) -> LocalizationResult | Re
 
 
 def rejection_fields(message: pb.Rejection) -> dict[str, Any]:
-    """Reason, hint and hypotheses of a rejection, as `Rejected` and `GroupRejected` have them."""
+    """Returns the fields of a rejection that `Rejected` and `GroupRejected` share."""
     return {
         "reason": wire.value_name(pb.RejectionReason, message.reason),
         "hint": optional(message, "hint", _hint_from_message),
@@ -341,12 +341,12 @@ def _intrinsics_checks_from(message: pb.Localization | pb.Rejection) -> tuple[In
 
 
 def covariance_from_message(message: Any) -> Array | None:
-    """(6, 6) of a message that may have a `covariance`."""
+    """Covariance (6, 6) of a message; None if the message has none."""
     return np.array(message.covariance.row_major).reshape(6, 6) if message.HasField("covariance") else None
 
 
 def accuracy_from_message(message: pb.Accuracy) -> Accuracy:
-    """Radii of a message; of an older server, which says only whether they were measured."""
+    """Converts radii from their message; one of an older server states only whether they were measured."""
     source = message.calibration or (
         pb.CALIBRATION_SOURCE_MEASURED if message.calibrated else pb.CALIBRATION_SOURCE_GENERIC
     )
@@ -354,7 +354,7 @@ def accuracy_from_message(message: pb.Accuracy) -> Accuracy:
 
 
 def geo_pose_from_message(message: pb.GeoPose) -> GeoPose:
-    """GeoPose of a message."""
+    """Converts a GeoPose from its message."""
     position, q = message.position, message.quaternion
     return GeoPose(position.lat, position.lon, position.h, Quaternion(q.x, q.y, q.z, q.w))
 
@@ -396,7 +396,7 @@ def _debug_from_message(message: pb.Debug) -> Debug:
 
 
 def diagnostics_from_message(message: pb.Diagnostics) -> Diagnostics:
-    """Diagnostics of a message."""
+    """Converts diagnostics from their message."""
     return wire.filled(
         Diagnostics,
         message,
@@ -418,5 +418,5 @@ def _seconds(duration: Any) -> float:
 
 
 def prior_checks_from_messages(messages: Iterable[pb.PriorCheck]) -> tuple[PriorCheck, ...]:
-    """Checks of an answer's or a photograph's priors."""
+    """Converts the checks of priors from their messages."""
     return tuple(wire.filled(PriorCheck, check, kind=wire.value_name(pb.PriorKind, check.kind)) for check in messages)

@@ -36,7 +36,7 @@ from .geometry import Array, RigidTransform
 
 
 class Axes(Enum):
-    """Axes of a platform, see the module."""
+    """The axes of a platform; the table of this module defines them."""
 
     OPENCV = "opencv"
     ARKIT = "arkit"
@@ -76,9 +76,9 @@ _COVARIANCE_SIGNS = {axes: _covariance_signs(world) for axes, world in WORLD_FRO
 
 
 def pose_to(axes: Axes, world_from_camera: RigidTransform) -> RigidTransform:
-    """A camera's pose, its camera in OpenCV's axes and its world right-handed, in other axes.
+    """Converts a camera's pose from OpenCV's axes and a right-handed world to other axes.
 
-    The rotation is a proper one (determinant 1) for Unity, too, since world and camera are both mirrored.
+    For Unity, too, the rotation has determinant 1, since world and camera are both mirrored.
     """
     if axes is Axes.OPENCV:
         return world_from_camera
@@ -88,7 +88,7 @@ def pose_to(axes: Axes, world_from_camera: RigidTransform) -> RigidTransform:
 
 
 def pose_from(axes: Axes, world_from_camera: RigidTransform) -> RigidTransform:
-    """The inverse of `pose_to`: also for a device's `session_from_camera`, whose session is then right-handed."""
+    """Inverse of `pose_to`. It also converts a device's `session_from_camera`; its session is then right-handed."""
     world = WORLD_FROM_RIGHT_HANDED[axes]
     rotation = world @ world_from_camera.rotation @ CV_FROM_CAMERA[axes].T
     return RigidTransform(rotation, world @ world_from_camera.translation)
@@ -99,58 +99,58 @@ def world_from_session_in(
 ) -> RigidTransform:
     """Transform from a device's session to the world, both frames in these axes.
 
-    Times the device's `session_from_camera` of any later moment, in these axes, it is the camera in the world in them.
+    Multiplied by the device's `session_from_camera` of a later moment, it gives the camera's pose in the world then.
 
     Args:
-        axes: the device's.
-        world_from_camera: the answer, OpenCV.
-        session_from_camera: of the moment of capture, as the device gives it, in these axes.
+        axes: the axes of the device.
+        world_from_camera: the pose of the answer, in OpenCV's axes.
+        session_from_camera: the device's pose at the moment of capture, in the device's axes.
     """
     return pose_to(axes, world_from_camera).compose(session_from_camera.inverse())
 
 
 def points_to(axes: Axes, x_in_world: ArrayLike) -> Array:
-    """Points or directions (..., 3) of a right-handed world in these axes."""
+    """Converts points or directions (..., 3) from a right-handed world to the world of these axes."""
     return np.asarray(x_in_world, float) @ WORLD_FROM_RIGHT_HANDED[axes].T
 
 
 def points_from(axes: Axes, x_in_world: ArrayLike) -> Array:
-    """The inverse of `points_to`."""
+    """Inverse of `points_to`."""
     return np.asarray(x_in_world, float) @ WORLD_FROM_RIGHT_HANDED[axes]
 
 
 def camera_points_to(axes: Axes, x_in_camera: ArrayLike) -> Array:
-    """Points or directions (..., 3) of OpenCV's camera frame in the camera frame of these axes."""
+    """Converts points or directions (..., 3) from OpenCV's camera frame to the camera frame of these axes."""
     return np.asarray(x_in_camera, float) @ CV_FROM_CAMERA[axes]
 
 
 def camera_points_from(axes: Axes, x_in_camera: ArrayLike) -> Array:
-    """The inverse of `camera_points_to`."""
+    """Inverse of `camera_points_to`."""
     return np.asarray(x_in_camera, float) @ CV_FROM_CAMERA[axes].T
 
 
 def covariance_to(axes: Axes, covariance: ArrayLike) -> Array:
-    """The covariance of a pose in these axes, (6, 6), in ROS's order: x, y, z, then rotations about fixed world axes.
+    """Converts the covariance (6, 6) of a pose to these axes; order x y z rx ry rz about fixed world axes (ROS's).
 
     A rotation by the vector w, R' = Exp(w) R, is in a mirrored world M R' = Exp(det(M) M w) M R: a mirror also reverses
-    the sense of a rotation vector. Its own inverse.
+    the sense of a rotation vector. The conversion is its own inverse.
     """
     changed: Array = _COVARIANCE_SIGNS[axes] * np.asarray(covariance, float)
     return changed
 
 
 def covariance_from(axes: Axes, covariance: ArrayLike) -> Array:
-    """The inverse of `covariance_to`."""
+    """Inverse of `covariance_to`."""
     return covariance_to(axes, covariance)
 
 
 def turned_raster(world_from_camera: RigidTransform, clockwise_quarter_turns: int) -> RigidTransform:
-    """The pose of the camera whose pixel raster is that of another, turned clockwise; both in OpenCV's axes.
+    """Pose of the camera whose pixel raster is the given camera's, turned clockwise; both in OpenCV's axes.
 
     Args:
-        world_from_camera: of the camera as it is.
-        clockwise_quarter_turns: how its raster is turned; negative numbers turn it back. 1 makes a raster of W x H
-            pixels one of H x W whose top is what was left.
+        world_from_camera: pose of the camera whose raster is turned.
+        clockwise_quarter_turns: number of turns by 90 degrees; negative numbers turn counterclockwise. After one turn,
+            a raster of W x H pixels has H x W, and its former left edge is its top.
     """
     turns = clockwise_quarter_turns % 4
     # What was up is now right, and what was right is now down.

@@ -1,4 +1,4 @@
-"""Reads cameras and poses: the interface's JSON, four numbers, or a folder's cameras.json."""
+"""Reads cameras and poses from the interface's JSON, from four numbers, or from a folder's cameras.json."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ MAX_SIDE_PX = 2**30
 
 
 def read_camera(source: str | Path, photo: str | Path | None = None) -> Camera:
-    """A camera: a JSON file or JSON text as the interface defines CameraIntrinsics, or "fx,fy,cx,cy" in pixels.
+    """Reads a camera: JSON (a file or text) in the form of CameraIntrinsics, or "fx,fy,cx,cy" in pixels.
 
     Args:
         source: the file, the JSON text, or the numbers.
-        photo: a photograph of the camera; four numbers need its header for the image size.
+        photo: a photograph of the camera, which gives the image size if the source is four numbers.
 
     Raises:
         OSError: a file cannot be read.
-        ValueError: the source is no valid camera; names the file and the field.
+        ValueError: the source is not a valid camera; the message names the file and the field.
     """
     text = str(source)
     if not _NUMBERS.fullmatch(text):
@@ -57,11 +57,11 @@ def read_camera(source: str | Path, photo: str | Path | None = None) -> Camera:
 
 
 def read_pose(source: str | Path) -> RigidTransform:
-    """A pose: a JSON file or JSON text as the interface defines RigidTransform, or a 4x4 or 3x4 matrix.
+    """Reads a pose: JSON (a file or text) in the form of RigidTransform, or a 4x4 or 3x4 matrix.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: the source is no valid pose; names the file and the field.
+        ValueError: the source is not a valid pose; the message names the file and the field.
     """
     text = str(source)
     is_inline = text.lstrip().startswith(("{", "["))
@@ -85,14 +85,14 @@ def _pose_from_matrix(content: str, name: str) -> RigidTransform:
 
 
 def read_cameras(file: str | Path) -> dict[Path, Camera]:
-    """The photographs of a cameras.json with their cameras, in the file's order.
+    """Reads the photographs of a cameras.json with their cameras, in the file's order.
 
-    The file has `frames`, each with `image` (path beside the file), `width`, `height`, `K` (3x3, pixels) and perhaps
+    The file has `frames`, each with `image` (path beside the file), `width`, `height`, `K` (3x3, pixels) and optionally
     `dist` (OpenCV's k1 k2 p1 p2 k3) and `lens` ("fisheye": `dist` is then k1 k2 k3 k4); poses are ignored.
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: the file has another form; names the frame and the field.
+        ValueError: the file has another form; the message names the frame and the field.
     """
     path = Path(file)
     try:
@@ -106,10 +106,10 @@ def read_cameras(file: str | Path) -> dict[Path, Camera]:
 
 
 def camera_of_frame(frame: Mapping[str, Any]) -> Camera:
-    """The camera of a frame of a cameras.json; its numbers are finite, but not yet within the interface's bounds.
+    """Camera of a frame of a cameras.json. Its numbers are finite, but the interface's bounds are not checked.
 
     Raises:
-        ValueError: a field is missing or wrong; names it.
+        ValueError: a field is missing or wrong; the message names it.
     """
     if missing := [it for it in ("width", "height", "K") if it not in frame]:
         raise ValueError(f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing")
@@ -130,7 +130,7 @@ def camera_of_frame(frame: Mapping[str, Any]) -> Camera:
 
 
 def _numbers(value: object) -> Array:
-    """An array of finite numbers; without dimensions if it is none."""
+    """Returns an array of finite numbers, or one without dimensions if the value is not such an array."""
     try:
         numbers = np.array(value, float)
     except (TypeError, ValueError, OverflowError):  # JSON's integers have any number of digits
@@ -152,7 +152,7 @@ _FIELDS_OF_FRAMES = {
 
 
 def _checked(camera: Camera) -> Camera:
-    """The camera; FieldError if it is out of the bounds of the interface."""
+    """Returns the camera; raises FieldError if it exceeds the interface's bounds."""
     return wire.camera_from_message(wire.camera_to_message(camera), "")
 
 

@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 
 def _blocking(call: Callable[P, Exchange[T]]) -> Callable[Concatenate[Client, P], T]:
-    """The method that executes a call, with the call's parameters, result and docstring."""
+    """Makes the method that executes a call, with the call's parameters, result and docstring."""
 
     @wraps(call)
     def method(self: Client, /, *arguments: P.args, **named: P.kwargs) -> T:
@@ -36,7 +36,7 @@ def _blocking(call: Callable[P, Exchange[T]]) -> Callable[Concatenate[Client, P]
 
 
 def _paged(call: Callable[P, Pages[T]]) -> Callable[Concatenate[Client, P], Iterator[T]]:
-    """The method that iterates over a list and fetches its pages when needed."""
+    """Makes the method that iterates over a list and fetches its pages when needed."""
 
     @wraps(call)
     def method(self: Client, /, *arguments: P.args, **named: P.kwargs) -> Iterator[T]:
@@ -51,7 +51,7 @@ def _paged(call: Callable[P, Pages[T]]) -> Callable[Concatenate[Client, P], Iter
 
 
 def _followed(call: Callable[P, Exchange[T]]) -> Callable[Concatenate[Client, P], Iterator[T]]:
-    """The method that yields a call's early answers and its final answer."""
+    """Makes the method that yields a call's early answers and its final answer."""
 
     @wraps(call)
     def method(self: Client, /, *arguments: P.args, **named: P.kwargs) -> Iterator[T]:
@@ -69,7 +69,7 @@ class Client:
     """
 
     def __init__(self, address: str, options: ConnectOptions | None = None) -> None:
-        """Connects with the first call, which reports a server that cannot be reached.
+        """Makes a client; the first call connects, and fails if the server cannot be reached.
 
         Args:
             address: "host:port".
@@ -92,7 +92,7 @@ class Client:
     def acting_for(self, token: str | None, client_id: str = "") -> Client:
         """A client on the same connection with another token and client id, for programs that serve several users.
 
-        It ends with this client.
+        Closing this client also ends the returned one.
 
         Raises:
             ValueError: see `ConnectOptions`.

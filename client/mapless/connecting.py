@@ -1,7 +1,7 @@
-"""Why a server cannot be reached whose name has several addresses, such as ::1 and 127.0.0.1 of localhost.
+"""Explains why a server cannot be reached whose host name has several addresses, such as ::1 and 127.0.0.1.
 
-gRPC tries all of them and reports the last failure. Where nothing listens at one address, that may hide what is wrong
-at the other, at which the server listens.
+gRPC tries all of them and reports the last failure. If nothing listens at one address, this may hide the failure at the
+other, at which the server listens.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ _ANSWER_LIMIT_S = 10.0  # a server with much to do, or a busy machine, may need 
 
 
 def is_unreached(error: MaplessError) -> bool:
-    """Whether it is of an address at which no server was reached, so that `explained` may say more."""
+    """Whether the error says that no server was reached at an address; `explained` may then find a better reason."""
     return error.message.startswith("cannot connect") and _UNREACHED.search(error.message) is not None
 
 
 def explained(error: MaplessError, address: str, options: ConnectOptions) -> MaplessError:
-    """The error; if no server was reached at its address, rather that of another one of the name that says more.
+    """Returns the error, or that of another address of the same host name if it explains more.
 
     Connects to the other addresses, which takes milliseconds. An address that does not answer takes 2 seconds; one that
     accepts connections and sends nothing, 10 seconds, or the options' timeout if that is less.

@@ -1,4 +1,4 @@
-"""Whether the server takes calls."""
+"""The health check: whether the server takes calls."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SERVICES = ("mapless.v1.LocalizationService", "mapless.v1.ReferenceService")
 
 
 def is_serving(service: str = "", *, timeout_s: float | None = None) -> Exchange[bool]:
-    """Whether the server takes calls; False while it starts or drains, an error if it cannot be reached.
+    """Returns whether the server takes calls: False while it starts or drains. Raises an error if it cannot be reached.
 
     Args:
         service: one of `SERVICES`; empty for the whole server.

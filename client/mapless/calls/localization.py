@@ -63,19 +63,19 @@ def localize(
         scene: the scene to localize in.
         references: the references to use, most similar first, at most 64; empty: the server chooses.
         priors: what is known of the pose before the photograph is used.
-        intrinsics_uncertainty: how far the camera's intrinsics may be off; None for the defaults, and for less where
-            the references are of the same camera.
+        intrinsics_uncertainty: standard deviations of the camera's intrinsics; None for the defaults, which are smaller
+            where the references have the same camera.
         variant: "best" (default), "full", "no_structure" or "coarse".
         scale_strategy: "two_stage" (default), "triangulation" or "trajectory".
         reference_count: number of references that the server chooses; 0 for its default.
-        rerank_references: whether the server chooses among `references`, which may then be 1000.
+        rerank_references: whether the server chooses among `references`, of which there may then be up to 1000.
         allow_coarse: whether to return a pose that could not be refined before the deadline, with
             `LocalizationResult.pose_stage` "COARSE" and no covariance, instead of raising `DeadlineExceeded`.
         coverage: share of right answers to accept, above 0 and below 1; 0 for the server's default.
-        ignore_calibration: whether radii and trust are to be the generic ones, as if the scene had no calibration.
-        confidential: whether the photograph serves this answer alone: it is neither captured nor shown to watchers.
-        axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: of `session_from_camera` and of
-            `LocalizationResult.in_axes`.
+        ignore_calibration: whether radii and trust are computed as if the scene had no calibration.
+        confidential: whether the photograph is used for this answer only: neither captured nor shown to watchers.
+        axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: the axes of `session_from_camera`
+            and of `LocalizationResult.in_axes`.
         include_debug: whether the answer includes the matches that support it.
         capture_time: time of the photograph, with time zone; returned with the answer.
         session_from_camera: the device's own pose at that time; returned with the answer, and used for
@@ -113,7 +113,7 @@ def localize(
 
 
 def _asked_like(model: Callable[P, Any]) -> Callable[[Callable[..., T]], Callable[P, T]]:
-    """Makes a call that has the parameters of another."""
+    """Decorator for a call that has the same parameters as `model`, for type checkers."""
 
     def with_parameters(call: Callable[..., T]) -> Callable[P, T]:
         return wraps(model, ("__annotations__", "__type_params__"), ())(call)
@@ -123,11 +123,11 @@ def _asked_like(model: Callable[P, Any]) -> Callable[[Callable[..., T]], Callabl
 
 @_asked_like(localize)
 def localize_progressively(*asked: Any, **named: Any) -> Exchange[LocalizationResult | Rejected]:
-    """Localizes a photograph, with a coarse pose as soon as there is one and the answer of `localize` after it.
+    """Localizes a photograph; yields a coarse pose as soon as there is one, then the answer of `localize`.
 
     Yields at most two answers. The first, if there is one, is a `LocalizationResult` with `pose_stage` "COARSE": an
     unverified pose without covariance, accuracy and trust. The last, with `is_final`, is the answer of `localize`,
-    possibly a very different pose or `Rejected`; an error is raised in its place.
+    possibly a very different pose or `Rejected`; an error is raised instead of it.
 
     The call is cancelled when the caller stops reading. If the connection breaks after the first answer, the call is
     retried like any other, and only the last answer is yielded.
@@ -147,7 +147,7 @@ def localize_progressively(*asked: Any, **named: Any) -> Exchange[LocalizationRe
 
 
 def _early_answer(message: pb.LocalizeProgressivelyResponse) -> LocalizationResult | None:
-    """The coarse answer of a message; None if its answer is final."""
+    """Returns the coarse answer of a message; None if the message has the final answer."""
     if message.is_final:
         return None
     answer = answer_from_message(message.answer)
@@ -167,9 +167,9 @@ def localize_rig(
     session_from_rig: RigidTransform | None = None,
     timeout_s: float | None = None,
 ) -> Exchange[RigLocalization | GroupRejected]:
-    """Localizes a rig by photographs that its cameras took at one moment.
+    """Localizes a rig from photographs that its cameras took at the same moment.
 
-    One pose is estimated from all photographs together: together they can suffice where each alone does not.
+    One pose is estimated from all photographs together, which can succeed where each photograph alone fails.
 
     Args:
         images: the photographs, 1 to 8.
@@ -206,10 +206,10 @@ def localize_sequence(
     axes: Axes | str = "",
     timeout_s: float | None = None,
 ) -> Exchange[SequenceLocalization | GroupRejected]:
-    """Localizes a device by a few photographs and the poses that it tracked meanwhile, which may drift or jump.
+    """Localizes a device from a few photographs and the poses that it tracked meanwhile, which may drift or jump.
 
-    Where the photographs contradict the tracking, it is cut, and the photographs since then are localized without the
-    earlier ones (`SequenceLocalization.jumps`).
+    Where the photographs contradict the tracking, the sequence is cut, and the photographs after the cut are localized
+    without the earlier ones (`SequenceLocalization.jumps`).
 
     Args:
         frames: 2 to 16 photographs with the device's poses, the oldest first.
@@ -218,8 +218,8 @@ def localize_sequence(
         reference_count: number of references that the server chooses for each photograph; 0 for its default.
         coverage: see `localize`; holds for the joint pose, and for each photograph alone.
         confidential: see `localize`.
-        axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: of the device's poses and of
-            `SequenceLocalization.world_from_session`.
+        axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: the axes of the device's poses
+            and of `SequenceLocalization.world_from_session`.
         timeout_s: deadline of the call.
     """
     request = pb.LocalizeSequenceRequest(

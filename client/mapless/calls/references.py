@@ -47,7 +47,7 @@ def create_scene(
     Args:
         scene_id: id of the scene.
         datum: position of its world on the Earth, if known.
-        down_in_world: (3,) direction of gravity, any length; None for the datum's, if there is one.
+        down_in_world: (3,) direction of gravity, of any length; None for the direction that the datum gives, if any.
         arbitrary_unit: whether its references' poses are in an arbitrary unit instead of metres.
         timeout_s: deadline of the call.
     """
@@ -81,14 +81,14 @@ def update_scene(
     arbitrary_unit: bool | UnchangedType | None = UNCHANGED,
     timeout_s: float | None = None,
 ) -> Exchange[Scene]:
-    """Changes properties of a scene; a property that is not given keeps its value, None deletes it.
+    """Changes properties of a scene. A property that is not given keeps its value; None deletes it.
 
     Args:
         scene: the scene.
         datum: position of its world on the Earth.
-        down_in_world: (3,) direction of gravity, any length; without it the datum's, if there is one.
+        down_in_world: (3,) direction of gravity, of any length; if deleted, the datum gives it, if there is one.
         calibration: measured factors of the radii of answers.
-        arbitrary_unit: whether its unit of length is arbitrary instead of the metre; None is False. Changes no pose.
+        arbitrary_unit: whether the unit of length is arbitrary instead of the metre; None is False. No pose changes.
         timeout_s: deadline of the call.
     """
     request = pb.UpdateSceneRequest(scene=pb.Scene(name=scene_name(scene)))
@@ -111,7 +111,7 @@ def update_scene(
 
 
 def list_scenes(*, page_size: int = 0, timeout_s: float | None = None) -> Pages[Scene]:
-    """All scenes by id, fetched page by page; the deadline holds for each page."""
+    """Lists all scenes by id, fetched page by page; the deadline holds for each page."""
 
     def fetch(token: str) -> Exchange[tuple[list[Scene], str]]:
         request = pb.ListScenesRequest(page_size=page_size, page_token=token)
@@ -141,7 +141,7 @@ def add_reference(scene: str, reference: NewReference, *, timeout_s: float | Non
 def add_batch(
     scene: str, requests: Sequence[pb.CreateReferenceRequest], timeout_s: float | None
 ) -> Exchange[list[Reference]]:
-    """Stores the references of one message: all of them, or none."""
+    """Stores the references of one message: either all of them or none."""
 
     def found(error: MaplessError) -> Exchange[pb.BatchCreateReferencesResponse]:
         stored = yield from repeats.stored_references(request, error)
@@ -164,7 +164,7 @@ def add_batch(
 
 
 def _name_reference(error: MaplessError, requests: Sequence[pb.CreateReferenceRequest]) -> None:
-    """Adds the reference's id to the error of a batch, whose index counts within one of several messages."""
+    """Adds the reference's id to a batch's error; the index in the error counts within one of several messages."""
     place = re.match(r"requests\[(\d+)\]", error.field or "")
     if place is not None and int(place[1]) < len(requests):
         error.args = (f"{error.reason}: reference {shown(requests[int(place[1])].reference_id)}: {error.message}",)
@@ -173,7 +173,7 @@ def _name_reference(error: MaplessError, requests: Sequence[pb.CreateReferenceRe
 def batches(
     scene: str, references: Iterable[NewReference], options: ConnectOptions
 ) -> Iterator[list[pb.CreateReferenceRequest]]:
-    """Requests in the references' order, in batches that fit a message; a request too large for that is sent alone."""
+    """Yields requests in the references' order, in batches that fit a message; a larger request is sent alone."""
     batch: list[pb.CreateReferenceRequest] = []
     batch_bytes = 0
     for reference in references:
@@ -199,7 +199,7 @@ def get_reference(
 
 
 def list_references(scene: str, *, page_size: int = 0, timeout_s: float | None = None) -> Pages[Reference]:
-    """A scene's references by id, without photographs, fetched page by page; the deadline holds for each page."""
+    """Lists a scene's references by id, without photographs, page by page; the deadline holds for each page."""
 
     def fetch(token: str) -> Exchange[tuple[list[Reference], str]]:
         request = pb.ListReferencesRequest(scene=scene_name(scene), page_size=page_size, page_token=token)

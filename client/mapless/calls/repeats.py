@@ -1,4 +1,4 @@
-"""Retries of changes whose first answer was lost: determines whether the existing state is the result of that change.
+"""Retries of changes whose first answer was lost: they determine whether the lost attempt made the existing state.
 
 The calls made here share the deadline of the change.
 """
@@ -24,14 +24,14 @@ _PAGE_SIZE = 1000  # the server's maximum
 
 
 def gone(error: MaplessError) -> Exchange[None]:
-    """Success: what an earlier attempt deleted is NOT_FOUND for the next; any other error is raised."""
+    """Success if an earlier attempt has deleted the resource (the error is NOT_FOUND); any other error is raised."""
     if error.code != "NOT_FOUND":
         raise error
     yield from ()
 
 
 def created_scene(wanted: pb.CreateSceneRequest, error: MaplessError) -> Exchange[pb.Scene]:
-    """The existing scene if it is unchanged since its creation and its world equals the wanted one; else the error."""
+    """Returns the existing scene if it is unchanged since creation and equals the wanted one; else raises the error."""
     if error.code != "ALREADY_EXISTS":
         raise error
     get = pb.GetSceneRequest(name=scene_name(wanted.scene_id))
@@ -43,7 +43,7 @@ def created_scene(wanted: pb.CreateSceneRequest, error: MaplessError) -> Exchang
 
 
 def stored_reference(wanted: pb.CreateReferenceRequest, error: MaplessError) -> Exchange[pb.Reference]:
-    """The stored reference if it equals the wanted one; else the error."""
+    """Returns the stored reference if it equals the wanted one; else raises the error."""
     if error.code != "ALREADY_EXISTS":
         raise error
     get = pb.GetReferenceRequest(name=_name(wanted))
@@ -57,9 +57,9 @@ def stored_reference(wanted: pb.CreateReferenceRequest, error: MaplessError) -> 
 
 
 def stored_references(wanted: pb.BatchCreateReferencesRequest, error: MaplessError) -> Exchange[list[pb.Reference]]:
-    """The stored references in the request's order if all equal the wanted ones; else the error.
+    """Returns the stored references in the request's order if all equal the wanted ones; else raises the error.
 
-    One call lists most scenes. In a larger scene, references on later pages are fetched one by one.
+    One call lists all references of most scenes. In a larger scene, references on later pages are fetched one by one.
     """
     if error.code != "ALREADY_EXISTS":
         raise error
@@ -91,7 +91,7 @@ def _is_same(wanted: pb.Reference, stored: pb.Reference) -> bool:
 
 
 def _of_world(message: Any) -> Array:
-    """World properties of a message: its unit, 12 numbers of its datum if it has one, 3 of its gravity's direction."""
+    """Properties of a message's world as an array: unit, 12 numbers of the datum, if any, 3 of gravity's direction."""
     numbers: list[float] = [float(message.arbitrary_unit)]
     if message.HasField("datum"):
         datum = datum_from_message(message.datum, "datum")

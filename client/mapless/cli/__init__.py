@@ -1,1 +1,1 @@
-"""The command `mapless`, in parts: its arguments, its commands, what they read and what they show."""
+"""The command `mapless`: its arguments, its commands, and what they read and print."""

@@ -1,4 +1,4 @@
-"""The arguments of the command line, and the options of the connection that they give."""
+"""The arguments of the command line, and the connection's options that they give."""
 
 from __future__ import annotations
 
@@ -54,17 +54,17 @@ _COMMON_DEFAULTS: dict[str, Any] = {
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that suggests what a wrong command, choice or flag was meant to be."""
+    """A parser that suggests a known command, choice or flag in place of an unknown one."""
 
     commands: argparse._SubParsersAction[Any] | None = None
 
     def add_subparsers(self, **options: Any) -> argparse._SubParsersAction[Any]:
-        """Remembers its commands, after which flags are theirs."""
+        """Remembers the commands; flags after a command belong to it."""
         self.commands = super().add_subparsers(**options)
         return self.commands
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Rejects unknown flags first: without them, what they were meant to be might be reported as missing."""
+        """Rejects unknown flags first; else a misspelt flag could be reported as a missing one."""
         args = sys.argv[1:] if args is None else list(args)
         ends = {"--", *(self.commands.choices if self.commands else ())}
         for flag in itertools.takewhile(lambda it: it not in ends, args):
@@ -83,7 +83,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 class _Command(_Parser):
-    """A command, which accepts the common flags too; they override those given before the command."""
+    """A command, which also accepts the common flags; they override those given before the command."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -91,7 +91,7 @@ class _Command(_Parser):
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The parser of the command line; `run` of its result is the command's function."""
+    """Makes the parser of the command line; the attribute `run` of its result is the command's function."""
     parser = _Parser(
         prog="mapless",
         description=DESCRIPTION,
@@ -126,7 +126,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def _completion(client: Client, arguments: argparse.Namespace) -> int:
-    """Prints the script; needs the package shtab."""
+    """Prints the completion script of a shell; needs the package shtab."""
     try:
         import shtab
     except ImportError:
@@ -139,7 +139,7 @@ def _completion(client: Client, arguments: argparse.Namespace) -> int:
 
 
 def all_parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
-    """A parser and those of its commands."""
+    """Yields a parser and the parsers of its commands."""
     yield parser
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
@@ -159,7 +159,7 @@ def _add_doctor(groups: argparse._SubParsersAction[_Command]) -> None:
 
 
 def connect_options(arguments: argparse.Namespace) -> ConnectOptions:
-    """Options of the connection; OSError or ValueError for wrong flags or files."""
+    """Options of the connection; raises OSError or ValueError for wrong flags or files."""
     # Not a flag of its own: all users of the machine can read a command line.
     token = arguments.token_file.read_text() if arguments.token_file else os.environ.get(TOKEN_VARIABLE)
     return ConnectOptions(
@@ -315,7 +315,7 @@ def _add_localize(command: argparse.ArgumentParser) -> None:
 
 
 def _count(text: str) -> int:
-    """At least 1: in a request, 0 stands for the server's default, as does omitting the flag."""
+    """Reads a count of at least 1; in a request, 0 stands for the server's default, as does an omitted flag."""
     count = int(text)
     if count < 1:
         raise argparse.ArgumentTypeError(f"must be at least 1, is {count}")

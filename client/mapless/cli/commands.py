@@ -138,7 +138,7 @@ def add_reference(client: Client, arguments: argparse.Namespace) -> int:
 
 
 def _id_of(photo: Path) -> str:
-    """The id that a file's name gives."""
+    """Returns the reference id for a photograph's file name."""
     try:
         return check_id(photo.stem)
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""`mapless doctor`: checks a connection step by step, and says what to do about what is wrong."""
+"""`mapless doctor`: checks a connection step by step, and says how to correct what is wrong."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Finding:
 
 @dataclass
 class _Session:
-    """What the checks share; `trailers` and `clock_error_s` are known after that of the token."""
+    """What the checks share; `trailers` and `clock_error_s` are known after `_check_token`."""
 
     client: Client
     address: str
@@ -92,7 +92,7 @@ _Result = tuple[str, str, str]
 
 
 def _check_address(session: _Session) -> _Result:
-    """Resolves the name, and connects to each of its addresses."""
+    """Resolves the host's name and connects to each of its addresses."""
     host, port = _host_and_port(session.address)
     if not host:
         return NOTE, f"{session.address} has a form of gRPC's own, which is not examined", ""
@@ -110,7 +110,7 @@ def _check_address(session: _Session) -> _Result:
 
 
 def _connected(family: int, endpoint: tuple[object, ...]) -> str:
-    """Why no connection can be made; empty if it can."""
+    """Returns why no connection can be made; empty if one can."""
     try:
         with closing(socket.socket(family, socket.SOCK_STREAM)) as probe:
             probe.settimeout(_CONNECT_LIMIT_S)
@@ -121,7 +121,7 @@ def _connected(family: int, endpoint: tuple[object, ...]) -> str:
 
 
 def _check_protocol(session: _Session) -> _Result:
-    """Speaks gRPC with the server, encrypted or not as the options say."""
+    """Makes a gRPC call, encrypted or not as the options say."""
     tls = session.options.tls
     try:
         session.client.is_serving()
@@ -172,7 +172,7 @@ def _check_services(session: _Session) -> _Result:
 
 
 def _check_token(session: _Session) -> _Result:
-    """Lists one scene, which the least role may; keeps the trailers."""
+    """Lists one scene, which every role may do; keeps the trailers."""
     options = session.options
     with options.channel(session.address) as channel:
         method = channel.unary_unary(
@@ -192,7 +192,7 @@ def _check_token(session: _Session) -> _Result:
 
 
 def _check_clock(session: _Session) -> _Result:
-    """Compares the clocks, to within the time of the call."""
+    """Compares the clocks of client and server, to within the duration of the call."""
     try:
         server_s = float(session.trailers.get(_TIME_KEY, ""))
     except ValueError:
@@ -255,7 +255,7 @@ def _check_query(session: _Session) -> _Result:
 
 
 def _host_and_port(address: str) -> tuple[str, int]:
-    """Of "host:port"; an empty host for gRPC's other forms."""
+    """Splits "host:port"; the host is empty for gRPC's other forms of an address."""
     host, colon, port = address.rpartition(":")
     if not colon or (":" in host and not host.startswith("[")):
         host, port = address, "443"
@@ -264,7 +264,7 @@ def _host_and_port(address: str) -> tuple[str, int]:
 
 
 def _speaks_tls(address: str) -> bool:
-    """Whether a TLS handshake gets as far as the server's certificate, whatever that is worth."""
+    """Whether the server answers a TLS handshake with a certificate, valid or not."""
     host, port = _host_and_port(address)
     context = ssl.create_default_context()
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE

@@ -1,4 +1,4 @@
-"""A folder of photographs: how many calls run at a time, what they gave, and how far the command has come."""
+"""Localizing a folder of photographs: number of concurrent calls, outcomes, and progress."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _REDRAW_S = 0.1
 class Concurrency:
     """Limits the number of concurrent calls: a refusal for lack of room halves it, each answer raises it a little.
 
-    A refused call keeps its place until it ends, so that new calls do not take the room that it waits for.
+    A refused call keeps its place until it ends, so that new calls do not overtake it.
     """
 
     def __init__(self, maximum: int) -> None:
@@ -36,7 +36,7 @@ class Concurrency:
 
     @contextmanager
     def call(self) -> Iterator[None]:
-        """Waits for a place; the block makes the call."""
+        """Waits until a call may start; the block makes the call."""
         with self._changed:
             self._changed.wait_for(lambda: self._running < int(self._limit))
             self._running += 1
@@ -99,7 +99,7 @@ class Tally:
 
     @property
     def exit_code(self) -> int:
-        """The command's exit code."""
+        """The command's exit code for these outcomes."""
         if self._counts[FAILED]:
             return EXIT_FAILED
         return EXIT_REJECTED if self._counts[NOT_LOCALIZED] else 0

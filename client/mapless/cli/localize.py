@@ -42,7 +42,7 @@ class Photo:
 
 
 def run(client: Client, arguments: argparse.Namespace) -> int:
-    """The command."""
+    """Runs the command."""
     if arguments.rerank and not arguments.reference:
         raise ValueError("--rerank needs --reference: it chooses among the references given")
     if arguments.parallel < 1:
@@ -72,7 +72,7 @@ def _one(client: Client, arguments: argparse.Namespace) -> int:
 
 
 def _folder(client: Client, arguments: argparse.Namespace) -> int:
-    """One line for each photograph, in order, as answers arrive; an error of one photograph does not end the others."""
+    """Localizes a folder: prints a line per photograph, in order; an error of one does not end the others."""
     photos = photos_of(arguments.photo, arguments.camera)
     names = [photo.name for photo in photos]
     width = max(map(len, names))
@@ -99,7 +99,7 @@ def _folder(client: Client, arguments: argparse.Namespace) -> int:
 
 
 def _print_paths(arguments: argparse.Namespace) -> None:
-    """Names the files that were written."""
+    """Prints the names of the files that were written."""
     if arguments.output is not None:
         print(f"answers are in {arguments.output}", file=sys.stderr)
     if arguments.draw is not None:
@@ -107,10 +107,10 @@ def _print_paths(arguments: argparse.Namespace) -> None:
 
 
 def photos_of(folder: Path, camera: str | None) -> list[Photo]:
-    """The photographs of a folder: those of its cameras.json, or all with one camera.
+    """Lists the photographs of a folder: those of its cameras.json, or all of them if one camera is given.
 
     Raises:
-        ValueError: there are none, or no camera.
+        ValueError: there are no photographs, or there is no camera.
     """
     if camera is None:
         if not (folder / FOLDER_FILE).is_file():
@@ -137,7 +137,7 @@ def _camera_of(path: Path, camera: str | None) -> Camera:
 
 
 def _camera_beside(path: Path) -> Camera:
-    """The camera of a photograph by the cameras.json of its folder, or of the one around it."""
+    """Camera of a photograph, from the cameras.json of its folder or of the folder above."""
     for folder in path.resolve().parents[:2]:
         if (folder / FOLDER_FILE).is_file():
             return _camera_of(path, str(folder / FOLDER_FILE))
@@ -145,7 +145,7 @@ def _camera_beside(path: Path) -> Camera:
 
 
 def _all(client: Client, photos: list[Photo], arguments: argparse.Namespace) -> Generator[Outcome, None, None]:
-    """An outcome for each photograph, in order; at most `parallel` concurrent calls, fewer if the server is full."""
+    """Yields an outcome per photograph, in order; at most `parallel` concurrent calls, fewer if the server is full."""
     concurrency = Concurrency(arguments.parallel)
 
     def outcome(photo: Photo) -> Outcome:
@@ -177,7 +177,7 @@ def _concerns_all(error: MaplessError) -> bool:
 
 
 def _localize(client: Client, photo: Photo, arguments: argparse.Namespace) -> LocalizationResult | Rejected:
-    """The final answer; a file that cannot be read is an error of this photograph alone."""
+    """Returns the final answer; a file that cannot be read is an error of this photograph alone."""
     try:
         image = photo.path.read_bytes()
     except OSError as error:
@@ -190,7 +190,7 @@ def _localize(client: Client, photo: Photo, arguments: argparse.Namespace) -> Lo
 def _answers(
     client: Client, photo: Photo, image: ImageSource, arguments: argparse.Namespace
 ) -> Iterator[LocalizationResult | Rejected]:
-    """The answer; with --progressive, a coarse pose may come first."""
+    """Yields the answer; with --progressive, a coarse pose may come first."""
     options: dict[str, Any] = {
         "priors": priors(arguments),
         "intrinsics_uncertainty": intrinsics_uncertainty(arguments),
@@ -217,7 +217,7 @@ def _answers(
 
 
 def _references(client: Client, scene: str, answer: LocalizationResult | Rejected) -> list[Reference]:
-    """References with matches that still exist, the hint's first; the best with their photographs."""
+    """Fetches the references with matches, the hint's first, the best with their photographs; skips deleted ones."""
     uses = sorted(answer.diagnostics.references, key=lambda use: (-use.inlier_count, -use.match_count))
     names = [use.name for use in uses if use.match_count > 0]
     hint = answer.hint if isinstance(answer, Rejected) else None
@@ -240,7 +240,7 @@ def _row(name: str, width: int, outcome: Outcome, as_json: bool, arguments: argp
 
 
 def _printed(answer: LocalizationResult | Rejected, arguments: argparse.Namespace) -> Any:
-    """The answer as it is printed: with its matches only if --debug was given."""
+    """The form of an answer that is printed: with its matches only if --debug was given."""
     return answer if arguments.debug else replace(answer, debug=None)
 
 

@@ -36,18 +36,18 @@ _CAPTURED = "captured by the server"
 
 
 def is_json(arguments: argparse.Namespace) -> bool:
-    """The rule of all commands: text on a terminal, JSON elsewhere; --json and --text decide otherwise."""
+    """Whether to print JSON: not on a terminal, unless --json or --text decides."""
     return bool(arguments.json if arguments.json is not None else not sys.stdout.isatty())
 
 
 def show(arguments: argparse.Namespace, value: object, text: Sequence[str]) -> int:
-    """Prints a value as JSON or its text, by the rule of all commands; returns exit code 0."""
+    """Prints a value as JSON or as its text, see `is_json`; returns exit code 0."""
     print(json.dumps(plain(value), indent=2) if is_json(arguments) else "\n".join(text), flush=True)
     return 0
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:
-    """Lines of a table: rows below their head, numbers to the right."""
+    """Lines of a table: a heading and rows, with numbers aligned to the right."""
     columns = [[name, *map(str, cells)] for name, *cells in zip(head, *rows, strict=True)]
     for column in columns:
         is_number = len(column) > 1 and all(map(_NUMBER.fullmatch, column[1:]))
@@ -57,7 +57,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:
 
 
 def card(**fields: object) -> list[str]:
-    """Lines of one thing: a name and a value in each, without those that are None."""
+    """Lines with a name and a value each; omits fields that are None."""
     known = {name: value for name, value in fields.items() if value is not None}
     width = max(map(len, known), default=0)
     return [f"{name:{width}}  {value}" for name, value in known.items()]
@@ -144,7 +144,7 @@ def line(name: str, answer: LocalizationResult | Rejected) -> str:
 
 
 def heading(width: int) -> str:
-    """Heading of that table, for names of this width."""
+    """Heading of the table of `line`, for names of this width."""
     return f"{'photograph':{width}}  {'x':>9} {'y':>9} {'z':>9}    {'95 % within':>10} {'trust':>6}  {'inliers':>9}"
 
 
@@ -155,7 +155,7 @@ def _outcome(answer: LocalizationResult) -> str:
 
 
 def _support(answer: LocalizationResult) -> str:
-    """Support of a pose."""
+    """Text of a pose's inliers and references."""
     if answer.pose_stage == "COARSE":
         return "not verified"
     used = sum(use.inlier_count > 0 for use in answer.diagnostics.references)
@@ -163,7 +163,7 @@ def _support(answer: LocalizationResult) -> str:
 
 
 def _checked(check: PriorCheck) -> str:
-    """How an answer compares with a prior."""
+    """Text of how an answer compares with a prior."""
     if check.conflict:
         ignored = "" if check.used else ", not used"
         return f"{check.kind} contradicts the photograph: {check.mahalanobis:.1f} standard deviations{ignored}"
@@ -176,7 +176,7 @@ def _differs(check: IntrinsicsCheck) -> bool:
 
 
 def _corrected(check: IntrinsicsCheck) -> str:
-    """How a parameter of the camera differs from what the photograph says."""
+    """Text of how a parameter of the camera differs from the photograph's estimate."""
     name = _FIELDS.get(check.parameter, check.parameter)
     digits = 3 if check.parameter == "K1" else 1
     return (

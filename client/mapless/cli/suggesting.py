@@ -1,4 +1,4 @@
-"""Scenes and references whose names resemble one that does not exist."""
+"""Suggestions of existing scenes and references for a name that does not exist."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MAX_COMPARED = 10_000
 
 @contextmanager
 def suggesting(client: Client) -> Iterator[None]:
-    """NotFound within the block also says which existing scene or reference resembles the one that was named."""
+    """Adds to a NotFound of the block the existing scene or reference whose name resembles the given one."""
     try:
         yield
     except NotFound as error:
@@ -31,7 +31,7 @@ def suggesting(client: Client) -> Iterator[None]:
 
 
 def _existing(client: Client, resource: str) -> list[str]:
-    """Ids of those beside a resource, which does not exist."""
+    """Ids of the existing resources of the same kind and parent as a resource that does not exist."""
     parent, _, _ = resource.rpartition("/references/")
     if parent:
         return [it.reference_id for it in islice(client.list_references(parent), _MAX_COMPARED)]

@@ -48,11 +48,11 @@ def adjust_pose(
 
     Args:
         query: the query.
-        references: in the order that the structure's tracks number them.
+        references: the references, in the order of the structure's tracks.
         structure: metric points.
-        matches: of the query with them.
+        matches: 2D-3D matches of the query with these points.
         estimate: the initial pose; its errors select the matches.
-        options: see there.
+        options: of the adjustment.
         priors: on the query's pose. Each is checked against the pose from the photograph alone; only consistent ones
             are used.
         intrinsics: standard deviations of the query's intrinsics; None for the defaults.
@@ -85,7 +85,7 @@ def _adjusted(
     priors: Priors,
     intrinsics: IntrinsicsSigma | None,
 ) -> PoseEstimate | None:
-    """The estimate at the optimum with priors; None if it diverges or has too few matches."""
+    """Returns the estimate at the optimum with priors; None if it diverges or has too few matches."""
     used = np.flatnonzero(estimate.errors_px < options.max_error_px)
     if len(used) < 3:  # two equations each, for six unknowns
         return None
@@ -112,9 +112,9 @@ def pose_covariance(
     """Covariance (6, 6) of a pose, order x y z rx ry rz, fixed world axes, metres and radians.
 
     Args:
-        support: with an estimate, of any stage.
+        support: the pose's support, with an estimate of any stage.
         scale: its metric scale, whose deviation is used as its relative standard deviation.
-        options: see there.
+        options: of the adjustment.
         priors: on the pose; those that were used reduce the covariance.
         points_are_predicted: whether the structure's points are predicted by the reconstruction, rather than
             triangulated from the references' poses.

@@ -1,4 +1,4 @@
-"""Poses where `localize` has no points: from one reference, or from references that share too little."""
+"""Poses for queries where `localize` has no points: one reference, or references that share too little."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from .views import Reconstruction
 
 
 def from_one_reference(coarse: Coarse, scale: MetricScale) -> Answer:
-    """From a single reference, by the network's depths and metres; priors are compared with the pose, and not used."""
+    """Estimates the pose from a single reference with a network's depths; priors are compared with it, but not used."""
     prepared, options = coarse.prepared, coarse.prepared.pipeline.options
     assert isinstance(coarse.reconstruction, Reconstruction)
     given = prepared.query, prepared.references, coarse.reconstruction, scale, prepared.correspondences.query_matches
@@ -44,7 +44,7 @@ def from_one_reference(coarse: Coarse, scale: MetricScale) -> Answer:
 
 
 def from_two_views(coarse: Coarse, answer: Answer) -> Answer:
-    """The answer from two-view matches and 2D-3D matches together; the given rejection if that gives none."""
+    """Estimates the pose from two-view and 2D-3D matches together; returns the given rejection if there is no pose."""
     support = _two_view_support(coarse, answer.support)
     answer = replace(answer, stage_seconds=dict(coarse.prepared.context.stage_seconds))
     if support is None or support.estimate is None:
@@ -69,7 +69,7 @@ def from_two_views(coarse: Coarse, answer: Answer) -> Answer:
 
 
 def _two_view_support(coarse: Coarse, found: Support | None) -> Support | None:
-    """The pose from two-view matches and wide correspondences; a pose found before is a candidate."""
+    """Finds a pose from two-view matches and wide correspondences; a pose found before is one of the candidates."""
     prepared, options = coarse.prepared, coarse.prepared.pipeline.options
     query, references, context = prepared.query, prepared.references, prepared.context
     query_matches, matcher = prepared.correspondences.query_matches, prepared.pipeline.matcher

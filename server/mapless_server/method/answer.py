@@ -26,7 +26,7 @@ class Localization:
         pose_stage: the stage that gave the pose.
         inlier_count: number of 2D-3D matches that are inliers; of two-view matches too, if the pose rests on them.
         match_count: number of all these matches.
-        reprojection_error_px: median of the inliers, pixels of the processed image.
+        reprojection_error_px: median of the inliers' errors, pixels of the processed image.
         prior_checks: comparison of the pose with each prior.
         trust: 0 to 1, share of right answers whose score is at most as high (see `judge`); None for a pose without
             refinement.
@@ -54,7 +54,7 @@ class Localization:
         two_view: TwoViewSupport | None = None,
         intrinsics_checks: tuple[IntrinsicsCheck, ...] = (),
     ) -> Localization:
-        """The localization of an accepted estimate, and the two-view matches that it rests on, if any."""
+        """Makes the localization of an accepted estimate, with the two-view matches that it rests on, if any."""
         errors_px, inliers = estimate.errors_px, estimate.inliers
         if two_view is not None:
             errors_px = np.concatenate([errors_px, two_view.errors_px])
@@ -94,7 +94,7 @@ class Answer:
 
 
 def shifted(answer: Answer, offset: Array) -> Answer:
-    """The answer in a world whose coordinates are larger by `offset` (3,)."""
+    """Returns the answer in a world whose coordinates are larger by `offset` (3,)."""
     outcome, scale = answer.outcome, answer.scale
     if isinstance(outcome, Localization):
         outcome = replace(outcome, world_from_camera=outcome.world_from_camera.shifted(offset))
@@ -119,7 +119,7 @@ def is_better(wide: Answer, strict: Answer, max_radius_ratio: float) -> bool:
 
 
 def _position_radius_m(answer: Answer) -> float:
-    """Position radius of 68 % by the covariance; infinite without one."""
+    """Radius of the position at 68 % from the covariance, metres; infinite without a covariance."""
     if isinstance(answer.outcome, Rejection) or answer.outcome.covariance is None:
         return math.inf
     return accuracy_from_covariance(answer.outcome.covariance).position_68_m

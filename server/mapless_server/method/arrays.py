@@ -52,7 +52,7 @@ def length(vectors: AnyArray) -> AnyArray:
 
 
 def apply(matrices: AnyArray, vectors: AnyArray) -> AnyArray:
-    """Many small matrices (N, I, J) times vectors (N, J), (N, I).
+    """Multiplies many small matrices (N, I, J) with one vector (N, J) each: (N, I).
 
     NumPy's matmul takes three times as long; on a GPU, matmul launches a group of threads for each matrix.
     """
@@ -62,7 +62,7 @@ def apply(matrices: AnyArray, vectors: AnyArray) -> AnyArray:
 
 
 def multiply(first: AnyArray, second: AnyArray) -> AnyArray:
-    """Many small matrices (N, I, J) times others (N, J, K), (N, I, K)."""
+    """Multiplies many small matrices (N, I, J) with one matrix (N, J, K) each: (N, I, K)."""
     if namespace(first) is np:
         return first @ second
     return (first[:, :, :, None] * second[:, None, :, :]).sum(2)
@@ -79,7 +79,7 @@ def columns(values: AnyArray) -> AnyArray:
 
 
 def rows(values: AnyArray) -> AnyArray:
-    """The inverse of `columns`."""
+    """Inverse of `columns`."""
     if namespace(values) is np:
         return np.ascontiguousarray(np.moveaxis(values, -1, 0))
     return values.movedim(-1, 0).contiguous()
@@ -91,7 +91,7 @@ def take(values: AnyArray, index: AnyArray) -> AnyArray:
 
 
 def apply_columns(matrices: AnyArray, vectors: AnyArray) -> AnyArray:
-    """Many small matrices (I, J, N) times vectors (J, N), (I, N)."""
+    """Multiplies many small matrices in columns (I, J, N) with vectors (J, N): (I, N)."""
     if namespace(matrices) is np:
         return np.einsum("ijn,jn->in", matrices, vectors)
     return (matrices * vectors).sum(1)
@@ -102,13 +102,13 @@ SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def symmetric_products(first: AnyArray, second: AnyArray) -> AnyArray:
-    """A^T B of many small matrices (I, 3, N) where it is symmetric, its elements (6, N) as in `SYMMETRIC`."""
+    """Products A^T B of many small matrices (I, 3, N), if symmetric: elements (6, N) in the order of `SYMMETRIC`."""
     across = [(first[:, i, None] * second[:, i + 1 :]).sum(0) for i in range(2)]
     return namespace(first).concatenate([(first * second).sum(0), *across])
 
 
 def solve_columns(matrices: AnyArray, vectors: AnyArray) -> AnyArray:
-    """Solves symmetric 3x3 systems in columns, (6, P) as in `SYMMETRIC`, (3, P); NaN where singular."""
+    """Solves symmetric 3x3 systems in columns, (6, P) in the order of `SYMMETRIC`: (3, P); NaN where singular."""
     xp = namespace(matrices)
     xx, yy, zz, xy, xz, yz = matrices
     x, y, z = vectors

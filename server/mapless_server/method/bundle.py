@@ -35,14 +35,14 @@ from .views import PosedView
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Several camera_from_world: rotation (V, 3, 3), translation (V, 3)."""
+    """The poses `camera_from_world` of several cameras: rotation (V, 3, 3), translation (V, 3)."""
 
     rotation: Array
     translation: Array
 
     @staticmethod
     def of(world_from_camera: Iterable[RigidTransform]) -> Poses:
-        """From world_from_camera."""
+        """Makes the poses from `world_from_camera` of each camera."""
         poses = [it.inverse() for it in world_from_camera]
         if not poses:
             return Poses(np.empty((0, 3, 3)), np.empty((0, 3)))
@@ -53,23 +53,23 @@ class Poses:
 
     @property
     def centres(self) -> Array:
-        """(V, 3) of the cameras, in the world."""
+        """Centres (V, 3) of the cameras in the world."""
         return np.asarray(-np.einsum("vji,vj->vi", self.rotation, self.translation))
 
     def and_last(self, camera_from_world: RigidTransform) -> Poses:
-        """With another pose appended."""
+        """Returns these poses with another one appended."""
         return Poses(
             np.concatenate([self.rotation, camera_from_world.rotation[None]]),
             np.concatenate([self.translation, camera_from_world.translation[None]]),
         )
 
     def moved(self, motion: Array) -> Poses:
-        """After left perturbations (V, 6)."""
+        """Returns the poses after left perturbations (V, 6)."""
         turn = np.stack([rotation_from_vector(w) for w in motion[:, 3:]])
         return Poses(turn @ self.rotation, (turn @ self.translation[:, :, None])[..., 0] + motion[:, :3])
 
     def motion_from(self, given: Poses) -> Array:
-        """(V, 6): the left perturbations from `given` to these poses, if small."""
+        """Left perturbations (V, 6) that move the poses `given` to these, if they are small."""
         turn = self.rotation @ np.swapaxes(given.rotation, 1, 2)
         shift = self.translation - (turn @ given.translation[:, :, None])[..., 0]
         skew = (turn - np.swapaxes(turn, 1, 2)) / 2
@@ -78,14 +78,14 @@ class Poses:
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Poses of the references, then the query, points (P, 3), and errors (I,) of the query's intrinsics, 4 or none."""
+    """Values of the unknowns: cameras' poses (the query's last), points (P, 3), errors (I,) of intrinsics."""
 
     poses: Poses
     points: Array
     intrinsics: Array = field(default_factory=lambda: np.zeros(0))
 
     def moved(self, motion: Array, steps: Array, intrinsics: Array | None = None) -> Bundle:
-        """After left perturbations (V, 6) of the poses, and steps (P, 3) of the points and (I,) of the intrinsics."""
+        """Values after left perturbations (V, 6) of the poses, and steps (P, 3) of points and (I,) of intrinsics."""
         errors = self.intrinsics if intrinsics is None else self.intrinsics + intrinsics
         return Bundle(self.poses.moved(motion), self.points + steps, errors)
 
@@ -140,11 +140,11 @@ class BundleProblem:
         return slice(count, count + 6)
 
     def reference_motion(self, bundle: Bundle) -> Array:
-        """(V - 1, 6): the motion of each reference away from its given pose."""
+        """Motion (V - 1, 6) of each reference from its given pose."""
         return bundle.poses[:-1].motion_from(self.given)
 
     def cost(self, bundle: Bundle) -> float:
-        """NaN for a point behind a camera."""
+        """Cost of the values; NaN if a point is behind a camera."""
         x_in_camera = self.by_view.in_camera(bundle.poses, np.ascontiguousarray(bundle.points.T))
         squared = (self.by_view.residuals(x_in_camera, bundle.intrinsics) ** 2).sum(axis=0)
         motion = self.reference_motion(bundle).ravel()
@@ -158,7 +158,7 @@ class BundleProblem:
         return cauchy_cost(squared, self.loss_scale_sigma) + prior
 
     def linearize(self, bundle: Bundle) -> NormalEquations:
-        """See optimize.Problem."""
+        """See `optimize.Problem`."""
         equations = self.by_view.equations(bundle, self.loss_scale_sigma)
         query = self.query_rows
         references, intrinsics = slice(query.start), slice(query.stop, None)
@@ -175,7 +175,7 @@ class BundleProblem:
         return equations
 
     def step(self, bundle: Bundle, equations: NormalEquations, damping: float) -> Bundle | None:
-        """See optimize.Problem."""
+        """See `optimize.Problem`."""
         matrix, gradient, points = equations.reduced(damping)
         motion = solve_step(matrix, gradient)
         if motion is None:
@@ -246,7 +246,7 @@ class ViewColumns:
         view_count: int,
         planes: DepthPlanes | None,
     ) -> ViewColumns:
-        """From columns that are sorted by view."""
+        """Makes the columns from arrays that are sorted by view."""
         parts = itertools.pairwise(np.searchsorted(view, np.arange(view_count + 1)).tolist())
         count = len(point)
         sums = csr_array((np.ones(count), (point, np.arange(count))), shape=(int(point.max(initial=-1)) + 1, count))
@@ -254,7 +254,7 @@ class ViewColumns:
         return ViewColumns(point, view, slices, focal, offset, sums, by_intrinsics, planes)
 
     def of_points(self, chosen: NDArray[np.bool_]) -> ViewColumns:
-        """The observations of some of the points (P,), which are numbered anew."""
+        """Returns the observations of some of the points (P,), with the points numbered anew."""
         kept = chosen[self.point]
         point, view = (np.cumsum(chosen) - 1)[self.point[kept]], self.view[kept]
         by_intrinsics = (
@@ -264,17 +264,17 @@ class ViewColumns:
         return ViewColumns._sorted(point, view, *columns, len(self.parts), self.planes and self.planes[chosen])
 
     def in_camera(self, poses: Poses, x_in_world: Array) -> Array:
-        """(3, O) in the cameras' frames, from points (3, P)."""
+        """Coordinates (3, O) of the observed points in the cameras' frames, from points (3, P)."""
         rotation = take(columns(poses.rotation), self.view)
         return np.asarray(apply_columns(rotation, take(x_in_world, self.point)) + take(poses.translation.T, self.view))
 
     def residuals(self, x_in_camera: Array, intrinsics: Array) -> Array:
-        """(2, O), in standard deviations; NaN behind the camera."""
+        """Residuals (2, O) in standard deviations; NaN for points behind the camera."""
         depth = np.where(x_in_camera[2] > 0, x_in_camera[2], np.nan)
         return self._with_intrinsics(np.asarray(x_in_camera[:2] / depth * self.focal + self.offset), intrinsics)
 
     def _with_intrinsics(self, residual: Array, intrinsics: Array) -> Array:
-        """The residuals (2, O), changed in place, at errors (I,) of the query's intrinsics."""
+        """Changes residuals (2, O) in place to those at errors (I,) of the query's intrinsics, and returns them."""
         if intrinsics.size:
             residual[:, self.parts[-1]] += np.einsum("aio,i->ao", self.by_intrinsics, intrinsics)
         return residual
@@ -335,7 +335,7 @@ class ViewColumns:
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """[B E; E^T C] [d_pose; d_point] = -[g; h], where C is block-diagonal and poses include the query's intrinsics.
+    """Normal equations [B E; E^T C] [d_pose; d_point] = -[g; h]: C is block-diagonal, poses include the intrinsics.
 
     Attributes:
         columns: the observations.
@@ -344,7 +344,7 @@ class NormalEquations:
         point_block: C, (6, P) as in `arrays.SYMMETRIC`.
         point_gradient: h, (3, P).
         cross: E, (6, 3, O), the block of each observation's view and point.
-        cross_intrinsics: E, (I, 3, O_q), that of the query's intrinsics.
+        cross_intrinsics: E, (I, 3, O_q), the block of the query's intrinsics.
     """
 
     columns: ViewColumns
@@ -356,7 +356,7 @@ class NormalEquations:
     cross_intrinsics: Array
 
     def reduced(self, damping: float) -> tuple[Array, Array, EliminatedPoints]:
-        """B - E C^-1 E^T (U, U), g - E C^-1 h (U,), U = 6 V + I, and the points, diagonals enlarged by `damping`.
+        """Eliminates the points: B - E C^-1 E^T (U, U), g - E C^-1 h (U,), U = 6 V + I; `damping` enlarges diagonals.
 
         With Cholesky's C = L L^T the products are those of F = E L^-T with itself and with L^-1 h.
         """
@@ -383,7 +383,7 @@ class NormalEquations:
 
 @dataclass(frozen=True, eq=False)
 class EliminatedPoints:
-    """What determines the points once the cameras are known.
+    """What is needed to compute the points once the cameras are known.
 
     Attributes:
         factor: L (6, P), as in `arrays.SYMMETRIC`.
@@ -396,11 +396,11 @@ class EliminatedPoints:
     cross: Array
 
     def solved(self, vectors: Array, point: NDArray[np.intp]) -> Array:
-        """L^-1 b of vectors b (3, ..., O), each with the factor of its point (O,)."""
+        """Solves L y = b for vectors b (3, ..., O), each with the factor of its point (O,)."""
         return np.stack(_forward(take(self.factor, point), vectors))
 
     def steps(self, motion: Array) -> Array:
-        """Steps (P, 3) of the points after a motion (U,) of the cameras."""
+        """Steps (P, 3) of the points that follow from a motion (U,) of the cameras."""
         xx, yy, zz, xy, xz, yz = self.factor
         x, y, z = -(self.gradient + (motion @ self.cross).reshape(3, -1))
         z = z / zz
@@ -409,7 +409,7 @@ class EliminatedPoints:
 
 
 def _cholesky(matrices: Array) -> Array:
-    """L (6, P) of symmetric positive matrices (6, P); both as in `arrays.SYMMETRIC`, NaN where singular."""
+    """Cholesky factors L (6, P) of positive matrices (6, P), both as in `arrays.SYMMETRIC`; NaN where singular."""
     xx, yy, zz, xy, xz, yz = matrices
     with np.errstate(divide="ignore", invalid="ignore"):
         first = np.sqrt(xx)
@@ -423,7 +423,7 @@ def _cholesky(matrices: Array) -> Array:
 
 
 def _forward(factor: Array, vectors: Array) -> list[Array]:
-    """L^-1 b of vectors b (3, ..., P), their components."""
+    """Solves L y = b for vectors b (3, ..., P); returns the components of y."""
     xx, yy, zz, xy, xz, yz = factor
     x = vectors[0] / xx
     y = (vectors[1] - xy * x) / yy
@@ -433,10 +433,10 @@ def _forward(factor: Array, vectors: Array) -> list[Array]:
 def bundle_of(
     tracks: Tracks, views: Sequence[PosedView], structure: Structure, chosen: NDArray[np.bool_] | NDArray[np.intp]
 ) -> tuple[Observations, Bundle, float]:
-    """The observations of points of a structure, the initial bundle, and the points' median depth in metres.
+    """Sets up an adjustment: observations, initial bundle and median depth of the chosen points of a structure, metres.
 
     Args:
-        tracks: of these points over the views.
+        tracks: the tracks of these points over the views.
         views: the references, then the query.
         structure: the points.
         chosen: mask or indices of the points to use.

@@ -42,12 +42,12 @@ PAIR_RULE = 2
 
 @dataclass(frozen=True)
 class CorrespondOptions:
-    """Options of matching, all that depend on the descriptor; `OPTIONS` has a set for each extractor.
+    """Options of matching that depend on the descriptor; `OPTIONS` has a set for each extractor.
 
     Attributes:
         reference_ratio: Lowe's ratio, the largest distance of the nearest descriptor over that of the second-nearest,
             between references, from either of them; loose, because the epipolar constraint filters too.
-        query_ratio: the same for matches with the query, which have no other filter.
+        query_ratio: the same ratio for matches with the query, which have no other filter.
         epipolar_px: largest distance from the epipolar line, in both images; keypoints are accurate to about a pixel.
         wide_ratio: the ratio among the keypoints along the line; stricter, because they are few.
         wide_similarity: smallest cosine of descriptors of a match along the line, for the same reason.
@@ -116,7 +116,7 @@ class Correspondences:
     _tracks: dict[int | None, Tracks] = field(default_factory=dict, init=False, repr=False)
 
     def tracks(self, references: Sequence[PosedView], anchor: int | None = None) -> Tracks:
-        """The tracks over the references, merged once for all stages; `anchor` as in `build_tracks`."""
+        """Builds the tracks over the references, once for all stages; `anchor` as in `build_tracks`."""
         if anchor not in self._tracks:
             counts = [len(reference.view.features) for reference in references]
             self._tracks[anchor] = build_tracks(self.reference_pairs, counts, anchor)
@@ -155,7 +155,7 @@ class StoredPairs(Protocol):
     """Matches of pairs of references that were made before."""
 
     def find(self, matching: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> Sequence[Matches | None]:
-        """The matches of each pair, given `in_order`, that `Matcher.match_pair` made; None where there are none.
+        """Returns the stored matches of each pair, given `in_order`; None for a pair that is not stored.
 
         `matching` is what `Matcher.matching` returns. Does not raise.
         """
@@ -163,7 +163,7 @@ class StoredPairs(Protocol):
 
 
 class NearestNeighbours:
-    """Mutual nearest neighbours that pass the ratio test, for any descriptor."""
+    """Matches mutual nearest neighbours that pass the ratio test, for any descriptor."""
 
     def __init__(self, ratio: float, pool: ThreadPoolExecutor) -> None:
         self.ratio = ratio
@@ -190,8 +190,8 @@ class Matcher:
         pair_matching: matches the query again with its best references, and references ahead of the queries; None if
             nothing does. A query finds *strong* pairs of references, which it made, in `stored` only: it has no time to
             make them, and matches the others by nearest neighbours. So its answer depends on which are stored.
-        pair_s: how long `pair_matching` took in the mean of the last queries' pairs, seconds; None before the first.
-        stored: where pairs are looked up that are not cached; None looks up none.
+        pair_s: mean time of `pair_matching` for a pair of the last queries, seconds; None before the first.
+        stored: where pairs that are not cached are looked up; None looks up none.
     """
 
     def __init__(
@@ -218,7 +218,7 @@ class Matcher:
         check: Callable[[], None] = lambda: None,
         query_matches: Sequence[Matches] | None = None,
     ) -> Correspondences:
-        """Matches between all pairs of references, wide ones on request, and between the query and each reference.
+        """Finds matches between all pairs of references, wide ones if `wide`, and of the query with each reference.
 
         Calls `check` before each pair and does not catch what it raises. `query_matches`, if known already from
         `match_query` or another call with the same references, are used as they are.
@@ -238,7 +238,7 @@ class Matcher:
     def match_query(
         self, query: View, references: Sequence[PosedView], check: Callable[[], None] = lambda: None
     ) -> Sequence[Matches]:
-        """Matches between the query and each reference; `check` as in `correspond`."""
+        """Finds matches between the query and each reference; `check` as in `correspond`."""
         matches = list(self.match_quickly(query, references, check))
         for i in self.to_rematch(matches):
             check()
@@ -248,18 +248,18 @@ class Matcher:
     def match_quickly(
         self, query: View, references: Sequence[PosedView], check: Callable[[], None] = lambda: None
     ) -> Sequence[Matches]:
-        """The same before `rematch`, for choosing references; final without a `pair_matching`."""
+        """Finds the matches that references are chosen by, without `rematch`; final if there is no `pair_matching`."""
         return self._query_matching.match(query, references, check)
 
     def to_rematch(self, matches: Sequence[Matches]) -> list[int]:
-        """Indices of the references with which a query is to be matched by `rematch`, the best first."""
+        """Returns the indices of the references that `rematch` should match with a query, the best first."""
         if self.pair_matching is None:
             return []
         best_first = sorted(range(len(matches)), key=lambda i: -len(matches[i]))
         return best_first[: self.options.rematched_references]
 
     def rematch(self, query: View, reference: PosedView) -> Matches:
-        """Matches of a query with one reference by the `pair_matching`."""
+        """Matches a query with one reference by the `pair_matching`."""
         assert self.pair_matching is not None
         begin_s = time.monotonic()
         matches = self.pair_matching.match_one(query, reference.view)
@@ -272,7 +272,7 @@ class Matcher:
         self._pool.shutdown()
 
     def matching(self, wide: bool = False, strong: bool = False) -> str:
-        """Names everything that determines the matches of a pair, except for the two references."""
+        """Returns a name for everything that determines a pair's matches, except for the two references."""
         options = self.options
         strict = f"{PAIR_RULE}-{options.reference_ratio}-{options.epipolar_px}"
         if strong:
@@ -281,9 +281,9 @@ class Matcher:
         return f"wide-{strict}-{options.wide_ratio}-{options.wide_similarity}" if wide else f"strict-{strict}"
 
     def match_references(self, first: PosedView, second: PosedView, wide: bool = False) -> Matches:
-        """Matches between two references, each within `epipolar_px` of the epipolar line of the known poses.
+        """Finds matches between two references, each within `epipolar_px` of the epipolar line of the known poses.
 
-        Strong ones, if those that are not wide have been looked up; otherwise by nearest neighbours.
+        They are strong ones if the strict matches have been looked up as such; otherwise from nearest neighbours.
         """
         pair = in_order(first, second)
         strong = self._recall(_Key.of(pair, False, True)) is not None
@@ -303,14 +303,14 @@ class Matcher:
         strict: Matches | None = None,
         pause: Callable[[], None] = lambda: None,
     ) -> Matches:
-        """The same for two references `in_order`, computed anew and not cached.
+        """Computes the matches of two references, given `in_order`, anew and without caching them.
 
         Args:
-            first: reference.
+            first: a reference.
             second: another one.
             wide: whether the matches are wide ones.
-            strong: whether they are those of `pair_matching`.
-            strict: those that are not wide, if they are known.
+            strong: whether to match by `pair_matching`.
+            strict: the matches that are not wide, if they are known.
             pause: see PairMatching.
         """
         if strict is None:
@@ -318,11 +318,11 @@ class Matcher:
         return self._widened(first, second, strict) if wide else strict
 
     def has_enough(self, nearest: Matches) -> bool:
-        """Whether a pair of references that nearest neighbours match so well is not matched by `pair_matching`."""
+        """Whether nearest neighbours find so many matches of a pair that `pair_matching` is not used for it."""
         return len(nearest) >= self.options.enough_matches
 
     def _look_up(self, pairs: Sequence[tuple[PosedView, PosedView]], wide: bool) -> None:
-        """Caches those of these pairs that are stored; strong ones if there are."""
+        """Caches those of these pairs that are stored, strong matches if there are any."""
         if self.stored is None:
             return
         strong = self._found(pairs, False, True) if self.pair_matching else [False] * len(pairs)
@@ -332,7 +332,7 @@ class Matcher:
             self._found([pair for pair, is_strong in zip(pairs, strong, strict=True) if is_strong], wide, True)
 
     def _found(self, pairs: Sequence[tuple[PosedView, PosedView]], wide: bool, strong: bool) -> list[bool]:
-        """Which of these pairs are cached, after those that are stored have been cached."""
+        """Caches these pairs' stored matches; returns which of the pairs are cached then."""
         keys = [_Key.of(pair, wide, strong) for pair in pairs]
         with self._lock:
             found = [key in self._remembered for key in keys]
@@ -377,7 +377,7 @@ class Matcher:
         return matches[epipolar_distance_px(first, second, matches) < self.options.epipolar_px]
 
     def _widened(self, first: PosedView, second: PosedView, strict: Matches) -> Matches:
-        """The strict matches, and matches along the epipolar lines of the other keypoints."""
+        """Returns the strict matches, and matches along the epipolar lines of the other keypoints."""
         similarity = first.view.features.unit_descriptors() @ second.view.features.unit_descriptors().T
         similarity[epipolar_distances_px(first, second) >= self.options.epipolar_px] = -1.0
         added = best_of_both(similarity, self.options.wide_ratio, self.options.wide_similarity)
@@ -386,7 +386,7 @@ class Matcher:
 
 
 class _Key(NamedTuple):
-    """Of a pair of references in the cache."""
+    """The key of a pair of references in the cache."""
 
     first: str
     second: str
@@ -399,7 +399,7 @@ class _Key(NamedTuple):
 
 
 def in_order(first: PosedView, second: PosedView) -> tuple[PosedView, PosedView]:
-    """Two references in the order in which they are matched, whichever comes first in a query.
+    """Returns two references in the order in which they are always matched, whichever comes first in a query.
 
     The ratio test of wide matches is not symmetric, and the order decides how sums are rounded. Names, unlike keys, are
     the same wherever the scene is stored.
@@ -408,11 +408,11 @@ def in_order(first: PosedView, second: PosedView) -> tuple[PosedView, PosedView]
 
 
 def make_matcher(features: str, threads: int = 1, weights: Path | None = None, device: str = "cpu") -> Matcher:
-    """The matcher for an extractor.
+    """Makes the matcher for an extractor.
 
     Args:
         features: one of `OPTIONS`.
-        threads: see Matcher.
+        threads: number of threads that a query's pairs are distributed over.
         weights: of the features' LightGlue; None takes nearest neighbours alone. On a CUDA device LightGlue matches the
             query; on a CPU, where it is slow, it is the `Matcher.pair_matching`.
         device: "cpu" or a CUDA device, for LightGlue.
@@ -438,7 +438,7 @@ def make_matcher(features: str, threads: int = 1, weights: Path | None = None, d
 
 
 def mutual_matches(first: Features, second: Features, ratio: float, either: bool = False) -> Matches:
-    """Mutual nearest neighbours that pass the ratio test from first to second, or, if `either`, from second to first.
+    """Mutual nearest neighbours that pass the ratio test from first to second or, if `either`, from second to first.
 
     Descriptors have unit length, so with cosine s the distance is sqrt(2 - 2 s).
     """
@@ -452,7 +452,7 @@ def best_of_both(
 ) -> Matches:
     """Entries of a matrix of cosines (N, M) that are mutual maxima, above `smallest`, and pass the ratio test by row.
 
-    If `either`, it suffices that they pass it by column. Overwrites the matrix.
+    If `either`, it suffices to pass the ratio test by column. Overwrites the matrix.
     """
     if not similarity.size:
         return np.empty((0, 2), np.int32)
@@ -473,7 +473,7 @@ def best_of_both(
 def epipolar_distance_px(first: PosedView, second: PosedView, matches: Matches) -> Array:
     """Distance (M,) of matches from the epipolar lines of the known poses, the larger of both images.
 
-    0 without a baseline, where there is no such line.
+    The distance is 0 without a baseline, where there is no epipolar line.
     """
     fundamental = fundamental_matrix(first, second)
     x_first = _homogeneous(first.view.features.keypoints[matches[:, 0]])
@@ -484,7 +484,7 @@ def epipolar_distance_px(first: PosedView, second: PosedView, matches: Matches) 
 
 
 def epipolar_distances_px(first: PosedView, second: PosedView) -> NDArray[np.float32]:
-    """The same (N, M) for every keypoint of the first view with every keypoint of the second."""
+    """The same distances (N, M) for every keypoint of the first view with every keypoint of the second."""
     fundamental = fundamental_matrix(first, second)
     x_first, x_second = (_homogeneous(v.view.features.keypoints) for v in (first, second))
     in_first = x_first.astype(np.float32) @ _lines(x_second @ fundamental.T).T.astype(np.float32)
@@ -496,7 +496,7 @@ def epipolar_distances_px(first: PosedView, second: PosedView) -> NDArray[np.flo
 
 
 def fundamental_matrix(first: PosedView, second: PosedView) -> Array:
-    """F (3, 3) of the known poses, x_first^T F x_second = 0 in homogeneous pixels; zero without a baseline."""
+    """F (3, 3) of the known poses, x_first^T F x_second = 0 in homogeneous pixels; a zero matrix without a baseline."""
     first_from_world = first.world_from_camera.rotation.T
     # The difference first: world coordinates may be millions of metres.
     baseline = first_from_world @ (second.world_from_camera.translation - first.world_from_camera.translation)
@@ -508,7 +508,7 @@ def fundamental_matrix(first: PosedView, second: PosedView) -> Array:
 
 
 def _lines(lines: Array) -> Array:
-    """Lines (N, 3) scaled so that a product with a homogeneous pixel is a distance in pixels."""
+    """Scales lines (N, 3) so that the product with a homogeneous pixel is a distance in pixels."""
     return np.asarray(lines / np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12))
 
 

@@ -54,7 +54,7 @@ class _Case:
     """The numbers that a hint follows from.
 
     Attributes:
-        rejection: of the query.
+        rejection: the query's rejection.
         features: number of features of the photograph.
         matches: number of matches with the best reference.
         inliers: number of inliers among all 2D-3D matches.
@@ -84,11 +84,11 @@ def hinted(
     """Adds a hint to a rejection without one.
 
     Args:
-        answer: of the method.
+        answer: the answer of the method.
         query: the photograph.
         references: used for the query, in the order of the answer's counts.
         has_prior: whether the request has a prior on position or heading.
-        options: see there.
+        options: options of the hints.
     """
     rejection = answer.outcome
     if not isinstance(rejection, Rejection) or rejection.hint is not None:
@@ -144,7 +144,7 @@ def _advice(case: _Case, options: HintOptions) -> tuple[Advice, str]:
 
 
 def _of_overlap(case: _Case, options: HintOptions) -> tuple[Advice, str]:
-    """The photograph and the references are usable, but have too little in common."""
+    """The hint if photograph and references are usable, but have too little in common."""
     shared = f"the best reference shares {case.matches} of the photograph's {case.features} features"
     if case.features < options.few_features:
         return Advice.RETAKE_PHOTOGRAPH, _retake(case)

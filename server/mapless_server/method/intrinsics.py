@@ -35,13 +35,13 @@ PRINCIPAL = (1, 2)
 
 @dataclass(frozen=True)
 class ContradictionOptions:
-    """When a photograph contradicts a parameter of its intrinsics.
+    """Options that define when a photograph contradicts a parameter of its intrinsics.
 
     Attributes:
-        sigmas: it is off by more standard deviations of its estimate. These leave out what matches share: of right
-            ones SIFT's were off by 3.2 at most in eleven scenes, EdgePoint2's by 4.3 with five references of a kitchen;
-            of photographs that are localized to 3 % of the distance among internet photographs, whose references have
-            wrong intrinsics themselves, by 7.5.
+        sigmas: the parameter is off by more than this many standard deviations of its estimate. These do not contain
+            errors that matches share: right parameters were off by at most 3.2 with SIFT in eleven scenes, by 4.3 with
+            EdgePoint2 and five references of a kitchen, and by 7.5 among internet photographs (localized to 3 % of the
+            distance), whose references have wrong intrinsics themselves.
         focal_share, principal_share, k1: standard deviations (of the focal length and the width, as shares) above
             which a photograph does not determine a parameter. Noise in the depth of a flat wall's points looks like
             relief of the wall: its focal length was off by 72 % with a standard deviation of 8.5 %.
@@ -58,7 +58,7 @@ class ContradictionOptions:
 
 @dataclass(frozen=True, eq=False)
 class IntrinsicsEvidence:
-    """What a photograph's matches say of the errors of its intrinsics: true minus given, s, x, y and k1.
+    """What a photograph's matches say about the errors of its intrinsics: true minus given, for s, x, y and k1.
 
     Attributes:
         given: the camera, in pixels of the processed image, with its distortion.
@@ -84,13 +84,13 @@ class IntrinsicsEvidence:
 
     @property
     def pose_covariance(self) -> Array:
-        """(6, 6): what these errors add to the covariance of a pose that was computed without them."""
+        """What these errors add to the covariance (6, 6) of a pose that was computed without them."""
         return np.asarray(self.motion @ self.covariance @ self.motion.T)
 
     def contradicted(self, options: ContradictionOptions) -> NDArray[np.bool_]:
-        """(4,): which parameters are significantly wrong, and by more than one standard deviation of the prior.
+        """Which parameters (4,) are significantly wrong, and by more than one standard deviation of the prior.
 
-        A prior that is wider than the default does not raise that limit: the photograph then knows better.
+        A prior that is wider than the default does not raise this limit: the photograph is then more accurate.
         """
         width_px, size = self.given.width_px, np.abs(self.value)
         usual = np.minimum(self.prior_sigma, IntrinsicsSigma().of(self.given))
@@ -111,18 +111,18 @@ def intrinsics_evidence(
     inflation: float,
     to_world: Array,
 ) -> IntrinsicsEvidence | None:
-    """The evidence in normal equations of poses and intrinsics; None if they are singular.
+    """Computes the evidence from normal equations of poses and intrinsics; None if they are singular.
 
     Args:
-        matrix: (U, U) points eliminated; the last 4 unknowns are errors of the intrinsics, without their prior, the 6
-            before them the query's pose.
-        gradient: (U,).
+        matrix: (U, U), with the points eliminated; the last 4 unknowns are errors of the intrinsics, without their
+            prior, and the 6 before them the query's pose.
+        gradient: (U,) of the same unknowns.
         given: the photograph, with its intrinsics as given.
         removed: (4,) errors that are removed from the intrinsics at which they are linearized.
         prior_sigma: (4,) see `IntrinsicsEvidence`.
         held_sigma: (4,) the same where the pose was computed: less for a camera that the references share, more for
             parameters that the photograph contradicts.
-        inflation: of standard deviations that follow from residuals.
+        inflation: factor on standard deviations that follow from residuals.
         to_world: (6, 6) derivative of the world error by the pose's unknowns.
     """
     split = len(gradient) - 4
@@ -151,7 +151,7 @@ def intrinsics_evidence(
 
 
 def keypoint_motion(camera: Camera, distortion: Distortion | None, pixels: Array) -> Array:
-    """(N, 2, 4): by how much ideal pixels (N, 2) lie too far, for each of the four errors of the intrinsics."""
+    """Shift (N, 2, 4) of ideal pixels (N, 2) for one unit of each of the four errors of the intrinsics."""
     ideal = camera.rays(pixels)[:, :2]
     lens = distortion or RadialTangential()
     bent, by_k1 = lens.distort(ideal), _by_k1(lens, ideal)
@@ -164,7 +164,7 @@ def keypoint_motion(camera: Camera, distortion: Distortion | None, pixels: Array
 
 
 def corrected(camera: Camera, errors: Sequence[float] | Array) -> Camera:
-    """A camera, with its distortion, after these four errors are removed from its intrinsics."""
+    """Returns the camera and its distortion after these four errors are removed from its intrinsics."""
     log_ratio, x_px, y_px, k1 = (float(it) for it in errors)
     lens = camera.distortion or RadialTangential()
     return replace(
@@ -178,7 +178,7 @@ def corrected(camera: Camera, errors: Sequence[float] | Array) -> Camera:
 
 
 def corrected_view(view: View, errors: Array) -> View:
-    """A view after these errors are removed from its intrinsics; keypoints that have no place in it are NaN."""
+    """Returns the view after these errors are removed from its intrinsics; keypoints without an ideal pixel are NaN."""
     lens = replace(view.camera, distortion=view.distortion)
     pixels = lens.project(lens.rays(view.features.keypoints.astype(np.float64)))
     better, photograph = corrected(lens, errors), view.photograph
@@ -192,11 +192,11 @@ def corrected_view(view: View, errors: Array) -> View:
 
 
 def _by_k1(lens: Distortion, ideal: Array) -> Array:
-    """dD/dk1, (N, 2): the models are linear in their coefficients."""
+    """dD/dk1 (N, 2); lens models are linear in their coefficients."""
     return np.asarray(replace(lens, k1=lens.k1 + 1.0).distort(ideal) - lens.distort(ideal))
 
 
 def _jacobian(lens: Distortion, ideal: Array, step: float = 1e-6) -> Array:
-    """dD/dy, (N, 2, 2), by differences."""
+    """dD/dy (N, 2, 2), by finite differences."""
     ahead = [lens.distort(ideal + step * axis) - lens.distort(ideal - step * axis) for axis in np.eye(2)]
     return np.asarray(np.stack(ahead, axis=2) / (2 * step))

@@ -24,8 +24,8 @@ class LightGlueOptions:
 
     Attributes:
         min_score: least probability of a match; the authors' value.
-        max_keypoints: the first so many of each photograph are matched; extractors return the strongest first. The
-            time is quadratic in it.
+        max_keypoints: largest number of keypoints of a photograph that are matched, the strongest ones (extractors
+            return these first). The time is quadratic in it.
         pairs_at_once: batch size; all pairs of a query on a GPU. A CPU does not gain from batches.
         half: compute in float16, as the authors do on a GPU.
         depth_confidence, width_confidence: see `LightGlue.match_one`, which matches if batches are of one pair; the
@@ -53,10 +53,10 @@ class LightGlueMatching:
     """Matches photographs by LightGlue, see correspond.QueryMatching and correspond.PairMatching.
 
     Args:
-        network: with its weights.
+        network: the network, with its weights.
         device: "cpu" or a CUDA device.
         options: None takes those for the device.
-        sha256: of the weights, for the name.
+        sha256: hash of the weights, a part of the name.
     """
 
     def __init__(
@@ -146,12 +146,12 @@ class Padded:
 
     @property
     def arrays(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-        """In the order of the network's arguments."""
+        """The arrays in the order of the network's arguments."""
         return self.positions, self.descriptors, self.mask
 
     @classmethod
     def of(cls, views: Sequence[View], max_keypoints: int) -> Padded:
-        """Pads views with the same kind of descriptor, the first `max_keypoints` keypoints of each."""
+        """Pads views that have the same kind of descriptor; uses the first `max_keypoints` keypoints of each."""
         counts = [min(len(v.features), max_keypoints) for v in views]
         shape = (len(views), max(counts))
         positions = np.zeros((*shape, 2), np.float32)
@@ -163,6 +163,6 @@ class Padded:
 
 
 def normalized_positions(features: Features, camera: Camera) -> NDArray[np.float32]:
-    """(N, 2): relative to the image centre, in halves of its longer side, as the authors do."""
+    """Positions (N, 2) relative to the image centre, in halves of its longer side, as the authors normalize them."""
     size = np.array([camera.width_px, camera.height_px], np.float32)
     return np.asarray((features.keypoints - size / 2) / (size.max() / 2), np.float32)

@@ -60,9 +60,9 @@ def prepare(
     priors: Priors = NO_PRIORS,
     is_metric: bool = True,
 ) -> Prepared | Answer:
-    """Matches the query with its references and these with one another; an answer if the query is rejected here.
+    """Matches the query with its references, and these with one another; an answer if the query is rejected here.
 
-    `query_matches` with each reference, if given, are used as they are: the references were chosen by them.
+    `query_matches` with each reference, if given, are used unchanged: the references were chosen by them.
     `is_metric` is whether the unit of the references' poses is the metre. Raises ValueError if a view lacks input of
     the coarse backend.
     """
@@ -81,7 +81,7 @@ def prepare(
 
 
 def refine(coarse: Coarse) -> Answer:
-    """Structure, matches and pose; if the result is weak, all again from wide correspondences.
+    """Computes structure, matches and pose; if the result is weak, all of it again from wide correspondences.
 
     If the gate still rejects the pose, its agreement with gravity or heading is counted as evidence for it. If that
     does not help either, the pose is estimated from matches with the references themselves (see `two_view`).
@@ -103,7 +103,7 @@ def _strict_then_wide(coarse: Coarse, counts_agreement: bool) -> Answer:
 
 
 def _solve(coarse: Coarse, counts_agreement: bool) -> Answer:
-    """From the metric scale to an accepted pose; `counts_agreement` with gravity and heading as evidence for it."""
+    """Computes an accepted pose from the scale; if `counts_agreement`, gravity and heading count as evidence for it."""
     prepared, scale, stage = coarse.prepared, coarse.scale, coarse.prepared.context.stage
     if isinstance(scale, Rejection):
         return coarse.answer(scale)

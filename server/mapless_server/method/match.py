@@ -63,7 +63,7 @@ def match_points(
         structure: metric points.
         correspondences: matches between query and references.
         world_from_query: the query's initial pose.
-        options: `PAPER_MATCH` for the paper's form.
+        options: options of matching; `PAPER_MATCH` for the paper's form.
         prior_pose: world_from_query of a pose prior; the search starts from it if more of the matches through tracks
             are inliers of it than of the initial pose.
     """
@@ -87,14 +87,14 @@ def match_points(
 def _inlier_count(
     query: View, structure: Structure, known: PointMatches, world_from_query: RigidTransform, options: MatchOptions
 ) -> int:
-    """How many matches lie within the radius of a guided search from this pose."""
+    """Counts the matches within the radius of a guided search from this pose."""
     x_in_camera = world_from_query.inverse().apply(structure.x_in_world[known.point])
     away = query.camera.project(x_in_camera) - query.features.keypoints[known.keypoint]
     return int((np.linalg.norm(away, axis=1) < options.radius_px).sum())
 
 
 def vote(structure: Structure, keypoint_counts: Sequence[int], correspondences: Correspondences) -> PointMatches:
-    """Carries matches between query and references to points; where references disagree, the majority decides."""
+    """Carries matches between query and references to points; if references disagree, the majority decides."""
     tracks = structure.tracks
     offsets = np.concatenate([[0], np.cumsum(keypoint_counts)])
     point_of = np.full(offsets[-1], -1)

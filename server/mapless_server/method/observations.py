@@ -46,9 +46,9 @@ class Observations:
         size_px: (O,) size of the keypoint.
         sigma_px: (O,) standard deviation of its coordinates.
         rotation: (O, 3, 3) camera_from_world of the observing reference.
-        translation: (O, 3) of the same, metres.
-        focal_px: (O, 2) of its camera.
-        principal_px: (O, 2) of its camera.
+        translation: (O, 3) translation of the same pose, metres.
+        focal_px: (O, 2) focal lengths of its camera.
+        principal_px: (O, 2) principal point of its camera.
     """
 
     tracks: Grouping
@@ -62,29 +62,29 @@ class Observations:
 
     @property
     def point(self) -> AnyArray:
-        """(O,) index of each row's point."""
+        """Index (O,) of each row's point."""
         return self.tracks.point
 
     def residuals(self, x_in_world: AnyArray) -> AnyArray:
-        """(O, 2) projection minus observation of points (P, 3), in standard deviations; NaN behind the camera."""
+        """Projection minus observation (O, 2) of points (P, 3), in standard deviations; NaN behind the camera."""
         return rows(self.columns.residuals(self.columns.in_camera(columns(x_in_world))))
 
     @cached_property
     def columns(self) -> Columns:
-        """The same in columns, which are faster."""
+        """Returns the observations in columns, which are faster to compute with."""
         return Columns.of(self)
 
     def linearized(self, x_in_world: AnyArray) -> tuple[AnyArray, AnyArray]:
-        """The residuals (O, 2), and the derivative (O, 2, 3) of each by its point, per metre."""
+        """Returns residuals (O, 2) and the derivative (O, 2, 3) of each by its point, per metre."""
         x_in_camera = self.in_camera(x_in_world)
         return self.camera_residuals(x_in_camera), multiply(self.camera_jacobians(x_in_camera), self.rotation)
 
     def camera_residuals(self, x_in_camera: AnyArray) -> AnyArray:
-        """The same residuals (O, 2) of points in the camera's frame (O, 3)."""
+        """Residuals (O, 2) of points (O, 3) in the camera's frame, in standard deviations."""
         return (normalize(x_in_camera) * self.focal_px + self.principal_px - self.pixel) / self.sigma_px[:, None]
 
     def camera_jacobians(self, x_in_camera: AnyArray) -> AnyArray:
-        """(O, 2, 3) derivative of each residual by its point in the camera's frame (O, 3), per metre."""
+        """Derivative (O, 2, 3) of each residual by its point (O, 3) in the camera's frame, per metre."""
         return normalize_jacobian(x_in_camera) * (self.focal_px / self.sigma_px[:, None])[:, :, None]
 
     def rays(self) -> tuple[AnyArray, AnyArray]:
@@ -97,7 +97,7 @@ class Observations:
         return self.tracks.sum_by_point(values)
 
     def max_by_point(self, values: AnyArray) -> AnyArray:
-        """Largest of (O,) over each point's observations, (P,); infinite where one is NaN."""
+        """Largest of values (O,) over each point's observations, (P,); infinite if one is NaN."""
         xp = namespace(values)
         return self.tracks.max_by_point(xp.where(xp.isnan(values), np.inf, values))
 
@@ -106,11 +106,11 @@ class Observations:
         return apply(self.rotation, x_in_world[self.point]) + self.translation
 
     def weighted(self, noise: KeypointNoise) -> Observations:
-        """The same observations with another noise."""
+        """Returns the same observations with another noise."""
         return replace(self, sigma_px=noise.sigma_px(self.size_px))
 
     def prune(self, chosen: AnyArray, x_in_world: AnyArray) -> tuple[Observations, AnyArray]:
-        """Only the chosen rows (O,), and the points (P, 3) with at least two of them."""
+        """Keeps the chosen rows (O,) and the points (P, 3) that have at least two of them."""
         tracks, rows, points = self.tracks.prune(chosen)
         columns = ("pixel", "size_px", "sigma_px", "rotation", "translation", "focal_px", "principal_px")
         return Observations(tracks, *(getattr(self, name)[rows] for name in columns)), x_in_world[points]
@@ -118,13 +118,13 @@ class Observations:
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """The same observations with one row for each component: column o is one observation (see `arrays.columns`).
+    """Observations with one row for each component: column o is one observation (see `arrays.columns`).
 
     Attributes:
         point: (O,) index of each column's point.
         rotation: (3, 3, O) camera_from_world of the observing reference.
-        translation: (3, O) of the same, metres.
-        focal: (2, O) of its camera, in standard deviations.
+        translation: (3, O) translation of the same pose, metres.
+        focal: (2, O) focal lengths of its camera, divided by the keypoint's standard deviation.
         offset: (2, O) principal point minus observed pixel, in standard deviations.
     """
 
@@ -136,7 +136,7 @@ class Columns:
 
     @staticmethod
     def of(observations: Observations) -> Columns:
-        """From rows."""
+        """Makes the columns from rows."""
         sigma_px = observations.sigma_px[:, None]
         return Columns(
             observations.point,
@@ -147,11 +147,11 @@ class Columns:
         )
 
     def in_camera(self, x_in_world: AnyArray) -> AnyArray:
-        """(3, O), from points (3, P) in the world."""
+        """Coordinates (3, O) in the cameras' frames, from points (3, P) in the world."""
         return apply_columns(self.rotation, take(x_in_world, self.point)) + self.translation
 
     def residuals(self, x_in_camera: AnyArray) -> AnyArray:
-        """(2, O), in standard deviations, of points in the camera's frame (3, O); NaN behind the camera."""
+        """Residuals (2, O), in standard deviations, of points (3, O) in the camera's frame; NaN behind the camera."""
         return x_in_camera[:2] * _inverse_depth(x_in_camera) * self.focal + self.offset
 
     def rays(self) -> tuple[AnyArray, AnyArray]:
@@ -163,7 +163,7 @@ class Columns:
         return -apply_columns(world_from_camera, self.translation), direction / (direction**2).sum(0) ** 0.5
 
     def linearized(self, x_in_world: AnyArray) -> tuple[AnyArray, AnyArray]:
-        """The residuals (2, O) at points (3, P), and the derivative (2, 3, O) of each by its point, per metre."""
+        """Returns residuals (2, O) at points (3, P), and the derivative (2, 3, O) of each by its point, per metre."""
         x_in_camera = self.in_camera(x_in_world)
         inverse_depth = _inverse_depth(x_in_camera)
         ideal, slope = x_in_camera[:2] * inverse_depth, self.focal * inverse_depth
@@ -172,7 +172,7 @@ class Columns:
 
 
 def _inverse_depth(x_in_camera: AnyArray) -> AnyArray:
-    """(O,) of points (3, O); NaN behind the camera."""
+    """Inverse depths (O,) of points (3, O); NaN behind the camera."""
     return 1 / namespace(x_in_camera).where(x_in_camera[2] > 0, x_in_camera[2], np.nan)
 
 
@@ -195,7 +195,7 @@ def triangulate(observations: Observations) -> AnyArray:
 
 
 def better_start(observations: Observations, first: AnyArray, second: AnyArray, loss_scale_sigma: float) -> AnyArray:
-    """Point by point the one of two initial values (P, 3) with the lower cost."""
+    """Returns, for each point, that of two initial values (P, 3) which has the lower cost."""
     xp = namespace(first)
     cost_first = _cost(observations, observations.residuals(first), loss_scale_sigma)
     cost_second = _cost(observations, observations.residuals(second), loss_scale_sigma)
@@ -209,13 +209,13 @@ def adjust_points(
     """Minimizes the soft L1 reprojection error over the points alone, all at once.
 
     Args:
-        observations: of all points.
+        observations: observations of all points.
         x_in_world: (P, 3) initial points; rows with NaN stay as they are.
         loss_scale_sigma: residual at which the loss turns from square to linear, standard deviations.
         iterations: number of Levenberg-Marquardt steps.
 
     Returns:
-        (P, 3). No point has a higher cost than at the start.
+        The points (P, 3). No point has a higher cost than at the start.
     """
     problem = observations.columns
 
@@ -234,7 +234,7 @@ def adjust_points(
 
 
 def estimate_noise(observations: Observations, x_in_world: AnyArray, noise: KeypointNoise) -> KeypointNoise:
-    """`noise`, with which the observations were weighted, with its level estimated from their residuals.
+    """Returns `noise`, which the observations were weighted with, at the level estimated from their residuals.
 
     Uses points with three or more observations; fewer than 30 rows leave the level as it is. The median length of a
     two-dimensional normal residual is sqrt(2 ln 2) sigma; a point takes 3 of its 2 n degrees of freedom, so residuals

@@ -1,4 +1,4 @@
-"""The pose from a single reference, where a network predicts its depths in metres.
+"""The pose from a single reference, with depths in metres that a network predicts.
 
 Nothing can be triangulated with one reference. Its matches with the photograph determine the rotation and the direction
 of the step from one camera to the other; the length of the step follows from the predicted depths. Both are one
@@ -8,8 +8,8 @@ epipolar line, so the covariance of a residual is
     sigma^2 I + s_d^2 j j^T,    j the derivative of the projection by the logarithm of the depth,
 
 where sigma and s_d, the errors of keypoints and of single depths, are estimated from the residuals. An error that all
-depths share, of the network's metre, shows in no residual: it moves the camera along the step, and the covariance of
-the pose contains it as s^2 d d^T, d the step and s its relative standard deviation.
+depths share, of the network's metre, changes no residual: it moves the camera along the step, and the covariance of the
+pose contains it as s^2 d d^T, with d the step and s its relative standard deviation.
 """
 
 from __future__ import annotations
@@ -44,16 +44,17 @@ class OneReferenceOptions:
     """Options of the pose from one reference.
 
     Attributes:
-        first_sigma_px, first_depth_sigma: the errors of keypoints, pixels, and of single depths, relative, with which
-            the estimation begins.
-        min_sigma_px, min_depth_sigma: the least that is believed of them.
-        max_depth_sigma: with larger errors of depth nearly every match is on its epipolar line.
+        first_sigma_px, first_depth_sigma: initial values of the errors of keypoints, pixels, and of single depths,
+            relative.
+        min_sigma_px, min_depth_sigma: least values of these errors.
+        max_depth_sigma: largest error of depth; with a larger one nearly every match would be an inlier along its
+            epipolar line.
         inlier_sigma: largest residual of an inlier, in standard deviations.
-        iterations: of the estimation; the errors are estimated anew in each.
+        iterations: number of iterations of the estimation; the errors are estimated anew in each.
         min_inliers: fewer give no pose.
-        shared_matches: errors that matches share, of the depths of one surface or of a lens, do not average out over
-            more matches than so many.
-        rotation_factor: on standard deviations of the rotation. Poses from several references needed it with a
+        shared_matches: largest number of matches over which errors average out that matches share, such as those of a
+            lens or of the depths of one surface.
+        rotation_factor: factor on standard deviations of the rotation. Poses from several references needed it with a
             covariance of this form; with one reference it is not measured.
         scores: quantiles, at `LEVELS`, of the scores of right answers (see `score_of`), from `research.one_reference`:
             of 138 pairs of photographs of nine places, each of which counts alike, with depths triangulated from other
@@ -90,7 +91,7 @@ class Found:
     """A pose from one reference.
 
     Attributes:
-        support: with the estimate; its points are at their predicted depths.
+        support: support with the estimate; its points have their predicted depths.
         score: the larger, the less likely are so many inliers among wrong matches.
     """
 
@@ -107,19 +108,19 @@ def solve_one_reference(
     origin: Array,
     options: OneReferenceOptions,
 ) -> Found | Rejection:
-    """The pose of a query from its matches with a single reference.
+    """Estimates the pose of a query from its matches with a single reference.
 
     Args:
         query: the photograph.
-        references: the one, posed.
-        reconstruction: with its predicted depths.
+        references: the single posed reference.
+        reconstruction: the reconstruction, with predicted depths.
         scale: metres per unit of the reconstruction, with the relative standard deviation.
-        query_matches: with the reference.
-        origin: (3,) of the references' world in the caller's.
-        options: see there.
+        query_matches: matches with the reference.
+        origin: (3,) origin of the reference's world in the caller's world.
+        options: options of the pose from one reference.
 
     Returns:
-        The pose; or TOO_FEW_MATCHES, PNP_FAILED.
+        The pose, or a rejection: TOO_FEW_MATCHES or PNP_FAILED.
     """
     (reference,), (matches,) = references, query_matches
     points = _predicted(reference, reconstruction, scale, matches)
@@ -156,7 +157,7 @@ def trust_of_score(score: float, options: OneReferenceOptions) -> float:
 
 
 def one_reference_failure(found: Found, trust: float, coverage: float, gate: GateOptions) -> str | None:
-    """Why a pose is not accepted, in one sentence; None if it is."""
+    """Says in one sentence why a pose is not accepted; None if it is."""
     assert found.support.estimate is not None
     inliers = found.support.estimate.inliers
     count = f"{inliers.sum()} of {len(inliers)} matches agree on a pose"
@@ -170,7 +171,7 @@ def one_reference_failure(found: Found, trust: float, coverage: float, gate: Gat
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Points (M, 3) in the world at predicted depths, the query's pixels (M, 2), and the reference's centre (3,)."""
+    """Points (M, 3) at predicted depths in the world, the query's pixels (M, 2), and the reference's centre (3,)."""
 
     camera: Camera
     x_in_world: Array
@@ -191,7 +192,7 @@ class _Solved:
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Residuals (M, 2), their derivatives (M, 2, 6) by a left perturbation, and (M, 2) by the depths' logarithms."""
+    """Residuals (M, 2), and their derivatives (M, 2, 6) by a left perturbation and (M, 2) by log depths."""
 
     residual: Array
     by_pose: Array
@@ -199,19 +200,19 @@ class _Rows:
     in_front: NDArray[np.bool_]
 
     def information(self, sigma_px: float, depth_sigma: float) -> Array:
-        """(M, 2, 2) inverse covariances of the residuals, in closed form: a point beside the camera makes them huge."""
+        """Inverse covariances (M, 2, 2) of the residuals, in closed form: points beside the camera make them huge."""
         j = depth_sigma * self.by_depth
         share = j[:, :, None] * j[:, None, :] / (sigma_px**2 + np.square(j).sum(axis=1))[:, None, None]
         return np.asarray((np.eye(2) - share) / sigma_px**2)
 
     def areas(self, sigma_px: float, depth_sigma: float) -> Array:
-        """(M,) of their ellipses of one standard deviation, square pixels."""
+        """Areas (M,) of the residuals' ellipses of one standard deviation, square pixels."""
         along_px = np.sqrt(sigma_px**2 + np.square(depth_sigma * self.by_depth).sum(axis=1))
         return np.asarray(np.pi * sigma_px * along_px)
 
 
 def _predicted(reference: PosedView, reconstruction: Reconstruction, scale: MetricScale, matches: Matches) -> Array:
-    """Points (M, 3) in the world at the predicted depths of the reference's keypoints; NaN without one."""
+    """Points (M, 3) in the world at the predicted depths of the reference's keypoints; NaN without a depth."""
     camera = reference.view.camera
     pixels = reference.view.features.keypoints[matches[:, 1]].astype(np.float64)
     depth = scale.metres_per_unit * reconstruction.references[0].depth_at(pixels, camera)
@@ -234,14 +235,14 @@ def _linearize(problem: _Problem, world_from_camera: RigidTransform) -> _Rows:
 
 
 def _distances(rows: _Rows, sigma_px: float, depth_sigma: float) -> Array:
-    """(M,) of the residuals, in standard deviations."""
+    """Lengths (M,) of the residuals, in standard deviations."""
     information = rows.information(sigma_px, depth_sigma)
     squared = np.einsum("mi,mij,mj->m", rows.residual, information, rows.residual)
     return np.asarray(np.where(rows.in_front, np.sqrt(np.maximum(squared, 0)), np.inf))
 
 
 def _solve(problem: _Problem, initial: RigidTransform, options: OneReferenceOptions) -> _Solved:
-    """The candidate with the most inliers, refined: the network's own pose, and those of RANSAC at two thresholds."""
+    """Refines the candidate with the most inliers: the network's own pose, or one of RANSAC at two thresholds."""
     candidates = [initial]
     for inlier_px in (4.0, 16.0):
         found = ransac(problem.camera, problem.x_in_world, problem.pixels, initial, PnpOptions(inlier_px=inlier_px))
@@ -250,13 +251,13 @@ def _solve(problem: _Problem, initial: RigidTransform, options: OneReferenceOpti
 
 
 def _inlier_count(problem: _Problem, pose: RigidTransform, options: OneReferenceOptions) -> int:
-    """With the errors that the estimation begins with."""
+    """Counts the inliers of a pose, at the initial errors of keypoints and depths."""
     distance = _distances(_linearize(problem, pose), options.first_sigma_px, options.first_depth_sigma)
     return int((distance < options.inlier_sigma).sum())
 
 
 def _refine(problem: _Problem, pose: RigidTransform, options: OneReferenceOptions) -> _Solved:
-    """Gauss-Newton with a Cauchy loss; the errors of keypoints and depths are estimated from the inliers."""
+    """Refines a pose by Gauss-Newton with a Cauchy loss, and estimates both errors from the inliers."""
     sigma_px, depth_sigma = options.first_sigma_px, options.first_depth_sigma
     for iteration in range(options.iterations):
         rows = _linearize(problem, pose)
@@ -278,7 +279,7 @@ def _refine(problem: _Problem, pose: RigidTransform, options: OneReferenceOption
 
 
 def _noise(rows: _Rows, inliers: NDArray[np.bool_], options: OneReferenceOptions) -> tuple[float, float]:
-    """Standard deviations: of keypoints across the epipolar lines, and of depths along them."""
+    """Standard deviations of keypoints across the epipolar lines, and of depths along them."""
     residual, by_depth = rows.residual[inliers], rows.by_depth[inliers]
     length = np.linalg.norm(by_depth, axis=1)
     direction = by_depth / np.maximum(length, 1e-9)[:, None]
@@ -296,7 +297,7 @@ def _noise(rows: _Rows, inliers: NDArray[np.bool_], options: OneReferenceOptions
 
 
 def _covariance(problem: _Problem, solved: _Solved, options: OneReferenceOptions) -> Array:
-    """(6, 6) in the world, without the scale's part."""
+    """Covariance (6, 6) in the world, without the part of the scale."""
     rows = _linearize(problem, solved.world_from_camera)
     information = rows.information(solved.sigma_px, solved.depth_sigma) * solved.inliers[:, None, None]
     hessian = np.einsum("mia,mij,mjb->ab", rows.by_pose, information, rows.by_pose)

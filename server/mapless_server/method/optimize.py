@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt, and the robust losses: `minimize` for one problem, `minimize_each` for many small ones at once.
+"""Levenberg-Marquardt and robust losses: `minimize` for one problem, `minimize_each` for many small ones at once.
 
 A step solves the linearized problem with its diagonal enlarged by a relative damping. A step that lowers the cost is
 accepted and the damping is reduced; any other, also one that cannot be computed, is repeated with more damping. So the
@@ -65,9 +65,10 @@ class MinimizeOptions:
     """Options of `minimize`.
 
     Attributes:
-        iterations: at most so many steps are tried.
+        iterations: largest number of steps that are tried.
         min_decrease: stop after a step that lowers the cost by a smaller share.
-        damping: initial value. Small: within an inlier threshold of the minimum the Gauss-Newton step is nearly right.
+        damping: initial value; small, since the Gauss-Newton step is nearly right within an inlier threshold of the
+            minimum.
         raised_by: factor on the damping after a rejected step.
         max_damping: stop beyond it; the steps are then too short to matter.
     """
@@ -85,7 +86,7 @@ class MinimizeOptions:
 
 
 def minimize(problem: Problem[X, E], start: X, options: MinimizeOptions) -> X:
-    """The minimum near a start, or the point after the last step."""
+    """Finds the minimum near a start; returns the last point if the iterations do not suffice."""
     x, cost, damping = start, problem.cost(start), options.damping
     if math.isnan(cost):
         return start
@@ -114,16 +115,17 @@ def minimize_each(
     iterations: int,
     damping: float = 1e-3,
 ) -> AnyArray:
-    """Minima of many independent problems of three unknowns, each with its own damping.
+    """Finds minima of many independent problems of three unknowns, each with its own damping.
 
     Reads no value, so that nothing synchronizes with a device: all problems take the same number of steps.
 
     Args:
-        cost: of points (3, P), the cost of each (P,).
-        linearize: at points (3, P), hessians (6, P) as in `arrays.SYMMETRIC` and gradients (3, P) of half the cost.
-        start: (3, P).
+        cost: function that returns the cost (P,) of each of the points (3, P).
+        linearize: function that returns, at points (3, P), hessians (6, P) as in `arrays.SYMMETRIC` and gradients (3,
+            P) of half the cost.
+        start: (3, P) initial points.
         iterations: number of steps.
-        damping: initial value.
+        damping: initial value of the damping.
     """
     xp, x = namespace(start), start
     damped, least = xp.full_like(start[0], damping), cost(start)
@@ -140,12 +142,12 @@ def minimize_each(
 
 
 def damped_step(hessian: Array, gradient: Array, damping: float) -> Array | None:
-    """The step (N,) of dense normal equations (N, N), (N,); None where it is not determined."""
+    """Step (N,) of dense normal equations (N, N), (N,); None where it is not determined."""
     return solve_step(hessian + damping * np.diag(np.diag(hessian) + LEAST_DIAGONAL), gradient)
 
 
 def solve_step(matrix: Array, gradient: Array, *, least_norm: bool = False) -> Array | None:
-    """-matrix^-1 gradient; None if it does not exist or is not finite. `least_norm`: the shortest if it is singular."""
+    """Returns -matrix^-1 gradient; None if not finite. With `least_norm`, the shortest solution if singular."""
     try:
         step = -np.linalg.lstsq(matrix, gradient, rcond=None)[0] if least_norm else -np.linalg.solve(matrix, gradient)
     except np.linalg.LinAlgError:
@@ -154,7 +156,7 @@ def solve_step(matrix: Array, gradient: Array, *, least_norm: bool = False) -> A
 
 
 def cauchy_cost(squared: Array, scale: float) -> float:
-    """The sum of rho over squared residuals (N,); NaN if one is."""
+    """Sum of rho over squared residuals (N,); NaN if one is NaN."""
     return float(scale**2 * np.log1p(squared / scale**2).sum())
 
 
@@ -164,7 +166,7 @@ def cauchy_weight(squared: Array, scale: float) -> Array:
 
 
 def switched_cost(squared: Array, scale: float) -> float:
-    """The sum of rho over squared residuals (N,) with a switch each."""
+    """Sum of rho over squared residuals (N,), with a switch for each."""
     return float((squared / (1 + squared / scale**2)).sum())
 
 

@@ -1,4 +1,4 @@
-"""Options of a request, how options check themselves, and the context of one computation: cancellation, times.
+"""Options of a request, how options check themselves, and the context of a computation: cancellation and times.
 
 The options of each stage are in its module; `pipeline.StageOptions` combines them.
 """
@@ -20,7 +20,7 @@ _HOLDS = {"above": operator.gt, "at_least": operator.ge, "below": operator.lt, "
 
 
 def check_bounds(options: object, names: str, **bounds: float) -> None:
-    """Checks fields of a dataclass, every number of a tuple. NaN is out of bounds.
+    """Checks that fields of a dataclass, and every number of a tuple, are within bounds; NaN is out of bounds.
 
     Args:
         options: the dataclass.
@@ -64,8 +64,8 @@ class IntrinsicsSigma:
     """Standard deviations of a photograph's intrinsics.
 
     Attributes:
-        focal_share: of both focal lengths together, as a share of them. Lenses change by so much with focus and
-            temperature, and calibrations repeat no better.
+        focal_share: of both focal lengths together, as a share of them. Lenses change by this much with focus and
+            temperature, and calibrations are not more repeatable.
         principal_share: of each coordinate of the principal point, as a share of the image's width.
         k1: of the first radial coefficient.
     """
@@ -78,7 +78,7 @@ class IntrinsicsSigma:
         check_bounds(self, "focal_share principal_share k1", above=0, at_most=1)
 
     def of(self, camera: Camera) -> Array:
-        """(4,): of s, of the principal point in pixels of this camera, and of k1."""
+        """Standard deviations (4,) of s, of the principal point in pixels of this camera, and of k1."""
         principal_px = self.principal_share * camera.width_px
         return np.array([self.focal_share, principal_px, principal_px, self.k1])
 
@@ -92,8 +92,8 @@ class LocalizeOptions:
         scale_strategy: how the metric scale is estimated.
         coverage: share of right answers to accept, in a difficult place; a larger share accepts more wrong answers too
             (see `trust.judge`).
-        intrinsics: standard deviations of the photograph's intrinsics; None for the defaults, and less where the
-            references share its camera.
+        intrinsics: standard deviations of the photograph's intrinsics; None for the defaults, which are smaller where
+            the references have the same camera.
     """
 
     variant: Variant = Variant.BEST
@@ -127,7 +127,7 @@ class StageContext:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Calls `check`, then times a stage, also one that raises."""
+        """Calls `check`, then measures the time of a stage, also if the stage raises."""
         self.check()
         start_s = time.perf_counter()
         try:

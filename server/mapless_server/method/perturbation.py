@@ -25,20 +25,20 @@ from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian, 
 
 
 def perturbed(target_from_source: RigidTransform, step: Array) -> RigidTransform:
-    """After a left perturbation (v, w) (6,): a rotation by w about the target's origin, then a shift by v."""
+    """The pose after a left perturbation (v, w) (6,): a rotation by w about the target's origin, then a shift by v."""
     rotation = rotation_from_vector(step[3:])
     return RigidTransform(rotation @ target_from_source.rotation, rotation @ target_from_source.translation + step[:3])
 
 
 def moved(world_from_camera: RigidTransform, error: Array) -> RigidTransform:
-    """The pose after an error (6,), order x y z rx ry rz, about fixed world axes."""
+    """Returns the pose after an error (6,), order x y z rx ry rz, about fixed world axes."""
     return RigidTransform(
         rotation_from_vector(error[3:]) @ world_from_camera.rotation, world_from_camera.translation + error[:3]
     )
 
 
 def rotation_vector(rotation: Array) -> Array:
-    """The inverse of `rotation_from_vector`: axis (3,) times angle, 0 to pi radians."""
+    """Inverse of `rotation_from_vector`: axis (3,) times angle, 0 to pi radians."""
     axis = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
     cosine, sine = (float(np.trace(rotation)) - 1) / 2, float(np.linalg.norm(axis)) / 2
     if cosine < -0.5:  # near a half turn the axis vanishes from the differences

@@ -45,17 +45,17 @@ class StageOptions:
 
     Attributes:
         weak_inliers: an answer of `Variant.BEST` with fewer inliers is computed again from wide correspondences (see
-            `correspond`), and replaced if that gives more. Above a hundred they do not help.
+            `correspond`), and replaced if they give more inliers. They do not help above a hundred inliers.
         max_radius_ratio: the wide answer is not used if its radius is more than this many times as large. Where it was
             better, its radius was at most 1.7 times as large; where repeated floor tiles had given it inliers, and
             centimetres of error, 40 to 80 times.
-        pnp: of the pose solver.
-        gate: of the gate.
-        adjust: of the final adjustment.
-        judge: of the judge.
-        two_view: of the pose from matches with the references themselves, for queries that fail otherwise.
-        two_view_gate: of its acceptance.
-        one_reference: of the pose from a single reference, with a network that predicts metres.
+        pnp: options of the pose solver.
+        gate: options of the gate.
+        adjust: options of the final adjustment.
+        judge: options of the judge.
+        two_view: options of the pose from two-view matches, for queries that fail otherwise.
+        two_view_gate: options of accepting such a pose.
+        one_reference: options of the pose from a single reference, with a network that predicts metres.
     """
 
     weak_inliers: int = 100
@@ -88,7 +88,7 @@ class Pipeline:
     Attributes:
         reconstructor: the coarse backend.
         matcher: matches views, and caches matches between references.
-        options: of the stages.
+        options: options of the stages.
     """
 
     reconstructor: Reconstructor = field(default_factory=GeometricReconstructor)
@@ -96,7 +96,7 @@ class Pipeline:
     options: StageOptions = field(default_factory=StageOptions)
 
     def with_trust(self, quantiles: tuple[float, ...]) -> Pipeline:
-        """The pipeline for a scene whose right answers have these quantiles of trust; none: the usual ones."""
+        """The pipeline of a scene whose right answers have these quantiles of trust; empty for the usual ones."""
         if not quantiles:
             return self
         options = replace(self.options, judge=self.options.judge.with_trust(quantiles))
@@ -105,21 +105,21 @@ class Pipeline:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A query whose features are matched: the input of the coarse stage.
+    """A query whose features are matched; the input of the coarse stage.
 
     Attributes:
         query: the photograph.
         references: the most similar first, in a world whose origin is the first one's camera centre. World coordinates
             may be millions of metres (UTM, ECEF), too large for differences of squares in double precision.
-        references_in_world: the same in the caller's world, in which their pairs are matched: many queries use these
-            matches, which must not depend on a query's origin, not even by a last digit.
-        origin: (3,) that origin in the caller's world, metres.
+        references_in_world: the same references in the caller's world, in which their pairs are matched: many queries
+            use these matches, so they must not depend on a query's origin, not even in the last digit.
+        origin: (3,) origin of this world in the caller's world, metres.
         pipeline: backend, matcher and options.
-        options: of the request.
-        correspondences: between all photographs.
+        options: options of the request.
+        correspondences: matches between all photographs.
         bucket: prepared queries of the same bucket may be reconstructed together.
         context: cancels the computation and times its stages.
-        priors: on the query's pose, in the same world.
+        priors: priors on the query's pose, in the world of `references`.
         is_metric: whether the unit of the references' poses is the metre.
     """
 
@@ -156,11 +156,11 @@ class Prepared:
         return answer.outcome.inlier_count < self.pipeline.options.weak_inliers
 
     def can_use_two_views(self, answer: Answer) -> bool:
-        """Whether a pose may be found from matches with the references themselves, after this answer.
+        """Whether a pose may be estimated from two-view matches after this answer.
 
-        Not where a stage has found what is wrong: a second place, the intrinsics, or references at one place. Nor
-        where matches with points gave a pose that was not accepted: the same matches without points are no better
-        evidence. Of four photographs that they rescued in `office-lockers`, two were wrong.
+        It may not if a stage has found the cause of the rejection: a second place, wrong intrinsics, or references at
+            one place. Nor if 2D-3D matches gave a pose that was not accepted: the same matches without points are no
+            better evidence. Of four photographs accepted in this way in `office-lockers`, two had wrong poses.
         """
         outcome = answer.outcome
         if self.options.variant is not Variant.BEST or len(self.references) < 2 or isinstance(outcome, Localization):
@@ -178,7 +178,7 @@ class Coarse:
         reconstruction: up to scale, or a rejection.
         scale: the metric scale with the initial pose, in the world of `prepared`; or a rejection, if wide
             correspondences are still to be tried.
-        structure, matches: if they were computed on a device together with the scale.
+        structure, matches: None unless they were computed on a device together with the scale.
     """
 
     prepared: Prepared
@@ -188,7 +188,7 @@ class Coarse:
     matches: PointMatches | None = None
 
     def answer(self, outcome: Localization | Rejection, support: Support | None = None) -> Answer:
-        """The answer in the caller's world, from an outcome in the world of `prepared`."""
+        """Makes the answer in the caller's world from an outcome in the world of `prepared`."""
         prepared, scale = self.prepared, None if isinstance(self.scale, Rejection) else self.scale
         matches = tuple(len(m) for m in prepared.correspondences.query_matches)
         inliers = support.inliers_by_reference() if support else (0,) * len(prepared.references)
@@ -197,10 +197,10 @@ class Coarse:
 
 
 def reconstruct(batch: Sequence[Prepared]) -> list[Coarse | Answer | Exception]:
-    """The coarse stage of a batch of queries, then the metric scale of each.
+    """Computes the coarse stage of a batch of queries, then the metric scale of each.
 
-    For a reconstruction on a device, scale, structure and matches are computed there too; the device has no work left
-    for these queries when this returns.
+    For a reconstruction on a device, scale, structure and matches are computed there too; the device has finished with
+    these queries when this returns.
 
     Args:
         batch: queries of one reconstructor. Those of one bucket are reconstructed together.
@@ -231,14 +231,14 @@ def reconstruct(batch: Sequence[Prepared]) -> list[Coarse | Answer | Exception]:
 
 
 def coarse_answer(coarse: Coarse) -> Answer | None:
-    """The answer if there is no time to refine: the pose of `Variant.COARSE`; None if there is none yet."""
+    """The answer if there is no time to refine: the pose of `Variant.COARSE`; None if there is no pose yet."""
     if isinstance(coarse.scale, Rejection):
         return None
     return coarse.answer(_unverified(coarse.scale, PoseStage.COARSE))
 
 
 def with_wide_correspondences(coarse: Coarse) -> Coarse:
-    """The query with wide correspondences among the references; reconstructed again if the backend uses them."""
+    """The query with wide correspondences among the references, reconstructed again if the backend uses them."""
     prepared, reconstruction = coarse.prepared, coarse.reconstruction
     query, references, pipeline, context = prepared.query, prepared.references, prepared.pipeline, prepared.context
     with context.stage("correspond"):
@@ -254,7 +254,7 @@ def with_wide_correspondences(coarse: Coarse) -> Coarse:
 
 
 def _each(work: Callable[..., T], *columns: Sequence[Any]) -> list[T | Exception]:
-    """The result of `work` for each row; an exception in a row, or raised by it, is the result of that row."""
+    """Calls `work` for each row; an exception in a row, or raised by the call, is the result of that row."""
     results: list[T | Exception] = []
     for row in zip(*columns, strict=True):
         failures = [value for value in row if isinstance(value, Exception)]
@@ -266,7 +266,7 @@ def _each(work: Callable[..., T], *columns: Sequence[Any]) -> list[T | Exception
 
 
 def _launch_scale(prepared: Prepared, reconstruction: Outcome) -> Callable[[], Coarse]:
-    """Launches the metric scale where the reconstruction is; the returned function waits for its result."""
+    """Launches the metric scale on the device of the reconstruction; the returned function waits for the result."""
     references, correspondences, context = prepared.references, prepared.correspondences, prepared.context
     options = ScaleOptions(prepared.options.scale_strategy)
     coarse = partial(Coarse, prepared, reconstruction)
@@ -297,7 +297,7 @@ def _launch_scale(prepared: Prepared, reconstruction: Outcome) -> Callable[[], C
 
 
 def _answered_if_final(coarse: Coarse) -> Coarse | Answer:
-    """The answer, if nothing remains to be refined."""
+    """Returns the answer if nothing remains to be refined; else the coarse result unchanged."""
     if isinstance(coarse.scale, Rejection):
         answer = coarse.answer(coarse.scale)
         return coarse if coarse.prepared.can_improve(answer) else answer
@@ -307,12 +307,12 @@ def _answered_if_final(coarse: Coarse) -> Coarse | Answer:
 
 
 def _unverified(scale: MetricScale, stage: PoseStage) -> Localization:
-    """The initial pose, which nothing has checked."""
+    """The localization with the initial pose, which nothing has checked."""
     return Localization(scale.world_from_query, None, stage, 0, 0, 0.0, scale_source=scale.source)
 
 
 def structure_and_matches(coarse: Coarse, scale: MetricScale) -> tuple[Structure, PointMatches]:
-    """Computed on the device together with the scale, or else here."""
+    """Structure and matches: from the device, if they were computed there with the scale, else computed here."""
     if coarse.structure is not None and coarse.matches is not None:
         return coarse.structure, coarse.matches
     prepared, reconstruction = coarse.prepared, coarse.reconstruction

@@ -29,10 +29,10 @@ class PnpOptions:
 
     Attributes:
         inlier_px: largest reprojection error of an inlier.
-        loss_scale_px: of the Cauchy loss in the final refinement; about the error of a good keypoint.
+        loss_scale_px: scale of the Cauchy loss in the final refinement; about the error of a good keypoint.
         min_iterations: least number of RANSAC iterations; enough with an initial pose.
         max_iterations: largest number of RANSAC iterations, reached with 5 % inliers.
-        max_matches: evenly thinned; more are not more accurate, and scoring is linear in it.
+        max_matches: largest number of matches, evenly thinned; more are not more accurate, and scoring is linear in it.
         min_matches: fewer give no pose.
         error_inflation: factor on the standard deviations of a pose from matches, before it is compared or combined
             with priors; as in the adjustment.
@@ -66,11 +66,11 @@ def solve_pose(
     options: PnpOptions,
     priors: Priors = NO_PRIORS,
 ) -> PoseEstimate | Rejection:
-    """The query's pose from its matches with the structure.
+    """Estimates the query's pose from its matches with the structure.
 
     Returns:
         The refined or the initial pose, whichever has more inliers (the refined one on a tie); or a better candidate
-        from priors, refined with the consistent priors. Rejections: TOO_FEW_MATCHES; PNP_FAILED if no pose has four
+        from priors, refined with the consistent priors. Or a rejection: TOO_FEW_MATCHES; PNP_FAILED if no pose has four
         inliers.
     """
     if len(matches) < options.min_matches:
@@ -103,7 +103,7 @@ def solve_pose(
 def _estimate(
     camera: Camera, x_in_world: Array, pixels: Array, stage: PoseStage, pose: RigidTransform, options: PnpOptions
 ) -> PoseEstimate | Rejection:
-    """Inliers, errors and covariance of a pose; PNP_FAILED if it has fewer than four inliers."""
+    """The estimate of a pose, with inliers, errors and covariance; PNP_FAILED for fewer than four inliers."""
     errors_px = reprojection_errors_px(camera, pose, x_in_world, pixels)
     inliers = errors_px < options.inlier_px
     if inliers.sum() < 4:
@@ -118,7 +118,7 @@ def _estimate(
 def ransac(
     camera: Camera, x_in_world: Array, pixels: Array, world_from_camera: RigidTransform | None, options: PnpOptions
 ) -> RigidTransform | None:
-    """P3P in RANSAC with a final Cauchy refinement, by PoseLib; None without a finite pose.
+    """Estimates a pose by P3P in RANSAC with a final Cauchy refinement (PoseLib); None without a finite pose.
 
     PoseLib silently ignores options that it does not know.
     """
@@ -143,7 +143,7 @@ def ransac(
 
 
 def poselib_camera(camera: Camera) -> dict[str, object]:
-    """A pinhole camera as PoseLib takes it."""
+    """A pinhole camera in PoseLib's form."""
     return {
         "model": "PINHOLE",
         "width": camera.width_px,
@@ -153,7 +153,7 @@ def poselib_camera(camera: Camera) -> dict[str, object]:
 
 
 def poselib_pose(target_from_source: RigidTransform) -> poselib.CameraPose:
-    """A pose as PoseLib takes it; those of cameras are camera_from_world."""
+    """A pose in PoseLib's form; a camera's pose is camera_from_world."""
     q = target_from_source.quaternion()
     pose = poselib.CameraPose()
     pose.q, pose.t = np.array([q.w, q.x, q.y, q.z]), target_from_source.translation

@@ -49,7 +49,7 @@ class PoseErrorOptions:
             three do not. Reconstructions are smooth, so without evidence the poses drift.
         prior_log: standard deviation of log a and log b.
         own_inflation, drift_inflation: factors on the a and b that are found from residuals. Keypoints move with the
-            viewpoint, and far references share that, so the drift is larger than residuals say. With 1 the median is
+            viewpoint, by the same for far references, so the drift is larger than residuals say. With 1 the median is
             0.167 instead of 0.150 cm in a kitchen, 0.55 instead of 0.53 on a drive. Where the errors are all the poses'
             own, more of the drift makes the answer worse.
     """
@@ -80,7 +80,7 @@ class PoseErrors:
     drift: Array
 
     def covariance(self, own: float, drift: float) -> Array:
-        """C, (6 K, 6 K)."""
+        """The covariance C (6 K, 6 K) for sizes a = `own` and b = `drift`."""
         return own**2 * self.own + drift**2 * self.drift
 
 
@@ -93,17 +93,17 @@ def pose_errors(
     depth_m: float,
     observing: NDArray[np.intp] | None = None,
 ) -> PoseErrors:
-    """The parts of the covariance of references' errors.
+    """Computes the two parts of the covariance of references' errors.
 
     Args:
         centres: (K, 3) camera centres, metres.
         rotations: (K, 3, 3) camera_from_world.
-        query_centre: (3,).
-        level_px: noise of the structure.
+        query_centre: (3,) camera centre of the query, metres.
+        level_px: noise of the structure, pixels.
         focal_px: focal length of the references.
-        depth_m: of the points.
-        observing: indices of the references that observe points; None are all. The others, which may be in another
-            part of the scene, have no part in d.
+        depth_m: median depth of the points.
+        observing: indices of the references that observe points; None for all. The others, which may be in another part
+            of the scene, do not count for d.
     """
     unit = level_px / focal_px * np.array([depth_m, 1.0])
     between = np.linalg.norm(centres[:, None] - centres, axis=2)
@@ -115,7 +115,7 @@ def pose_errors(
 
 
 def _of_motions(covariance: Array, rotations: Array, unit: Array) -> Array:
-    """(6 K, 6 K) of left perturbations, from that (K, K) of shifts and rotations along each axis of the world."""
+    """Covariance (6 K, 6 K) of left perturbations, from that (K, K) of shifts and rotations along each world axis."""
     count = len(rotations)
     turned = np.einsum("ij,iab,jcb->iajc", covariance, rotations, rotations)
     result = np.zeros((count, 2, 3, count, 2, 3))
@@ -125,7 +125,7 @@ def _of_motions(covariance: Array, rotations: Array, unit: Array) -> Array:
 
 
 def most_probable(errors: PoseErrors, matrix: Array, gradient: Array, options: PoseErrorOptions) -> tuple[float, float]:
-    """A and b, from normal equations of 6 K unknowns and the query's, which are last, at the given poses."""
+    """Most probable a and b, from normal equations of 6 K unknowns and, last, the query's, at the given poses."""
     finite = bool(np.isfinite(matrix).all() and np.isfinite(gradient).all())
     if not finite:
         return options.own_inflation * options.usual_own, options.drift_inflation * options.usual_drift
@@ -143,14 +143,14 @@ def most_probable(errors: PoseErrors, matrix: Array, gradient: Array, options: P
 
 
 def _without_query(matrix: Array, gradient: Array, n: int) -> tuple[Array, Array]:
-    """The normal equations (n, n), (n,) of the references, with the query's unknowns eliminated."""
+    """Normal equations (n, n), (n,) of the references, with the query's unknowns eliminated."""
     coupling = matrix[:n, n:]
     solved = np.linalg.lstsq(matrix[n:, n:], np.column_stack([coupling.T, gradient[n:]]), rcond=None)[0]
     return matrix[:n, :n] - coupling @ solved[:, :-1], gradient[:n] - coupling @ solved[:, -1]
 
 
 def _whitened(matrix: Array, gradient: Array, unit: Array) -> tuple[Array, Array]:
-    """P (M, 6 K) and d (M,): observations d of the errors e, P e with noise of standard deviation 1."""
+    """Linear observations of the errors e: P (M, 6 K) and d (M,), with d = P e + noise of standard deviation 1."""
     values, vectors = np.linalg.eigh(matrix * unit[:, None] * unit)
     seen = values > LEAST_EIGENVALUE * max(values[-1], 1.0)
     root, vectors = np.sqrt(values[seen]), vectors[:, seen]

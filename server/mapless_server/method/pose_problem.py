@@ -36,20 +36,20 @@ class AdjustOptions:
     """Options of the adjustment.
 
     Attributes:
-        loss_scale_sigma: of the Cauchy loss, under which the influence of outliers vanishes.
+        loss_scale_sigma: scale of the Cauchy loss, with which the influence of outliers vanishes.
         error_inflation: factor by which standard deviations from the sum over residuals are typically too small; it
             sets the weight of priors. The answer's covariance does not use it (see `uncertainty`).
         inlier_px: as in the pose solver; the inliers of the answer are those of its own pose.
         min_kept_share: an adjustment that keeps a smaller share of the inliers has diverged and is not used.
         max_error_px: matches with a larger error under the initial pose are not used.
-        iterations: at most so many Levenberg-Marquardt steps.
+        iterations: largest number of Levenberg-Marquardt steps.
         min_decrease: stop when a step lowers the cost by a smaller share.
         suspicion: when a parameter of the intrinsics is estimated with the pose. A large error leaves few inliers, of
             which those with other errors are missing.
         contradiction: when this estimate is used.
-        rounds: at most so many times an estimated parameter's photograph is read again.
-        pose_errors: of the errors of the references' poses.
-        uncertainty: of the answer's covariance.
+        rounds: how often, at most, the query's keypoints are corrected by an estimated parameter.
+        pose_errors: options of the errors of the references' poses.
+        uncertainty: options of the answer's covariance.
     """
 
     loss_scale_sigma: float = 1.4
@@ -80,7 +80,7 @@ def pose_problem(
     world_from_query: RigidTransform,
     options: AdjustOptions,
 ) -> tuple[BundleProblem, Bundle]:
-    """The problem of one query without priors, and its start; `used` are the indices of the matches to use."""
+    """Sets up the problem of one query without priors, and its start; `used` are the indices of the matches to use."""
     views = [*references, PosedView("", "", query, world_from_query)]
     tracks, chosen = tracks_with_query(structure, matches.point[used], matches.keypoint[used], len(references))
     observations, start, depth_m = bundle_of(tracks, views, structure, chosen)
@@ -100,7 +100,7 @@ def pose_problem(
 
 
 def with_intrinsics(problem: BundleProblem, bundle: Bundle, query: View) -> tuple[BundleProblem, Bundle]:
-    """The same problem and values with errors of the query's intrinsics as unknowns, without a prior on them."""
+    """Adds errors of the query's intrinsics to the unknowns of a problem, without a prior on them."""
     is_query = problem.view == len(problem.given.rotation)
     observations = problem.observations
     motion = keypoint_motion(query.camera, query.distortion, observations.pixel[is_query])
@@ -120,7 +120,7 @@ def adjusted_estimate(
     options: AdjustOptions,
     intrinsics: tuple[View, Array, Array, Array],
 ) -> PoseEstimate | None:
-    """The estimate at the optimum, its covariance without priors; None if it has diverged.
+    """Returns the estimate at the optimum, with its covariance without priors; None if it has diverged.
 
     `intrinsics`: the query with its intrinsics as given, the errors that are removed from them, and the standard
     deviations `prior_sigma` and `held_sigma` of `intrinsics_evidence`.

@@ -1,6 +1,6 @@
-"""Intrinsics that the photograph contradicts are estimated with the pose.
+"""Intrinsics that the photograph contradicts are estimated together with the pose.
 
-The most significant one first; then the photograph is read again with its value.
+The most significant one is estimated first; then the keypoints are undistorted again with its value.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def recalibrated(
     priors: Priors,
     usual: Array,
 ) -> PoseEstimate:
-    """The estimate with the parameters that the photograph contradicts; the one found if it contradicts none."""
+    """Returns the estimate with the parameters that the photograph contradicts; `found` if it contradicts none."""
     held, is_held = usual.copy(), np.ones(4, bool)
     wide = np.maximum(usual, WIDE_SIGMA * np.array([1, query.camera.width_px, query.camera.width_px, 1]))
     while (worst := _contradicted(found, options.suspicion, is_held)) is not None:
@@ -57,7 +57,7 @@ def recalibrated(
 def _contradicted(
     found: PoseEstimate, options: ContradictionOptions, is_held: NDArray[np.bool_]
 ) -> tuple[int, ...] | None:
-    """The parameter, or both of the principal point, that the photograph contradicts most; of those that are held."""
+    """The held parameter that the photograph contradicts most; both coordinates of the principal point are one."""
     evidence = found.intrinsics
     if evidence is None:
         return None
@@ -79,7 +79,7 @@ def _with_errors(
     usual: Array,
     held: Array,
 ) -> PoseEstimate | None:
-    """The estimate with errors of the intrinsics as unknowns, of prior standard deviations `held`; None if it fails."""
+    """The estimate with intrinsics as unknowns of prior standard deviations `held`; None if it fails."""
     assert found.intrinsics is not None
     errors, pose, view = found.intrinsics.removed, found.world_from_camera, found.view or query
     steps = MinimizeOptions(options.iterations, options.min_decrease)

@@ -58,18 +58,18 @@ class IntrinsicsParameter(str, Enum):
 
     @property
     def field(self) -> str:
-        """Its name in requests; the focal length's is that along x."""
+        """Its name in requests; for the focal length the one along x."""
         return {"focal_length": "focal_x_px", "k1": "k1"}.get(self.value, f"{self.value}_px")
 
 
 @dataclass(frozen=True)
 class IntrinsicsCheck:
-    """What a photograph's matches say of one parameter of its intrinsics, in pixels of the photograph as it was sent.
+    """Comparison of one intrinsic parameter with the matches' estimate, in pixels of the photograph as it was sent.
 
     Attributes:
-        parameter: which.
+        parameter: the parameter.
         given: its value in the request.
-        estimated: its value by the photograph alone, the other parameters held by their priors.
+        estimated: its value estimated from the photograph alone, with the other parameters held by their priors.
         estimated_sigma: standard deviation of the estimated value.
         given_sigma: standard deviation of the given one.
         conflict: whether they differ by more than both allow.
@@ -109,7 +109,7 @@ class Hypothesis:
     Attributes:
         world_from_camera: metric.
         inlier_count: keypoints of the photograph with an inlier match with any reference.
-        references: names of the references that support it more than the other hypothesis.
+        references: names of the references that support this hypothesis more than the other.
     """
 
     world_from_camera: RigidTransform

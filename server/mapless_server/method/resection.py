@@ -26,10 +26,10 @@ class Fit:
         camera_from_world: the pose.
         log_ratio: s.
         x_in_camera: (N, 3) points.
-        focal_px: (2,) along x and y.
+        focal_px: (2,) focal lengths along x and y.
         centred_px: (N, 2) where the points project, from the principal point.
         residual: (N, 2) in standard deviations; NaN behind the camera.
-        squared: (N,) their squared lengths, as the loss takes them.
+        squared: (N,) squared lengths of the residuals, the argument of the loss.
     """
 
     camera_from_world: RigidTransform
@@ -46,13 +46,13 @@ class Resection:
     """The cost and its derivatives; see `optimize.Problem`.
 
     Attributes:
-        camera: pinhole, with the focal length given.
+        camera: the pinhole camera with the given focal length.
         x_in_world: (N, 3) points.
         pixels: (N, 2) where they are seen.
         sigma_px: (N,) standard deviation of each coordinate.
-        loss_scale_sigma: of the Cauchy loss.
+        loss_scale_sigma: scale of the Cauchy loss, in standard deviations.
         unknowns: which of v, w and s are free.
-        behind_sigma: residual of a point behind the camera; with NaN no step may move a point there.
+        behind_sigma: residual of a point behind the camera; if NaN, no step may move a point there.
         max_log_step: largest change of s in one step.
         shorten_all: whether a step with a larger change is shortened as a whole, which keeps its direction near the
             minimum, or in s alone, so that a pose far from the minimum still moves by the full step.
@@ -69,7 +69,7 @@ class Resection:
     shorten_all: bool = True
 
     def at(self, camera_from_world: RigidTransform, log_ratio: float = 0.0) -> Fit:
-        """Residuals at a pose and focal length."""
+        """Computes the residuals at a pose and focal length."""
         camera, x_in_camera = self.camera, camera_from_world.apply(self.x_in_world)
         focal_px = np.array([camera.focal_x_px, camera.focal_y_px]) * math.exp(log_ratio)
         centred_px = normalize(x_in_camera) * focal_px
@@ -79,7 +79,7 @@ class Resection:
         return Fit(camera_from_world, log_ratio, x_in_camera, focal_px, centred_px, residual, squared)
 
     def cost(self, fit: Fit) -> float:
-        """See optimize.Problem."""
+        """See `optimize.Problem`."""
         return cauchy_cost(fit.squared, self.loss_scale_sigma)
 
     def linearize(self, fit: Fit) -> tuple[Array, Array]:
@@ -88,7 +88,7 @@ class Resection:
         return hessian, gradients.sum(axis=0)
 
     def equations(self, fit: Fit) -> tuple[Array, Array]:
-        """The hessian, and the gradient match by match (N, 7); zero behind the camera."""
+        """Hessian (7, 7), and the gradient of each match (N, 7); zero behind the camera."""
         by_point = normalize_jacobian(fit.x_in_camera) * fit.focal_px[:, None]
         by_pose = by_point @ motion_jacobian(fit.x_in_camera)
         by_all = np.concatenate([by_pose, fit.centred_px[:, :, None]], axis=2)
@@ -98,7 +98,7 @@ class Resection:
         return hessian, np.asarray(np.einsum("nia,ni->na", weighted, np.nan_to_num(fit.residual)))
 
     def step(self, fit: Fit, equations: tuple[Array, Array], damping: float) -> Fit | None:
-        """See optimize.Problem."""
+        """See `optimize.Problem`."""
         (hessian, gradient), free = equations, list(self.unknowns)
         found = damped_step(hessian[np.ix_(free, free)], gradient[free], damping)
         if found is None:

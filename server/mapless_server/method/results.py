@@ -44,7 +44,7 @@ class MetricScale:
     Attributes:
         metres_per_unit: S, above 0; metres per unit of the reconstruction.
         stage: the stage that gave it.
-        deviation: d of this scale, 0 and above.
+        deviation: the trajectory deviation d of this scale, 0 or more.
         anchor: index of the reference whose pose ties the local frame to the world.
         world_from_local: the reconstruction's frame in the world, metres.
         world_from_query: the query camera's initial pose P_q^init, metres.
@@ -61,7 +61,7 @@ class MetricScale:
 
     @property
     def source(self) -> ScaleSource:
-        """What it rests on."""
+        """What the scale rests on."""
         return ScaleSource.NETWORK if self.stage is ScaleStage.NETWORK else ScaleSource.REFERENCES
 
 
@@ -70,8 +70,8 @@ class KeypointNoise:
     """Localization noise of keypoints: sigma^2 = level^2 + (slope * size)^2.
 
     Attributes:
-        level_px: noise common to all keypoints: detection, and the effect of pose and lens errors in pixels. While it
-            is being estimated, an array of that one number.
+        level_px: noise common to all keypoints: detection, and the effect of pose and lens errors in pixels. An array
+            of one number while it is being estimated.
         slope: noise per diameter of the patch; a blob of 20 px is localized to a pixel, one of 3 px to a fifth.
             Measured on photographs with surveyed poses.
     """
@@ -179,12 +179,12 @@ class PoseEstimate:
         errors_px: (M,) reprojection errors; NaN for points behind the camera.
         covariance: (6, 6), order x y z rx ry rz, fixed world axes, metres and radians.
         prior_checks: comparison with each prior.
-        is_adjusted: whether the pose is that of the adjustment. The covariance of another is from the residuals alone
-            and leaves out correlated errors (see `adjust.pose_covariance`).
+        is_adjusted: whether the pose is that of the adjustment. The covariance of any other pose follows from the
+            residuals alone, without correlated errors (see `adjust.pose_covariance`).
         without_priors: the estimate before priors were used; None if none was used.
         intrinsics: what the matches with points say of errors of the photograph's intrinsics, which the covariance of
             an adjusted pose contains; None without an adjustment.
-        view: the photograph read with the intrinsics of the estimate, where it contradicts those given; None else.
+        view: the photograph's view with the intrinsics of the estimate, if it contradicts the given ones; else None.
     """
 
     world_from_camera: RigidTransform
@@ -228,13 +228,13 @@ class Support:
 
     Attributes:
         query: the photograph.
-        references: in the order of the structure's tracks.
+        references: the references, in the order of the structure's tracks.
         structure: metric points and the references' keypoints that observe them.
-        matches: of the query with the points.
+        matches: matches of the query with the points.
         estimate: pose and inliers; None without a pose.
-        origin: (3,) that origin in the caller's world, metres.
+        origin: (3,) origin of this world in the caller's world, metres.
         two_view: matches with single references, where the pose rests on them too.
-        query_matches: of the query with each reference.
+        query_matches: matches of the query with each reference.
     """
 
     query: View
@@ -247,7 +247,7 @@ class Support:
     query_matches: tuple[Matches, ...] = ()
 
     def inlier_count(self) -> int:
-        """Inliers of the estimate, and of two views."""
+        """Number of inliers of the estimate, two-view inliers included."""
         assert self.estimate is not None
         of_two_views = 0 if self.two_view is None else int(self.two_view.inliers.sum())
         return int(self.estimate.inliers.sum()) + of_two_views
@@ -262,7 +262,7 @@ class Support:
         return max(float(np.median(depth_m)), float(np.finfo(float).tiny))
 
     def inliers_by_reference(self) -> tuple[int, ...]:
-        """Per reference, inliers on points that it observes, and inliers of two views."""
+        """Number of inliers on points that each reference observes, and of two-view inliers with it."""
         count = len(self.references)
         if self.estimate is None:
             return (0,) * count

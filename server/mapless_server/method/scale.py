@@ -30,13 +30,13 @@ def estimate_scale(
     correspondences: Correspondences,
     options: ScaleOptions | None = None,
 ) -> MetricScale | Rejection:
-    """The metric scale of a reconstruction, and with it the query's initial pose.
+    """Estimates the metric scale of a reconstruction, and with it the query's initial pose.
 
     Args:
         reconstruction: query and references up to scale, its references in the order of `references`.
-        references: with known poses.
+        references: the references, with known poses.
         correspondences: matches between references; those with the query are not used.
-        options: defaults to the paper's.
+        options: options of the scale; by default the paper's.
 
     Returns:
         The scale, with finite values only; or a rejection: NO_USABLE_REFERENCES for fewer than two references,
@@ -58,10 +58,10 @@ def estimate_scale(
 
 
 def network_scale(reconstruction: Reconstruction, reference: PosedView) -> MetricScale | Rejection:
-    """The scale of a reconstruction whose unit is about the metre, with a single reference.
+    """Returns the scale of a reconstruction from a single reference whose unit is approximately the metre.
 
     Returns:
-        One metre a unit, and the query's pose that follows; SCALE_UNRELIABLE if the reconstruction is not finite.
+        One metre per unit, with the query's pose that follows; SCALE_UNRELIABLE if the reconstruction is not finite.
 
     Raises:
         ValueError: the reconstruction's unit is arbitrary, or it has several references.
@@ -100,7 +100,7 @@ def check_references(references: Sequence[PosedView], options: ScaleOptions) -> 
 
 
 def judge(candidates: ScaleCandidates, reference_count: int, options: ScaleOptions) -> MetricScale | Rejection:
-    """The scale from the candidates, or a rejection."""
+    """Chooses the scale from the candidates, or rejects the query."""
     broken = not_finite(candidates, reference_count)
     if broken:
         return Rejection(RejectionReason.SCALE_UNRELIABLE, broken)
@@ -131,7 +131,7 @@ def judge(candidates: ScaleCandidates, reference_count: int, options: ScaleOptio
 
 
 def not_finite(candidates: ScaleCandidates, reference_count: int) -> str | None:
-    """What of a network's output is not finite, in one sentence; None if everything is finite."""
+    """Says in one sentence which part of a network's output is not finite; None if all of it is finite."""
     if candidates.broken_poses:
         return f"{candidates.broken_poses:.0f} of {reference_count + 1} predicted poses are not finite"
     if not candidates.known_depths:

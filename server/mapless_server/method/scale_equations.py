@@ -86,13 +86,13 @@ class ScaleOptions:
 
     @property
     def by_trajectory(self) -> bool:
-        """Whether stage 2 may."""
+        """Whether stage 2 may give the scale."""
         return self.strategy is not ScaleStrategy.TRIANGULATION
 
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """Known values of K references. Keypoint indices are into the concatenated keypoints of all references.
+    """Known values of K references; keypoint indices are into the concatenated keypoints of all references.
 
     Attributes:
         rotation: (K, 3, 3) world_from_camera.
@@ -115,9 +115,9 @@ class Predicted:
 
     Attributes:
         rotation: (K + 1, 3, 3) local_from_camera of the references, then of the query.
-        centre: (K + 1, 3) of the same.
-        depth: (N,) at the references' keypoints; NaN where there is none.
-        confidence: (K,) total of each reference.
+        centre: (K + 1, 3) camera centres of the same.
+        depth: (N,) depths at the references' keypoints; NaN where there is none.
+        confidence: (K,) total confidence of each reference.
     """
 
     rotation: AnyArray
@@ -128,16 +128,16 @@ class Predicted:
 
 @dataclass(frozen=True, eq=False)
 class ScaleCandidates:
-    """Result of the two stages, from which `scale.judge` takes the scale; arrays of one number if no shape is given.
+    """Result of the two stages, from which `scale.judge` takes the scale; scalar arrays if no shape is given.
 
     Attributes:
         broken_poses: number of predicted poses that are not finite.
         known_depths: number of keypoints with a depth.
-        radius_per_depth: of the predicted trajectory, by the median depth.
+        radius_per_depth: radius of the predicted trajectory over the median depth.
         ratio_count: number of depth ratios.
         metres_per_unit: S; NaN if the strategy finds none.
-        by_triangulation: whether it is from stage 1.
-        deviation: d of this scale.
+        by_triangulation: whether the scale is that of stage 1.
+        deviation: trajectory deviation d of this scale.
         anchor: index of the reference with the highest total confidence, the first of equals.
         local_rotation, local_centre: (3, 3), (3,) world_from_local without the scale.
         query_rotation, query_centre: (3, 3), (3,) world_from_query, P_q^init.
@@ -158,7 +158,7 @@ class ScaleCandidates:
 
 
 def predict(reconstruction: Reconstruction, references: Sequence[PosedView]) -> Predicted:
-    """The reconstruction's values that the scale uses."""
+    """Extracts the values of the reconstruction that the scale uses."""
     poses = [view.local_from_camera for view in (*reconstruction.references, reconstruction.query)]
     return Predicted(
         np.stack([pose.rotation for pose in poses]),
@@ -169,7 +169,7 @@ def predict(reconstruction: Reconstruction, references: Sequence[PosedView]) -> 
 
 
 def gather(references: Sequence[PosedView], correspondences: Correspondences, options: ScaleOptions) -> Known:
-    """The known values of two or more references."""
+    """Collects the known values of two or more references."""
     poses = [reference.world_from_camera for reference in references]
     if not options.by_triangulation:
         correspondences = Correspondences({}, ())
@@ -190,7 +190,7 @@ def gather(references: Sequence[PosedView], correspondences: Correspondences, op
 def _matches_in_range(
     references: Sequence[PosedView], correspondences: Correspondences, options: ScaleOptions
 ) -> NDArray[np.intp]:
-    """Matches (M, 2) of pairs with a baseline in range."""
+    """Returns the matches (M, 2) of pairs whose baseline is in range."""
     offsets = keypoint_offsets(references)
     chosen = [np.empty((0, 2), np.intp)]
     for (i, j), matches in correspondences.reference_pairs.items():
@@ -208,7 +208,7 @@ def pairs_of(count: int, max_cameras: int) -> NDArray[np.intp]:
 
 
 def scale_candidates(known: Known, predicted: Predicted, options: ScaleOptions) -> ScaleCandidates:
-    """Both stages, from known and predicted values."""
+    """Computes the candidates of both stages from known and predicted values."""
     xp, count = namespace(predicted.depth), len(known.centre)
     finite = xp.isfinite(xp.concatenate([predicted.rotation.reshape(count + 1, 9), predicted.centre], 1)).all(1)
     has_depth = ~xp.isnan(predicted.depth)
@@ -251,7 +251,7 @@ def scale_candidates(known: Known, predicted: Predicted, options: ScaleOptions) 
 
 
 def _pick(rows: AnyArray, index: AnyArray) -> AnyArray:
-    """One row; torch synchronizes for an index that is not in a tensor."""
+    """Returns one row; torch would synchronize for an index that is not in a tensor."""
     return rows[index.reshape(1)][0]
 
 
@@ -309,7 +309,7 @@ def trajectory_scale(aligned: AnyArray, centres_world: AnyArray, pairs: AnyArray
     Args:
         aligned: (K, 3) predicted centres in world axes, R_align C^local.
         centres_world: (K, 3) known centres, metres.
-        pairs: (P, 2) of the cameras, at least one.
+        pairs: (P, 2) pairs of cameras, at least one.
         inlier_distance_m: largest distance of an inlier.
 
     Returns:

@@ -47,7 +47,7 @@ class StructureOptions:
             reference's pairs alone.
         optimize: adjust the points; otherwise they stay as the reconstruction predicts them (the paper's ablation).
         model_noise: weight observations by the noise of their keypoint; the paper gives all the same weight.
-        iterations: Levenberg-Marquardt steps, twice; four converge from a good start.
+        iterations: number of Levenberg-Marquardt steps, made twice; four converge from a good start.
         loss_scale_sigma: residual, in standard deviations, at which the loss turns from square to linear.
         max_residual_sigma: points with a larger residual in any view are dropped; None keeps all.
         min_parallax_deg: points with a smaller parallax are dropped, because their depth is not determined.
@@ -94,14 +94,14 @@ def build_structure(
     """Triangulates metric points from the references' tracks, starting at the reconstruction's depths; possibly none.
 
     Args:
-        reconstruction: up to scale; its references in the order of `references`.
+        reconstruction: query and references up to scale, its references in the order of `references`.
         scale: its metric scale.
-        references: with known poses.
+        references: the references, with known poses.
         correspondences: matches between the references.
-        options: `PAPER_STRUCTURE` for the paper's form.
+        options: options of the structure; `PAPER_STRUCTURE` for the paper's form.
 
     Returns:
-        The structure. Every point is finite, in front of the references that see it.
+        The structure. Every point is finite and in front of the references that observe it.
     """
     tracks = tracks_of(references, correspondences, options)
     start = predicted_points(reconstruction, scale, references, tracks)
@@ -125,7 +125,7 @@ def _refined(observations: Observations, start: Array, options: StructureOptions
 
 
 def tracks_of(references: Sequence[PosedView], correspondences: Correspondences, options: StructureOptions) -> Tracks:
-    """The tracks to triangulate."""
+    """Builds the tracks to triangulate."""
     return correspondences.tracks(references, None if options.all_references else 0)
 
 
@@ -178,7 +178,7 @@ def trustworthy(observations: Observations, x_in_world: AnyArray, options: Struc
 
 
 def observe(tracks: Tracks, references: Sequence[PosedView], noise: KeypointNoise) -> Observations:
-    """The observations of tracks over these references."""
+    """Makes the observations of tracks over these references."""
     camera_from_world = [r.world_from_camera.inverse() for r in references]
     rotations = np.stack([c.rotation for c in camera_from_world])
     translations = np.stack([c.translation for c in camera_from_world])
@@ -205,7 +205,7 @@ def predicted_points(
 ) -> Array:
     """Back-projects the first keypoint of each track with its predicted depth at metric scale, (P, 3) in the world.
 
-    NaN where the reconstruction has no depth.
+    Points are NaN where the reconstruction has no depth.
     """
     first = keypoint_offsets(references)[tracks.view[tracks.starts]] + tracks.keypoint[tracks.starts]
     centre, ray = keypoint_rays(references)
@@ -217,16 +217,16 @@ def predicted_points(
 def tracks_with_query(
     structure: Structure, point: NDArray[np.intp], keypoint: NDArray[np.intp], view: int
 ) -> tuple[Tracks, NDArray[np.bool_]]:
-    """Tracks over the references and the query, of the points that the query is matched with.
+    """Builds tracks over references and query, of the points that the query is matched with.
 
     Args:
-        structure: of P points.
-        point: (M,) of each match, none twice.
-        keypoint: (M,) of the query.
-        view: number that the query gets.
+        structure: the structure of P points.
+        point: (M,) point of each match, none twice.
+        keypoint: (M,) keypoint of the query.
+        view: index of the query as a view.
 
     Returns:
-        The tracks, and which points (P,) they are of.
+        The tracks, and a mask (P,) of the points that they belong to.
     """
     chosen = np.zeros(len(structure.x_in_world), bool)
     chosen[point] = True

@@ -62,12 +62,12 @@ class Grouping(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Observations of points, sorted by point, then view; one per point and view at most, two per point at least.
+    """Observations of points, sorted by point, then view; at most one per point and view, at least two per point.
 
     Attributes:
         point: (O,) index of the point, 0 to P - 1; each occurs.
         view: (O,) index of the observing reference.
-        keypoint: (O,) index of its keypoint there.
+        keypoint: (O,) index of the keypoint in that reference.
     """
 
     point: NDArray[np.intp]
@@ -81,7 +81,7 @@ class Tracks:
 
     @cached_property
     def starts(self) -> NDArray[np.intp]:
-        """(P,) index of each point's first observation."""
+        """Index (P,) of each point's first observation."""
         return np.flatnonzero(np.diff(self.point, prepend=-1))
 
     def select(self, points: NDArray[np.bool_]) -> Tracks:
@@ -92,7 +92,7 @@ class Tracks:
 
     @property
     def length(self) -> NDArray[np.intp]:
-        """(O,) number of observations of each observation's point."""
+        """Number (O,) of observations of each observation's point."""
         return np.bincount(self.point)[self.point]
 
     def sum_by_point(self, values: Array) -> Array:
@@ -106,16 +106,16 @@ class Tracks:
 
     @cached_property
     def _sums(self) -> Any:
-        """(P, O): a product with it sums over each point's observations, five times as fast as `reduceat`."""
+        """Matrix (P, O) whose product sums over each point's observations, five times as fast as `reduceat`."""
         count, ends = len(self.point), np.append(self.starts, len(self.point))
         return csr_array((np.ones(count), np.arange(count), ends), shape=(self.point_count, count))
 
     def max_by_point(self, values: Array) -> Array:
-        """Largest of (O,) over each point's observations, (P,)."""
+        """Largest of values (O,) over each point's observations, (P,)."""
         return np.maximum.reduceat(values, self.starts) if len(self.starts) else values[:0]
 
     def prune(self, observations: NDArray[np.bool_]) -> tuple[Tracks, NDArray[np.bool_], NDArray[np.bool_]]:
-        """The tracks with only the chosen observations (O,), without points that have fewer than two of them.
+        """Keeps the chosen observations (O,), without points that have fewer than two of them.
 
         Returns:
             The tracks, and masks (O,) and (P,) of the observations and points that are kept.

@@ -21,7 +21,7 @@ class Features:
     Attributes:
         keypoints: (N, 2) float32, x and y in pixels of the view's camera, lens distortion removed.
         descriptors: (N, D): float32, unit length; or in a quarter of the bytes, int8 of any length, or uint8, a
-            histogram. `unit_descriptors` is what they mean.
+            histogram. `unit_descriptors` converts all of them.
         sizes_px: (N,) float32, diameter of the patch that each descriptor describes.
     """
 
@@ -41,13 +41,13 @@ class Features:
 
     @property
     def size_bytes(self) -> int:
-        """Memory of the arrays."""
+        """Memory of the arrays, bytes."""
         return self.keypoints.nbytes + self.descriptors.nbytes + self.sizes_px.nbytes
 
     def unit_descriptors(self, rows: NDArray[np.intp] | slice = slice(None)) -> NDArray[np.float32]:
-        """Some of the descriptors (R, D), or all; float32, unit length, so that a product is a cosine.
+        """Converts some descriptors, or all, to (R, D) float32 of unit length, so that a product is a cosine.
 
-        Of a histogram it is the square root of each number's share (Arandjelovic and Zisserman 2012).
+        A histogram becomes the square roots of its numbers' shares (Arandjelovic and Zisserman 2012).
         """
         chosen = self.descriptors[rows]
         if chosen.dtype == np.float32:
@@ -60,7 +60,7 @@ class Features:
 
 
 def rounded_descriptors(descriptors: NDArray[np.floating]) -> NDArray[np.int8]:
-    """Descriptors (N, D) in 8 bits: each is multiplied so that its largest number becomes 127."""
+    """Rounds descriptors (N, D) to 8 bits: each is scaled so that its largest number becomes 127."""
     finite = np.nan_to_num(descriptors)
     largest = np.abs(finite).max(axis=1, keepdims=True, initial=np.finfo(np.float32).tiny)
     return np.asarray(np.rint(finite * (127 / largest.astype(np.float64))), np.int8)
@@ -71,9 +71,9 @@ class Photograph:
     """The image of a view, for stages that use pixels. Reading it may involve a database and a decoder.
 
     Attributes:
-        sha256: of the encoded image, hexadecimal; key for caches of anything computed from the pixels.
-        camera: in pixels of the image, with its lens distortion.
-        read: returns the pixels, (H, W, 3) uint8 RGB, of the camera's size.
+        sha256: hash of the encoded image, hexadecimal; key for caches of anything computed from the pixels.
+        camera: camera in pixels of the image, with its lens distortion.
+        read: function that returns the pixels, (H, W, 3) uint8 RGB, of the camera's size.
     """
 
     sha256: str
@@ -86,10 +86,10 @@ class View:
     """A photograph as the method uses it: processed size, no distortion.
 
     Attributes:
-        camera: pinhole, in pixels of the processed (reduced) image.
-        features: in the same pixels.
+        camera: pinhole camera in pixels of the processed (reduced) image.
+        features: local features, in the same pixels.
         photograph: the image itself; None if no stage needs it.
-        distortion: of the lens, with which the keypoints were undistorted; None for a pinhole, and for stored
+        distortion: distortion of the lens, which was removed from the keypoints; None for a pinhole, and for stored
             references, where it is not needed.
     """
 
@@ -99,7 +99,7 @@ class View:
     distortion: Distortion | None = None
 
     def has_camera_of(self, other: View) -> bool:
-        """Whether both have the same intrinsics, to a thousandth of its width, and so the same errors of them."""
+        """Whether both have the same intrinsics, to a thousandth of the width, and so the same errors of them."""
         ours, theirs = self.camera, other.camera
         if (ours.width_px, ours.height_px) != (theirs.width_px, theirs.height_px):
             return False
@@ -170,7 +170,7 @@ class ReconstructedView:
     """One view's part of a reconstruction.
 
     Attributes:
-        camera: pinhole, in pixels of the maps below; the view's own camera, moved and scaled along the axes.
+        camera: pinhole camera in pixels of the maps below: the view's own, moved and scaled along the axes.
         point_map: (H, W, 3) float32, the point seen at each pixel, in this camera's frame, up to the common scale; NaN
             where unknown.
         confidence: (H, W) float32, 0 to 1; 0 where unknown.
@@ -192,14 +192,14 @@ class ReconstructedView:
     def cells(
         self, pixels: NDArray[np.floating], camera: Camera
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
-        """Rows and columns (N,) of the maps' cells at pixels (N, 2) of the view's camera, and which lie in the maps."""
+        """Rows and columns (N,) of the maps' cells at pixels (N, 2) of the view's camera, and which are inside."""
         return map_cells(self.camera, pixels, camera)
 
 
 def map_cells(
     map_camera: Camera, pixels: NDArray[np.floating], camera: Camera
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
-    """Rows and columns (N,) of the cells of one camera's maps at pixels (N, 2) of another; and which lie inside."""
+    """Rows and columns (N,) of the cells of one camera's maps at pixels (N, 2) of another, and which are inside."""
     ideal = camera.rays(pixels)[:, :2]
     focal = map_camera.focal_x_px, map_camera.focal_y_px
     mapped = np.rint(ideal * focal + (map_camera.principal_x_px, map_camera.principal_y_px))
@@ -215,7 +215,8 @@ class Reconstruction:
     Attributes:
         query: the query.
         references: the references, in order.
-        metre_sigma: relative standard deviation of its unit, if that is about the metre; None if it is arbitrary.
+        metre_sigma: relative standard deviation of the unit, if that is approximately the metre; None if it is
+            arbitrary.
     """
 
     query: ReconstructedView

@@ -1,9 +1,9 @@
 """The feed-forward 3D networks pi^3 (Wang et al. 2025), its successor Pi3X, and MapAnything (Keetha et al. 2025).
 
-They are written from descriptions. A network takes images of one scene and computes, up to one similarity, each view's
-pose and the point seen at each of its pixels. The modules' names are those of the official checkpoints' entries. This
-room imports only `mapless_server.extras`, and this file imports nothing: torch takes seconds. Begin with `network`,
-then `pi3`.
+They are our own code, written from descriptions. A network takes images of one scene and computes, up to one
+similarity, each view's pose and the point seen at each of its pixels. The modules' names are those of the official
+checkpoints' entries. This room imports only `mapless_server.extras`, and this file imports nothing: torch takes
+seconds. Begin with `network`, then `pi3`.
 
     network.py     the interface of all
     blocks.py      attention, normalization, rotary positions

@@ -49,7 +49,7 @@ class LayerScale(nn.Module):
 
 
 class Mlp(nn.Module):
-    """Two linear layers, four times as wide between, exact GELU."""
+    """Two linear layers with an exact GELU between them, where the width is four times as large."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -107,7 +107,7 @@ def rope_table(positions: Tensor, head_width: int) -> Rope:
 
 
 def flash_attention(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-    """Flash attention (Dao 2023) of (B, heads, T, d); RuntimeError where there is no such kernel."""
+    """Flash attention (Dao 2023) of (B, heads, T, d); RuntimeError if the device has no such kernel."""
     return torch.ops.aten._scaled_dot_product_flash_attention(q, k, v)[0]
 
 
@@ -123,7 +123,7 @@ class Attention(nn.Module):
         self.k_norm: nn.Module = LayerNorm(width // heads, eps=QK_EPS) if normalize_qk else nn.Identity()
 
     def project(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Queries, keys and values (B, heads, T, d) of tokens (B, T, C), queries and keys normalized."""
+        """Computes queries, keys and values (B, heads, T, d) of tokens (B, T, C), queries and keys normalized."""
         q, k, v = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4).unbind(0)
         return self.q_norm(q), self.k_norm(k), v
 
@@ -140,7 +140,7 @@ class Attention(nn.Module):
         return F.scaled_dot_product_attention(q, k, v)
 
     def merge(self, x: Tensor) -> Tensor:
-        """The output (B, T, C) of all heads' (B, heads, T, d)."""
+        """Merges all heads' (B, heads, T, d) to the output (B, T, C)."""
         return self.proj(x.transpose(1, 2).flatten(2))
 
     def forward(self, x: Tensor, rope: Rope | None) -> Tensor:
@@ -151,7 +151,7 @@ class Attention(nn.Module):
         return self.merge(self.attend(q, k, v))
 
     def of_last(self, x: Tensor, count: int) -> Tensor:
-        """The output (B, count, C) at the last tokens alone, of tokens (B, T, C), without rotation."""
+        """The output (B, count, C) of the last `count` tokens of (B, T, C), without rotation."""
         width = x.shape[-1]
         weight, bias = self.qkv.weight, self.qkv.bias
         q = F.linear(x[:, -count:].to(weight.dtype), weight[:width], bias[:width])
@@ -182,6 +182,6 @@ class Block(nn.Module):
         return x + self.ls2(self.mlp(self.norm2(x)))
 
     def of_last(self, x: Tensor, count: int) -> Tensor:
-        """The output (B, count, C) at the last tokens alone, of tokens (B, T, C), without rotation."""
+        """The output (B, count, C) of the last `count` tokens of (B, T, C), without rotation."""
         last = x[:, -count:] + self.ls1(self.attn.of_last(self.norm1(x), count))
         return last + self.ls2(self.mlp(self.norm2(last)))

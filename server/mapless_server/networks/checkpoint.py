@@ -27,12 +27,13 @@ def _no_further_words(_: Mapping[str, tuple[int, ...]]) -> str:
 
 @dataclass(frozen=True)
 class FileNames:
-    """How the files of a network may differ from its tensors; a class has it as its attribute `file_names`.
+    """How a network's file may differ from its tensors; a class has it as its attribute `file_names`.
 
     Attributes:
-        canonical: the name of a tensor in the network, of any name that files may give it.
+        canonical: function from any name that a file may give to a tensor to its name in the network.
         unused_prefixes: files may hold further tensors with these prefixes, which are not loaded.
-        describe_misfit: what a file is that does not fit, from the shapes of its tensors; empty if that is not known.
+        describe_misfit: function that says, from the shapes of its tensors, what a file is that does not fit; empty if
+            unknown.
     """
 
     canonical: Callable[[str], str] = str
@@ -41,7 +42,7 @@ class FileNames:
 
 
 def file_names_of(network: type[torch.nn.Module]) -> FileNames:
-    """Those of its class; without any, a file must have exactly the network's names."""
+    """The file names of a network's class; by default, a file must have exactly the network's names."""
     names: FileNames = getattr(network, "file_names", FileNames())
     return names
 
@@ -66,7 +67,7 @@ def load_strictly(
     *,
     optional: Mapping[str, Sequence[float] | None] = IMAGE_NORMALIZATION,
 ) -> str:
-    """Replaces all parameters and persistent buffers of a module by those of a file; other buffers are not changed.
+    """Replaces all parameters and persistent buffers of a module by a file's; other buffers are not changed.
 
     The file is read once, and the bytes that are hashed are those that are loaded; a digest recorded beside the file
     could belong to another file (copying tools preserve sizes and times). Tensors are read one at a time, so a module
@@ -74,8 +75,8 @@ def load_strictly(
     the dtype of the module's tensor.
 
     Args:
-        module: on any device; the meta device saves memory.
-        file: safetensors, of any floating-point type.
+        module: the network, on any device; the meta device saves memory.
+        file: a safetensors file of any floating-point type.
         optional: names that the file may lack, with their default values; None leaves the module's own.
 
     Returns:
@@ -122,9 +123,9 @@ def compare_tensors(
     """Raises CheckpointError unless a file has the module's tensors, under any of their names.
 
     Args:
-        header: of the file.
-        module: on any device.
-        description: of the file in messages.
+        header: the file's header.
+        module: the network, on any device.
+        description: name of the file in messages.
         optional: names that the file may lack.
     """
     names = file_names_of(type(module))
@@ -137,7 +138,7 @@ def compare_tensors(
 
 
 def expected_tensors(module: torch.nn.Module) -> dict[str, tuple[tuple[int, ...], bool]]:
-    """Shape, and whether it is a floating-point number, of every tensor that a file must hold, by name."""
+    """Shape of every tensor that a file must hold, and whether it is a floating-point number, by name."""
     return {name: (tuple(tensor.shape), tensor.is_floating_point()) for name, tensor in module.state_dict().items()}
 
 
@@ -165,10 +166,10 @@ def _read(stream: BufferedReader, entry: Entry, file: Path) -> torch.Tensor:
 
 
 def _is_finite(tensor: torch.Tensor) -> bool:
-    """Whether all numbers are finite; by their extremes, in a thirtieth of the time of torch.isfinite."""
+    """Whether all numbers are finite, tested by their extremes in a thirtieth of the time of torch.isfinite."""
     return not tensor.is_floating_point() or tensor.numel() == 0 or all(map(math.isfinite, tensor.aminmax()))
 
 
 def _bytes_of(tensor: torch.Tensor) -> memoryview:
-    """The tensor's own memory."""
+    """A view of the tensor's memory."""
     return tensor.reshape(-1).view(torch.uint8).numpy().data

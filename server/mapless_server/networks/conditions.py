@@ -1,4 +1,4 @@
-"""The conditions of Pi3X, its input beside the images: rays of all views, poses of some.
+"""The conditions of Pi3X, its input besides the images: rays of all views, poses of some.
 
 Poses enter through attention among the posed views, whose queries, keys and values are transformed by the cameras
 (PRoPE, Li et al. 2025); rays are added to the patch tokens.
@@ -21,9 +21,10 @@ def rays_from_intrinsics(intrinsics: Tensor, height_px: int, width_px: int) -> T
     """Rays (V, 2, H, W), x and y at depth 1, of the pixels' centres.
 
     Args:
-        intrinsics: (V, 3, 3), where the top-left pixel's centre is (0.5, 0.5): half a pixel more than elsewhere here.
-        height_px: of the images.
-        width_px: of the images.
+        intrinsics: (V, 3, 3), in which (0.5, 0.5) is the centre of the top-left pixel; elsewhere in mapless it is (0,
+            0).
+        height_px: height of the images.
+        width_px: width of the images.
     """
     columns = torch.arange(width_px, device=intrinsics.device) + 0.5
     rows = torch.arange(height_px, device=intrinsics.device) + 0.5
@@ -36,7 +37,7 @@ def rays_from_intrinsics(intrinsics: Tensor, height_px: int, width_px: int) -> T
 
 
 def invert_small(matrices: Tensor) -> Tensor:
-    """Inverses of (..., 3, 3)."""
+    """Inverses of matrices (..., 3, 3)."""
     a, b, c = matrices.unbind(-2)
     adjugate = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], dim=-1)
     return adjugate / (a * adjugate[..., 0]).sum(-1)[..., None, None]
@@ -49,10 +50,10 @@ def invert_poses(poses: Tensor) -> Tensor:
 
 
 def normalize_poses(poses: Tensor) -> Tensor:
-    """Poses of each scene's views relative to its first, at the scale of the network's training.
+    """Converts poses of each scene's views to be relative to the first, at the scale of the network's training.
 
-    The mean distance of the other views from the first is 1, of all of them, also those whose pose is not used. So the
-    value given for an unknown pose matters.
+    The mean distance of all other views from the first becomes 1, including views whose pose is not used. So the value
+    given for an unknown pose matters.
 
     Args:
         poses: (B, N, 4, 4) world_from_camera.
@@ -91,15 +92,15 @@ class Prope:
     sin: Tensor
 
     def query(self, x: Tensor) -> Tensor:
-        """E^T q and the rotation, of (B, heads, M * P, d)."""
+        """E^T q of queries (B, heads, M * P, d), rotated."""
         return self._apply(x, self.camera_from_world.mT, self.sin)
 
     def key(self, x: Tensor) -> Tensor:
-        """E^-1 k, also for values."""
+        """E^-1 k of keys or values (B, heads, M * P, d), rotated."""
         return self._apply(x, self.world_from_camera, self.sin)
 
     def output(self, x: Tensor) -> Tensor:
-        """E o, and the rotation back."""
+        """E o of outputs (B, heads, M * P, d), rotated back."""
         return self._apply(x, self.camera_from_world, -self.sin)
 
     def _apply(self, x: Tensor, matrices: Tensor, sin: Tensor) -> Tensor:
@@ -123,7 +124,7 @@ def prope(poses: Tensor, grid: tuple[int, int], head_width: int) -> Prope:
 
 
 class PoseInjection(nn.Module):
-    """The update of the posed views' patches by one another's cameras. Attention and MLP are parallel branches."""
+    """Updates the posed views' patches by one another's cameras; attention and MLP are parallel branches."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()

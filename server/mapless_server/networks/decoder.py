@@ -42,7 +42,7 @@ def make_layout(grid: tuple[int, int], head_width: int, device: torch.device) ->
 
 
 class AlternatingDecoder(nn.ModuleList):
-    """An even number of blocks; those with an even index attend within a view, the others over the whole scene."""
+    """An even number of blocks; those with an even index attend within a view, the others over the scene."""
 
     def __init__(self, width: int, heads: int, depth: int) -> None:
         super().__init__(Block(width, heads, normalize_qk=True) for _ in range(depth))
@@ -52,11 +52,11 @@ class AlternatingDecoder(nn.ModuleList):
         return self[0](tokens, rope)
 
     def forward(self, tokens: Tensor, rope: Rope, inject: Injection | None = None) -> Tensor:
-        """The other blocks.
+        """Computes the other blocks.
 
         Args:
             tokens: (B, N, T, C) of B scenes with N views, after `begin`.
-            rope: of one view.
+            rope: rotary positions of one view.
             inject: changes the output of a block over the whole scene; None changes nothing.
 
         Returns:

@@ -47,7 +47,7 @@ class Fusion(nn.Module):
 
 
 class DenseFeatures(nn.Module):
-    """Patch tokens of four depths to one map of eight times the patches' size."""
+    """Converts patch tokens of four depths to one map of eight times the patches' size."""
 
     def __init__(self, width: int, map_widths: Sequence[int], width_out: int) -> None:
         super().__init__()
@@ -68,7 +68,7 @@ class DenseFeatures(nn.Module):
         self.scratch = nn.ModuleDict({f"refinenet{i}": Fusion(width_out, is_coarsest=i == 4) for i in (1, 2, 3, 4)})
 
     def forward(self, tokens: Sequence[Tensor], grid: tuple[int, int]) -> Tensor:
-        """Tokens (V, P, C) of four depths, the first depth first, of a grid (rows, columns), to (V, C', 8 h, 8 w)."""
+        """Tokens (V, P, C) of four depths, the first depth first, and a grid (rows, columns), to (V, C', 8 h, 8 w)."""
         inputs = (it.transpose(1, 2).unflatten(2, grid) for it in tokens)
         maps = [process(it) for process, it in zip(self.input_process, inputs, strict=True)]
         fusions = self.scratch
@@ -79,7 +79,7 @@ class DenseFeatures(nn.Module):
 
 
 class DenseRegression(nn.Module):
-    """Channels of every pixel from the map of `DenseFeatures`."""
+    """Computes the channels of every pixel from the map of `DenseFeatures`."""
 
     def __init__(self, width: int, hidden: int, channels: int) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""The image encoders: DINOv2 with registers (Oquab, Darcet et al. 2023), and the older one without.
+"""The image encoders: DINOv2 with registers (Oquab, Darcet et al. 2023), and without.
 
 They encode each view alone. Pi3 and Pi3X have a ViT-L/14 with registers; MapAnything a ViT-g/14 and MegaLoc a ViT-B/14
 without.
@@ -47,7 +47,7 @@ class Encoder(nn.Module):
         self.norm = LayerNorm(width, eps=BLOCK_EPS)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Images (V, 3, H, W), sides multiples of 14, to tokens (V, P, C) float32, P = H/14 * W/14, by rows."""
+        """Images (V, 3, H, W), sides multiples of 14, to tokens (V, P, C) float32, P = H/14 * W/14, row by row."""
         grid = (images.shape[2] // PATCH_PX, images.shape[3] // PATCH_PX)
         of_class, of_patches = self.positions(grid).split([1, grid[0] * grid[1]], dim=1)
         views = len(images)

@@ -57,7 +57,7 @@ def nearest_rotation(matrices: Tensor) -> Tensor:
 
 
 class HeadDecoder(nn.Module):
-    """Blocks within each view, between two linear layers."""
+    """Transformer blocks within each view, between two linear layers."""
 
     def __init__(self, width_in: int, width: int, width_out: int, heads: int, depth: int) -> None:
         super().__init__()
@@ -75,7 +75,7 @@ class HeadDecoder(nn.Module):
 
 
 class LinearHead(nn.Module):
-    """Channels of every pixel of a patch from its token."""
+    """Computes the channels of every pixel of a patch from its token."""
 
     def __init__(self, width: int, channels: int) -> None:
         super().__init__()
@@ -100,7 +100,7 @@ class ResidualMlp(nn.Module):
         self.res_conv3 = layer(width, width)
 
     def forward(self, x: Tensor) -> Tensor:
-        """As large as the input."""
+        """Returns a tensor of the input's shape."""
         inner = x
         for layer in (self.res_conv1, self.res_conv2, self.res_conv3):
             inner = F.relu(layer(inner))
@@ -108,7 +108,7 @@ class ResidualMlp(nn.Module):
 
 
 class CameraHead(nn.Module):
-    """A pose from the mean of a view's patch tokens."""
+    """Computes a pose from the mean of a view's patch tokens."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -133,7 +133,7 @@ class CameraHead(nn.Module):
 
 
 class MapUpsampling(nn.Sequential):
-    """Twice the size: transposed convolution, then two residual blocks."""
+    """Doubles the size of a map: transposed convolution, then two residual blocks."""
 
     def __init__(self, width_in: int, width: int) -> None:
         super().__init__(
@@ -164,7 +164,7 @@ class ResidualConvolution(nn.Module):
 
 
 class ConvHead(nn.Module):
-    """Maps from patch tokens, by convolutions; one or more outputs with a common trunk."""
+    """Computes maps from patch tokens by convolutions; one or more outputs with a common trunk."""
 
     def __init__(self, width: int, stages: Sequence[int], last_width: int, channels: Sequence[int]) -> None:
         super().__init__()
@@ -190,7 +190,7 @@ def _convolution(width_in: int, width_out: int) -> nn.Conv2d:
 
 
 def _with_uv(x: Tensor, grid: tuple[int, int]) -> Tensor:
-    """A map (V, C, H, W) with two more channels, u along x and v along y; the image's corners are at radius 1."""
+    """A map (V, C, H, W) with two more channels, u along x and v along y; the image's corners have radius 1."""
     height, width = x.shape[2:]
     diagonal = (grid[0] ** 2 + grid[1] ** 2) ** 0.5
     u_end = grid[1] / diagonal * (width - 1) / width

@@ -36,11 +36,11 @@ if TYPE_CHECKING:  # needed for SuperPoint's only
 
 
 class LightGlue(nn.Module):
-    """The network, its parameters under the names of the authors' checkpoint.
+    """The network; its parameters have the names of the authors' checkpoint.
 
     Args:
-        input_dim: of descriptors: 128 for ALIKED, 256 for SuperPoint.
-        layers: the authors' 9.
+        input_dim: length of descriptors: 128 for ALIKED, 256 for SuperPoint.
+        layers: number of layers; the authors use 9.
     """
 
     def __init__(self, input_dim: int, layers: int = 9) -> None:
@@ -63,7 +63,7 @@ class LightGlue(nn.Module):
             descriptor: (1, N, D) their descriptors.
             positions: (K, M, 2) the references' keypoints.
             descriptors: (K, M, D) their descriptors.
-            mask: (K, M) which of them there are; at least one each.
+            mask: (K, M) which rows are keypoints; at least one for each reference.
 
         Returns:
             index: (K, N) the reference keypoint that each query keypoint and that matches each other best.
@@ -95,16 +95,16 @@ class LightGlue(nn.Module):
 
         Args:
             first: (1, N, 2) keypoints, normalized, and (1, N, D) their descriptors; at least one.
-            second: (1, M, 2) and (1, M, D), likewise.
-            depth_confidence: the layers end when so large a share of the keypoints has found its final match, or that
-                it has none; 1 runs all.
-            width_confidence: a keypoint that has, with such confidence, no match is left out of the next layers; 1
-                leaves out none.
+            second: (1, M, 2) and (1, M, D), the same of the other photograph.
+            depth_confidence: the layers end when this share of the keypoints is certain of its match, or of having
+                none; 1 runs all layers.
+            width_confidence: a keypoint without a match, with this confidence, is left out of the next layers; 1 leaves
+                out none.
             pause: called between layers; may wait.
 
         Returns:
-            index: (N,) as `forward`, for each keypoint of the first photograph.
-            score: (N,) likewise; 0 for those that were left out.
+            index: (N,) as in `forward`, for each keypoint of the first photograph.
+            score: (N,) as in `forward`; 0 for keypoints that were left out.
         """
         sides = [_Side.of(self.input_proj(x), self.posenc(position)) for position, x in (first, second)]
         count, last = sum(len(side.index) for side in sides), len(self.transformers) - 1
@@ -139,7 +139,7 @@ class LightGlue(nn.Module):
         return index, score
 
     def _is_certain(self, number: int, x: Tensor) -> Tensor:
-        """(N,) which keypoints' matches no layer after this one will change; the authors' threshold."""
+        """Mask (N,) of the keypoints whose matches no later layer will change, by the authors' threshold."""
         threshold = 0.8 + 0.1 * math.exp(-4 * number / len(self.transformers))
         certain: Tensor = self.token_confidence[number](x, x)[0][0] >= threshold
         return certain
@@ -150,9 +150,9 @@ class _Side:
     """One photograph between two layers.
 
     Attributes:
-        x: (1, N, C) of the keypoints that are left.
-        rotation: their positions, encoded.
-        index: (N,) of each among all.
+        x: (1, N, C) states of the remaining keypoints.
+        rotation: their encoded positions.
+        index: (N,) index of each among all keypoints.
     """
 
     x: Tensor
@@ -161,16 +161,16 @@ class _Side:
 
     @classmethod
     def of(cls, x: Tensor, rotation: Tensor) -> _Side:
-        """With all its keypoints."""
+        """Makes the side of a photograph with all its keypoints."""
         return cls(x, rotation, torch.arange(x.shape[1], device=x.device))
 
     def kept(self, keep: Tensor) -> _Side:
-        """With those of a mask (N,)."""
+        """Returns the side with only the keypoints of a mask (N,)."""
         return _Side(self.x[:, keep], self.rotation[..., keep, :], self.index[keep])
 
 
 def _attend_within(block: SelfBlock, x: Tensor, rotation: Tensor, key_mask: Tensor | None) -> Tensor:
-    """SelfBlock of kornia with a mask of keys instead of pairs, (B, N, C) to (B, N, C)."""
+    """SelfBlock of kornia with a mask of keys instead of pairs: (B, N, C) to (B, N, C)."""
     qkv = block.Wqkv(x).unflatten(-1, (block.num_heads, -1, 3)).transpose(1, 2)
     q, k, v = qkv.unbind(-1)
     q, k = apply_cached_rotary_emb(rotation, q), apply_cached_rotary_emb(rotation, k)
@@ -181,7 +181,7 @@ def _attend_within(block: SelfBlock, x: Tensor, rotation: Tensor, key_mask: Tens
 
 
 def _attend_across(block: CrossBlock, x0: Tensor, x1: Tensor, key_mask: Tensor | None) -> tuple[Tensor, Tensor]:
-    """CrossBlock of kornia, the second photograph's keys masked; never holds a matrix of all similarities."""
+    """CrossBlock of kornia with the second photograph's keys masked; never holds a matrix of all similarities."""
 
     def heads(x: Tensor) -> Tensor:
         split: Tensor = x.unflatten(-1, (block.heads, -1))
@@ -198,9 +198,9 @@ def _attend_across(block: CrossBlock, x0: Tensor, x1: Tensor, key_mask: Tensor |
 
 
 def _log_probabilities(head: MatchAssignment, x0: Tensor, x1: Tensor, mask: Tensor) -> Tensor:
-    """(K, N, M): both softmaxes of the similarity and both keypoints' matchabilities, added as logarithms.
+    """Log-probabilities (K, N, M): both softmaxes of the similarity plus both keypoints' matchabilities.
 
-    -inf for padding.
+    Padding has -inf.
     """
     y0, y1 = (head.final_proj(x) / x.shape[-1] ** 0.25 for x in (x0, x1))
     similarity = (y0 @ y1.transpose(1, 2)).float()
@@ -212,7 +212,7 @@ def _log_probabilities(head: MatchAssignment, x0: Tensor, x1: Tensor, mask: Tens
 
 
 def _mutual_best(log_probabilities: Tensor) -> tuple[Tensor, Tensor]:
-    """Of (K, N, M), each row's best column (K, N), and its probability, or 0 if the row is not that column's best."""
+    """Each row's best column (K, N) of (K, N, M), and its probability; 0 if the row is not that column's best."""
     best, column = log_probabilities.max(2)
     row_of_column = log_probabilities.argmax(1)
     rows = torch.arange(column.shape[1], device=column.device)
@@ -221,7 +221,7 @@ def _mutual_best(log_probabilities: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def load_lightglue(features: str, weights: Path) -> tuple[LightGlue, str]:
-    """The network that matches an extractor's features, with the authors' weights, and their SHA-256.
+    """Loads the LightGlue for an extractor's features with the authors' weights; returns it and their SHA-256.
 
     Args:
         features: "aliked" or "superpoint".
@@ -241,11 +241,11 @@ def load_lightglue(features: str, weights: Path) -> tuple[LightGlue, str]:
 
 
 def load_superpoint_lightglue(weights: Path, config: LightGlueConfig | None = None) -> tuple[LightGlue, str]:
-    """The network from the file that transformers reads, the same tensors split differently; and the file's SHA-256.
+    """Loads LightGlue from transformers' file, whose tensors are split differently; returns it and the file's SHA-256.
 
     Args:
-        weights: safetensors file with transformers' names. What it holds of SuperPoint itself is not used.
-        config: of transformers' network; None is that of the published weights.
+        weights: safetensors file with transformers' names. The tensors of SuperPoint itself in it are not used.
+        config: configuration of transformers' network; None for that of the published weights.
 
     Raises:
         CheckpointError: the weights do not fit.
@@ -261,7 +261,7 @@ def load_superpoint_lightglue(weights: Path, config: LightGlueConfig | None = No
 
 
 def _translated(theirs: Mapping[str, Tensor], layers: int) -> dict[str, Tensor]:
-    """The tensors of transformers' network under the names of this one."""
+    """Renames the tensors of transformers' network to the names of this one."""
     ours = {"posenc.Wr.weight": theirs["positional_encoder.projector.weight"]}
     for i in range(layers):
         layer, to = f"transformer_layers.{i}", f"transformers.{i}"

@@ -26,7 +26,7 @@ DERIVED = {"dkd.hw_grid": None}
 
 
 def load_aliked(weights: Path, max_keypoints: int = 2048) -> tuple[ALIKED, str]:
-    """ALIKED n16 and its weights' identity. It takes the strongest maxima, at most `max_keypoints`, however weak."""
+    """Loads ALIKED n16, with its weights' SHA-256; it finds the `max_keypoints` strongest maxima, however weak."""
     from kornia.feature import ALIKED
 
     # A threshold of 0 lets kornia take the strongest maxima. With one it takes any if none is above it.
@@ -35,7 +35,7 @@ def load_aliked(weights: Path, max_keypoints: int = 2048) -> tuple[ALIKED, str]:
 
 
 def load_xfeat(weights: Path) -> tuple[XFeatModel, str]:
-    """XFeat and its weights' identity."""
+    """Loads XFeat, with its weights' SHA-256."""
     from kornia.feature.xfeat import XFeatModel
 
     network = XFeatModel()
@@ -43,7 +43,7 @@ def load_xfeat(weights: Path) -> tuple[XFeatModel, str]:
 
 
 def load_edgepoint2(variant: str, weights: Path) -> tuple[EdgePoint2, str]:
-    """EdgePoint2 of a variant ("s64", "m64", "l64", "e64") and its weights' identity."""
+    """Loads a variant of EdgePoint2 ("s64", "m64", "l64", "e64"), with its weights' SHA-256."""
     from .edgepoint2 import VARIANTS, EdgePoint2
 
     network = EdgePoint2(VARIANTS[variant])
@@ -53,7 +53,7 @@ def load_edgepoint2(variant: str, weights: Path) -> tuple[EdgePoint2, str]:
 def load_superpoint(
     weights: Path, config: SuperPointConfig | None = None
 ) -> tuple[SuperPointForKeypointDetection, str]:
-    """SuperPoint and its weights' identity; without a `config` that of the authors' weights."""
+    """Loads SuperPoint, with its weights' SHA-256; without a `config`, that of the authors' weights is used."""
     from transformers import SuperPointConfig, SuperPointForKeypointDetection
 
     network = SuperPointForKeypointDetection(config or SuperPointConfig())

@@ -1,7 +1,8 @@
-"""MapAnything (Keetha et al. 2025), version 1.1: metric points, confidence and poses from images and what is given.
+"""MapAnything (Keetha et al. 2025), version 1.1: metric points, confidence and poses from images and hints.
 
 Any subset of the views may have rays, poses and depths. The first view is the reference: poses are given and predicted
-relative to it, and it must be posed if any is. What is given is a hint: align the output with the given poses.
+relative to it, and it must be posed if any is. The network takes given values as hints only, so the output has to be
+aligned with the given poses.
 
     image > DINOv2 ViT-g > + rays, depths      (of each view alone: `encode`, whose result can be cached)
                          > + poses, normalize  > blocks over the scene and within views in turn
@@ -58,7 +59,7 @@ ALIASES = (
 
 
 def canonical_name(name: str) -> str:
-    """The name of a tensor here, which is the published file's, of any of its official names."""
+    """Converts any official name of a tensor to its name here, which is that in the published file."""
     for pattern, replacement in ALIASES:
         name = re.sub(rf"^{pattern}", replacement, name)
     return name
@@ -76,8 +77,8 @@ class MapAnythingSizes:
 
     Attributes:
         width: channels of a token.
-        encoder_heads, encoder_depth: of the encoder.
-        heads, depth: of the transformer over all views; even.
+        encoder_heads, encoder_depth: heads and blocks of the encoder.
+        heads, depth: heads and (an even number of) blocks of the transformer over all views.
         taps: two blocks of it whose output the dense head gets, besides its input and its last output.
         map_widths, vector_widths: channels in the encoders of rays and depths, and of poses and scales.
         dense_map_widths, dense_width, dense_hidden: channels of the dense head.
@@ -119,8 +120,8 @@ class Decoded:
         depths: (B, M, H, W) distances along the rays.
         confidence_logits: (B, M, H, W); the official confidence is 1 + their exponential.
         mask_logits: (B, M, H, W); above 0 where the pixel shows a surface.
-        translations: (B, N, 3) of the last N views that have a pose here.
-        quaternions: (B, N, 4) x, y, z, w of the same, unit, world_from_camera.
+        translations: (B, N, 3) camera centres of the last N views, whose poses are computed.
+        quaternions: (B, N, 4) rotations of the same, x, y, z, w, unit length, world_from_camera.
         scale: (B, 1) metres per unit.
     """
 
@@ -182,7 +183,7 @@ class MapAnything(Network):
         return PatchLayout(grid)
 
     def encode(self, images: Tensor, layout: PatchLayout, intrinsics: Tensor | None = None) -> Tensor:
-        """See Network.encode; without intrinsics the views' rays are unknown."""
+        """See Network.encode; without intrinsics, the views' rays are unknown."""
         if intrinsics is None:
             return self.encode_views(images)
         # Elsewhere (0.5, 0.5) is the centre of the top-left pixel, here it is (0, 0).
@@ -192,7 +193,7 @@ class MapAnything(Network):
         return self.encode_views(images, GivenMaps(rays, rays.new_ones(len(rays), dtype=torch.bool)))
 
     def encode_views(self, images: Tensor, given: GivenMaps | None = None) -> Tensor:
-        """Tokens (V, P + 1, C) float32 of each view alone, the class token last, of images (V, 3, H, W) in [0, 1]."""
+        """Tokens (V, P + 1, C) float32 of each view alone, the class token last, from images (V, 3, H, W) in [0, 1]."""
         encoded = self.encoder["model"]((images - self.image_mean) / self.image_std)
         of_class, patches = encoded.split([1, encoded.shape[1] - 1], dim=1)
         if given is not None:
@@ -200,7 +201,7 @@ class MapAnything(Network):
         return torch.cat([patches, of_class], dim=1)
 
     def _features_of(self, given: GivenMaps) -> Tensor:
-        """(V, P, C), 0 where nothing is given."""
+        """Features (V, P, C) of the given maps; 0 where nothing is given."""
         features = _where(given.has_rays, self.ray_dirs_encoder(given.rays.permute(0, 3, 1, 2)))
         if given.depths is None or given.has_depth is None or given.is_metric is None:
             return features
@@ -210,7 +211,7 @@ class MapAnything(Network):
         return features + _where(given.has_depth & given.is_metric, of_scale)
 
     def conditions(self, poses: Tensor, posed: Tensor, metric: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
-        """See Network.conditions: all three as they are, the scenes may differ in what is posed.
+        """See Network.conditions; returns the arguments unchanged, since scenes may differ in which views are posed.
 
         Raises:
             ValueError: the first view of a scene has no pose, but another one has.
@@ -228,7 +229,7 @@ class MapAnything(Network):
         posed: Tensor | None = None,
         metric: Tensor | None = None,
     ) -> NetworkOutput:
-        """See Network.reconstruct; the output is metric, as far as the network can tell."""
+        """See Network.reconstruct; the output is metric, within the network's accuracy."""
         return as_output(self.decode(tokens, layout, mapped, _relative(poses, posed), posed, metric))
 
     def query_pose(
@@ -239,7 +240,7 @@ class MapAnything(Network):
         posed: Tensor | None = None,
         metric: Tensor | None = None,
     ) -> Tensor:
-        """The pose (B, 1, 4, 4) of the last view of each scene alone, as of `reconstruct` with the same arguments.
+        """The pose (B, 1, 4, 4) of the last view of each scene alone, the same as that of `reconstruct`.
 
         The last block over the scene computes the rows of that view only, and the block after it that view only.
         """
@@ -257,16 +258,16 @@ class MapAnything(Network):
         *,
         last_pose_only: bool = False,
     ) -> Decoded:
-        """The network's output from tokens (B, N, T, C) of `encode_views`.
+        """Computes the network's output from tokens (B, N, T, C) of `encode_views`.
 
         Args:
-            tokens: of all views; the first is the reference.
-            layout: of one view.
+            tokens: tokens of all views; the first is the reference.
+            layout: layout of one view.
             mapped: M; see Network.reconstruct.
-            relative: poses; None if none is known.
+            relative: relative poses; None if none is known.
             posed: (B, N) bool, which views have a pose.
             metric: (B, N) bool, whether a view's pose is in metres; None if all are.
-            last_pose_only: compute no pose but that of the last view; then nothing can be mapped.
+            last_pose_only: whether only the last view's pose is computed; `mapped` must then be 0.
         """
         tokens = tokens.to(self.scale_token.dtype)
         patches, of_class = tokens.split([tokens.shape[2] - 1, 1], dim=2)
@@ -289,7 +290,7 @@ class MapAnything(Network):
         )
 
     def _features_of_poses(self, relative: RelativePoses, posed: Tensor, metric: Tensor | None) -> Tensor:
-        """(B, N, C), 0 where no pose is given."""
+        """Features (B, N, C) of the poses; 0 where no pose is given."""
         of_pose = self.cam_rot_encoder(relative.quaternions) + self.cam_trans_encoder(relative.translations)
         of_scale = self.cam_trans_scale_encoder((relative.scale + MIN_LENGTH).log()[:, None])[:, None]
         has_scale = posed if metric is None else posed & metric
@@ -325,9 +326,9 @@ class ViewTransformer(nn.Module):
         """Transforms the tokens of B scenes.
 
         Args:
-            tokens: (B, N, T, C).
-            scale_token: (C,).
-            kept: of how many views, the last ones, the last two blocks are computed.
+            tokens: (B, N, T, C) of all views.
+            scale_token: (C,) the learned token.
+            kept: number of views, the last ones, for which the last two blocks are computed.
 
         Returns:
             The normalized output (B, N, T, C) of the two blocks at the taps; of the last block (B, kept, T, C); and
@@ -355,7 +356,7 @@ class ViewTransformer(nn.Module):
 
 
 class PoseHead(nn.Module):
-    """A pose from the mean of a view's patch tokens, in float32."""
+    """Computes a pose from the mean of a view's patch tokens, in float32."""
 
     def __init__(self, width_in: int, width: int) -> None:
         super().__init__()
@@ -376,7 +377,7 @@ class PoseHead(nn.Module):
 
 
 class ScaleHead(nn.Module):
-    """The logarithm of metres per unit, from the scale token."""
+    """Computes the logarithm of metres per unit from the scale token."""
 
     def __init__(self, width_in: int, width: int) -> None:
         super().__init__()
@@ -391,7 +392,7 @@ class ScaleHead(nn.Module):
 
 
 def as_output(decoded: Decoded) -> NetworkOutput:
-    """The output in metres, as of every network; masked pixels have no confidence.
+    """Converts the output to metres and to every network's form; masked pixels have no confidence.
 
     The official confidence c >= 1 becomes 1 - 1/c, which is the sigmoid of its logit.
     """
@@ -406,7 +407,7 @@ def as_output(decoded: Decoded) -> NetworkOutput:
 
 
 def _relative(poses: Tensor | None, posed: Tensor | None) -> RelativePoses | None:
-    """Relative poses of poses (B, N, 4, 4)."""
+    """Makes relative poses from poses (B, N, 4, 4); None without poses."""
     if poses is None or posed is None:
         return None
     return relative_poses(quaternions_from_rotations(poses[..., :3, :3]), poses[..., :3, 3], posed)
@@ -417,5 +418,5 @@ def _pointwise(width_in: int, width: int) -> nn.Module:
 
 
 def _where(mask: Tensor, features: Tensor) -> Tensor:
-    """Features (..., C) of views where the mask is true, otherwise 0."""
+    """Features (..., C) of views where the mask is true, and 0 elsewhere."""
     return torch.where(mask.view(*mask.shape, *[1] * (features.dim() - mask.dim())), features, 0.0)

@@ -109,7 +109,7 @@ class MegaLocSizes:
         width, heads, depth: of the transformer.
         hidden: channels within SALAD's perceptrons.
         clusters, cluster_width, token_width: see Salad.
-        length: of the descriptor.
+        length: length of the descriptor.
     """
 
     width: int = 768
@@ -133,7 +133,7 @@ class Backbone(PlainEncoder):
         """Images (B, 3, H, W), sides multiples of 14, to tokens (B, 1 + P, C) float32; the class token comes first.
 
         Raises:
-            ValueError: sides that are not.
+            ValueError: a side is not a multiple of 14.
         """
         patch_grid(images)
         tokens: Tensor = self.norm(super().forward(images))
@@ -171,14 +171,14 @@ class MegaLoc(nn.Module):
 
     @property
     def length(self) -> int:
-        """Of the descriptors."""
+        """Length of the descriptors."""
         return self.aggregator.linear.out_features
 
     def forward(self, images: Tensor) -> Tensor:
         """Images (B, 3, H, W) in [0, 1], sides multiples of 14, to descriptors (B, length) float32 of unit length.
 
         Raises:
-            ValueError: sides that are not, or no more patches than SALAD has clusters.
+            ValueError: a side is not a multiple of 14, or there are no more patches than SALAD has clusters.
         """
         tokens = self.backbone((images - self.image_mean) / self.image_std)
         descriptors: Tensor = F.normalize(self.aggregator(tokens), dim=1)
@@ -202,7 +202,7 @@ class MegaLoc(nn.Module):
         with orthonormal rows. It is built into the linear layer, which shrinks as the descriptors do.
 
         Raises:
-            ValueError: the length is not a divisor of the present one.
+            ValueError: the length does not divide the present one.
         """
         if length == self.length:
             return
@@ -218,9 +218,9 @@ class MegaLoc(nn.Module):
 
 
 def signed_groups(count: int) -> tuple[Tensor, Tensor]:
-    """A random order (count,) int64 of numbers, consecutive ones of which make a group, and a sign (count,) for each.
+    """A random order (count,) int64 of numbers, of which consecutive ones form groups, and a sign (count,) for each.
 
-    From the raw stream of a generator, which NumPy keeps stable across versions; its distributions are not.
+    It uses the raw stream of a generator, which NumPy keeps stable across versions, unlike its distributions.
     """
     raw = np.random.PCG64(REDUCTION_SEED).random_raw(2 * count)
     order = np.argsort(raw[:count], kind="stable")
@@ -229,7 +229,7 @@ def signed_groups(count: int) -> tuple[Tensor, Tensor]:
 
 
 def _signed_sums(rows: Tensor, order: Tensor, signs: Tensor) -> Tensor:
-    """Sums (D, ...) of G each of ``rows`` (D * G, ...), in the order and with the signs (D, G), over the root of G.
+    """Sums (D, ...) over groups of G rows (D * G, ...), in this order and with these signs (D, G), over the root of G.
 
     One summand at a time, in preallocated memory: all of them together are as large as the rest of the network.
     """

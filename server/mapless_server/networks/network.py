@@ -1,4 +1,4 @@
-"""The interface of all networks: from images to tokens of each view alone, and from those to poses and maps."""
+"""The interface of all networks: images to tokens of each view alone, then tokens to poses and maps."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Network(nn.Module, ABC):
 
     Attributes:
         conditioned: whether it takes intrinsics and poses.
-        metre_sigma: relative standard deviation of the unit of its output, if that is about the metre; None if it is
+        metre_sigma: relative standard deviation of the output's unit, if that is approximately the metre; None if it is
             arbitrary.
     """
 
@@ -59,29 +59,29 @@ class Network(nn.Module, ABC):
     @property
     @abstractmethod
     def width(self) -> int:
-        """C, channels of a token."""
+        """The number C of channels of a token."""
 
     @staticmethod
     @abstractmethod
     def token_count(grid: tuple[int, int]) -> int:
-        """T, tokens of a view with a grid (rows, columns) of patches."""
+        """The number T of tokens of a view with a grid (rows, columns) of patches."""
 
     @abstractmethod
     def layout(self, grid: tuple[int, int]) -> Any:
-        """The layout of tokens that the methods below take, of a grid (rows, columns) of patches."""
+        """The layout of tokens for a grid (rows, columns) of patches, an argument of the methods below."""
 
     @abstractmethod
     def encode(self, images: Tensor, layout: Any, intrinsics: Tensor | None = None) -> Tensor:
-        """Tokens (V, T, C) of each view alone.
+        """Computes the tokens (V, T, C) of each view alone.
 
         Args:
             images: (V, 3, H, W) in [0, 1], sides multiples of 14.
-            layout: of their grid.
-            intrinsics: (V, 3, 3) in pixels, (0.5, 0.5) the centre of the top-left one; only of a conditioned network.
+            layout: layout of their grid.
+            intrinsics: (V, 3, 3) in pixels, (0.5, 0.5) the centre of the top-left one; only for a conditioned network.
         """
 
     def conditions(self, poses: Tensor, posed: Tensor, metric: Tensor) -> tuple[Tensor, ...] | None:
-        """Poses of a conditioned network's views in the form that `reconstruct` takes; None if they are of no use.
+        """Converts poses of a conditioned network's views to `reconstruct`'s form; None if they are of no use.
 
         Args:
             poses: (B, N, 4, 4) world_from_camera, float32.
@@ -100,13 +100,13 @@ class Network(nn.Module, ABC):
         posed: Tensor | None = None,
         metric: Tensor | None = None,
     ) -> NetworkOutput:
-        """Poses of all views of each scene, and maps of the first ``mapped`` of them.
+        """Computes poses of all views of each scene, and maps of the first ``mapped`` of them.
 
         Args:
             tokens: (B, N, T, C) from `encode`.
-            layout: of one view.
+            layout: layout of one view.
             mapped: M; points and confidence of all views would be a tenth of the work, so only those used are computed.
-            poses: from `conditions`, as the next two; None if nothing is known, or the network is not conditioned.
+            poses: from `conditions`, like the next two; None if nothing is known, or the network is not conditioned.
             posed: which views have a pose.
             metric: whether a pose is in metres; only MapAnything takes it.
         """

@@ -35,8 +35,8 @@ class CompiledShape:
 
     Attributes:
         grid: rows and columns of patches.
-        views: of a scene, the query included; all others are mapped.
-        scenes: reconstructed together.
+        views: number of views of a scene, the query included; all others are mapped.
+        scenes: number of scenes that are reconstructed together.
     """
 
     grid: tuple[int, int]
@@ -49,9 +49,10 @@ class RunnerOptions:
     """Options of a runner.
 
     Attributes:
-        dtype: of the computation in transformer blocks; None is bfloat16 on CUDA, like the official code, else float32.
-        compile_backend: of torch.compile, for the shapes passed to `warm_up`; None compiles nothing. "inductor" fuses
-            the operations between matrix products, about a third of the time on a large GPU.
+        dtype: type of the computation in transformer blocks; None for bfloat16 on CUDA, as in the official code, else
+            float32.
+        compile_backend: backend of torch.compile, for the shapes passed to `warm_up`; None compiles nothing. "inductor"
+            fuses the operations between matrix products, about a third of the time on a large GPU.
     """
 
     dtype: torch.dtype | None = None
@@ -59,13 +60,13 @@ class RunnerOptions:
 
 
 class NetworkRunner:
-    """Runs a network. Safe to call from several threads; one thread of its own computes, in order of arrival.
+    """Runs a network. Safe to call from several threads; a thread of its own computes, in order of arrival.
 
     Attributes:
         name: one of `method.choices.NETWORKS`.
-        weights_sha256: of the checkpoint.
-        device: on which it computes.
-        dtype: of the computation in transformer blocks, and of tokens.
+        weights_sha256: hash of the checkpoint.
+        device: the device on which it computes.
+        dtype: type of the computation in transformer blocks, and of tokens.
         conditioned: whether the network takes intrinsics and poses.
         metre_sigma: see Network.
     """
@@ -78,7 +79,7 @@ class NetworkRunner:
         device: torch.device | str = "cpu",
         options: RunnerOptions | None = None,
     ) -> None:
-        """Raises UnsuitableDevice if the device lacks the kernels."""
+        """Makes a runner; raises UnsuitableDevice if the device lacks the kernels."""
         options = options or RunnerOptions()
         self.name = name
         self.weights_sha256 = weights_sha256
@@ -112,7 +113,7 @@ class NetworkRunner:
         return compiled(self.network.encode), compiled(self.network.reconstruct)
 
     def _check_kernels(self, name: str) -> None:
-        """One tiny attention now, instead of a failure in every query."""
+        """Computes one tiny attention, so that a missing kernel fails now and not in every query."""
         token = torch.ones(1, 1, 1, 64, device=self.device, dtype=self.dtype)
         try:
             Attention.attend(token, token, token)
@@ -124,7 +125,7 @@ class NetworkRunner:
         self._thread.shutdown()
 
     def warm_up(self, shapes: Sequence[CompiledShape]) -> None:
-        """Compiles and runs these shapes; all others are run uncompiled."""
+        """Compiles and runs these shapes; other shapes are run uncompiled."""
         for shape in shapes:
             self._thread.submit(self._warm_up, shape).result()
 
@@ -152,14 +153,14 @@ class NetworkRunner:
         posed: Tensor | None = None,
         metric: Tensor | None = None,
     ) -> NetworkOutput:
-        """Poses of all views of each scene, and maps of the first ``mapped`` ones.
+        """Computes poses of all views of each scene, and maps of the first ``mapped`` ones.
 
         Args:
             tokens: (B, N, T, C) from `encode`.
             grid: rows and columns of patches.
             mapped: M; see Network.reconstruct.
-            poses: (B, N, 4, 4) world_from_camera, for a conditioned network; see its `conditions` for what it makes of
-                the unit and of views without a pose.
+            poses: (B, N, 4, 4) world_from_camera, for a conditioned network, whose `conditions` says how it treats the
+                unit and views without a pose.
             posed: (B, N) bool on the CPU, whether a view has a pose.
             metric: (B, N) bool on the CPU, whether its unit is the metre; None if all are.
 
@@ -214,7 +215,7 @@ class NetworkRunner:
         return NetworkOutput(*(tensor.clone() for tensor in vars(output).values()))
 
     def _conditions(self, poses: Tensor | None, posed: Tensor | None, metric: Tensor | None) -> tuple[Tensor, ...]:
-        """What the network makes of the poses, on the device; empty if they are of no use to it."""
+        """The network's conditions from the poses, on the device; empty if the poses are of no use to it."""
         if poses is None or posed is None:
             return ()
         metric = torch.ones_like(posed) if metric is None else metric
@@ -224,7 +225,7 @@ class NetworkRunner:
 
     @staticmethod
     def _shape(tokens: Tensor, grid: tuple[int, int], mapped: int, conditions: Sequence[Tensor]) -> object:
-        """What the compiled code depends on."""
+        """Everything that the compiled code depends on."""
         return ("reconstruct", grid, *tokens.shape[:2], mapped, *(it.shape for it in conditions))
 
     def _warm_up(self, shape: CompiledShape) -> None:
@@ -248,7 +249,7 @@ class NetworkRunner:
 
 
 def _keep_graphs_in_this_thread() -> None:
-    """Before torch 2.13 only the thread that imports torch's CUDA graphs first can use them."""
+    """Reserves CUDA graphs for this thread: before torch 2.13 only the thread that first imports them can use them."""
     if TorchVersion(torch.__version__) < "2.13" and torch.cuda.is_available():
         from torch._inductor.cudagraph_trees import local
 

@@ -1,4 +1,4 @@
-"""The conditions of MapAnything: what is given of some views besides their images, as features added to their patches.
+"""The conditions of MapAnything: what is known of some views besides images, as features added to patches.
 
 Rays, depths and poses may each be given for any subset of the views. Rays and depths concern one view alone; poses are
 relative to view 0, and their translations are divided by a common length, which is given apart, if it is metric.
@@ -49,7 +49,7 @@ class RelativePoses:
     Attributes:
         quaternions: (B, N, 4) x, y, z, w; the identity where unknown.
         translations: (B, N, 3) divided by `scale`; 0 where unknown.
-        scale: (B,) mean distance of the posed views from view 0, of those that are not at its place.
+        scale: (B,) mean distance from view 0 of the posed views that are at another place.
     """
 
     quaternions: Tensor
@@ -67,12 +67,12 @@ def pinhole_rays(intrinsics: Tensor, height_px: int, width_px: int) -> Tensor:
 
 
 def _focal_and_principal(intrinsics: Tensor) -> tuple[Tensor, Tensor]:
-    """Both (V, 2), x and y."""
+    """Focal lengths and principal points, (V, 2) each, x and y."""
     return intrinsics[:, :2, :2].diagonal(dim1=1, dim2=2), intrinsics[:, :2, 2]
 
 
 def normalize_depths(depths: Tensor) -> tuple[Tensor, Tensor]:
-    """log(1 + depth / s), holes staying 0, of depths (V, H, W); and s (V,), each view's mean of those above 0."""
+    """Returns log(1 + depth / s) of depths (V, H, W), with holes 0; and s (V,), the mean depth above 0 of each view."""
     known = depths > 0
     total = torch.where(known, depths, 0.0).sum((1, 2))
     scale = (total / known.sum((1, 2)).clamp_min(1)).clamp_min(MIN_LENGTH)
@@ -117,17 +117,17 @@ def rotations_from_quaternions(quaternions: Tensor) -> Tensor:
 
 
 def multiply_quaternions(left: Tensor, right: Tensor) -> Tensor:
-    """Hamilton's product (..., 4), x, y, z, w."""
+    """Hamilton product (..., 4), x, y, z, w."""
     a, b = left[..., 3:], right[..., 3:]
     vector = a * right[..., :3] + b * left[..., :3] + torch.linalg.cross(left[..., :3], right[..., :3])
     return torch.cat([vector, a * b - (left[..., :3] * right[..., :3]).sum(-1, keepdim=True)], dim=-1)
 
 
 def relative_poses(quaternions: Tensor, translations: Tensor, posed: Tensor) -> RelativePoses:
-    """Poses relative to view 0, which must have one.
+    """Computes poses relative to view 0, which must have a pose.
 
-    Subtract large origins before, in double precision. Views at exactly the place of view 0, itself included, do not
-    count for the scale.
+    Large origins should be subtracted before, in double precision. Views at exactly the place of view 0, itself
+    included, do not count for the scale.
 
     Args:
         quaternions: (B, N, 4) x, y, z, w, world_from_camera; their sign is kept.
@@ -147,7 +147,7 @@ def relative_poses(quaternions: Tensor, translations: Tensor, posed: Tensor) -> 
 
 
 class MapEncoder(nn.Module):
-    """A vector for each patch from values for each pixel, by convolutions over patches."""
+    """Computes a vector for each patch from values for each pixel, by convolutions over patches."""
 
     def __init__(self, channels: int, widths: Sequence[int], width_out: int) -> None:
         super().__init__()
@@ -178,7 +178,7 @@ class ResidualPatches(nn.Module):
 
 
 class VectorEncoder(nn.Module):
-    """A vector for a whole view from a few numbers."""
+    """Computes a vector for a whole view from a few numbers."""
 
     def __init__(self, width_in: int, widths: Sequence[int], width_out: int) -> None:
         super().__init__()

@@ -25,11 +25,11 @@ Outcome: TypeAlias = "Reconstruction | DeviceReconstruction | Rejection"
 
 @dataclass(frozen=True)
 class Bucket:
-    """The shape of a query's input: queries of one bucket may be reconstructed together. As text, a short name of it.
+    """The shape of a query's input: queries of one bucket may be reconstructed together. `str` gives its short name.
 
     Attributes:
-        backend: its name.
-        reference_count: of each query.
+        backend: name of the backend.
+        reference_count: number of references of each query.
         grid: rows and columns of the pictures' patches; None for a backend without pictures.
     """
 
@@ -48,7 +48,7 @@ class Request:
 
     Attributes:
         query: the photograph to localize.
-        references: with known poses.
+        references: photographs with known poses.
         correspondences: between all views; networks use the images alone and need none.
         priors: on the query's pose, in the world of the references; networks ignore them.
         is_metric: whether the unit of the references' poses is the metre.
@@ -75,22 +75,22 @@ class Reconstructor(Protocol):
 
     @property
     def name(self) -> str:
-        """See the class."""
+        """Name of the backend."""
         ...
 
     @property
     def weights_sha256(self) -> str:
-        """See the class."""
+        """SHA-256 of the network's weights; empty without any."""
         ...
 
     @property
     def uses_correspondences(self) -> bool:
-        """See the class."""
+        """Whether the result depends on the correspondences."""
         ...
 
     @property
     def is_batched(self) -> bool:
-        """See the class."""
+        """Whether queries are reconstructed together."""
         ...
 
     def close(self) -> None:
@@ -98,7 +98,7 @@ class Reconstructor(Protocol):
         ...
 
     def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
-        """The bucket of a query, which has one reference at least.
+        """Returns the bucket of a query, which has at least one reference.
 
         Raises:
             ValueError: a view lacks input of the backend.
@@ -125,7 +125,7 @@ def reconstruct_one(
     correspondences: Correspondences | None = None,
     priors: Priors = NO_PRIORS,
 ) -> Outcome:
-    """The outcome of a single request; raises the exception that it had."""
+    """Reconstructs a single request; raises its exception, if it has one."""
     (outcome,) = reconstructor.reconstruct_many([Request(query, references, correspondences, priors)])
     if isinstance(outcome, Exception):
         raise outcome

@@ -21,7 +21,7 @@ class DeviceReconstruction:
 
     Attributes:
         reference_cameras: K pinholes, in pixels of the maps; see ReconstructedView.camera.
-        query_camera: the same of the query.
+        query_camera: the same for the query.
         point_maps: (K, H, W, 3) float32, of the references alone: the point at each pixel, in that camera's frame.
         confidence: (K, H, W) float32, 0 to 1; 0 where the point is unknown.
         local_from_camera: (K + 1, 4, 4) float32, of the references in order, then of the query.
@@ -48,12 +48,12 @@ class DeviceReconstruction:
             raise ValueError(f"cameras are not of the maps' size {tuple(size)}")
 
     def broken_pixels(self) -> Tensor:
-        """Number (): pixels without a finite confidence, or with one above 0 and without a finite point."""
+        """Counts pixels without a finite confidence, or with one above 0 and no finite point; a scalar tensor."""
         point_is_finite = self.point_maps.isfinite().all(-1)
         return (~self.confidence.isfinite() | ((self.confidence > 0) & ~point_is_finite)).sum()
 
     def fetch(self) -> Reconstruction:
-        """The same on the host, in one transfer; the query's own map is NaN."""
+        """Returns the reconstruction on the host, copied in one transfer; the query's own point map is NaN."""
         parts = (self.point_maps, self.confidence, self.local_from_camera)
         flat = torch.cat([part.float().reshape(-1) for part in parts]).cpu().numpy()
         point_maps, confidence, poses = (

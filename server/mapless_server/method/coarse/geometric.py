@@ -37,11 +37,12 @@ class GeometricOptions:
     """Options of the geometric backend.
 
     Attributes:
-        structure: few iterations, since the structure stage follows.
-        pnp: of the query's pose.
+        structure: options of the triangulation, with few iterations, since the structure stage follows.
+        pnp: options of the query's pose.
         gate: a pose is rejected if chance could have produced its inliers.
-        min_baseline_m: least distance of the farthest reference from the mean of all; below, nothing is triangulated.
-        cell_px: side of a cell of the point maps, pixels of the view. Small enough that two keypoints seldom share one.
+        min_baseline_m: least distance of the farthest reference from the mean of all; below it, nothing is
+            triangulated.
+        cell_px: side of a cell of the point maps, pixels of the view; so small that two keypoints seldom share a cell.
     """
 
     structure: StructureOptions = field(default_factory=lambda: StructureOptions(iterations=3))
@@ -73,7 +74,7 @@ class GeometricReconstructor:
         return Bucket(self.name, len(references))
 
     def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
-        """See Reconstructor.reconstruct_many; one after the other."""
+        """See Reconstructor.reconstruct_many; requests are computed one after the other."""
         return [self._attempt(request) for request in requests]
 
     def _attempt(self, request: Request) -> Outcome | Exception:
@@ -124,7 +125,7 @@ class GeometricReconstructor:
     def _judge(
         self, query: View, structure: Structure, matches: PointMatches, pose: RigidTransform | None, priors: Priors
     ) -> tuple[Rejection | None, NDArray[np.bool_]]:
-        """A rejection of the pose, if any, and which of the matches (M,) are its inliers."""
+        """Returns the reason to reject the pose, if any, and which of the matches (M,) are its inliers."""
         inlier_px = self.options.pnp.inlier_px
         if pose is None:
             message = f"the photograph matches {len(matches)} of {len(structure.x_in_world)} points of the references"
@@ -172,7 +173,7 @@ class GeometricReconstructor:
         query_points: Array,
         query_pixels: Array,
     ) -> Reconstruction:
-        """Point maps in a local frame: that of the first reference, in which the median point is one unit away."""
+        """Makes point maps in the frame of the first reference, scaled so that the median point is one unit away."""
         local_from_world = _unit_frame(references[0].world_from_camera, structure.x_in_world)
         tracks = structure.tracks
         views = []

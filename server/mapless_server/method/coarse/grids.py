@@ -36,12 +36,12 @@ class Grid:
 
     @property
     def width_px(self) -> int:
-        """Of the picture."""
+        """Width of the picture, pixels."""
         return self.columns * PATCH_PX
 
     @property
     def height_px(self) -> int:
-        """Of the picture."""
+        """Height of the picture, pixels."""
         return self.rows * PATCH_PX
 
     @property
@@ -55,9 +55,9 @@ class GridOptions:
     """Options of the pictures.
 
     Attributes:
-        pixel_limit: of a picture. 518x392 for 4:3 has a fifth fewer patches than the official loader's 574x434, and
-            attention over all views is quadratic in them; both lie in the range that the networks were trained on,
-            100 000 to 255 000 pixels.
+        pixel_limit: largest number of pixels of a picture. 518x392 for 4:3 has a fifth fewer patches than the official
+            loader's 574x434, and attention over all views is quadratic in them; both lie in the range that the networks
+            were trained on, 100 000 to 255 000 pixels.
         aspects: width to height, over the range that the networks were trained on. The aspect of a photograph within
             that range differs from its nearest grid's by at most 15 %.
         max_stretch: a photograph whose aspect is the grid's within this factor is resized along each axis separately,
@@ -85,12 +85,12 @@ class GridOptions:
 
     @cached_property
     def grids(self) -> tuple[Grid, ...]:
-        """One for each aspect."""
+        """Returns one grid for each aspect."""
         return tuple(fitted_grid(width, height, self.pixel_limit) for width, height in self.aspects)
 
 
 def fitted_grid(width_px: float, height_px: float, pixel_limit: int) -> Grid:
-    """The official loader's size for an image: its aspect as nearly as patches allow, and at most so many pixels."""
+    """Size that the official loader gives an image: its aspect as nearly as patches allow, within `pixel_limit`."""
     scale = math.sqrt(pixel_limit / (width_px * height_px))
     columns, rows = round(width_px * scale / PATCH_PX), round(height_px * scale / PATCH_PX)
     while columns * rows * PATCH_PX**2 > pixel_limit:
@@ -102,14 +102,14 @@ def fitted_grid(width_px: float, height_px: float, pixel_limit: int) -> Grid:
 
 
 def natural_grid(camera: Camera, options: GridOptions) -> Grid:
-    """The grid whose aspect is the nearest to a photograph's, by ratio; the first of equals."""
+    """Returns the grid whose aspect is nearest to a photograph's, by ratio; the first of equally near ones."""
     ideal = ideal_camera(camera, options)
     aspect = ideal.width_px / ideal.height_px
     return min(options.grids, key=lambda grid: abs(math.log(grid.aspect / aspect)))
 
 
 def common_grid(cameras: Sequence[Camera], options: GridOptions) -> Grid:
-    """The natural grid of most photographs; of equally frequent ones that of the first photograph."""
+    """Returns the natural grid of most photographs; of equally frequent ones that of the first photograph."""
     return Counter(natural_grid(camera, options) for camera in cameras).most_common(1)[0][0]
 
 
@@ -142,7 +142,7 @@ def _distortion_matters(camera: Camera, options: GridOptions) -> bool:
 
 
 def _field(camera: Camera, options: GridOptions) -> tuple[float, float, float, float]:
-    """Left, top, right and bottom at depth 1 of the largest upright field whose sides lie inside the photograph's."""
+    """Left, top, right and bottom, at depth 1, of the largest upright rectangle within the field of view."""
     size = np.array([camera.width_px, camera.height_px])
     limit = math.tan(math.radians(options.max_half_field_deg))
     along = np.linspace(0, 1, 33)
@@ -163,7 +163,7 @@ def _field(camera: Camera, options: GridOptions) -> tuple[float, float, float, f
 
 
 def _lattice(width_px: int, height_px: int, count: int) -> Array:
-    """Pixels (count, count, 2) from edge to edge of an image."""
+    """Evenly spaced pixels (count, count, 2) of an image, from edge to edge."""
     columns, rows = (np.linspace(-0.5, side - 0.5, count) for side in (width_px, height_px))
     return np.stack(np.meshgrid(columns, rows), axis=-1)
 
@@ -176,7 +176,7 @@ class Layout:
         grid: the picture's size.
         source: the photograph's camera.
         ideal: the pinhole that the photograph is undistorted to.
-        box: left, top, width and height, pixels, of the picture's part that is not filling.
+        box: left, top, width and height, pixels, of the part of the picture that shows the photograph.
         options: of the pictures.
     """
 
@@ -201,7 +201,7 @@ class Layout:
 
     @cached_property
     def undistorts(self) -> bool:
-        """Whether the lens is more than a pinhole."""
+        """Whether the lens has distortion that has to be removed."""
         return _distortion_matters(self.source, self.options)
 
     @cached_property
@@ -221,7 +221,7 @@ class Layout:
         return None if shown.all() else shown
 
     def picture(self, photograph: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The picture (3, H, W) in 0 to 1 of a photograph (H, W, 3) RGB, filled with the mean of the shown pixels.
+        """Makes the picture (3, H, W), 0 to 1, of a photograph (H, W, 3) RGB, filled with the mean of the shown pixels.
 
         Raises:
             ValueError: the photograph is not of its camera's size.
@@ -243,7 +243,7 @@ class Layout:
         return np.ascontiguousarray(picture.transpose(2, 0, 1), np.float32) / np.float32(255)
 
     def _undistorted(self, photograph: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The photograph in the ideal camera, at twice the picture's size, where resampling costs little sharpness."""
+        """Undistorts the photograph, at twice the picture's size, where resampling costs little sharpness."""
         source, ideal = self._at_twice_the_size()
         reduced = _resized(photograph, source.width_px, source.height_px)
         # Outside the photograph its edge is repeated, so that no other colour bleeds into the inside.
@@ -251,7 +251,7 @@ class Layout:
         return np.asarray(cv2.remap(reduced, columns, rows, cv2.INTER_CUBIC, None, cv2.BORDER_REPLICATE), np.uint8)
 
     def _at_twice_the_size(self) -> tuple[Camera, Camera]:
-        """Source and ideal camera, reduced by the same factor; unchanged if the picture is not smaller."""
+        """Source and ideal camera at twice the picture's size; unchanged if the photograph is not larger."""
         _, _, width, height = self.box
         scale = min(1.0, max(2 * width / self.ideal.width_px, 2 * height / self.ideal.height_px))
         source, ideal = (
@@ -275,7 +275,7 @@ def lay_out(camera: Camera, grid: Grid, options: GridOptions) -> Layout:
 
 
 def _resized(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np.uint8]:
-    """An image (H, W, 3) in another size, by the filter of the official loader; OpenCV's does not antialias.
+    """Resizes an image (H, W, 3) with the filter of the official loader; OpenCV's filters do not antialias.
 
     Images of more than four times the size are first reduced by averaging to at least twice the size: a third of the
     time for 12 megapixels, and half a grey level of difference (RMS) on photographs.
@@ -286,14 +286,14 @@ def _resized(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray
 
 @lru_cache(maxsize=8)  # 7 MB each; a robot's camera seldom changes, references are prepared once
 def _lens_map(source: Camera, ideal: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """For each pixel of the ideal image its column and row in the distorted one, at most two pixels outside."""
+    """For each pixel of the ideal image, column and row in the distorted one, at most two pixels outside of it."""
     pixels, _ = _covered(source, ideal)
     pixels = np.clip(pixels, -2, (source.width_px + 1, source.height_px + 1)).astype(np.float32)
     return np.ascontiguousarray(pixels[..., 0]), np.ascontiguousarray(pixels[..., 1])
 
 
 def _covered(source: Camera, ideal: Camera) -> tuple[Array, NDArray[np.bool_]]:
-    """For each pixel of the ideal image its pixel (H, W, 2) in the distorted one, and whether (H, W) it is inside."""
+    """For each pixel of the ideal image, its pixel (H, W, 2) in the distorted one, and whether (H, W) it is inside."""
     rows, columns = np.indices((ideal.height_px, ideal.width_px))
     pixels = source.project(ideal.rays(np.stack([columns, rows], axis=-1)))
     inside = ((pixels >= -0.5) & (pixels <= (source.width_px - 0.5, source.height_px - 0.5))).all(axis=-1)
@@ -301,7 +301,7 @@ def _covered(source: Camera, ideal: Camera) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def _unfolded(pixels: Array) -> NDArray[np.bool_]:
-    """Where a lens map (H, W, 2) keeps orientation; beyond, a polynomial repeats the image, mirrored."""
+    """Where a lens map (H, W, 2) keeps orientation; beyond, a polynomial shows the image again, mirrored."""
     if min(pixels.shape[:2]) < 2:
         return np.ones(pixels.shape[:2], bool)
     (x_down, x_right), (y_down, y_right) = (np.gradient(pixels[..., i]) for i in (0, 1))

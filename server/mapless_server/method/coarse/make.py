@@ -34,7 +34,7 @@ def make_reconstructor(
     query_rays: bool = True,
     answers_queries: bool = True,
 ) -> Reconstructor:
-    """The backend that a setting names.
+    """Makes the backend that a setting names.
 
     `auto` is a network if its weights are in the folder and there is a CUDA device, on which a query takes a fraction
     of a second and not minutes as on a CPU; otherwise it is `geometric`, and the reason is logged.
@@ -52,7 +52,7 @@ def make_reconstructor(
     Raises:
         ValueError: unknown name.
         WeightsMissing: the network's weights are not in the folder; the message names the command that fetches them.
-        CheckpointError: they do not fit.
+        CheckpointError: the weights do not fit the network.
         ImportError: a package that networks need is not installed.
     """
     if backend not in (AUTO, *BACKENDS):

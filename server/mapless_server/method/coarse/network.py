@@ -76,12 +76,12 @@ class NetworkReconstructor:
 
     @property
     def name(self) -> str:
-        """Of the network."""
+        """Name of the network."""
         return self._runner.name
 
     @property
     def weights_sha256(self) -> str:
-        """Of the network."""
+        """SHA-256 of the network's weights."""
         return self._runner.weights_sha256
 
     def close(self) -> None:
@@ -94,13 +94,13 @@ class NetworkReconstructor:
         return Bucket(self.name, len(references), (grid.rows, grid.columns))
 
     def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
-        """See Reconstructor.reconstruct_many: together those that have the same grid and number of references.
+        """See Reconstructor.reconstruct_many: requests of the same grid and number of references are computed together.
 
         Each view is encoded once, also if several requests use it. If the device's memory does not suffice, cached
         tokens are moved from the device, and the failed computation is tried once more.
 
         Returns:
-            The outcomes, among them the exceptions:
+            The outcomes; an outcome can be one of these exceptions:
             ValueError: a view has no photograph.
             torch.OutOfMemoryError: the memory does not suffice for this query alone.
             RequestError: a reference's photograph cannot be read any more.
@@ -139,7 +139,7 @@ class NetworkReconstructor:
         return [outcome for outcome in outcomes if outcome is not None]
 
     def _with_room(self, work: Callable[[], T]) -> T:
-        """Calls `work`, a second time with the cache's device memory released if the memory did not suffice."""
+        """Calls `work`; if the memory does not suffice, releases the cache's device memory and calls it again."""
         try:
             return work()
         except torch.OutOfMemoryError as error:
@@ -151,7 +151,7 @@ class NetworkReconstructor:
         return work()
 
     def _run(self, scenes: Sequence[_EncodedScene]) -> list[Outcome]:
-        """Outcomes of scenes of one grid and number of views."""
+        """Reconstructs scenes that have the same grid and number of views."""
         grid, references = scenes[0].scene.grid, scenes[0].scene.references
         poses = posed = metric = None
         if self._runner.conditioned:
@@ -166,7 +166,7 @@ class NetworkReconstructor:
         return [self._outcome(it.scene, output, index) for index, it in enumerate(scenes)]
 
     def _encode(self, scene: _Scene, encoded: dict[TokenKey, Tensor]) -> tuple[Tensor, ...]:
-        """Tokens (T, C) of each of a scene's views.
+        """Returns the tokens (T, C) of each of a scene's views.
 
         Views that are not in `encoded` are added to it. Tokens of references are looked up in the cache first;
         photographs are read only if they are not there.
@@ -180,7 +180,7 @@ class NetworkReconstructor:
         return tuple(encoded[key] for key in keys)
 
     def _encode_reference(self, key: TokenKey, view: _LaidOut) -> Tensor:
-        """Tokens (T, C), cached for later queries."""
+        """Computes the tokens (T, C) of a reference and caches them for later queries."""
         tokens = self.cache.get(key)
         if tokens is None:
             tokens = self._encode_view(view)
@@ -188,7 +188,7 @@ class NetworkReconstructor:
         return tokens
 
     def _encode_view(self, view: _LaidOut) -> Tensor:
-        """Tokens (T, C)."""
+        """Computes the tokens (T, C) of a view."""
         picture = torch.from_numpy(view.layout.picture(view.photograph.read()))
         intrinsics = None
         if self._runner.conditioned and view.given_rays:
@@ -227,9 +227,9 @@ class NetworkReconstructor:
 
 @dataclass(frozen=True, eq=False)
 class _LaidOut:
-    """A view's photograph, and its layout on the scene's grid.
+    """A view's photograph and its layout on the scene's grid.
 
-    `given_rays` is whether the network gets its intrinsics, if it takes any.
+    `given_rays` is whether the view's intrinsics are given to a network that takes intrinsics.
     """
 
     photograph: Photograph
@@ -239,7 +239,7 @@ class _LaidOut:
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """One request: its grid, its references and all its views, the query's last; and whether its unit is the metre."""
+    """One request: grid, references, all views with the query last, and whether the unit is the metre."""
 
     grid: Grid
     references: Sequence[PosedView]
@@ -248,7 +248,7 @@ class _Scene:
 
     @classmethod
     def of(cls, request: Request, options: NetworkOptions) -> _Scene:
-        """ValueError if a view has no photograph."""
+        """Makes the scene of a request; raises ValueError if a view has no photograph."""
         references = [_photograph(reference.view, reference.name) for reference in request.references]
         query = _photograph(request.query, "the query")
         grid = common_grid([photograph.camera for photograph in references], options.grids)
@@ -284,7 +284,7 @@ def _without_filling(confidence: Tensor, layouts: Sequence[Layout]) -> Tensor:
 
 
 def _on_device(tensor: Tensor, device: torch.device) -> Tensor:
-    """The tensor on the device; copied from pinned memory, so that the host does not wait."""
+    """Moves a tensor to the device; copies from pinned memory, so that the host does not wait."""
     return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor
 
 
@@ -293,7 +293,8 @@ def condition_poses(world_from_references: Sequence[RigidTransform]) -> Array:
 
     Pi3X normalizes by the mean distance of all views from the first, whether their poses are used or not. The
     placeholder is at the mean distance of the other references, so that it does not change that mean; its direction is
-    arbitrary, since nothing else is computed from it. With a single reference, whose pose is not used, it is there.
+    arbitrary, since nothing else is computed from it. With a single reference, whose pose is not used, the placeholder
+    is the identity.
 
     Args:
         world_from_references: (K,), one at least.

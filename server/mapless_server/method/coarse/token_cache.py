@@ -1,4 +1,4 @@
-"""Cache of references' tokens, which a network computes from one view alone, so that they are the same in every call.
+"""Cache of references' tokens, which a network computes from one view alone, so they are the same in every call.
 
 Tokens are kept on the device, and in the host's memory if the device has no room. The key holds everything that they
 depend on, so an entry is never stale.
@@ -28,7 +28,7 @@ class TokenKey:
         image_sha256: of the encoded photograph.
         source: the photograph's camera, from which its undistortion follows.
         grid: size of the picture.
-        camera: of the picture; a conditioned network takes it. None if it is not given.
+        camera: the picture's camera, for a network that takes intrinsics; None if it is not given to the network.
     """
 
     network: str
@@ -85,12 +85,12 @@ class TokenCache:
 
     @property
     def counters(self) -> TokenCacheCounters:
-        """A snapshot."""
+        """Returns a snapshot of the counters."""
         with self._lock:
             return replace(self._counters, device_bytes=self._on_device.used_bytes, host_bytes=self._on_host.used_bytes)
 
     def get(self, key: TokenKey) -> Tensor | None:
-        """The tokens (T, C) on the device, or None; they must not be modified."""
+        """Returns the tokens (T, C) on the device, or None if they are not cached; they must not be modified."""
         with self._lock:
             tokens = self._on_device.get(key)
             if tokens is not None:
@@ -106,7 +106,7 @@ class TokenCache:
             return tokens
 
     def put(self, key: TokenKey, tokens: Tensor) -> None:
-        """Stores a copy of tokens (T, C) on the device: a part of a batch would keep the whole batch in memory."""
+        """Stores a copy of tokens (T, C) on the device; a view of a batch would keep the whole batch in memory."""
         with self._lock:
             self._hold(key, tokens.clone())
 

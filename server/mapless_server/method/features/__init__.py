@@ -41,28 +41,28 @@ class FeatureExtractor(Protocol):
 
     @property
     def name(self) -> str:
-        """See the class."""
+        """Identifies the extractor and everything that changes its output."""
         ...
 
     def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
-        """The view of a photograph.
+        """Finds the features of a photograph.
 
         Args:
             image: (H, W, 3) uint8, RGB, as stored in the file.
-            camera: its camera, of the same size.
+            camera: the photograph's camera, of the same size.
 
         Returns:
-            The view, possibly without keypoints (a blank wall).
+            The view of the photograph, possibly without keypoints (of a blank wall).
         """
         ...
 
 
 def make_extractor(name: str, weights: Path | None = None, device: str = "cpu") -> FeatureExtractor:
-    """The extractor of a kind of features.
+    """Makes the extractor of a kind of features.
 
     Args:
         name: one of `FEATURES`.
-        weights: the file of its network; `sift` has none.
+        weights: the file of the network's weights; None for `sift`.
         device: "cpu" or a CUDA device, for networks.
 
     Raises:

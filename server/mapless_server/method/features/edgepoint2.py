@@ -43,7 +43,7 @@ class EdgePoint2Extractor:
         variant: "s64", "m64", "l64" or "e64".
         weights: safetensors file, the names of the authors' checkpoint.
         device: "cpu" or a CUDA device.
-        options: see there.
+        options: the defaults, with the authors' threshold, if None.
 
     Raises:
         CheckpointError: the weights do not fit.
@@ -83,7 +83,7 @@ def _logit(score: float) -> float:
 
 
 def _sampled(feature_map: torch.Tensor, keypoints: torch.Tensor) -> torch.Tensor:
-    """(N, D) of a map (1, D, H, W) between its pixels, which lie side by side from the image's corner on."""
+    """Samples a map (1, D, H, W) at keypoints, (N, D); the map's pixels lie side by side from the image's corner on."""
     height, width = feature_map.shape[2:]
     size_px = DESCRIPTOR_STEP_PX * keypoints.new_tensor([width, height])
     places = (2 * keypoints + 1) / size_px - 1  # -1 and 1 are the outer edges of the outermost pixels

@@ -1,4 +1,4 @@
-"""Common to all extractors: reduction of the image, and undistortion of keypoints to an ideal pinhole camera."""
+"""What all extractors share: reducing the image, and undistorting keypoints to an ideal pinhole camera."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from ..views import Features, View, rounded_descriptors
 def reduce_image(
     image: NDArray[np.uint8], camera: Camera, max_side_px: int, multiple_px: int = 1
 ) -> tuple[NDArray[np.uint8], Camera]:
-    """The image, its longer side at most `max_side_px`, and its camera.
+    """Reduces an image so that its longer side is at most `max_side_px`; returns it and its camera.
 
     Args:
         image: (H, W) or (H, W, 3).
-        camera: of the same size.
-        max_side_px: of the result, a multiple of `multiple_px`.
+        camera: the image's camera, of the same size.
+        max_side_px: longest side of the result, a multiple of `multiple_px`.
         multiple_px: both sides of the result are multiples of it, the nearest ones that keep the aspect; the image may
             grow for that by less than one multiple.
     """
@@ -37,7 +37,7 @@ MAX_INCIDENCE_DEG = 80.0
 
 
 def undistort_pixels(pixels: Array, camera: Camera) -> Array:
-    """Pixels (N, 2) of the ideal pinhole camera with the same K; NaN where the lens model has no inverse."""
+    """Undistorts pixels (N, 2) to the ideal pinhole camera with the same K; NaN where the lens model has no inverse."""
     if camera.distortion is None:
         return pixels
     d, k = camera.distortion, camera.matrix()
@@ -75,9 +75,9 @@ def view_of(
     descriptors: NDArray[np.float32] | NDArray[np.uint8],
     sizes_px: NDArray[np.float32],
 ) -> View:
-    """The view of keypoints found in an image: undistorted, without those that have no undistorted pixel.
+    """Makes the view of keypoints found in an image: undistorted, without those that have no undistorted pixel.
 
-    Descriptors are rounded to 8 bits: so are those of stored references, and a query has the same as they.
+    Descriptors are rounded to 8 bits, for queries as for stored references.
 
     Args:
         camera: of the image, with its lens distortion.

@@ -1,4 +1,4 @@
-"""Common to the learned extractors."""
+"""What the learned extractors share: their options, and maxima of score maps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class LearnedOptions:
 
     Attributes:
         max_keypoints: the strongest are kept; matching is quadratic in it.
-        max_side_px: longer images are reduced to it; the size of the networks' training and publication.
+        max_side_px: longer images are reduced to it; the size that the networks were trained and published with.
         min_score: weaker keypoints are dropped; the extractor's docstring gives the range of its scores.
     """
 
@@ -37,24 +37,24 @@ class LearnedOptions:
 
 
 def image_tensor(image: NDArray[np.uint8], device: torch.device) -> torch.Tensor:
-    """(1, C, H, W) float32 in 0 to 1 of an image (H, W) or (H, W, 3)."""
+    """Converts an image (H, W) or (H, W, 3) to a tensor (1, C, H, W), float32 in 0 to 1."""
     pixels = image[..., None] if image.ndim == 2 else image
     # Transferred as bytes, a quarter of the size of floats.
     return torch.from_numpy(np.ascontiguousarray(pixels)).to(device).permute(2, 0, 1)[None].float() / 255
 
 
 def array_of(tensor: torch.Tensor) -> NDArray[np.float32]:
-    """The tensor as float32 on the host."""
+    """Copies a tensor to the host as float32."""
     return np.asarray(tensor.float().cpu().numpy(), np.float32)
 
 
 def strict_maxima(scores: torch.Tensor, window_px: int, threshold: float) -> torch.Tensor:
-    """Pixels (N, 2), x and y, above the threshold and above all others of their window, which lies in the image.
+    """Finds pixels (N, 2), x and y, above the threshold and above all others of their window, which lies in the image.
 
     Args:
-        scores: (H, W).
-        window_px: odd.
-        threshold: see above.
+        scores: (H, W) map of scores.
+        window_px: side of the window, odd.
+        threshold: scores must be above it.
     """
     margin = window_px // 2
     if min(scores.shape) < window_px:
@@ -73,17 +73,17 @@ def strict_maxima(scores: torch.Tensor, window_px: int, threshold: float) -> tor
 
 
 def peak_offsets(heights: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
-    """From strict maxima (N, 2) to the peak of the parabolas through their neighbours, (N, 2), at most half a pixel.
+    """Offsets (N, 2) from strict maxima to the peaks of parabolas through their neighbours, at most half a pixel.
 
     Args:
-        heights: (H, W).
-        pixels: x and y, not at the border.
+        heights: (H, W) map, for example of scores or logits.
+        pixels: (N, 2) maxima, x and y, not at the border.
     """
     return peaks(heights, pixels)[0]
 
 
 def peaks(heights: torch.Tensor, pixels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """As `peak_offsets`, and the second derivatives (N, 2) of the parabolas, negative."""
+    """Returns the result of `peak_offsets`, and the second derivatives (N, 2) of the parabolas, which are negative."""
     x, y = pixels.unbind(1)
     here = heights[y, x]
     left, right, above, below = heights[y, x - 1], heights[y, x + 1], heights[y - 1, x], heights[y + 1, x]

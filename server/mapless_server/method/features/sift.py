@@ -1,4 +1,4 @@
-"""SIFT: no weights, no torch; the default where there are no weights."""
+"""SIFT features: no weights, no torch; the default where there are no weights."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ class SiftOptions:
 
 @dataclass(frozen=True)
 class SiftExtractor:
-    """SIFT (Lowe 2004) by OpenCV with the histograms of its descriptors, see `Features`."""
+    """SIFT (Lowe 2004) by OpenCV; its descriptors are stored as histograms, see `Features`."""
 
     options: SiftOptions = field(default_factory=SiftOptions)
 
     @property
     def name(self) -> str:
-        """E.g. "sift-2048-1024px-0.02"."""
+        """Name of the extractor with its options, "sift-2048-1024px-0.02"."""
         options = self.options
         return f"sift-{options.max_keypoints}-{options.max_side_px}px-{options.contrast_threshold:g}"
 

@@ -1,1 +1,1 @@
-"""Photographs posed together: a `rig` of cameras at one moment, a `sequence` along a walk."""
+"""Photographs posed together: a `rig` of cameras at one moment, or a `sequence` along a walk."""

@@ -1,4 +1,4 @@
-"""Checks of a group: whether its photographs contradict a rig's mounting or a session's unit; and hints.
+"""Checks of a group: whether its photographs contradict a rig's mounting or a session's unit. Also its hints.
 
 A wrong mounting or unit still gives a pose with small radii, because the photographs that fit agree well. The evidence
 against it is the inliers that other photographs lose, and the length of the path.
@@ -35,10 +35,10 @@ SIGNIFICANT_SIGMAS = 4.0
 
 
 def check_mounting(estimate: RigEstimate, alone: Sequence[Answer]) -> RigEstimate | Rejection:
-    """Checks a rig's pose against the photographs that are localized reliably alone.
+    """Checks a rig's pose against the poses of the photographs that are localized reliably alone.
 
     Args:
-        estimate: of the rig.
+        estimate: the rig's pose.
         alone: each photograph's own answer.
 
     Returns:
@@ -62,7 +62,7 @@ def check_mounting(estimate: RigEstimate, alone: Sequence[Answer]) -> RigEstimat
 def check_unit(
     estimate: SequenceEstimate, session_from_camera: Sequence[RigidTransform]
 ) -> SequenceEstimate | Rejection:
-    """Checks the unit of a session that the request calls metric by the length of the photographs' path, without jumps.
+    """Checks the unit of a session that is said to be metric, by the length of the photographs' path without jumps.
 
     Returns:
         The estimate; or a rejection SCALE_UNRELIABLE with the estimated unit, if the two lengths differ significantly.
@@ -89,7 +89,6 @@ def check_unit(
 
 
 def _distance(first: RigidTransform, second: RigidTransform) -> float:
-    """Between two positions."""
     return math.dist(first.translation, second.translation)
 
 
@@ -100,12 +99,12 @@ STAGE = "join"
 def hinted_group(
     rejection: Rejection, images: Sequence[tuple[Answer, Sequence[PosedView]]], options: HintOptions | None = None
 ) -> Rejection:
-    """The rejection of a group, with a hint if it has none yet.
+    """Adds a hint to the rejection of a group, if it has none yet.
 
     Args:
-        rejection: of all together.
+        rejection: the group's rejection.
         images: each photograph's own answer, and the references that were used, in the order of its counts.
-        options: of the hints.
+        options: options of the hints.
     """
     if rejection.hint is not None:
         return rejection
@@ -115,7 +114,7 @@ def hinted_group(
 
 
 def _best(images: Sequence[tuple[Answer, Sequence[PosedView]]]) -> tuple[int, str | None]:
-    """The most matches that a reference has with any of the photographs, and its name; None if none has any."""
+    """Returns the most matches of a reference with any of the photographs, and its name; None if there are none."""
     counted = [
         (count, reference.name)
         for answer, references in images

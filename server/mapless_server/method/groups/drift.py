@@ -29,16 +29,17 @@ _MEDIAN_SQUARE = 5.35
 
 @dataclass(frozen=True)
 class DriftOptions:
-    """Noise of the steps of a session: standard deviations of each axis.
+    """Noise of the steps of a session, as standard deviations of each axis.
 
     Attributes:
-        share: of the distance travelled. Visual-inertial tracking of phones and headsets drifts by about 1 %; this is
-            2 %, all axes together. With twice as much, jumps of 0.3 m are not found in steps of 5 m.
-        floor_m: added, also standing still.
-        deg_per_m: of direction, for a metre travelled.
-        turn_share: of direction, of the angle turned.
-        floor_deg: added, also standing still.
-        loss_scale: of the switched loss, in standard deviations of a step of six numbers.
+        share: noise of the position, as a share of the distance travelled. Visual-inertial tracking of phones and
+            headsets drifts by about 1 %; this is 2 %, all axes together. With twice as much, jumps of 0.3 m are not
+            found in steps of 5 m.
+        floor_m: noise of the position that is added, also without motion.
+        deg_per_m: noise of the direction per metre travelled.
+        turn_share: noise of the direction, as a share of the angle turned.
+        floor_deg: noise of the direction that is added, also without motion.
+        loss_scale: scale of the switched loss, in standard deviations of a step of six numbers.
     """
 
     share: float = 0.012
@@ -53,7 +54,7 @@ class DriftOptions:
         check_bounds(self, "deg_per_m turn_share", at_least=0)
 
     def sigma(self, step: RigidTransform) -> Array:
-        """(6,) of a metric step: metres, then radians."""
+        """Standard deviations (6,) of a metric step: metres, then radians."""
         length_m = float(np.linalg.norm(step.translation))
         turn_deg = math.degrees(float(np.linalg.norm(rotation_vector(step.rotation))))
         angle = math.radians(self.floor_deg + self.deg_per_m * length_m + self.turn_share * turn_deg)
@@ -62,7 +63,7 @@ class DriftOptions:
 
 @dataclass(frozen=True, eq=False)
 class SequenceState:
-    """The poses of a sequence, with a cost on the difference of its steps from the session's; see `problem.GroupState`.
+    """The poses of a sequence; its cost is the difference of its steps from the session's. See `problem.GroupState`.
 
     The parameters are left perturbations (v, w) of every frame's camera_from_world, in order, and, if the unit of the
     session is unknown, the logarithm of the scale.
@@ -72,7 +73,7 @@ class SequenceState:
         steps: from each frame to the next as the session has them: camera i from camera i + 1, in its unit.
         scale: metres per unit of the session.
         scale_is_free: whether it is estimated.
-        sigma: (F - 1, 6) of the steps; infinite for those that are cut.
+        sigma: (F - 1, 6) standard deviations of the steps; infinite for steps that are cut.
         options: noise of the steps.
     """
 
@@ -92,7 +93,7 @@ class SequenceState:
         options: DriftOptions,
         cut: Collection[int] = (),
     ) -> SequenceState:
-        """Frames at these poses, in a session, without the steps `cut`; step i is from frame i to frame i + 1."""
+        """Makes the state of frames at these poses, without the steps `cut`; step i is from frame i to frame i + 1."""
         neighbours = itertools.pairwise(session_from_camera)
         steps = tuple(first.inverse().compose(second) for first, second in neighbours)
         metric = (replace(step, translation=scale * step.translation) for step in steps)
@@ -124,9 +125,9 @@ class SequenceState:
         return replace(self, frames=frames, scale=scale)
 
     def relaxed(self) -> SequenceState:
-        """With the noise of the steps enlarged to that observed.
+        """The same state with the noise of the steps enlarged to that observed.
 
-        The quality is that of the whole session, estimated by the median over the steps, which jumps do not affect.
+        One factor for the whole session is estimated by the median over the steps, which jumps do not affect.
         """
         kept = np.isfinite(self.sigma[:, 0])
         if not kept.any():
@@ -139,11 +140,11 @@ class SequenceState:
         return switched_cost((self.residuals() ** 2).sum(axis=1), self._loss_scale)
 
     def residuals(self) -> Array:
-        """(F - 1, 6): difference of each step from the session's, in standard deviations."""
+        """Difference (F - 1, 6) of each step from the session's, in standard deviations."""
         return np.array([self._error(i) for i in range(len(self.steps))]).reshape(-1, 6) / self.sigma
 
     def weights(self) -> Array:
-        """(F - 1,) robust weight of each step, 0 to 1."""
+        """Robust weight (F - 1,) of each step, 0 to 1."""
         return switched_weight((self.residuals() ** 2).sum(axis=1), self._loss_scale)
 
     def equations(self) -> tuple[Array, Array]:
@@ -158,21 +159,21 @@ class SequenceState:
 
     @property
     def _loss_scale(self) -> float:
-        """Of the squares of six numbers."""
+        """Scale of the loss, for the squared norm of six numbers."""
         return math.sqrt(6) * self.options.loss_scale
 
     def _step(self, i: int) -> RigidTransform:
-        """Camera i from camera i + 1, from the frames' poses."""
+        """Pose of camera i + 1 in camera i, from the frames' poses."""
         return self.frames[i].compose(self.frames[i + 1].inverse())
 
     def _error(self, i: int) -> Array:
-        """(6,): difference of the step's shift from the session's, and rotation between them, axes of camera i."""
+        """Difference (6,) of a step from the session's: shift, then rotation, in the axes of camera i."""
         step, tracked = self._step(i), self.steps[i]
         shift = step.translation - self.scale * tracked.translation
         return np.concatenate([shift, rotation_vector(step.rotation @ tracked.rotation.T)])
 
     def _jacobian_of_error(self, i: int) -> Array:
-        """(6, N), for a small turn between the steps."""
+        """Derivative (6, N) of `_error` by the parameters, if the rotation between the steps is small."""
         step, jacobian = self._step(i), np.zeros((6, self.size))
         jacobian[:3, 6 * i : 6 * i + 3] = np.eye(3)
         jacobian[:3, 6 * i + 3 : 6 * i + 6] = -cross_matrix(step.translation)
@@ -187,7 +188,7 @@ class SequenceState:
 def world_from_session_at(
     world_from_camera: RigidTransform, session_from_camera: RigidTransform, scale: float
 ) -> Similarity:
-    """The similarity that maps one frame of a session to its pose in the world."""
+    """Similarity that maps one frame of a session to its pose in the world."""
     rotation = world_from_camera.rotation @ session_from_camera.rotation.T
     translation = world_from_camera.translation - scale * rotation @ session_from_camera.translation
     return Similarity(scale, rotation, translation)

@@ -1,4 +1,4 @@
-"""Poses of several cameras as one: generalized PnP, by PoseLib.
+"""Poses of several cameras as one: generalized PnP by PoseLib.
 
 A generalized camera is a set of rays without a common centre: those of all cameras, in the frame that they are fixed
 to. Three 2D-3D matches of any of the cameras determine its pose (gp3p), four also the unit of that frame (gp4ps):
@@ -35,8 +35,8 @@ class CameraMatches:
     """One camera of a group, with its matches.
 
     Attributes:
-        camera: pinhole.
-        rig_from_camera: its mounting; metres, or units of the rig's frame.
+        camera: the pinhole camera.
+        rig_from_camera: its pose in the rig; metres, or units of the rig's frame.
         pixels: (M, 2) of the matches.
         x_in_world: (M, 3) metres.
     """
@@ -52,12 +52,12 @@ class CameraMatches:
         return reprojection_errors_px(self.camera, pose, self.x_in_world, self.pixels) < inlier_px
 
     def thinned(self, step: int) -> CameraMatches:
-        """Every `step`-th match."""
+        """Returns the camera with every `step`-th match."""
         return CameraMatches(self.camera, self.rig_from_camera, self.pixels[::step], self.x_in_world[::step])
 
 
 def camera_in_world(world_from_rig: RigidTransform | Similarity, rig_from_camera: RigidTransform) -> RigidTransform:
-    """``world_from_camera``, metric."""
+    """Metric `world_from_camera` of a camera of the rig."""
     if isinstance(world_from_rig, Similarity):
         return world_from_rig.transform_pose(rig_from_camera)
     return world_from_rig.compose(rig_from_camera)
@@ -71,7 +71,7 @@ def inlier_count(
 
 
 def rig_ransac(cameras: Sequence[CameraMatches], options: PnpOptions) -> RigidTransform | None:
-    """``world_from_rig`` by gp3p in RANSAC with a final Cauchy refinement; None without a finite pose.
+    """Estimates `world_from_rig` by gp3p in RANSAC with a final Cauchy refinement; None without a finite pose.
 
     The same matches give the same pose.
     """
@@ -98,13 +98,13 @@ def rig_ransac(cameras: Sequence[CameraMatches], options: PnpOptions) -> RigidTr
 def scaled_ransac(
     cameras: Sequence[CameraMatches], options: PnpOptions, max_iterations: int, max_matches: int
 ) -> Similarity | None:
-    """The similarity ``world_from_rig`` by gp4ps in a RANSAC of our own: PoseLib has the solver, but no estimator.
+    """Estimates the similarity `world_from_rig` by gp4ps in our own RANSAC; PoseLib has the solver, but no estimator.
 
     Args:
-        cameras: with `rig_from_camera` in a unit of its own.
-        options: of the inlier bound.
+        cameras: the cameras, with `rig_from_camera` in any common unit.
+        options: options with the bound of inliers.
         max_iterations: largest number of samples; fewer if a pose has many inliers.
-        max_matches: on which poses are scored; evenly thinned.
+        max_matches: number of matches on which poses are scored; more are thinned evenly.
 
     Returns:
         The pose with the most inliers; None if there is none. A scale that is not above zero, or not determined because
@@ -139,9 +139,9 @@ def scaled_ransac(
 
 @contextmanager
 def _repeatable() -> Iterator[None]:
-    """Makes PoseLib's generalized solvers repeatable: they rotate the problem by the C library's random numbers.
+    """Makes PoseLib's generalized solvers repeatable: they rotate the problem by random numbers of the C library.
 
-    PoseLib's seed does not apply to these: without this, the same matches give poses that differ in their last digits.
+    PoseLib's seed does not apply to these numbers: the same matches would give poses that differ in the last digits.
     """
     with _rand_lock:
         _libc.srand(0)
@@ -149,7 +149,7 @@ def _repeatable() -> Iterator[None]:
 
 
 def _iterations_needed(inlier_share: float) -> int:
-    """Samples until four of four are inliers with 99.9 %, if half of the samples are of one camera alone."""
+    """Number of samples of which one has four inliers with 99.9 %, if half of all are of a single camera."""
     good = inlier_share**4 / 2
     return 2 if good >= 1 else math.ceil(math.log(1e-3) / math.log1p(-good))
 
@@ -160,7 +160,7 @@ def _bounded(cameras: Sequence[CameraMatches], max_matches: int) -> list[CameraM
 
 
 def _rays(camera: CameraMatches) -> Array:
-    """Unit directions (M, 3) in the rig's axes."""
+    """Unit directions (M, 3) of the matches' rays in the rig's axes."""
     rays = camera.camera.rays(camera.pixels) @ camera.rig_from_camera.rotation.T
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 

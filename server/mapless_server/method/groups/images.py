@@ -57,9 +57,9 @@ class GroupImage:
     """A photograph of a group with its own answer.
 
     Attributes:
-        answer: its own; the group uses its `support`.
+        answer: the photograph's own answer; the group uses its `support`.
         match: options of the guided search.
-        priors: on its camera's pose.
+        priors: priors on its camera's pose.
     """
 
     answer: Answer
@@ -78,9 +78,9 @@ class MatchedImage:
         structure: metric points.
         tracked: matches that do not depend on a pose of the photograph.
         own_pose: world_from_camera of its own answer; None if it is rejected.
-        own_covariance: (6, 6) of it, order x y z rx ry rz, fixed world axes, metres and radians.
+        own_covariance: (6, 6) covariance of `own_pose`, order x y z rx ry rz, fixed world axes, metres and radians.
         match: see GroupImage.
-        query_matches: of the photograph with each reference.
+        query_matches: matches of the photograph with each reference.
     """
 
     image: int
@@ -94,12 +94,12 @@ class MatchedImage:
     query_matches: tuple[Matches, ...] = ()
 
     def camera_matches(self, rig_from_camera: RigidTransform) -> CameraMatches:
-        """The tracked matches as pixels and points of a camera with this mounting."""
+        """Returns the tracked matches as pixels and points of a camera with this pose in the rig."""
         pixels = self.query.features.keypoints[self.tracked.keypoint].astype(np.float64)
         return CameraMatches(self.query.camera, rig_from_camera, pixels, self.structure.x_in_world[self.tracked.point])
 
     def matches_at(self, world_from_camera: RigidTransform) -> PointMatches:
-        """The tracked matches, and those of a guided search from a pose."""
+        """Returns the tracked matches and those of a guided search from a pose."""
         found = search(self.query, self.references, self.structure, world_from_camera, self.tracked, self.match)
         return PointMatches(
             np.concatenate([self.tracked.point, found.point]),
@@ -116,7 +116,7 @@ class PosedImage:
     Attributes:
         source: the matched image.
         world_from_camera: its pose in the group.
-        matches: of the photograph with the points.
+        matches: 2D-3D matches of the photograph.
         inliers: (M,) which of the matches are inliers.
         errors_px: (M,) reprojection errors; NaN for points behind the camera.
     """
@@ -128,7 +128,7 @@ class PosedImage:
     errors_px: Array
 
     def inliers_by_reference(self) -> tuple[int, ...]:
-        """Per reference, inliers on points that it observes."""
+        """Number of inliers on points that each reference observes."""
         structure, count = self.source.structure, len(self.source.references)
         agreeing = np.zeros(len(structure.x_in_world), bool)
         agreeing[self.matches.point[self.inliers]] = True
@@ -137,7 +137,7 @@ class PosedImage:
 
 
 def matched_images_of(images: Sequence[GroupImage]) -> tuple[Array, list[MatchedImage]]:
-    """The photographs that have matches, and the origin (3,) of their common world, metres, in the caller's."""
+    """Returns the photographs that have matches, in one world, and that world's origin (3,), metres."""
     with_matches = [
         (i, image, image.answer.support)
         for i, image in enumerate(images)
@@ -170,12 +170,12 @@ def _matched_image(index: int, image: GroupImage, support: Support, origin: Arra
 
 
 def priors_of(images: Sequence[GroupImage], origin: Array) -> dict[int, Priors]:
-    """The priors on the photographs that have some, by index, in a world with this origin (3,)."""
+    """Priors of each photograph that has some, by index, in a world with this origin (3,)."""
     return {i: image.priors.shifted(-origin) for i, image in enumerate(images) if image.priors}
 
 
 def rejection_without_matches(images: Sequence[GroupImage]) -> Rejection:
-    """The rejection of a group without matches: that of the photograph that reached the latest stage."""
+    """Returns the rejection of a group without matches: that of the photograph that reached the latest stage."""
     order = list(RejectionReason)
     outcomes = [(i, image.answer.outcome) for i, image in enumerate(images)]
     rejected = [(order.index(outcome.reason), i, outcome) for i, outcome in outcomes if isinstance(outcome, Rejection)]
@@ -189,10 +189,10 @@ def rejection_without_matches(images: Sequence[GroupImage]) -> Rejection:
 
 
 def group_gate_failure(matched: Sequence[PosedImage], inlier_px: float, options: GroupGateOptions) -> str | None:
-    """Why the pose of a group fails the gate; None if it passes.
+    """Returns why the pose of a group fails the gate; None if it passes.
 
-    `gate.gate_failure` with sums over the photographs; besides, a share of the points must be found, over more than
-    one corner.
+    `gate.gate_failure` with sums over the photographs; besides, a share of the points must be found, over more than a
+    corner of the image.
     """
     inlier_total = sum(int(it.inliers.sum()) for it in matched)
     count = (
@@ -226,7 +226,7 @@ def group_log10_false_alarms(matched: Sequence[PosedImage], inlier_px: float) ->
 
 
 def _searched_area(matched: PosedImage, guided: bool) -> float:
-    """Area in which a match was searched, square pixels over pi."""
+    """Area in which a match was searched, in square pixels divided by pi."""
     if guided:
         return matched.matches.radius_px**2
     camera = matched.source.query.camera
@@ -234,7 +234,7 @@ def _searched_area(matched: PosedImage, guided: bool) -> float:
 
 
 def tracked_support(prepared: Prepared) -> Support | None:
-    """Matches of a photograph that could not be posed alone, from wide correspondences; None without any.
+    """Support of a photograph that could not be posed alone, from wide correspondences; None without matches.
 
     Without a reconstruction, the references' tracks and poses are enough to triangulate points, and the photograph's
     matches with the references lead to them through the tracks.
@@ -262,5 +262,5 @@ def tracked_support(prepared: Prepared) -> Support | None:
 
 
 def _is_of_network(answer: Answer) -> bool:
-    """Whether its points are at a network's depths, with a single reference; a group takes triangulated points only."""
+    """Whether its points have a network's depths (a single reference); a group uses triangulated points only."""
     return answer.scale is not None and answer.scale.source is ScaleSource.NETWORK

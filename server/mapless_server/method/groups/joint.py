@@ -1,4 +1,4 @@
-"""Joint adjustment of a group: the poses of its photographs, their points and the references.
+"""Joint adjustment of a group: poses of its photographs, their points, and the references.
 
 What `adjust` minimizes for one photograph, summed over those of a group,
 
@@ -36,9 +36,9 @@ class JointEstimate(Generic[S]):
 
     Attributes:
         state: the poses at the optimum.
-        covariance: (N, N) of its parameters.
-        matched: photographs with their matches, in the order of the matched images.
-        prior_checks: of the photographs with priors, by index.
+        covariance: (N, N) covariance of the state's parameters.
+        matched: the posed photographs, in the order of the matched images.
+        prior_checks: comparisons with the photographs' priors, by the photographs' index.
     """
 
     state: S
@@ -48,7 +48,7 @@ class JointEstimate(Generic[S]):
 
     @property
     def inlier_count(self) -> int:
-        """Of all photographs."""
+        """Number of inliers of all photographs."""
         return sum(int(it.inliers.sum()) for it in self.matched)
 
 
@@ -99,10 +99,10 @@ def adjust_jointly(
 
     Args:
         matched_images: the photographs that have matches.
-        matches: of each with its points; those with too large an error at the start are not used.
+        matches: 2D-3D matches of each photograph; those with a too large initial error are not used.
         state: the initial poses.
-        options: of the adjustment.
-        priors: on the photographs' poses, by index; all are used.
+        options: options of the adjustment.
+        priors: priors on the photographs' poses, by index; all are used.
 
     Returns:
         The refined poses; the initial ones if no match is used.
@@ -132,9 +132,9 @@ def _matched(
 
 
 def covariance_in_world(covariance: Array, world_from_body: RigidTransform) -> Array:
-    """Covariance (6, 6) of world_from_body, order x y z rx ry rz about fixed world axes.
+    """Covariance (6, 6) of `world_from_body`, order x y z rx ry rz about fixed world axes.
 
-    Takes that of a left perturbation (v, w) of body_from_world; see `perturbation.world_covariance`.
+    `covariance` is that of a left perturbation (v, w) of body_from_world; see `perturbation.world_covariance`.
     """
     rotate = np.kron(np.eye(2), world_from_body.rotation)
     turned = rotate @ covariance @ rotate.T

@@ -9,7 +9,7 @@ position and rotation, has a covariance from the poses' own and from the drift o
 contradicts the tracking. Either it has jumped, or one of the two poses is wrong. So a chain of poses from the first to
 the last is found that has the least cost: m^2 for each link, at most the threshold, at which it is cut; and more than
 that for each pose left out. A pose that contradicts both its neighbours, which agree with each other, is left out; any
-other contradiction is a jump. The last pose is never left out: it is answered as its own photograph says.
+other contradiction is a jump. The last pose is never left out: the answer follows its photograph.
 
 If the session's unit is unknown, the chain of least cost over the units that the pairs give is used.
 """
@@ -40,7 +40,7 @@ class Jump:
         before: index of the last photograph before it.
         after: index of the first one after it. Photographs between them have too few matches: it is not known at which
             of these the tracking has jumped, and their poses may be on the wrong side of it.
-        shift_m: how far the tracked position is from that of the photographs, after it, metres.
+        shift_m: distance of the tracked position after the jump from that of the photographs, metres.
         rotation_deg: the angle between the two orientations.
     """
 
@@ -62,9 +62,9 @@ class JumpOptions:
 
     Attributes:
         own_inflation: factor on the standard deviations of the photographs' own poses. In places that no constant was
-            fitted on, errors are up to so many times as large as they say.
-        left_out_cost: of leaving out a pose, in thresholds; more than one jump and less than two.
-        units: of an unknown unit, so many pairs at most are tried, those with the longest steps.
+            fitted on, errors are up to this many times as large as their standard deviations say.
+        left_out_cost: cost of leaving out a pose, in thresholds; more than one jump and less than two.
+        units: largest number of pairs that an unknown unit is tried from, those with the longest steps.
     """
 
     own_inflation: float = 2.0
@@ -82,9 +82,9 @@ class Chain:
     """Photographs whose own poses and the tracking are consistent, except at jumps.
 
     Attributes:
-        frames: in order.
-        jumps: between successive ones of them.
-        scale: metres per unit of the session; where it is unknown, of the chain.
+        frames: indices of the photographs, in order.
+        jumps: the jumps between successive ones of them.
+        scale: metres per unit of the session; the chain's own estimate where it was unknown.
     """
 
     frames: tuple[int, ...]
@@ -93,7 +93,7 @@ class Chain:
 
     @property
     def link_count(self) -> int:
-        """Pairs of successive frames without a jump."""
+        """Number of pairs of successive frames without a jump."""
         return len(self.frames) - 1 - len(self.jumps)
 
 
@@ -104,14 +104,14 @@ def find_jumps(
     drift: DriftOptions,
     options: JumpOptions,
 ) -> Chain | None:
-    """The chain of least cost.
+    """Finds the chain of least cost.
 
     Args:
         own: world_from_camera and its covariance (6, 6) of each photograph that is localized alone, by its index.
-        session_from_camera: of every photograph.
+        session_from_camera: tracked pose of every photograph.
         scale: metres per unit of the session; None if it is unknown.
         drift: noise of the steps.
-        options: see there.
+        options: options of the search.
 
     Returns:
         The chain; None if there is no pose, or no unit of the session.
@@ -132,7 +132,7 @@ def find_jumps(
 
 
 def _cheapest(squared: Array, threshold: float, left_out: float) -> tuple[float, list[int]]:
-    """Cost and positions of the chain from the first to the last of N poses; `squared` (N, N) of each pair."""
+    """Cost and positions of the cheapest chain from the first to the last of N poses, from the m^2 (N, N) of pairs."""
     count = len(squared)
     costs, previous = np.full(count, math.inf), np.full(count, -1)
     costs[0] = 0.0
@@ -148,7 +148,7 @@ def _cheapest(squared: Array, threshold: float, left_out: float) -> tuple[float,
 
 @dataclass(frozen=True, eq=False)
 class _Links:
-    """The pairs (i < j) of N own poses, differences in the world's axes.
+    """The pairs (i < j) of N own poses, with their differences in the world's axes.
 
     Attributes:
         frames: (N,) index of the photograph of each.
@@ -156,9 +156,10 @@ class _Links:
         shift: (P, 3) from the first camera to the second.
         tracked: (P, 3) the same as tracked, in units of the session.
         turn: (P, 3) rotation from the tracked orientation to the photograph's.
-        own: (P, 6, 6) covariance of shift and turn by the poses' own.
-        steps: (F - 1, 2) of each step of the session its length, in its unit, and its angle in degrees.
-        levers: (P, F - 1) tracked distance from the end of each step to the second camera; NaN of steps outside.
+        own: (P, 6, 6) covariance of shift and turn that follows from the poses' own.
+        steps: (F - 1, 2) length, in the session's unit, and angle, in degrees, of each step of the session.
+        levers: (P, F - 1) tracked distance from the end of each step to the second camera; NaN for steps outside the
+            pair.
         drift: noise of the steps.
     """
 
@@ -212,7 +213,7 @@ class _Links:
         )
 
     def scales(self, most: int) -> list[float]:
-        """Metres per unit by the pairs with the longest steps."""
+        """Metres per unit that the pairs with the longest steps give, at most `most` values."""
         travelled, moved_m = np.linalg.norm(self.tracked, axis=1), np.linalg.norm(self.shift, axis=1)
         usable = np.flatnonzero((travelled > 0) & (moved_m > 0))
         neighbours_first = np.argsort(self.second[usable] - self.first[usable], kind="stable")
@@ -220,7 +221,7 @@ class _Links:
         return [float(moved_m[i] / travelled[i]) for i in order[:most]]
 
     def squared(self, scale: float) -> Array:
-        """m^2 of each pair (N, N), of those above the diagonal."""
+        """The matrix (N, N) of each pair's m^2, above the diagonal."""
         result = np.zeros((len(self.frames),) * 2)
         if not len(self.first):
             return result

@@ -29,39 +29,39 @@ S = TypeVar("S", bound="GroupState")
 
 
 class GroupState(Protocol):
-    """The poses of a group, as values of N parameters that have a cost of their own.
+    """The poses of a group as values of N parameters, which have a cost of their own.
 
     Attributes:
-        size: N.
+        size: the number N of parameters.
     """
 
     @property
     def size(self) -> int:
-        """See the class."""
+        """The number N of parameters."""
         ...
 
     def camera_from_world(self, image: int) -> RigidTransform:
-        """Of one photograph."""
+        """Pose of one photograph."""
         ...
 
     def jacobian(self, image: int) -> Array:
-        """(6, N): the left perturbation (v, w) of its camera_from_world by the parameters."""
+        """Derivative (6, N) of the left perturbation (v, w) of a photograph's camera_from_world by the parameters."""
         ...
 
     def moved(self: S, step: Array) -> S:
-        """After a step (N,) of the parameters."""
+        """Returns the state after a step (N,) of the parameters."""
         ...
 
     def relaxed(self: S) -> S:
-        """The same point; the cost's standard deviations are enlarged to the observed errors."""
+        """Returns the same poses with the cost's standard deviations enlarged to the observed errors."""
         ...
 
     def cost(self) -> float:
-        """The cost of the parameters, beside that of the observations."""
+        """The cost of the parameters, without that of the observations."""
         ...
 
     def equations(self) -> tuple[Array, Array]:
-        """J^T J (N, N) and J^T r (N,) of this cost."""
+        """Returns J^T J (N, N) and J^T r (N,) of this cost."""
         ...
 
 
@@ -72,8 +72,8 @@ class Part:
     Attributes:
         source: the photograph.
         world_from_camera: its initial pose.
-        chosen: (P_b,) points of its structure that it is matched with.
-        tracks: of these, over its references and, last, the photograph itself.
+        chosen: (P_b,) indices of the points of its structure that it is matched with.
+        tracks: tracks of these points over its references and, last, the photograph itself.
     """
 
     source: MatchedImage
@@ -85,7 +85,7 @@ class Part:
 def part_of(
     source: MatchedImage, matches: PointMatches, state: GroupState, max_error_px: float, max_matches: int
 ) -> Part:
-    """The part of a photograph, from its matches with small errors, evenly thinned."""
+    """Selects the part of a photograph from its matches with small errors, evenly thinned."""
     structure, pose = source.structure, state.camera_from_world(source.image).inverse()
     pixels = source.query.features.keypoints[matches.keypoint].astype(np.float64)
     errors_px = reprojection_errors_px(source.query.camera, pose, structure.x_in_world[matches.point], pixels)
@@ -104,12 +104,12 @@ class Shared:
             self._times.update(_measurements(part))
 
     def times(self, part: Part) -> Array:
-        """(O,) of a part's observations."""
+        """Number of uses (O,) in the group of each observation of a part."""
         return np.array([self._times[it] for it in _measurements(part)], np.float64)
 
 
 def _measurements(part: Part) -> list[object]:
-    """The identity of each observation: its photograph and keypoint."""
+    """Identity of each observation: its photograph and keypoint."""
     views = [it.view for it in part.source.references]
     # Named by its keypoints: a photograph that was sent twice is one measurement.
     names: list[object] = [it.key for it in part.source.references]
@@ -124,8 +124,9 @@ class JointOptions:
     """Options of the joint adjustment.
 
     Attributes:
-        adjust: as for one photograph.
-        max_matches: of a photograph, evenly thinned; several photographs have enough together.
+        adjust: options as for one photograph.
+        max_matches: largest number of matches of a photograph, evenly thinned; several photographs have enough
+            together.
         iterations: largest number of Levenberg-Marquardt steps; drift needs more than one photograph's pose.
     """
 
@@ -140,14 +141,14 @@ class JointOptions:
 
 @dataclass(frozen=True, eq=False)
 class ImageBlock:
-    """One photograph's part of the problem: `adjust`'s, without the prior, which is the group's.
+    """One photograph's part of the problem: as in `adjust`, without the prior, which the group has.
 
     Attributes:
         image: index of the photograph in the group.
         problem: the cost and its derivatives.
         references: (V - 1,) index of each of its references in the group; the last camera is the photograph.
-        level_px: noise of its structure.
-        depth_m: median depth of its points.
+        level_px: noise of its structure, pixels.
+        depth_m: median depth of its points, metres.
     """
 
     image: int
@@ -157,7 +158,7 @@ class ImageBlock:
     depth_m: float
 
     def columns(self, reference_count: int, state: GroupState) -> Array:
-        """(6 V, 6 R + N): derivative of its cameras' motions by the unknowns of the group."""
+        """Derivative (6 V, 6 R + N) of its cameras' motions by the unknowns of the group."""
         local = len(self.references)
         columns = np.zeros((6 * local + 6, 6 * reference_count + state.size))
         for row, reference in enumerate(self.references):
@@ -175,7 +176,7 @@ class Point(Generic[S]):
     state: S
 
     def bundle(self, index: int, block: ImageBlock) -> Bundle:
-        """The values of one block."""
+        """Returns the values of one block."""
         last = self.state.camera_from_world(block.image)
         return Bundle(self.references[block.references].and_last(last), self.points[index])
 
@@ -186,8 +187,8 @@ class GroupProblem(Generic[S]):
     Attributes:
         start: the initial values.
         blocks: one for each photograph with matches.
-        chosen: of each block, the indices (P_b,) of its points in the photograph's structure.
-        priors: on the photographs' poses, by index.
+        chosen: for each block, the indices (P_b,) of its points in the photograph's structure.
+        priors: priors on the photographs' poses, by index.
     """
 
     def __init__(
@@ -220,7 +221,7 @@ class GroupProblem(Generic[S]):
 
     @property
     def reference_count(self) -> int:
-        """References of all photographs, each counted once."""
+        """Number of different references of all photographs."""
         return len(self._references)
 
     def _block(self, part: Part, shared: Shared) -> ImageBlock:
@@ -240,10 +241,10 @@ class GroupProblem(Generic[S]):
         return self._references.setdefault(reference.key, (len(self._references), reference))[0]
 
     def _reference_information(self) -> Array:
-        """Of the priors on the references' poses, (6 R, 6 R): the inverse covariance of their errors (`pose_errors`).
+        """Inverse covariance (6 R, 6 R) of the priors on the references' poses (see `pose_errors`).
 
-        The sizes are those that the photograph with the most observations finds, and the place to which the errors are
-        relative is that of the last photograph.
+        The size of the errors is estimated from the photograph with the most observations; they are relative to the
+        place of the last photograph.
         """
         index = max(range(len(self.blocks)), key=lambda i: len(self.blocks[i].problem.view))
         block, given = self.blocks[index], self.start.references
@@ -262,7 +263,7 @@ class GroupProblem(Generic[S]):
         return np.asarray(np.linalg.inv(errors.covariance(own, drift)), np.float64)
 
     def cost(self, point: Point[S]) -> float:
-        """NaN for a point behind a camera."""
+        """Cost of a point of the search; NaN if a structure point is behind a camera."""
         data = sum(block.problem.cost(point.bundle(i, block)) for i, block in enumerate(self.blocks))
         poses = {image: point.state.camera_from_world(image).inverse() for image in self.priors}
         prior = sum(self.priors[image].cost(pose) for image, pose in poses.items())
@@ -275,18 +276,18 @@ class GroupProblem(Generic[S]):
         )
 
     def _reference_motion(self, point: Point[S]) -> Array:
-        """(6 R,): the motion of each reference away from its given pose."""
+        """Motion (6 R,) of each reference from its given pose."""
         return point.references.motion_from(self.start.references).ravel()
 
     def linearize(self, point: Point[S]) -> list[NormalEquations]:
-        """See optimize.Problem."""
+        """See `optimize.Problem`."""
         return [block.problem.linearize(point.bundle(i, block)) for i, block in enumerate(self.blocks)]
 
     def _columns(self, point: Point[S]) -> list[Array]:
         return [block.columns(self.reference_count, point.state) for block in self.blocks]
 
     def step(self, point: Point[S], equations: Sequence[NormalEquations], damping: float) -> Point[S] | None:
-        """See optimize.Problem."""
+        """See `optimize.Problem`."""
         columns = self._columns(point)
         reduced = [it.reduced(damping) for it in equations]
         matrix, gradient = self._prior_equations(point, self.options.adjust.error_inflation**2)
@@ -308,7 +309,7 @@ class GroupProblem(Generic[S]):
     def _prior_equations(
         self, point: Point[S], prior_weight: float = 1.0, data_inflation: float = 1.0
     ) -> tuple[Array, Array]:
-        """Matrix and gradient of the references' and the photographs' priors, and of the parameters' cost."""
+        """Matrix and gradient of the priors of references and photographs, and of the parameters' cost."""
         references = 6 * self.reference_count
         matrix = np.zeros((references + point.state.size,) * 2)
         gradient = np.zeros(len(matrix))
@@ -324,10 +325,10 @@ class GroupProblem(Generic[S]):
         return matrix, gradient
 
     def covariance(self, point: Point[S]) -> Array:
-        """(N, N) of the parameters; infinite on the diagonal of unobserved ones.
+        """Covariance (N, N) of the parameters; infinite on the diagonal for unobserved ones.
 
-        The parameters' cost and priors count as stated, the observations with inflated standard deviations (see
-        AdjustOptions.error_inflation).
+        The standard deviations of the observations are inflated (see AdjustOptions.error_inflation), those of the
+        priors and of the parameters' cost are not.
         """
         inflation = self.options.adjust.error_inflation
         matrix, _ = self._prior_equations(point, data_inflation=inflation)
@@ -343,7 +344,7 @@ class GroupProblem(Generic[S]):
 
 
 def _stepped(points: Array, steps: Array, centre: Array) -> Array:
-    """Points (P, 3) after steps (P, 3), none longer than half its distance to a camera.
+    """Moves points (P, 3) by steps (P, 3), none longer than half the point's distance to a camera.
 
     The point of a wrong match, whose weight vanishes, would otherwise diverge until the system is singular.
     """
@@ -353,7 +354,7 @@ def _stepped(points: Array, steps: Array, centre: Array) -> Array:
 
 
 def _inverse(hessian: Array) -> Array:
-    """Inverse of a symmetric matrix; very large in its null space, where a pseudo-inverse would be zero."""
+    """Inverts a symmetric matrix; the result is very large in its null space, where a pseudo-inverse would be zero."""
     if not np.isfinite(hessian).all():
         return np.full(hessian.shape, np.inf)
     unit = np.sqrt(np.maximum(np.diag(hessian), 1e-12))

@@ -39,12 +39,12 @@ class RigOptions:
     """Options of posing a rig.
 
     Attributes:
-        pnp: of the pose solver; `min_matches` of all cameras together.
-        gate: of the gate, on the sums over the cameras.
-        joint: of the adjustment.
-        judge: of the trust.
+        pnp: options of the pose solver; `min_matches` holds for all cameras together.
+        gate: options of the gate, which tests sums over the cameras.
+        joint: options of the adjustment.
+        judge: options of the trust.
         coverage: share of right answers that are accepted.
-        rounds: of searching matches and adjusting; the second starts from a better pose.
+        rounds: number of rounds of searching matches and adjusting; the second starts from a better pose.
     """
 
     pnp: PnpOptions = field(default_factory=PnpOptions)
@@ -64,12 +64,12 @@ class RigEstimate:
     """The estimated pose of a rig.
 
     Attributes:
-        world_from_rig: metric.
-        covariance: (6, 6) of it, order x y z rx ry rz, fixed world axes, metres and radians.
+        world_from_rig: the metric pose.
+        covariance: (6, 6) of the pose, order x y z rx ry rz, fixed world axes, metres and radians.
         matched: the images that have matches, in order.
-        origin: (3,) of the world in which these are, metres; the pose is in the caller's.
+        origin: (3,) origin of the world of `matched`, metres; the pose is in the caller's world.
         trust: 0 to 1, see `trust`.
-        prior_checks: of the photographs with priors, by index.
+        prior_checks: comparisons with the photographs' priors, by the photographs' index.
     """
 
     world_from_rig: RigidTransform
@@ -94,7 +94,7 @@ class RigState:
         return self.rig_from_camera[image].inverse().compose(self.rig_from_world)
 
     def jacobian(self, image: int) -> Array:
-        """The adjoint of camera_from_rig."""
+        """The adjoint of the camera's `camera_from_rig`."""
         camera_from_rig = self.rig_from_camera[image].inverse()
         rotation = camera_from_rig.rotation
         lever = cross_matrix(camera_from_rig.translation) @ rotation
@@ -105,7 +105,7 @@ class RigState:
         return RigState(perturbed(self.rig_from_world, step), self.rig_from_camera)
 
     def relaxed(self) -> RigState:
-        """Unchanged: a rig is rigid."""
+        """The state itself: a rig is rigid."""
         return self
 
     def cost(self) -> float:
@@ -120,16 +120,16 @@ class RigState:
 def solve_rig(
     images: Sequence[GroupImage], rig_from_camera: Sequence[RigidTransform], options: RigOptions
 ) -> RigEstimate | Rejection:
-    """The pose of a rig.
+    """Estimates the pose of a rig.
 
     Args:
-        images: one of each camera, with its own answer.
-        rig_from_camera: mounting of each camera, metric.
-        options: of the rig.
+        images: the photograph of each camera, with its own answer.
+        rig_from_camera: metric pose of each camera in the rig.
+        options: options of the rig.
 
     Returns:
-        The estimate. Rejections: that of the image that reached the latest stage, if none has matches; TOO_FEW_MATCHES;
-        PNP_FAILED if no pose has four inliers; GATE.
+        The estimate, or a rejection: that of the image that reached the latest stage, if none has matches;
+            TOO_FEW_MATCHES; PNP_FAILED if no pose has four inliers; GATE.
     """
     origin, matched_images = matched_images_of(images)
     if not matched_images:
@@ -157,7 +157,7 @@ def solve_rig(
 def _start(
     matched_images: Sequence[MatchedImage], rig_from_camera: Sequence[RigidTransform], options: RigOptions
 ) -> RigidTransform | Rejection:
-    """The pose with most inliers: from generalized PnP, or from the own pose of an image."""
+    """Returns the pose with most inliers, from generalized PnP or from the own pose of an image."""
     cameras = [it.camera_matches(rig_from_camera[it.image]) for it in matched_images]
     total = sum(len(camera.pixels) for camera in cameras)
     if total < options.pnp.min_matches:

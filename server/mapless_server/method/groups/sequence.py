@@ -45,15 +45,15 @@ class SequenceEstimate:
     """The estimated poses of a sequence.
 
     Attributes:
-        world_from_session: as it is at the last frame, metres from the session's unit.
+        world_from_session: transform at the last frame, from the session's unit to metres.
         scale_sigma: relative standard deviation of its scale; 0 where the session is metric.
-        world_from_camera: of every frame, metric, drift and jumps taken out.
-        covariances: (F, 6, 6) of the same, order x y z rx ry rz, fixed world axes, metres and radians.
+        world_from_camera: metric pose of every frame, corrected for drift and jumps.
+        covariances: (F, 6, 6) of these poses, order x y z rx ry rz, fixed world axes, metres and radians.
         matched: the frames that have matches, in order.
-        origin: (3,) of the world in which these are, metres; the poses are in the caller's.
-        jumps: of the tracking, in order.
+        origin: (3,) origin of the world of `matched`, metres; the poses are in the caller's world.
+        jumps: jumps of the tracking, in order.
         trust: 0 to 1, see `trust`; of the frames since the last jump.
-        prior_checks: of the frames with priors, by index.
+        prior_checks: comparisons with the frames' priors, by the frames' index.
     """
 
     world_from_session: Similarity
@@ -73,18 +73,19 @@ def solve_sequence(
     estimate_scale: bool,
     options: SequenceOptions,
 ) -> SequenceEstimate | Rejection:
-    """The poses of a sequence.
+    """Estimates the poses of a sequence.
 
     Args:
         images: the frames in the order they were taken, with their own answers.
         session_from_camera: the tracked pose of each.
         estimate_scale: whether the unit of the session is unknown; else it is the metre.
-        options: of the sequence.
+        options: options of the sequence.
 
     Returns:
-        The estimate. Rejections: that of the frame that reached the latest stage, if none has matches; TOO_FEW_MATCHES;
-        PNP_FAILED if no poses have four inliers; SCALE_UNRELIABLE if the scale is unknown and the session moves too
-        little to determine it, or jumps; GATE, also if the tracking jumps and the frames after it are not localized.
+        The estimate, or a rejection: that of the frame that reached the latest stage, if none has matches;
+            TOO_FEW_MATCHES; PNP_FAILED if no poses have four inliers; SCALE_UNRELIABLE if the scale is unknown and the
+            session moves too little to determine it, or jumps; GATE, also if the tracking jumps and the frames after it
+            are not localized.
     """
     origin, matched_images = matched_images_of(images)
     if not matched_images:
@@ -122,7 +123,7 @@ def solve_sequence(
 def _estimated(
     matched_images: Sequence[MatchedImage], session: Session
 ) -> tuple[Start, JointEstimate[SequenceState]] | Rejection:
-    """Initial poses and the joint adjustment from there."""
+    """Finds initial poses and adjusts them jointly."""
     start = session.start(matched_images)
     if isinstance(start, Rejection):
         return start
@@ -149,7 +150,7 @@ def _rejection(estimate: JointEstimate[SequenceState], start: Start, options: Se
 def _last_contradicted(
     estimate: JointEstimate[SequenceState], frame_count: int, options: SequenceOptions
 ) -> PosedImage | None:
-    """The last frame, if its matches do not support the pose that it is tracked to, though they should."""
+    """Returns the last frame if its matches, though enough, do not support the pose that it is tracked to."""
     last = estimate.matched[-1]
     if last.source.image != frame_count - 1 or last.source.own_pose is not None:
         return None
@@ -171,7 +172,7 @@ def _visible(matched: PosedImage) -> int:
 def _posed_by_themselves(
     images: Sequence[GroupImage], matched_images: Sequence[MatchedImage], session: Session, last: PosedImage
 ) -> list[MatchedImage] | Rejection:
-    """The matched images, the last ones with poses from their own matches, together; a rejection if there are none."""
+    """Poses the last images by their own matches, together; a rejection if no pose is found."""
     posed = [it.image for it in matched_images if it.own_pose is not None]
     # Of frames in an unknown unit only the last is posed.
     first = len(images) - 1 if session.scale_is_free else max(posed, default=-1) + 1

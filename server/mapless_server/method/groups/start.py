@@ -30,14 +30,14 @@ class SequenceOptions:
     """Options of posing a sequence.
 
     Attributes:
-        pnp: of the pose solvers; `min_matches` of all frames together.
-        gate: of the gate, on the sums over the frames.
-        joint: of the adjustment.
-        judge: of the trust.
+        pnp: options of the pose solvers; `min_matches` holds for all frames together.
+        gate: options of the gate, which tests sums over the frames.
+        joint: options of the adjustment.
+        judge: options of the trust.
         coverage: share of right answers that are accepted.
-        drift: of the session.
-        jumps: of the search for jumps of the tracking.
-        rounds: of searching matches and adjusting; the second starts from better poses.
+        drift: noise of the session's steps.
+        jumps: options of the search for jumps of the tracking.
+        rounds: number of rounds of searching matches and adjusting; the second starts from better poses.
         loose_px: inlier bound for initial guesses, which drift.
         should_show, least_near: the last photograph, not localized alone, contradicts the pose that it is tracked to if
             so many points should be visible, or are matched, and fewer of its matches are near them, within `loose_px`
@@ -46,8 +46,8 @@ class SequenceOptions:
         min_motion: least extent of a session of unknown unit, as a share of its distance from its own origin; less is
             rounding.
         max_scale_sigma: largest relative standard deviation of an accepted scale.
-        scale_iterations: samples of the RANSAC for pose and scale.
-        scale_matches: matches on which they are scored.
+        scale_iterations: number of samples of the RANSAC for pose and scale.
+        scale_matches: number of matches on which samples are scored.
     """
 
     pnp: PnpOptions = field(default_factory=PnpOptions)
@@ -78,10 +78,10 @@ class Start:
     """Initial poses.
 
     Attributes:
-        poses: world_from_camera of every frame.
+        poses: `world_from_camera` of every frame.
         scale: metres per unit of the session.
-        jumps: of the tracking.
-        cut: the step of each jump, from frame i to frame i + 1.
+        jumps: jumps of the tracking.
+        cut: index i of each jump's step, from frame i to frame i + 1.
     """
 
     poses: tuple[RigidTransform, ...]
@@ -100,10 +100,10 @@ class Session:
     """The tracked session, and initial poses from it.
 
     Attributes:
-        frames: session_from_camera.
+        frames: `session_from_camera` of each frame.
         scale_is_free: whether its unit is unknown.
-        options: of the sequence.
-        priors: on the frames' poses, by index.
+        options: options of the sequence.
+        priors: priors on the frames' poses, by index.
     """
 
     frames: tuple[RigidTransform, ...]
@@ -113,13 +113,13 @@ class Session:
 
     @property
     def moves(self) -> bool:
-        """Whether there is enough motion to determine the unit."""
+        """Whether there is enough motion to determine the session's unit."""
         centres = np.array([frame.translation for frame in self.frames])
         extent = float(np.ptp(centres, axis=0).max())
         return extent > self.options.min_motion * float(np.abs(centres).max())
 
     def start(self, matched_images: Sequence[MatchedImage]) -> Start | Rejection:
-        """Initial poses of all frames: from their own ones and the tracking, or from the matches of all together."""
+        """Initial poses of all frames: from their own poses and the tracking, or from the matches of all together."""
         matched = {it.image: it for it in matched_images}
         own = {
             it.image: (it.own_pose, it.own_covariance)
@@ -151,7 +151,7 @@ class Session:
     def _is_outvoted(
         self, matched: MatchedImage, jump: Jump, chain: Chain, own: Mapping[int, tuple[RigidTransform, Array]]
     ) -> bool:
-        """Whether a photograph beside a jump shows what it should if there were none, rather than at its own pose."""
+        """Whether a photograph beside a jump shows what it would without the jump, rather than at its own pose."""
         if matched.image not in (jump.before, jump.after):
             return False
         other = jump.before if matched.image == jump.after else jump.after
@@ -159,7 +159,7 @@ class Session:
         return self._inliers(matched, tracked) > self._inliers(matched, own[matched.image][0])
 
     def _tracked(self, image: int, pose: RigidTransform, frame: int, scale: float) -> RigidTransform:
-        """world_from_camera of an image, tracked from the pose of a frame."""
+        """`world_from_camera` of an image, tracked from the pose of a frame."""
         return world_from_session_at(pose, self.frames[frame], scale).transform_pose(self.frames[image])
 
     def _inliers(self, matched: MatchedImage, pose: RigidTransform) -> int:
@@ -167,7 +167,7 @@ class Session:
         return int(camera.inliers(pose, self.options.loose_px).sum())
 
     def _of_all_matches(self, cameras: Sequence[CameraMatches]) -> Similarity | None:
-        """The world_from_session of the whole sequence as one camera; None if none explains four matches."""
+        """Estimates `world_from_session` of the whole sequence as one camera; None if no pose explains four matches."""
         options = self.options
         if self.scale_is_free:
             guess = scaled_ransac(cameras, options.pnp, options.scale_iterations, options.scale_matches)
@@ -179,7 +179,7 @@ class Session:
         return guess
 
     def _cut(self, matched: Mapping[int, MatchedImage], own: Mapping[int, RigidTransform], chain: Chain) -> Start:
-        """Initial poses, each from the nearest own one on its side of all jumps."""
+        """Initial poses, each from the nearest own pose on the same side of all jumps."""
 
         def tracked(image: int, nearest: int) -> RigidTransform:
             return self._tracked(image, own[nearest], nearest, chain.scale)

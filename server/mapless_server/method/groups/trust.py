@@ -1,9 +1,9 @@
-"""Trust in the joint pose of a group: that of `judge`, from the evidence of all photographs together.
+"""Trust in the joint pose of a group, as in `judge`, from the evidence of all photographs together.
 
-The photographs count as one camera with several images, mounted as the joint pose says: shares are those of their sums
-(of the matches on epipolar lines the mean, by inliers), the covered parts of the images are added, and halves of all
-matches, or of all references, give poses by generalized PnP. With one photograph this is the evidence of `judge`, so
-that trust means the same for both.
+The photographs count as one camera with several images, mounted as the joint pose says: shares are computed from sums
+    over the photographs (that of matches on epipolar lines is a mean weighted by inliers), the covered parts of the
+    images are added, and halves of all matches, or of all references, give poses by generalized PnP. With one
+    photograph this is the evidence of `judge`, so that trust means the same for both.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from .images import PosedImage
 def trust_of_group(
     matched: Sequence[PosedImage], options: JudgeOptions, coverage: float
 ) -> tuple[float, Rejection | None]:
-    """Trust, 0 to 1, and a rejection GATE if it is less than 1 - coverage.
+    """Computes the trust, 0 to 1, and a rejection GATE if it is less than 1 - coverage.
 
     Args:
-        matched: photographs with their joint poses and, together, four inliers or more.
-        options: of the judge.
+        matched: photographs with their joint poses; together they have at least four inliers.
+        options: options of the judge.
         coverage: share of right answers to accept, above 0 and at most 1.
     """
     sources = [it.source for it in matched]
@@ -68,7 +68,7 @@ def trust_of_group(
 
 
 def _distance_m(matched: Sequence[PosedImage]) -> float:
-    """Median depth of the inliers in their photographs."""
+    """Median depth of the inliers in their photographs, metres."""
     depths = []
     for it in matched:
         points = it.source.structure.x_in_world[it.matches.point[it.inliers]]
@@ -77,7 +77,7 @@ def _distance_m(matched: Sequence[PosedImage]) -> float:
 
 
 def _matches_apart(matched: Sequence[PosedImage], distance_m: float, options: AgreementOptions) -> float:
-    """`agreement.disagreement_of_matches` of all photographs."""
+    """`agreement.disagreement_of_matches` for all photographs together."""
     cameras = []
     for it, mounting in zip(matched, _mounting(matched), strict=True):
         source, matches = it.source, it.matches
@@ -93,7 +93,7 @@ def _matches_apart(matched: Sequence[PosedImage], distance_m: float, options: Ag
 
 
 def _references_apart(matched: Sequence[PosedImage], distance_m: float, options: AgreementOptions) -> float:
-    """`agreement.disagreement_of_references` of all photographs; a reference is in the same half for all."""
+    """`agreement.disagreement_of_references` for all photographs; a reference is in the same half for all of them."""
     cameras, owners, keypoints = [], [], []
     names: dict[str, int] = {}
     for it, mounting in zip(matched, _mounting(matched), strict=True):
@@ -128,7 +128,7 @@ def _votes(matched: PosedImage) -> Votes:
 
 
 def _mounting(matched: Sequence[PosedImage]) -> list[RigidTransform]:
-    """Pose of each camera in that of the last."""
+    """Pose of each camera in the frame of the last one."""
     last = matched[-1].world_from_camera.inverse()
     return [last.compose(it.world_from_camera) for it in matched]
 
@@ -140,7 +140,7 @@ def _median_disagreement(
     options: AgreementOptions,
     keypoints: Sequence[NDArray[np.intp]] | None,
 ) -> float:
-    """Median over the splits of the distance of the two halves' poses, as a share of `distance_m`; at most one."""
+    """Median over the splits of the distance between the two halves' poses, as a share of `distance_m`; at most 1."""
     random, apart = np.random.default_rng(0), []
     for _ in range(options.splits):
         in_first = draw_half(random)

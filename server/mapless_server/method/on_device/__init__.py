@@ -38,9 +38,9 @@ class Refined:
     """The results of the three stages.
 
     Attributes:
-        scale: with the initial pose.
-        structure: None without options of structure.
-        matches: of the query with the structure; None without options of matches.
+        scale: the metric scale with the initial pose.
+        structure: the points; None without options of structure.
+        matches: matches of the query with the structure; None without options of matches.
     """
 
     scale: MetricScale
@@ -57,14 +57,14 @@ def launch_on_device(
 ) -> Callable[[], Refined | Rejection]:
     """Launches the stages scale, structure and match on the device of the reconstruction, without waiting.
 
-    So every query of a batch is prepared, and its work launched, while the network still computes.
+    So all queries of a batch are prepared and launched while the network still computes.
 
     Args:
         reconstruction: query and references up to scale, its references in the order of `references`.
         query: the query.
-        references: with known poses.
+        references: the references, with known poses.
         correspondences: matches between the references, and of the query with them.
-        options: of the stages; without options of structure and matches, the scale alone.
+        options: options of the stages; without those of structure and matches, only the scale is computed.
 
     Returns:
         A function that waits for the results, which are those of estimate_scale, build_structure and match_points. A
@@ -108,9 +108,9 @@ class HostInputs:
     """Input prepared on the host while the network runs.
 
     Attributes:
-        inputs: to upload.
-        tracks: of the points.
-        row: (O,) index of each of their observations among the rows (P, L) on the device.
+        inputs: the arrays to upload.
+        tracks: tracks of the points.
+        row: (O,) index of each observation of the tracks among the rows (P, L) on the device.
     """
 
     inputs: Inputs
@@ -125,7 +125,7 @@ def prepare(
     correspondences: Correspondences,
     options: Options,
 ) -> HostInputs:
-    """All inputs that do not depend on the network; `map_cameras` are those of the references' maps."""
+    """Prepares all inputs that do not depend on the network; `map_cameras` are those of the references' maps."""
     known, cell = gather(references, correspondences, options.scale), _cells(map_cameras, references)
     nothing = np.empty(0, np.intp)
     if options.structure is None or options.match is None:
@@ -145,7 +145,7 @@ def _cells(map_cameras: Sequence[Camera], references: Sequence[PosedView]) -> ND
 
 
 def _not_finite(outputs: Outputs, reference_count: int) -> str | None:
-    """The part of the network's output that is not finite, in one sentence; None if all is finite."""
+    """Says in one sentence which part of the network's output is not finite; None if all of it is finite."""
     of_poses = not_finite(outputs.candidates, reference_count)
     if of_poses is None and outputs.broken_pixels:
         return f"{outputs.broken_pixels:.0f} predicted pixels are not finite"
@@ -153,7 +153,7 @@ def _not_finite(outputs: Outputs, reference_count: int) -> str | None:
 
 
 def _structure(points: Points, prepared: HostInputs, options: StructureOptions) -> Structure:
-    """The points and tracks that are kept."""
+    """Makes the structure of the points and tracks that are kept."""
     seen = points.seen.astype(bool)
     keep, rows = seen.any(axis=1), seen.reshape(-1)[prepared.row]
     renumbered, tracks = np.cumsum(keep) - 1, prepared.tracks

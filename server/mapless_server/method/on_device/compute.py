@@ -22,7 +22,7 @@ from .structure import DeviceTracks, StructureInputs, observe_on_device
 
 @dataclass(frozen=True, eq=False)
 class Options:
-    """Options of the three stages. Structure and matches are both computed, or neither."""
+    """Options of the three stages; structure and matches are computed both or not at all."""
 
     scale: ScaleOptions = field(default_factory=ScaleOptions)
     structure: StructureOptions | None = None
@@ -35,10 +35,10 @@ class Options:
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """The input beside the reconstruction.
+    """The input without the reconstruction.
 
     Attributes:
-        known: of the references.
+        known: known values of the references.
         cell: (N,) index of each of their keypoints in the pixels of all maps; -1 outside.
         structure, match: None without options of these stages.
     """
@@ -55,9 +55,9 @@ class Points:
 
     Attributes:
         x_in_world: (P, 3) metres.
-        noise_level_px: of the keypoints.
+        noise_level_px: level of the keypoints' noise.
         seen: (P, L) which rows are observations of a point that is kept.
-        keypoint: (P,) of the query; Q for a point without a match.
+        keypoint: (P,) keypoint of the query; Q for a point without a match.
         guided: (P,) see PointMatches.
     """
 
@@ -74,8 +74,8 @@ class Outputs:
 
     Attributes:
         broken_pixels: see DeviceReconstruction.
-        candidates: of the scale.
-        points: None without options of structure and matches.
+        candidates: candidates of the scale.
+        points: structure and matches; None without their options.
     """
 
     broken_pixels: AnyArray
@@ -84,13 +84,13 @@ class Outputs:
 
 
 def compute(reconstruction: DeviceReconstruction, inputs: Inputs, query_camera: Camera, options: Options) -> Outputs:
-    """Scale, structure and matches.
+    """Computes scale, structure and matches.
 
     Args:
         reconstruction: query and references up to scale.
-        inputs: on its device.
-        query_camera: in the pixels of the query's keypoints.
-        options: of the stages.
+        inputs: the other inputs, on its device.
+        query_camera: the query's camera, in the pixels of its keypoints.
+        options: options of the stages.
     """
     predicted = _predict(reconstruction, inputs.cell)
     candidates = scale_candidates(inputs.known, predicted, options.scale)

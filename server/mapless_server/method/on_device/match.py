@@ -27,7 +27,7 @@ CHUNK_ELEMENTS = 2**25
 
 @dataclass(frozen=True, eq=False)
 class MatchInputs:
-    """The input of matching beside the structure, of N keypoints of the references and Q of the query.
+    """The input of matching without the structure: N keypoints of the references and Q of the query.
 
     Attributes:
         descriptors: (N, D) float32.
@@ -51,7 +51,7 @@ def prepare_match(
     keypoint: NDArray[np.intp],
     options: MatchOptions,
 ) -> MatchInputs:
-    """The inputs; `keypoint` (P, L) are the structure's observations."""
+    """Makes the inputs; `keypoint` (P, L) are the structure's observations."""
     offsets, rows = keypoint_offsets(references), np.flatnonzero(keypoint >= 0)
     row_of = np.full(offsets[-1], -1)
     row_of[keypoint.reshape(-1)[rows]] = rows
@@ -85,10 +85,10 @@ class DevicePoints:
 def match_on_device(
     inputs: MatchInputs, points: DevicePoints, rotation: Tensor, centre: Tensor, camera: Camera, options: MatchOptions
 ) -> tuple[Tensor, Tensor]:
-    """Matches of the query, whose initial world_from_camera is `rotation` (3, 3), `centre` (3,), with the points.
+    """Matches the query, whose initial world_from_camera is `rotation` (3, 3) and `centre` (3,), with the points.
 
     Returns:
-        keypoint: (P,) of the query; Q for a point without a match.
+        keypoint: (P,) keypoint of the query; Q for a point without a match.
         guided: (P,) whether the match was found near the point's projection.
     """
     none = len(inputs.query_pixels)
@@ -100,7 +100,7 @@ def match_on_device(
 
 
 def _vote(inputs: MatchInputs, seen: Tensor) -> Tensor:
-    """See match.vote."""
+    """Votes as `match.vote` does."""
     (points, width), keypoints = seen.shape, len(inputs.query_pixels)
     counts = seen.reshape(-1)[inputs.vote_row]
     point = torch.where(counts, inputs.vote_row // width, points)
@@ -114,7 +114,7 @@ def _vote(inputs: MatchInputs, seen: Tensor) -> Tensor:
 def _search(
     inputs: MatchInputs, points: DevicePoints, x_in_query: Tensor, known: Tensor, camera: Camera, options: MatchOptions
 ) -> Tensor:
-    """See match.search; points are in the query's frame."""
+    """Searches as `match.search` does, with points in the query's frame."""
     (count, width), keypoints = points.seen.shape, len(inputs.query_pixels)
     x, y = normalize(x_in_query).unbind(1)
     x, y = x * camera.focal_x_px + camera.principal_x_px, y * camera.focal_y_px + camera.principal_y_px
@@ -143,7 +143,7 @@ def _search(
 
 
 def one_to_one(point: Tensor, score: Tensor, point_count: int) -> Tensor:
-    """From each keypoint's best point (Q,) and its score (Q,), the best keypoint (P,) of each point."""
+    """Returns the best keypoint (P,) of each point, from each keypoint's best point (Q,) and its score (Q,)."""
     keypoint = torch.arange(len(point), device=point.device)
     return best_by_group(point, keypoint, score, point_count, len(point))[0]
 
@@ -151,13 +151,13 @@ def one_to_one(point: Tensor, score: Tensor, point_count: int) -> Tensor:
 def best_by_group(
     group: Tensor, candidate: Tensor, score: Tensor, group_count: int, candidate_count: int
 ) -> tuple[Tensor, Tensor]:
-    """The candidate with the highest score in each group; of equal ones that with the smallest index.
+    """Finds the candidate with the highest score in each group; of equal ones that with the smallest index.
 
     Args:
         group: (M,) the candidate's group; `group_count` for none.
         candidate: (M,) index of the candidate.
-        score: (M,).
-        group_count: G.
+        score: (M,) the candidate's score.
+        group_count: number G of groups.
         candidate_count: the index that stands for no candidate.
 
     Returns:

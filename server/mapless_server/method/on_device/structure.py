@@ -24,16 +24,16 @@ from ..views import PosedView
 
 @dataclass(frozen=True, eq=False)
 class StructureInputs:
-    """The input of the structure beside the reconstruction, of P points in at most L of K references.
+    """The input of the structure without the reconstruction: P points in at most L of K references.
 
     Attributes:
         keypoint: (P, L) observations, as keypoints counted through all references; then -1 for blank rows.
         view: (P, L) their reference; 0 where blank.
-        pixel: (N, 2) float32, of the keypoints.
-        size_px: (N,) float32, of the keypoints.
+        pixel: (N, 2) float32, pixels of the keypoints.
+        size_px: (N,) float32, sizes of the keypoints.
         rotation: (K, 3, 3) camera_from_world.
-        translation: (K, 3) of the same, metres.
-        focal_px, principal_px: (K, 2).
+        translation: (K, 3) translation of the same pose, metres.
+        focal_px, principal_px: (K, 2) intrinsics of the references.
         first_centre, first_ray: (P, 3) camera centre and viewing ray of each point's first observation, in the world.
     """
 
@@ -50,7 +50,7 @@ class StructureInputs:
 
 
 def prepare_structure(tracks: Tracks, references: Sequence[PosedView]) -> tuple[StructureInputs, NDArray[np.intp]]:
-    """The inputs, and the index (O,) of each observation of the tracks among the flattened (P, L)."""
+    """Makes the inputs, and the index (O,) of each observation of the tracks among the flattened (P, L)."""
     column = np.arange(len(tracks.point)) - tracks.starts[tracks.point]
     shape = (tracks.point_count, int(column.max(initial=0)) + 1)
     keypoint, view = np.full(shape, -1), np.zeros(shape, np.int64)
@@ -132,7 +132,7 @@ class DeviceTracks:
 
 
 def observe_on_device(inputs: StructureInputs, noise: KeypointNoise) -> Observations:
-    """The observations of the tracks, float64; blank rows hold the first keypoint."""
+    """Makes the observations of the tracks, float64; blank rows hold the first keypoint."""
     keypoint, view = inputs.keypoint.clip(0).reshape(-1), inputs.view.reshape(-1)
     size_px = inputs.size_px[keypoint].double()
     return Observations(

@@ -14,10 +14,9 @@ Record = TypeVar("Record")
 
 
 def upload(record: Record, device: torch.device) -> Record:
-    """The dataclass with every NumPy array in it on the device.
+    """Copies a dataclass, with every NumPy array in it, to the device.
 
-    Returns at once: on CUDA the arrays are copied from pinned memory, after the network's kernels, and the host does
-    not wait for these.
+    Returns at once: on CUDA the arrays are copied from pinned memory, and the host does not wait for the network.
     """
 
     def up(array: Any) -> Tensor:
@@ -28,9 +27,9 @@ def upload(record: Record, device: torch.device) -> Record:
 
 
 def fetch(record: Record) -> Record:
-    """The dataclass with every tensor in it as a NumPy array, in one transfer.
+    """Copies a dataclass, with every tensor in it as a NumPy array, to the host in one transfer.
 
-    As float64, which holds every index and flag exactly.
+    Values are transferred as float64, which represents every index and flag exactly.
     """
     tensors: list[Tensor] = []
     _changed(record, Tensor, tensors.append)
@@ -40,7 +39,7 @@ def fetch(record: Record) -> Record:
 
 
 def _changed(record: Record, kind: type, change: Callable[[Any], object]) -> Record:
-    """A dataclass with every value of this kind in it changed, at any depth; the rest as it is."""
+    """Returns the dataclass with `change` applied to every value of this kind in it, at any depth."""
     values: dict[str, Any] = {field.name: getattr(record, field.name) for field in fields(record)}  # type: ignore[arg-type]
     changes = {name: change(value) for name, value in values.items() if isinstance(value, kind)}
     changes |= {name: _changed(value, kind, change) for name, value in values.items() if is_dataclass(value)}

@@ -1,4 +1,4 @@
-"""Pose from two 2D-3D matches and gravity, in RANSAC: with few inliers, samples of two need fewer draws than of three.
+"""Pose from two 2D-3D matches and gravity, in RANSAC; with few inliers, pairs need fewer samples than triples.
 
 Gravity is known to about a degree, which is many pixels, so a pose from two matches is only a hypothesis: it is scored
 with a tolerance as large as gravity's error in the image, and the best hypotheses are refined with gravity as one
@@ -26,9 +26,11 @@ class GravityOptions:
     """Options of the two-point RANSAC.
 
     Attributes:
-        max_matches: evenly thinned; more do not improve the choice, and scoring is linear in it.
-        batch: samples that are scored together.
-        max_samples: by then two right matches have been drawn with 99.4 % if 10 % are right.
+        max_matches: largest number of matches, evenly thinned; more do not improve the choice, and scoring is linear in
+            it.
+        batch: number of samples that are scored together.
+        max_samples: largest number of samples; if 10 % of the matches are right, two right ones have then been drawn
+            with 99.4 %.
         confidence: stop when two right matches have been drawn with this probability.
         refined: number of the best hypotheses to refine.
     """
@@ -52,15 +54,15 @@ def ransac_with_gravity(
     inlier_px: float,
     options: GravityOptions | None = None,
 ) -> list[RigidTransform]:
-    """The best hypotheses, refined; none if no two matches give a pose.
+    """Finds the best hypotheses and refines them; none if no two matches give a pose.
 
     Args:
-        camera: pinhole.
+        camera: the pinhole camera.
         x_in_world: (N, 3) points.
         pixels: (N, 2) where they are seen.
-        priors: with gravity. All are used in the refinement.
+        priors: the priors, gravity among them. All are used in the refinement.
         inlier_px: largest reprojection error of a right match.
-        options: see there.
+        options: options of the RANSAC.
     """
     options = options or GravityOptions()
     gravity = priors.gravity
@@ -86,19 +88,19 @@ def ransac_with_gravity(
 
 
 def solve_pairs(gravity: GravityPrior, rays: Array, x_in_world: Array, pairs: NDArray[np.int64]) -> tuple[Array, Array]:
-    """The poses that see two points along two rays, with the direction of gravity given.
+    """Poses that see two points along two rays, with the direction of gravity given.
 
     PoseLib's solver (Kukelova et al., "Closed-form solutions to minimal absolute pose problems with known vertical
     direction", ACCV 2010) takes both frames with their y axes along the vertical, both up or both down.
 
     Args:
-        gravity: down in both frames.
-        rays: (N, 3) of unit length in the camera.
-        x_in_world: (N, 3).
+        gravity: the direction down in both frames.
+        rays: (N, 3) viewing rays of unit length in the camera.
+        x_in_world: (N, 3) points.
         pairs: (S, 2) indices of matches.
 
     Returns:
-        rotations (H, 3, 3) and translations (H, 3) of camera_from_world, none to two for each pair.
+        Rotations (H, 3, 3) and translations (H, 3) of camera_from_world, none to two for each pair.
     """
     from_camera, from_world = _to_y(gravity.in_camera), _to_y(gravity.in_world)
     turned_rays, turned_points = rays @ from_camera.T, x_in_world @ from_world.T
@@ -121,7 +123,7 @@ def _to_y(direction: Array) -> Array:
 
 
 def _pairs(rng: np.random.Generator, count: int, size: int) -> NDArray[np.int64]:
-    """Pairs (size, 2) of two different indices below `count`."""
+    """Draws pairs (size, 2) of two different indices below `count`."""
     first = rng.integers(count, size=size)
     return np.stack([first, (first + rng.integers(1, count, size=size)) % count], axis=1)
 
@@ -133,7 +135,7 @@ def _samples_needed(inlier_share: float, confidence: float) -> float:
 
 
 class _Hypotheses:
-    """The best poses camera_from_world by the truncated sum of their squared errors."""
+    """The best poses camera_from_world, by the truncated sum of their squared errors."""
 
     def __init__(self, camera: Camera, x_in_world: Array, pixels: Array, tolerance_px: float, kept: int) -> None:
         self._focal = np.array([camera.focal_x_px, camera.focal_y_px])
@@ -143,7 +145,7 @@ class _Hypotheses:
         self.inlier_share = 0.0
 
     def add(self, rotation: Array, translation: Array) -> None:
-        """Scores poses (H, 3, 3), (H, 3)."""
+        """Scores poses with rotations (H, 3, 3) and translations (H, 3), and keeps the best."""
         if not len(rotation):
             return
         x, y, z = np.moveaxis(rotation @ self._x_in_world.T + translation[:, :, None], 1, 0)  # (H, N) each
@@ -160,7 +162,7 @@ class _Hypotheses:
         self._costs, self._poses = self._costs[order], self._poses[order]
 
     def best(self) -> list[RigidTransform]:
-        """world_from_camera of the best hypotheses, the best first."""
+        """Returns world_from_camera of the best hypotheses, the best first."""
         return [RigidTransform(pose[:, :3], pose[:, 3]).inverse() for pose in self._poses]
 
 

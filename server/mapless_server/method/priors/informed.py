@@ -2,7 +2,7 @@
 
 A candidate from priors must explain more matches than the pose from the photograph; a prior's cost counts at most as
 much as one match. The best pose is refined without priors, compared with each prior, and refined with the consistent
-ones. So a wrong prior does no harm: it is not used, and the answer is bit-identical to the one without it.
+ones. So a wrong prior does no harm: it is not used, and the answer equals the one without it bit for bit.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class InformedOptions:
 
     Attributes:
         inlier_px: largest reprojection error of a right match.
-        refine: of the refinement.
+        refine: options of the refinement.
         min_inliers: fewer give no pose.
         enough_inliers: with so many inliers no candidates from priors are tried, since none could be better. Repeated
             structure has supported wrong poses with at most 23 matches.
@@ -80,15 +80,15 @@ def informed_pose(
     priors: Priors,
     options: InformedOptions,
 ) -> InformedPose | None:
-    """The best of the pose from the photograph and those from priors; None if there is none.
+    """Chooses between the pose from the photograph and those from priors; None if there is none.
 
     Args:
-        camera: pinhole.
+        camera: the pinhole camera.
         x_in_world: (N, 3) points.
         pixels: (N, 2) where they are seen.
         found: world_from_camera from the photograph alone; None if there is none.
-        priors: on the pose.
-        options: see there.
+        priors: the priors on the pose.
+        options: options of the estimation.
     """
     support = 0 if found is None else inlier_count(camera, x_in_world, pixels, found, options)
     others = [] if support >= options.enough_inliers else _from_priors(camera, x_in_world, pixels, priors, options)
@@ -105,7 +105,7 @@ def informed_pose(
 def _from_priors(
     camera: Camera, x_in_world: Array, pixels: Array, priors: Priors, options: InformedOptions
 ) -> list[RigidTransform]:
-    """Candidates: the pose prior, and poses by RANSAC with gravity."""
+    """Candidates from priors: the pose prior, and poses by RANSAC with gravity."""
     poses = []
     if priors.pose:
         poses.append(refine_pose(camera, x_in_world, pixels, priors.pose.world_from_camera, priors, options.refine))
@@ -136,7 +136,7 @@ def use_priors(
     priors: Priors,
     options: InformedOptions,
 ) -> InformedPose:
-    """Checks the priors and refines a pose, of at least `min_inliers` inliers, with the consistent ones."""
+    """Checks the priors and refines a pose, which has `min_inliers` inliers or more, with the consistent ones."""
     alone = refine_pose(camera, x_in_world, pixels, world_from_camera, NO_PRIORS, options.refine)
     before, after = (inlier_count(camera, x_in_world, pixels, it, options) for it in (world_from_camera, alone))
     if after < max(options.min_inliers, options.min_kept_share * before):

@@ -62,21 +62,21 @@ class Term:
 
     @property
     def cost(self) -> float:
-        """r^T C^-1 r."""
+        """Cost of the prior, r^T C^-1 r."""
         return float(self.residual @ np.linalg.solve(self.covariance, self.residual))
 
     def gradient_and_information(self) -> tuple[Array, Array]:
-        """J^T C^-1 r (6,) and J^T C^-1 J (6, 6): half the cost's derivatives, Gauss-Newton's."""
+        """Half the cost's derivatives (Gauss-Newton): gradient J^T C^-1 r (6,) and information J^T C^-1 J (6, 6)."""
         weighted = np.linalg.solve(self.covariance, self.jacobian).T
         return weighted @ self.residual, weighted @ self.jacobian
 
     def squared_distance(self, pose_covariance: Array) -> float:
-        """m^2 with a pose's covariance (6, 6)."""
+        """Squared distance m^2 to a pose with a covariance (6, 6)."""
         covariance = self.covariance + self.jacobian @ pose_covariance @ self.jacobian.T
         return float(self.residual @ np.linalg.solve(covariance, self.residual))
 
     def relative_information(self, pose_covariance: Array) -> float:
-        """Largest information of the prior over that of a pose of covariance (6, 6), over all directions."""
+        """Largest ratio over all directions of the prior's information to that of a pose with a covariance (6, 6)."""
         known = self.jacobian @ pose_covariance @ self.jacobian.T
         return float(np.abs(np.linalg.eigvals(np.linalg.solve(self.covariance, known))).max())
 
@@ -101,15 +101,15 @@ class PositionPrior:
         check_covariance(self.covariance, 3)
 
     def term(self, world_from_camera: RigidTransform) -> Term:
-        """R = t - position."""
+        """The term with r = t - position."""
         return Term(world_from_camera.translation - self.position, np.eye(3, 6), self.covariance)
 
     def loosened(self, factor: float) -> PositionPrior:
-        """With its covariance multiplied by a factor."""
+        """Returns the prior with its covariance multiplied by a factor."""
         return replace(self, covariance=factor * self.covariance)
 
     def shifted(self, offset: Array) -> PositionPrior:
-        """The same in a world in which everything lies `offset` (3,) further."""
+        """Returns the prior in a world in which everything lies `offset` (3,) further."""
         return replace(self, position=self.position + offset)
 
 
@@ -142,7 +142,7 @@ class DirectionPrior:
         return math.radians(self.sigma_deg)
 
     def term(self, world_from_camera: RigidTransform) -> Term:
-        """The chord r = R in_camera - in_world: the angle if small, and longest for opposite directions.
+        """The term with the chord r = R in_camera - in_world: the angle if small, and longest for opposite directions.
 
         It has three components, but none along the direction itself, so two degrees of freedom.
         """
@@ -151,11 +151,11 @@ class DirectionPrior:
         return Term(turned - self.in_world, jacobian, self.sigma**2 * np.eye(3))
 
     def loosened(self, factor: float) -> DirectionPrior:
-        """With its variance multiplied by a factor, up to a sigma of 180 degrees, which is no information."""
+        """Returns the prior with its variance multiplied by a factor, up to a sigma of 180 degrees (no information)."""
         return replace(self, sigma_deg=min(180.0, math.sqrt(factor) * self.sigma_deg))
 
     def shifted(self, offset: Array) -> DirectionPrior:
-        """Unchanged: directions do not depend on the origin."""
+        """Returns the prior unchanged: directions do not depend on the origin."""
         return self
 
 
@@ -176,7 +176,7 @@ class HeadingPrior(DirectionPrior):
 
     @staticmethod
     def looking(in_world: Array, sigma_deg: float) -> HeadingPrior:
-        """The optical axis points along `in_world` (3,), unit length."""
+        """The prior of an optical axis that points along `in_world` (3,), unit length."""
         return HeadingPrior(np.array([0.0, 0.0, 1.0]), in_world, sigma_deg)
 
 
@@ -200,7 +200,7 @@ class PosePrior:
         check_covariance(self.covariance, 6)
 
     def term(self, world_from_camera: RigidTransform) -> Term:
-        """R = (t - t_prior, Log(R R_prior^T))."""
+        """The term with r = (t - t_prior, Log(R R_prior^T))."""
         turn = rotation_vector(world_from_camera.rotation @ self.world_from_camera.rotation.T)
         shift = world_from_camera.translation - self.world_from_camera.translation
         jacobian = np.eye(6)
@@ -208,11 +208,11 @@ class PosePrior:
         return Term(np.concatenate([shift, turn]), jacobian, self.covariance)
 
     def loosened(self, factor: float) -> PosePrior:
-        """With its covariance multiplied by a factor."""
+        """Returns the prior with its covariance multiplied by a factor."""
         return replace(self, covariance=factor * self.covariance)
 
     def shifted(self, offset: Array) -> PosePrior:
-        """The same in a world in which everything lies `offset` (3,) further."""
+        """Returns the prior in a world in which everything lies `offset` (3,) further."""
         return replace(self, world_from_camera=self.world_from_camera.shifted(offset))
 
 
@@ -224,9 +224,9 @@ class PriorCheck:
     """Comparison of a prior with the pose from the photograph alone.
 
     Attributes:
-        kind: which prior.
+        kind: kind of the prior.
         mahalanobis: m, 0 and above.
-        degrees_of_freedom: of m^2.
+        degrees_of_freedom: degrees of freedom of m^2.
         conflict: whether the two contradict each other.
         used: whether the prior was used for the pose: not if it is in conflict, nor if it has too little information
             (`MIN_RELATIVE_INFORMATION`).
@@ -260,11 +260,11 @@ class Priors:
         return self.gravity is not None or self.heading is not None
 
     def shifted(self, offset: Array) -> Priors:
-        """The same in a world in which everything lies `offset` (3,) further."""
+        """Returns the priors in a world in which everything lies `offset` (3,) further."""
         return Priors(**{prior.kind.value: prior.shifted(offset) for prior in self})  # type: ignore[arg-type]
 
     def check(self, world_from_camera: RigidTransform, covariance: Array) -> tuple[PriorCheck, ...]:
-        """Compares each prior with a pose estimated without any, of covariance (6, 6)."""
+        """Compares each prior with a pose that was estimated without priors and has this covariance (6, 6)."""
         checks = []
         for prior in self:
             term = prior.term(world_from_camera)
@@ -275,7 +275,7 @@ class Priors:
         return tuple(checks)
 
     def consistent(self, checks: tuple[PriorCheck, ...]) -> Priors:
-        """The priors that are used, with covariances enlarged by their distance.
+        """Returns the priors that are used, with covariances enlarged by their distance.
 
         The covariance of a prior that is further off than the average consistent one, m^2 > n, is multiplied by m^2 / n
         (Birge's ratio). Right priors lose little weight, and one that is wrong but not in conflict loses most of it.
@@ -289,14 +289,14 @@ class Priors:
         return Priors(**kept)  # type: ignore[arg-type]
 
     def penalty(self, world_from_camera: RigidTransform) -> float:
-        """The sum of the costs of the priors, each truncated at the conflict threshold.
+        """Sum of the priors' costs, each truncated at the conflict threshold.
 
         A prior may be wrong altogether, so it counts at most as much as one good match.
         """
         return sum(min(p.term(world_from_camera).cost, conflict_threshold(p.degrees_of_freedom)) for p in self)
 
     def cost(self, world_from_camera: RigidTransform) -> float:
-        """The sum of their costs."""
+        """Sum of the priors' costs."""
         return sum(prior.term(world_from_camera).cost for prior in self)
 
     def gradient_and_information(self, world_from_camera: RigidTransform) -> tuple[Array, Array]:
@@ -323,7 +323,7 @@ class Priors:
         return math.log10((1 - math.cos(angle)) / 2)
 
     def sharpened(self, covariance: Array, world_from_camera: RigidTransform) -> Array:
-        """The covariance (6, 6) of a pose refined with these priors, from one (6, 6) without them."""
+        """Covariance (6, 6) of a pose refined with these priors, from its covariance (6, 6) without them."""
         if not self:
             return covariance
         _, information = self.gradient_and_information(world_from_camera)
@@ -337,12 +337,12 @@ NO_PRIORS = Priors()
 
 
 def conflict_threshold(degrees_of_freedom: int) -> float:
-    """m^2 beyond which a prior is in conflict."""
+    """The m^2 above which a prior is in conflict."""
     return float(chdtri(degrees_of_freedom, CONFLICT_PROBABILITY))
 
 
 def check_covariance(covariance: Array, size: int) -> None:
-    """ValueError unless it is symmetric and positive definite, (size, size)."""
+    """Raises ValueError unless the covariance is symmetric, positive definite and of shape (size, size)."""
     c = np.asarray(covariance)
     if c.shape != (size, size) or not np.isfinite(c).all():
         raise ValueError(f"a covariance must be {size}x{size} finite numbers")

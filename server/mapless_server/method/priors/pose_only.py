@@ -1,4 +1,4 @@
-"""Refinement of a pose from 2D-3D matches with fixed points and priors.
+"""Refinement of a pose from 2D-3D matches with fixed points, and from priors.
 
     min  sum_i rho(|u_i - pi(P, X_i)|^2 / sigma^2) + w sum_k r_k^T C_k^-1 r_k,    rho(s) = c^2 log(1 + s / c^2)
 
@@ -25,9 +25,9 @@ class PoseOnlyOptions:
 
     Attributes:
         sigma_px: standard deviation of a right match.
-        loss_scale_sigma: of the Cauchy loss.
+        loss_scale_sigma: scale of the Cauchy loss, in standard deviations.
         prior_weight: w, factor by which the matches have less information than if their errors were independent.
-        iterations: at most so many steps.
+        iterations: largest number of steps.
         min_decrease: stop when a step lowers the cost by a smaller share.
     """
 
@@ -52,12 +52,12 @@ def refine_pose(
     """Minimizes the cost, starting from a pose.
 
     Args:
-        camera: pinhole.
+        camera: the pinhole camera.
         x_in_world: (N, 3) points; those behind the camera at the start are not used.
         pixels: (N, 2) where they are seen.
-        world_from_camera: the start.
-        priors: on the pose; all are used.
-        options: see there.
+        world_from_camera: the initial pose.
+        priors: the priors on the pose; all are used.
+        options: options of the refinement.
     """
     in_front = world_from_camera.inverse().apply(x_in_world)[:, 2] > 0
     problem = _Problem(camera, x_in_world[in_front], pixels[in_front], priors, options)
@@ -89,7 +89,7 @@ class _Problem:
         return x_in_camera, (self.camera.project(x_in_camera) - self.pixels) / self.options.sigma_px
 
     def cost(self, pose: RigidTransform) -> float:
-        """NaN for a point behind the camera, so that the step is rejected."""
+        """Cost at a pose; NaN if a point is behind the camera, so that the step is rejected."""
         _, residual = self.residuals(pose)
         matched = cauchy_cost((residual**2).sum(axis=1), self.options.loss_scale_sigma)
         return matched + self.options.prior_weight * self.priors.cost(pose)

@@ -41,13 +41,13 @@ class AmbiguityOptions:
         min_share: least number of keypoints of a rival, as a share of those of the first pose. A place with less than
             half the keypoints of another is distinguished from it.
         min_keypoints: least number of keypoints of a rival.
-        max_log10_false_alarms: as of the gate, but stricter, because a rival is searched for every answer.
+        max_log10_false_alarms: as in `GateOptions`, but stricter, because a rival is searched for every answer.
         min_own_share: least share of a rival's inliers from references that support it more than the first pose. A few
             references that show both places support both.
         min_apart_m, min_apart_deg: poses nearer than this are one place, independent of their radii.
         agreeing_px: matches within this distance belong to the first pose; larger than the inlier bound, since a point
             with an error is not a second place.
-        pnp: of the rival. The few iterations find a pose with a third of the matches as inliers.
+        pnp: options of the rival's pose. The few iterations find a pose with a third of the matches as inliers.
     """
 
     min_share: float = 0.5
@@ -67,14 +67,14 @@ class AmbiguityOptions:
 
 
 def find_rival(support: Support, votes: Votes, options: AmbiguityOptions) -> tuple[Hypothesis, Hypothesis] | None:
-    """The first pose and its rival, as hypotheses in the support's world; None without a rival.
+    """Finds the first pose and its rival, as hypotheses in the support's world; None without a rival.
 
     Projects all matches, and searches only if enough of them are outliers.
 
     Args:
-        support: of the first pose, with its estimate.
-        votes: of the query's matches.
-        options: see there.
+        support: the first pose's support, with its estimate.
+        votes: the query's matches with each reference.
+        options: options of the search.
     """
     estimate, camera = support.estimate, support.query.camera
     if estimate is None:
@@ -106,7 +106,7 @@ def find_rival(support: Support, votes: Votes, options: AmbiguityOptions) -> tup
 def _second_pose(
     camera: Camera, votes: Votes, wanted: int, options: AmbiguityOptions
 ) -> tuple[RigidTransform, Accuracy] | None:
-    """A pose with enough inliers that are not chance, and its radii."""
+    """Finds a pose with enough inliers that are not chance, and its radii."""
     pose = ransac(camera, votes.x_in_world, votes.pixels, None, options.pnp)
     if pose is None:
         return None
@@ -123,14 +123,14 @@ def _second_pose(
 
 
 def _supporters(names: Sequence[str], own: NDArray[np.intp], other: NDArray[np.intp]) -> tuple[str, ...]:
-    """Names of the references with more inliers of one pose than of the other, the most first."""
+    """Names of the references with more inliers of one pose than of the other, those with the most first."""
     return tuple(names[i] for i in np.argsort(-own, kind="stable") if own[i] > other[i])
 
 
 def _outliers(
     votes: Votes, own: NDArray[np.bool_], apart: NDArray[np.bool_], reference_count: int
 ) -> NDArray[np.bool_]:
-    """The matches (V,) far from the first pose, of references with more such matches than inliers."""
+    """Mask (V,) of the matches far from the first pose, of references with more such matches than inliers."""
     against, favour = (np.bincount(votes.reference[rows], minlength=reference_count) for rows in (apart, own))
     return np.asarray(apart & (against > favour)[votes.reference])
 

@@ -33,7 +33,7 @@ class Votes:
 
     Attributes:
         reference: (V,) index of the reference.
-        keypoint: (V,) of the query.
+        keypoint: (V,) index of the query's keypoint.
         x_in_world: (V, 3) the point.
         pixels: (V, 2) the keypoint.
     """
@@ -47,7 +47,7 @@ class Votes:
         return Votes(self.reference[rows], self.keypoint[rows], self.x_in_world[rows], self.pixels[rows])
 
     def errors_px(self, camera: Camera, world_from_camera: RigidTransform) -> Array:
-        """Distances (V,) of the points' projections from the keypoints; NaN behind the camera."""
+        """Distances (V,) of the points' projections from the keypoints, pixels; NaN behind the camera."""
         return reprojection_errors_px(camera, world_from_camera, self.x_in_world, self.pixels)
 
     def keypoint_count(self, rows: NDArray[np.bool_]) -> int:
@@ -56,7 +56,7 @@ class Votes:
 
 
 def votes_of(support: Support, query_matches: Sequence[Matches]) -> Votes:
-    """The matches with keypoints of triangulated points."""
+    """The matches of a support's query with keypoints of triangulated points."""
     return votes_on(support.query, support.references, support.structure, query_matches)
 
 
@@ -96,11 +96,12 @@ class AgreementOptions:
     """Options of the comparison.
 
     Attributes:
-        splits: into halves, of which the median counts; one split may put all good matches into one half.
+        splits: number of splits into halves, of which the median counts; one split may put all good matches into one
+            half.
         shuffling: references are assigned to halves in the order of their numbers of matches, each raised by up to this
             share at random, so that the splits differ and the halves remain balanced.
-        pnp: of the halves' poses. Of good matches 30 iterations give the same poses as 100; 1000 find a pose with
-            a third of the matches as inliers.
+        pnp: options of the halves' poses. With good matches, 30 iterations give the same poses as 100; 1000 find a pose
+            with a third of the matches as inliers.
     """
 
     splits: int = 3
@@ -113,7 +114,7 @@ class AgreementOptions:
 
 
 def disagreement_of_matches(support: Support, distance_m: float, options: AgreementOptions) -> float:
-    """Distance of the cameras that random halves of the 2D-3D matches give, as a share of `distance_m`; at most one."""
+    """Distance between the cameras that random halves of the matches give, as a share of `distance_m`; at most 1."""
     matches, structure = support.matches, support.structure
     rows = np.flatnonzero(~matches.guided)
     if not len(rows):
@@ -128,7 +129,7 @@ def disagreement_of_matches(support: Support, distance_m: float, options: Agreem
 
 
 def disagreement_of_references(support: Support, votes: Votes, distance_m: float, options: AgreementOptions) -> float:
-    """The same for the matches with one half of the references and with the other.
+    """The same distance for matches with one half of the references and with the other half.
 
     The halves have about as many matches each; of several matches of a keypoint within a half the first counts.
     """
@@ -157,7 +158,7 @@ def _median_disagreement(
     options: AgreementOptions,
     keypoint: NDArray[np.intp] | None = None,
 ) -> float:
-    """Median over the splits of the distance of the two halves' cameras, as a share of `distance_m`; at most one."""
+    """Median over the splits of the distance of the two halves' cameras, as a share of `distance_m`; at most 1."""
     random, apart = np.random.default_rng(0), []
     for _ in range(options.splits):
         in_first = draw_half(random)
@@ -181,14 +182,14 @@ class Evidence:
         match_count: number of 2D-3D matches.
         found_share: share of inliers among the points that project into the image, or among the photograph's features
             if they are fewer.
-        expected_share: the same of the references, the median: in the dark, between distant references, or where much
-            is hidden, a reference finds few of the points that it should see, too.
+        expected_share: median of the same share over the references: in the dark, between distant references, or where
+            much is hidden, a reference, too, observes few of the points that it should see.
         hull_share: share of the image covered by the convex hull of the inliers.
         epipolar_share: share of the matches with a reference that lie on their epipolar lines, for the two references
             with the most inliers, multiplied. Most of these matches have no point, so they took no part in the pose.
         matches_apart: distance of the cameras that halves of the matches give, as a share of their distance from what
             they see.
-        references_apart: the same for halves of the references.
+        references_apart: the same distance for halves of the references.
     """
 
     inlier_count: int
@@ -202,12 +203,12 @@ class Evidence:
 
     @property
     def found_ratio(self) -> float:
-        """Found over expected share, at most one."""
+        """Ratio of found to expected share, at most 1."""
         return min(1.0, self.found_share / max(self.expected_share, 1e-3))
 
     @property
     def disagreement(self) -> float:
-        """How far apart the halves are, both kinds together, at most one."""
+        """How far apart the halves' cameras are, both kinds of halves together, at most 1."""
         return min(1.0, math.hypot(self.matches_apart, self.references_apart))
 
     @property
@@ -224,13 +225,13 @@ class Evidence:
 def evidence_of(
     support: Support, votes: Votes, query_matches: Sequence[Matches], options: AgreementOptions
 ) -> Evidence:
-    """The evidence for the estimate of a support.
+    """Computes the evidence for the estimate of a support.
 
     Args:
-        support: with an estimate of four inliers or more.
-        votes: of the query's matches.
-        query_matches: of the query with each reference.
-        options: of the agreement of halves.
+        support: the support, whose estimate has at least four inliers.
+        votes: the query's matches, carried to points.
+        query_matches: matches of the query with each reference.
+        options: options of the comparison of halves.
 
     Raises:
         ValueError: there is no such estimate.
@@ -270,9 +271,9 @@ def epipolar_share(
     inlier_counts: Sequence[int],
     world_from_query: RigidTransform,
 ) -> float:
-    """Share of the matches on their epipolar lines, of the two references with the most inliers, multiplied.
+    """Product, over the two references with the most inliers, of the shares of matches on their epipolar lines.
 
-    Keypoints that have no place in an estimated lens, NaN, do not count.
+    Keypoints that an estimated lens model cannot undistort (NaN) do not count.
     """
     strongest = np.argsort(-np.array(inlier_counts), kind="stable")[:2]
     has_place = np.asarray(np.isfinite(query.features.keypoints).all(axis=1))

@@ -42,14 +42,14 @@ def gate_failure(
     options: GateOptions,
     log10_chance: float = 0.0,
 ) -> str | None:
-    """Why a pose fails the gate, in one sentence; None if it passes.
+    """Says in one sentence why a pose fails the gate; None if it passes.
 
     Args:
-        camera: of the photograph.
-        matches: of the photograph with the points of a structure.
+        camera: camera of the photograph.
+        matches: matches of the photograph with the points of a structure.
         inliers: (M,) which of them are inliers of the pose; at least four.
         inlier_px: largest reprojection error of an inlier.
-        options: see there.
+        options: options of the gate.
         log10_chance: see `Priors.log10_chance`.
     """
     expected = log10_false_alarms(camera, matches, inliers, inlier_px) + log10_chance
@@ -75,7 +75,7 @@ def log10_false_alarms(camera: Camera, matches: PointMatches, inliers: NDArray[n
 
 
 def false_alarms(match_count: int, inlier_count: int, chance: float, sample: int = 3) -> float:
-    """log10 of (n - m) C(n, k) C(k, m) p^(k - m), at least k of n matches agreeing with a pose through m of them.
+    """Log10 of (n - m) C(n, k) C(k, m) p^(k - m): at least k of n matches agree with a pose through m of them.
 
     Args:
         match_count: n.
@@ -96,7 +96,7 @@ def log10_tail(match_count: int, inlier_count: int, chance: float) -> float:
 
 
 def format_false_alarms(log10_expected: float) -> str:
-    """The number as text; it is infinite for three matches, which agree with a pose by construction."""
+    """Formats the expected number; it is infinite for three matches, which agree with a pose by construction."""
     if log10_expected == np.inf:
         return "any number of such poses expected"
     return f"10^{log10_expected:.1f} such poses expected"

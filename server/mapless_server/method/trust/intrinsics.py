@@ -62,7 +62,7 @@ def intrinsics_checks(evidence: IntrinsicsEvidence, options: IntrinsicsOptions) 
 
 
 def wrong_intrinsics(evidence: IntrinsicsEvidence, best_reference: str, options: IntrinsicsOptions) -> Rejection | None:
-    """A rejection that names each parameter in conflict, the most significant first; None if there is none."""
+    """A rejection that names each parameter in conflict, the most significant first; None without a conflict."""
     checks = intrinsics_checks(evidence, options)
     wrong = sorted(
         (it for it in checks if it.conflict), key=lambda it: -abs(it.estimated - it.given) / it.estimated_sigma

@@ -43,12 +43,12 @@ class JudgeOptions:
 
     Attributes:
         scores: quantiles of the scores of right answers at `LEVELS`.
-        agreement_weight: of ln(1 / chance) if gravity or heading agrees with a pose. It would be 1 if poses were wrong
-            only by chance; but poses from repeated structure and wrong references agree too, and so do slightly wrong
-            ones.
-        agreement: of the comparison of halves.
-        ambiguity: of the search for a second pose.
-        intrinsics: of the check of the photograph's intrinsics.
+        agreement_weight: weight of ln(1 / chance) if gravity or heading agrees with a pose. It would be 1 if poses were
+            wrong only by chance; but poses from repeated structure and wrong references agree too, and so do slightly
+            wrong ones.
+        agreement: options of the comparison of halves.
+        ambiguity: options of the search for a second pose.
+        intrinsics: options of the check of the photograph's intrinsics.
     """
 
     scores: tuple[float, ...] = (
@@ -68,7 +68,7 @@ class JudgeOptions:
             raise ValueError(f"JudgeOptions.scores must be rising, is {self.scores}")
 
     def with_trust(self, quantiles: tuple[float, ...]) -> JudgeOptions:
-        """For a scene whose right answers have these quantiles of the trust that these options give, at `LEVELS`."""
+        """Options of a scene whose right answers have these quantiles (at `LEVELS`) of the trust by these options."""
         return replace(self, scores=tuple(np.interp(quantiles, LEVELS, self.scores).tolist()))
 
 
@@ -97,14 +97,14 @@ def judge(
     """Judges the estimate of a support.
 
     Args:
-        support: with an estimate that passed the gate.
-        query_matches: of the query with each reference.
+        support: the support, whose estimate has passed the gate.
+        query_matches: matches of the query with each reference.
         coverage: share of right answers to accept, above 0 and at most 1.
-        options: see there.
+        options: options of the judge.
         log10_chance: see `Priors.log10_chance`.
 
     Returns:
-        The judgement. Rejections, in the support's world: GATE, with a hint, if the photograph contradicts its
+        The judgement. Its rejection, in the support's world, is GATE, with a hint, if the photograph contradicts its
         intrinsics; AMBIGUOUS with both hypotheses if a second pose is supported about as well; GATE if the trust is
         less than 1 - coverage.
     """
@@ -118,7 +118,7 @@ def judge(
 
 
 def contradiction(support: Support, votes: Votes, options: JudgeOptions) -> Rejection | None:
-    """A rejection if the matches with points contradict the intrinsics, or support a second pose about as well."""
+    """Rejects a pose if the matches with points contradict the intrinsics, or support a second pose about as well."""
     if support.estimate is not None and support.estimate.intrinsics is not None:
         best = support.references[int(np.argmax(support.inliers_by_reference()))].name
         wrong = wrong_intrinsics(support.estimate.intrinsics, best, options.intrinsics)
@@ -129,18 +129,18 @@ def contradiction(support: Support, votes: Votes, options: JudgeOptions) -> Reje
 
 
 def trust_of(evidence: Evidence, options: JudgeOptions, log10_chance: float = 0.0) -> float:
-    """Trust: share of right answers with at most this score, to which agreement with priors is added."""
+    """Trust: the share of right answers with at most this score; agreement with priors raises the score."""
     agreement = -options.agreement_weight * math.log(10) * log10_chance
     return float(np.interp(evidence.score + agreement, options.scores, LEVELS))
 
 
 def trust_in_scene(trust: float, quantiles: tuple[float, ...]) -> float:
-    """The trust that an answer has in a scene whose right answers have these quantiles of trust; none: the same."""
+    """Trust in a scene whose right answers have these quantiles of trust; unchanged without quantiles."""
     return float(np.interp(trust, quantiles, LEVELS)) if quantiles else trust
 
 
 def low_trust(evidence: Evidence, trust: float, coverage: float) -> Rejection | None:
-    """A rejection if the trust is less than 1 - coverage."""
+    """Rejects a pose if its trust is less than 1 - coverage."""
     if trust >= 1 - coverage:
         return None
     shown = math.floor(1000 * trust) / 1000  # rounded down, so that it never equals the bound
@@ -152,7 +152,7 @@ def low_trust(evidence: Evidence, trust: float, coverage: float) -> Rejection | 
 
 
 def format_evidence(evidence: Evidence) -> str:
-    """The evidence as text."""
+    """Formats the evidence as text."""
     return (
         f"{evidence.inlier_count} of {evidence.match_count} matches agree, {100 * evidence.found_share:.0f} % of the "
         f"points that should be found, of which references find {100 * evidence.expected_share:.0f} %, over "

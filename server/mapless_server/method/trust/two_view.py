@@ -43,7 +43,7 @@ class TwoViewGateOptions:
     Attributes:
         max_log10_pose: largest log10 of the expected number of such poses among wrong matches. Of 220 photographs with
             references of other places none was below -3.
-        max_log10_distance: the same of such distances.
+        max_log10_distance: the same limit for distances.
         min_second_share: least share of inliers among the matches of the reference with the second most inliers. On
             a statue that looks alike from several sides, wrong poses had up to 0.26, and one with a wrong focal length,
             off by 6 degrees, 0.32; of 31 right answers to photographs that failed otherwise 22 have more.
@@ -95,12 +95,12 @@ class TwoViewEvidence:
 def two_view_evidence(
     support: Support, query_matches: Sequence[Matches], options: TwoViewGateOptions
 ) -> TwoViewEvidence:
-    """The evidence for the estimate of a support with two-view matches.
+    """Computes the evidence for the estimate of a support with two-view matches.
 
     Args:
-        support: with an estimate and two-view matches.
-        query_matches: of the query with each reference.
-        options: see there.
+        support: the support, with an estimate and two-view matches.
+        query_matches: matches of the query with each reference.
+        options: options of the test.
 
     Raises:
         ValueError: there is no estimate, or there are no two-view matches.
@@ -136,12 +136,12 @@ def two_view_evidence(
 
 
 def lacks_distance(evidence: TwoViewEvidence, options: TwoViewGateOptions) -> bool:
-    """Whether one reference supports the pose, and too few other matches do."""
+    """Whether only one reference supports the pose, and too few other matches do."""
     return evidence.log10_pose <= options.max_log10_pose and evidence.log10_distance > options.max_log10_distance
 
 
 def two_view_failure(evidence: TwoViewEvidence, options: TwoViewGateOptions) -> str | None:
-    """Why a pose fails, in one sentence; None if it passes."""
+    """Says in one sentence why a pose fails; None if it passes."""
     count = f"{evidence.inlier_count} of {evidence.match_count} matches with references and points agree on a pose"
     if evidence.log10_pose > options.max_log10_pose:
         return f"{count}, which chance could do ({format_false_alarms(evidence.log10_pose)})"
@@ -161,7 +161,7 @@ def two_view_failure(evidence: TwoViewEvidence, options: TwoViewGateOptions) -> 
 
 
 def one_reference_rejection(reason: RejectionReason, message: str, support: Support) -> Rejection:
-    """The rejection of a pose without a distance, with what helps."""
+    """Makes the rejection of a pose without a distance, with its hint."""
     best = support.references[int(np.argmax(support.inliers_by_reference()))].name
     advice = (
         f"Add references that show the same as {best} from a step aside, or use others: one reference determines the "
@@ -171,10 +171,10 @@ def one_reference_rejection(reason: RejectionReason, message: str, support: Supp
 
 
 def two_view_trust(evidence: TwoViewEvidence, options: TwoViewGateOptions) -> float:
-    """Trust, 0 to 1: share of right answers whose second reference has at most this share of inliers."""
+    """Trust, 0 to 1: the share of right answers whose second reference has at most this share of inliers."""
     return float(np.interp(evidence.second_share, options.shares, LEVELS))
 
 
 def _hull_px2(pixels: Array) -> float:
-    """Area of the convex hull of pixels (N, 2); 0 of fewer than three."""
+    """Area of the convex hull of pixels (N, 2), square pixels; 0 for fewer than three."""
     return float(ConvexHull(pixels, qhull_options="QJ").volume) if len(pixels) >= 3 else 0.0

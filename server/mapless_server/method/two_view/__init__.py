@@ -1,1 +1,1 @@
-"""Pose from matches with the references themselves, where they share too little to triangulate: begin with `solve`."""
+"""Pose from two-view matches, where references share too little to triangulate points. Begin with `solve`."""

@@ -39,13 +39,13 @@ class TwoViewMatches:
 
     Attributes:
         reference: (T,) index of the reference.
-        keypoint: (T,) of the query; once for each reference at most.
-        reference_keypoint: (T,) of the reference.
-        ray: (T, 3) in the query's frame, depth one.
-        reference_ray: (T, 3) of depth one in the reference's frame, in world axes.
-        reference_centre: (T, 3) metres, world frame.
+        keypoint: (T,) keypoint of the query; once for each reference at most.
+        reference_keypoint: (T,) keypoint of the reference.
+        ray: (T, 3) viewing ray in the query's frame, of depth 1.
+        reference_ray: (T, 3) viewing ray of the reference, of depth 1 in its camera, in world axes.
+        reference_centre: (T, 3) camera centre of the reference, metres, world frame.
         reference_rotation: (T, 3, 3) world from camera of the reference.
-        focal_px, reference_focal_px: (T, 2).
+        focal_px, reference_focal_px: (T, 2) focal lengths along x and y.
     """
 
     reference: NDArray[np.intp]
@@ -66,7 +66,7 @@ class TwoViewMatches:
 
     @staticmethod
     def of(query: View, references: Sequence[PosedView], query_matches: Sequence[Matches]) -> TwoViewMatches:
-        """From matches (query keypoint, reference keypoint) with each reference."""
+        """Makes the matches from those (query keypoint, reference keypoint) with each reference."""
         count = [len(it) for it in query_matches]
         reference = np.repeat(np.arange(len(references)), count)
         pairs = np.concatenate([np.asarray(it, np.intp).reshape(-1, 2) for it in query_matches])
@@ -89,7 +89,7 @@ class TwoViewMatches:
         )
 
     def sampson_px(self, world_from_query: RigidTransform) -> Array:
-        """Sampson distances (T,); NaN without a baseline."""
+        """Sampson distances (T,) of the matches, pixels; NaN without a baseline."""
         rotation, centre = world_from_query.rotation, world_from_query.translation
         return np.asarray(self.sampson_along_px(rotation, centre, np.zeros(3), np.zeros(1))[0])
 

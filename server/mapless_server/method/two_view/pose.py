@@ -37,12 +37,12 @@ class RelativePoseOptions:
 
     Attributes:
         epipolar_px: largest Sampson distance of an inlier; keypoints are accurate to about a pixel.
-        pnp: of poses from 2D-3D matches; its `inlier_px` bounds their inliers.
-        min_iterations, max_iterations: of the generalized relative pose; 20,000 take 0.1 s.
-        pair_iterations: largest number for one reference, reached with 15 % inliers.
+        pnp: options of poses from 2D-3D matches; its `inlier_px` bounds their inliers.
+        min_iterations, max_iterations: bounds of iterations for the generalized relative pose; 20,000 take 0.1 s.
+        pair_iterations: largest number of iterations for one reference, reached with 15 % inliers.
         strongest: number of references whose relative pose is computed.
-        min_matches: with a reference, for its relative pose.
-        max_distances: of each, evenly thinned.
+        min_matches: least number of matches with a reference, for its relative pose.
+        max_distances: largest number of distances that are scored for each reference, evenly thinned.
     """
 
     epipolar_px: float = 2.0
@@ -67,10 +67,10 @@ class Evidence:
 
     Attributes:
         query: the photograph.
-        references: posed.
-        two_view: matches with them.
+        references: the posed references.
+        two_view: matches with the references.
         x_in_world: (N, 3) points of the 2D-3D matches.
-        keypoint: (N,) of the query.
+        keypoint: (N,) their keypoints in the query.
     """
 
     query: View
@@ -81,17 +81,17 @@ class Evidence:
 
     @property
     def pixels(self) -> Array:
-        """(N, 2) of the 2D-3D matches."""
+        """Pixels (N, 2) of the 2D-3D matches."""
         return self.query.features.keypoints[self.keypoint].astype(np.float64)
 
 
 def disc_chance(camera: Camera, inlier_px: float) -> float:
-    """Chance that a wrong match lies within `inlier_px` of a point's projection: the share of a disc in the image."""
+    """Chance that a wrong match lies within `inlier_px` of a point's projection: a disc's share of the image."""
     return float(min(1.0, np.pi * inlier_px**2 / (camera.width_px * camera.height_px)))
 
 
 def band_chance(camera: Camera, epipolar_px: float) -> float:
-    """Chance that a wrong match is this near to its epipolar line, by Sampson: the share of a band in the image.
+    """Chance that a wrong match is within this Sampson distance of its epipolar line: a band's share of the image.
 
     Both keypoints share the distance, so the band is sqrt(2) times as wide; it is at most as long as the diagonal.
     """
@@ -102,7 +102,7 @@ def band_chance(camera: Camera, epipolar_px: float) -> float:
 def find_pose(
     evidence: Evidence, options: RelativePoseOptions, known: Iterable[RigidTransform] = ()
 ) -> RigidTransform | None:
-    """world_from_query with the highest score, not refined; None without a candidate."""
+    """Returns the world_from_query with the highest score, not refined; None without a candidate."""
     candidates = [*known, *_from_points(evidence, options), *_generalized(evidence, options)]
     for reference in _strongest(evidence.two_view, options):
         candidates += _by_distance(evidence, reference, options)
@@ -112,7 +112,7 @@ def find_pose(
 
 
 def score(evidence: Evidence, world_from_query: RigidTransform, options: RelativePoseOptions) -> float:
-    """See the module."""
+    """The score of a pose; the docstring of this module defines it."""
     rotation, centre = world_from_query.rotation, world_from_query.translation
     return float(_scores_along(evidence, rotation, centre, np.zeros(3), np.zeros(1), options)[0])
 
@@ -179,14 +179,14 @@ def _generalized(evidence: Evidence, options: RelativePoseOptions) -> list[Rigid
 
 
 def _strongest(two_view: TwoViewMatches, options: RelativePoseOptions) -> list[int]:
-    """The references with the most matches."""
+    """Indices of the references with the most matches."""
     counts = np.bincount(two_view.reference)
     order = np.argsort(-counts, kind="stable")[: options.strongest]
     return [int(it) for it in order if counts[it] >= options.min_matches]
 
 
 def _by_distance(evidence: Evidence, reference: int, options: RelativePoseOptions) -> list[RigidTransform]:
-    """The pose relative to a reference, at the distance from it that the other matches support most."""
+    """Poses relative to a reference, each at the distance that the other matches support most."""
     view, two_view = evidence.references[reference], evidence.two_view
     theirs, ours = _pixels(evidence, two_view.reference == reference, reference)
     relative, _ = poselib.estimate_relative_pose(
@@ -218,7 +218,7 @@ def _by_distance(evidence: Evidence, reference: int, options: RelativePoseOption
 
 
 def _distances(evidence: Evidence, reference: int, rotation: Array, centre: Array, direction: Array) -> Array:
-    """The distance from the reference by each match with another reference, and by each with a point."""
+    """Distances from the reference that each match with another reference, and each 2D-3D match, gives."""
     others = evidence.two_view[evidence.two_view.reference != reference]
     normal = np.cross(others.ray @ rotation.T, others.reference_ray)
     rays = evidence.query.camera.rays(evidence.pixels) @ rotation.T
@@ -230,7 +230,7 @@ def _distances(evidence: Evidence, reference: int, rotation: Array, centre: Arra
 
 
 def _pixels(evidence: Evidence, rows: NDArray[np.bool_], reference: int) -> tuple[Array, Array]:
-    """Pixels (M, 2) of some matches in their reference and in the query."""
+    """Pixels (M, 2) of the given matches in their reference, and in the query."""
     two_view, view = evidence.two_view, evidence.references[reference].view
     theirs = view.features.keypoints[two_view.reference_keypoint[rows]]
     ours = evidence.query.features.keypoints[two_view.keypoint[rows]]
@@ -238,7 +238,7 @@ def _pixels(evidence: Evidence, rows: NDArray[np.bool_], reference: int) -> tupl
 
 
 def _finite(pose: poselib.CameraPose) -> list[RigidTransform]:
-    """The inverse of a pose of PoseLib; none if it is not finite."""
+    """Inverts a pose of PoseLib; an empty list if it is not finite."""
     rotation, translation = np.asarray(pose.R), np.asarray(pose.t)
     if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
         return []

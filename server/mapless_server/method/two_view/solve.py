@@ -35,9 +35,9 @@ class TwoViewOptions:
     """Options of the stage.
 
     Attributes:
-        pose: of the search for the initial pose, and of its inliers.
+        pose: options of the search for the initial pose, and of its inliers.
         min_parallax_deg: matches with a smaller parallax are not adjusted: their points have no depth.
-        rounds: of choosing inliers and adjusting.
+        rounds: number of rounds of choosing inliers and adjusting.
         min_inliers: fewer matches do not determine a pose with any redundancy.
     """
 
@@ -63,18 +63,18 @@ def solve_two_view(
     adjust_options: AdjustOptions,
     options: TwoViewOptions,
 ) -> Support | None:
-    """The pose that most of the matches of both kinds support, and these matches; None if there is none.
+    """Finds the pose that most matches of both kinds support, with these matches; None if there is none.
 
     Args:
         query: the photograph.
-        references: two or more.
-        correspondences: of all photographs.
-        known: world_from_query of other stages, which are candidates too.
-        origin: (3,) of the world of these, see `Support`.
-        structure_options: of the structure stage.
-        match_options: of the matching stage.
-        adjust_options: of the adjustment.
-        options: of this one.
+        references: two or more posed references.
+        correspondences: matches between all photographs.
+        known: poses world_from_query of other stages, which are candidates too.
+        origin: (3,) origin of their world, see `Support`.
+        structure_options: options of the structure stage.
+        match_options: options of the matching stage.
+        adjust_options: options of the adjustment.
+        options: options of this stage.
     """
     structure = triangulated_structure(references, correspondences, structure_options)
     matches = vote(structure, [len(it.view.features) for it in references], correspondences)
@@ -104,10 +104,10 @@ class _Solution:
     Attributes:
         world_from_query: the pose.
         score: see `pose`.
-        errors_px, inliers: (M,) of the 2D-3D matches.
+        errors_px, inliers: (M,) reprojection errors of the 2D-3D matches, and which are inliers.
         support: the two-view matches that are no inliers through a point.
-        parallax_deg: (T,) of these.
-        estimate: after an adjustment.
+        parallax_deg: (T,) their parallaxes.
+        estimate: the estimate after an adjustment; None before.
     """
 
     world_from_query: RigidTransform
@@ -132,7 +132,7 @@ class _Problem:
     options: TwoViewOptions
 
     def at(self, pose: RigidTransform, estimate: PoseEstimate | None = None) -> _Solution:
-        """The inliers of a pose."""
+        """Finds the inliers of a pose."""
         evidence, matches = self.evidence, self.matches
         query, pixels = evidence.query, evidence.query.features.keypoints[matches.keypoint].astype(np.float64)
         errors_px = reprojection_errors_px(query.camera, pose, self.structure.x_in_world[matches.point], pixels)
@@ -147,7 +147,7 @@ class _Problem:
         return _Solution(pose, value, errors_px, inliers, support, parallax_deg, estimate)
 
     def adjusted(self, start: _Solution) -> _Solution | None:
-        """After an adjustment over the inliers of both kinds; None if that fails."""
+        """Adjusts over the inliers of both kinds; None if that fails."""
         used = start.support.inliers & (start.parallax_deg >= self.options.min_parallax_deg)
         structure = _with_points(self.structure, start.support, used)
         added = np.arange(used.sum(), dtype=np.intp) + len(self.structure.x_in_world)
@@ -169,7 +169,7 @@ class _Problem:
 
 
 def _with_points(structure: Structure, support: TwoViewSupport, used: NDArray[np.bool_]) -> Structure:
-    """With the points of two-view matches, each seen by one reference."""
+    """Returns the structure with the points of two-view matches added, each observed by one reference."""
     tracks, points = structure.tracks, support.x_in_world[used]
     added = np.arange(len(points), dtype=np.intp) + len(structure.x_in_world)
     return replace(

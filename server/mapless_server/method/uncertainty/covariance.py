@@ -46,11 +46,12 @@ class UncertaintyOptions:
     """Options of the covariance.
 
     Attributes:
-        region_factor: on the standard deviations of the regions' part: the fit of the pose hides some of what a region
-            shares. With 1.5 the covariance is right against planted noise; between 1 and 2 photographs show no
-            difference.
-        position_factor, rotation_factor: on standard deviations, from `research.radii`.
-        max_matches: of the photograph, evenly thinned; the time is linear in it. All of them give radii as good.
+        region_factor: factor on the standard deviations of the regions' part: the fit of the pose hides a part of the
+            errors that a region shares. With 1.5 the covariance is right against planted noise; between 1 and 2
+            photographs show no difference.
+        position_factor, rotation_factor: factors on standard deviations, from `research.radii`.
+        max_matches: largest number of the photograph's matches, evenly thinned; the time is linear in it. Using all
+            matches gives no better radii.
     """
 
     region_factor: float = 1.5
@@ -65,12 +66,12 @@ class UncertaintyOptions:
 def adjusted_covariance(
     problem: BundleProblem, bundle: Bundle, options: UncertaintyOptions, is_offset: bool = False
 ) -> Array | None:
-    """All parts of a pose's covariance (6, 6) but that of the scale, with the factors; None if it is not determined.
+    """Covariance (6, 6) of a pose without the part of the scale, with the factors; None if it is not determined.
 
     Args:
-        problem: of the adjustment; priors on the query's pose take no part.
+        problem: problem of the adjustment; its priors on the query's pose are not used.
         bundle: its optimum.
-        options: see there.
+        options: options of the covariance.
         is_offset: whether the bundle is known not to be at the optimum.
     """
     dispersion = disperse(problem, bundle, options.max_matches)

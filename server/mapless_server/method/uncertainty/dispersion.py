@@ -56,10 +56,10 @@ REGIONS = 3
 
 @dataclass(frozen=True, eq=False)
 class Dispersion:
-    """Changes of a pose, left perturbations (v, w) of camera_from_world.
+    """Changes of a pose, as left perturbations (v, w) of camera_from_world.
 
     Attributes:
-        references: (K, 6) from the optimum to the one without each reference's observations.
+        references: (K, 6) change of the optimum without each reference's observations.
         regions: (G, 6) influence of the matches in each region of the photograph.
         offset: (6,) the Gauss-Newton step from the pose to the optimum.
     """
@@ -69,7 +69,7 @@ class Dispersion:
     offset: Array
 
     def covariance(self, region_factor: float) -> Array:
-        """C_r + f^2 C_p, (6, 6)."""
+        """Covariance C_r + f^2 C_p (6, 6)."""
         count = len(self.references)
         references = self.references - self.references.mean(axis=0)
         regions = region_factor * (self.regions - self.regions.mean(axis=0))
@@ -77,12 +77,13 @@ class Dispersion:
 
 
 def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Dispersion | None:
-    """How the query's pose changes without parts of the data; None if all together do not determine it.
+    """Computes how the query's pose changes without parts of the data; None if all data do not determine it.
 
     Args:
-        problem: of the adjustment; priors on the query's pose take no part.
+        problem: problem of the adjustment; its priors on the query's pose are not used.
         bundle: its optimum, or values near it.
-        max_matches: of the query, evenly thinned. What a reference or a region shares is the same in all of them.
+        max_matches: largest number of the query's matches, evenly thinned; the shared errors are the same in all of
+            them.
     """
     seen, bundle, thinning = _thinned(problem.by_view, bundle, max_matches)
     equations = seen.equations(bundle, problem.loss_scale_sigma)
@@ -116,7 +117,7 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
 
 
 def _thinned(seen: ViewColumns, bundle: Bundle, max_matches: int) -> tuple[ViewColumns, Bundle, int]:
-    """Every so many-th match of the query, with the other observations of its point."""
+    """Keeps every n-th match of the query, with the other observations of its point, so that `max_matches` remain."""
     of_query = seen.point[seen.parts[-1]]
     thinning = -(-len(of_query) // max_matches)
     if thinning <= 1:
@@ -127,7 +128,7 @@ def _thinned(seen: ViewColumns, bundle: Bundle, max_matches: int) -> tuple[ViewC
 
 
 def _rows_of_pose(matrix: Array) -> Array | None:
-    """Rows (6, U) of the inverse, those of the query's pose; None if it is not well-conditioned positive definite."""
+    """Rows (6, U) of the inverse for the query's pose; None if it is not well-conditioned and positive definite."""
     if not np.isfinite(matrix).all():
         return None
     try:
@@ -147,7 +148,7 @@ def _is_definite(covariance: Array) -> bool:
 
 
 def _influences(seen: ViewColumns, to_pose: Array, slopes: Array, points: EliminatedPoints) -> Array:
-    """(G, 6) of the regions, from the gradients (6, O) of the observations by their cameras' poses."""
+    """Influences (G, 6) of the regions, from the gradients (6, O) of the observations by their cameras' poses."""
     of_observation = np.concatenate(
         [to_pose[:, 6 * i : 6 * i + 6] @ slopes[:, part] for i, part in enumerate(seen.parts)], axis=1
     )
@@ -165,7 +166,7 @@ def _influences(seen: ViewColumns, to_pose: Array, slopes: Array, points: Elimin
 def _whitened(
     seen: ViewColumns, residual: Array, by_point: Array, weight: Array, points: EliminatedPoints
 ) -> tuple[Array, Array]:
-    """Of each observation a R^-T (3, 2, O) and R^-1 e (2, O), with S = R R^T."""
+    """For each observation, a R^-T (3, 2, O) and R^-1 e (2, O), with S = R R^T."""
     across = points.solved(np.moveaxis(by_point, 1, 0), seen.point)
     misfit = residual - (across * take(points.gradient, seen.point)[:, None]).sum(axis=0)
     least = LEAST_VARIANCE / weight

@@ -1,4 +1,4 @@
-"""Radii of a pose: errors not exceeded with a probability, by its covariance; how errors grow with the distance."""
+"""Radii of a pose, which errors do not exceed with a given probability; growth of errors with the distance."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def accuracy_from_covariance(covariance: Array) -> Accuracy:
 
 
 def error_radii(covariance: Array, probabilities: ArrayLike) -> Array:
-    """Lengths (P,) that a zero-mean normal vector with this covariance (n, n) does not exceed with probabilities (P,).
+    """Lengths (P,) that a zero-mean normal vector of covariance (n, n) does not exceed with probabilities (P,).
 
     The squared length is a sum of chi-squares weighted by the eigenvalues, approximated by one scaled chi-square with
     the same mean and variance (Satterthwaite). Exact if all eigenvalues are equal or all but one vanish, else within
@@ -71,7 +71,7 @@ SUPPORTING_SHARE = 0.1
 
 
 def viewpoint_gap(support: Support) -> tuple[float, float]:
-    """The distance to the nearest reference that holds the pose, by the median depth of the inliers; and that depth.
+    """Distance to the nearest reference that holds the pose, over the median depth of the inliers; and that depth.
 
     Raises:
         ValueError: there is no estimate.
@@ -90,6 +90,6 @@ def viewpoint_gap(support: Support) -> tuple[float, float]:
 
 
 def growth(gap: float) -> tuple[float, float]:
-    """Ratios of position's and rotation's errors to their radii at a gap, by those at the usual one."""
+    """Ratios of the errors of position and rotation to their radii at a gap, relative to those at the usual gap."""
     ratio = float(np.clip(gap, LEAST_GAP, LARGEST_GAP)) / USUAL_GAP
     return ratio**POSITION_GROWTH, ratio**ROTATION_GROWTH

