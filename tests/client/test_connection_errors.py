@@ -25,10 +25,7 @@ def addresses() -> Iterator[dict[str, str]]:
     """Servers that answer nothing, one with TLS, one without; and a port without a listener."""
     plain, tls = (grpc.server(ThreadPoolExecutor(1)) for _ in range(2))
     credentials = grpc.ssl_server_credentials([(CERTIFICATE.key_pem, CERTIFICATE.certificate_pem)])
-    ports = {
-        "plain": plain.add_insecure_port("127.0.0.1:0"),
-        "tls": tls.add_secure_port("127.0.0.1:0", credentials),
-    }
+    ports = {"plain": plain.add_insecure_port("127.0.0.1:0"), "tls": tls.add_secure_port("127.0.0.1:0", credentials)}
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         ports["nobody"] = taken.getsockname()[1]

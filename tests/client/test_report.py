@@ -15,14 +15,7 @@ import pytest
 from support.images import encode, textured, with_exif_orientation
 from support.planted_answers import CAMERA, NOW, debug, diagnostics, localized, rejected, truth
 
-from mapless.answers import (
-    Accuracy,
-    Hint,
-    Hypothesis,
-    LocalizationResult,
-    PriorCheck,
-    Rejected,
-)
+from mapless.answers import Accuracy, Hint, Hypothesis, LocalizationResult, PriorCheck, Rejected
 from mapless.geometry import Array
 from mapless.report import pictures, report_html, write_report
 from mapless.report.overlay import magnification

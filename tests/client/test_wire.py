@@ -44,16 +44,8 @@ def test_cameras_come_back_as_they_were(distortion: RadialTangential | Fisheye |
         (wire.camera_to_message, "camera.json", "camera must be a Camera, is str; read_camera"),
         (wire.camera_to_message, changed(width_px=640.0), "camera.width_px must be a whole number, is 640.0"),
         (wire.camera_to_message, changed(focal_x_px="5"), "camera.focal_x_px must be a number, is '5'"),
-        (
-            wire.transform_to_message,
-            np.eye(4),
-            "must be a RigidTransform, is numpy.ndarray; ",
-        ),
-        (
-            lambda it: names.reference_names("s", it),
-            "r1",
-            "references must be a list of .*, is the text 'r1'",
-        ),
+        (wire.transform_to_message, np.eye(4), "must be a RigidTransform, is numpy.ndarray; "),
+        (lambda it: names.reference_names("s", it), "r1", "references must be a list of .*, is the text 'r1'"),
         (lambda it: set_priors(None, it), PositionPrior(np.zeros(3), 1.0), "must be a Priors, .* is a PositionPrior"),
         (
             lambda it: create_request("s", it),

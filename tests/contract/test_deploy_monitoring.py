@@ -196,10 +196,7 @@ def test_alerts_come_and_stay_away() -> None:
 @pytest.mark.skipif(shutil.which("promtool") is None, reason="promtool, of Prometheus, is not here")
 def test_promtool_finds_no_fault_in_the_metrics() -> None:
     done = subprocess.run(
-        ["promtool", "check", "metrics"],
-        input=generate_latest(Metrics().registry),
-        capture_output=True,
-        timeout=60,
+        ["promtool", "check", "metrics"], input=generate_latest(Metrics().registry), capture_output=True, timeout=60
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
 

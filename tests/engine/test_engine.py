@@ -180,10 +180,7 @@ class TestTiers:
     def test_the_times_of_both_tiers_are_separate(self, setting: Setting) -> None:
         setting.replies = {"cheap": rejected(), "strong": localized(SURE_INLIERS)}
         seconds = setting.localize().stage_seconds
-        assert list(seconds) == [
-            *("decode", "features", "correspond"),
-            *("strong/features", "strong/coarse"),
-        ]
+        assert list(seconds) == [*("decode", "features", "correspond"), *("strong/features", "strong/coarse")]
         assert (seconds["correspond"], seconds["strong/coarse"]) == (0.125, 0.25)
 
     def test_contradicting_poses_are_rejected_by_name(self, setting: Setting) -> None:

@@ -75,10 +75,7 @@ def fuzz(target: str, output: Path, runs: int, seed: int, limit_s: float | None 
     (folder / "counts.json").unlink(missing_ok=True)
     arguments = [target, "--output", str(folder.resolve()), "--runs", str(runs), "--seed", str(seed)]
     begin_s = time.monotonic()
-    with (
-        (folder / "log").open("wb") as log,
-        tempfile.TemporaryDirectory(prefix="fuzz-", dir=folders.memory()) as place,
-    ):
+    with (folder / "log").open("wb") as log, tempfile.TemporaryDirectory(prefix="fuzz-", dir=folders.memory()) as place:
         ended = subprocess.run(
             [sys.executable, "-m", "fuzz.run", *arguments],
             cwd=TESTS,

@@ -98,11 +98,7 @@ def seeds() -> list[bytes]:
         b"postgres:///m?host=/run",
         b"postgresql://u@[::1]/m",
     ]
-    return [
-        *(b"\0" + it for it in files),
-        *(b"\1" + it for it in environments),
-        *(b"\2" + it for it in urls),
-    ]
+    return [*(b"\0" + it for it in files), *(b"\1" + it for it in environments), *(b"\2" + it for it in urls)]
 
 
 TARGET = Target(

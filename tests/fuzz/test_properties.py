@@ -60,11 +60,7 @@ def cameras(draw: st.DrawFn) -> Camera:
     focals = draw(st.tuples(*[st.floats(0.01 * max(width, height), 100.0 * max(width, height))] * 2))
     centre = draw(st.floats(-width, 2 * width)), draw(st.floats(-height, 2 * height))
     lens: Distortion | None = draw(
-        st.one_of(
-            st.none(),
-            st.builds(RadialTangential, *[coefficients] * 5),
-            st.builds(Fisheye, *[coefficients] * 4),
-        )
+        st.one_of(st.none(), st.builds(RadialTangential, *[coefficients] * 5), st.builds(Fisheye, *[coefficients] * 4))
     )
     return Camera(width, height, focals[0], focals[1], centre[0], centre[1], lens)
 

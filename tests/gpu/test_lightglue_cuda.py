@@ -18,10 +18,7 @@ from support.small_networks import small_network
 from mapless_server.networks.lightglue import LightGlue
 from mapless_server.networks.runner import NetworkRunner
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
-]
+pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")]
 
 KEYPOINTS, REFERENCES, WIDTH = 300, 4, 128
 

@@ -19,10 +19,7 @@ from support.small_networks import photograph, view_of
 from mapless_server.networks import blocks
 from mapless_server.scenes.retrieval.megaloc import MegaLocDescriptor, MegaLocOptions
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
-]
+pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")]
 
 OPTIONS = MegaLocOptions(dimension=24, batch=3)
 VIEWS = [view_of(photograph(textured(80 + 8 * i, 60, seed=i))) for i in range(7)]

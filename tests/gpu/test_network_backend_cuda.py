@@ -22,10 +22,7 @@ from mapless_server.method.coarse.token_cache import TokenCacheOptions
 from mapless_server.networks.network import NetworkOutput
 from mapless_server.networks.runner import NetworkRunner
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
-]
+pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")]
 
 OPTIONS = NetworkOptions(grids=GRIDS)
 UNCACHED = NetworkOptions(grids=GRIDS, cache=TokenCacheOptions(0, 0))

@@ -16,10 +16,7 @@ from mapless_server.method.on_device.compute import Options, compute
 from mapless_server.method.on_device.transfer import upload
 from mapless_server.method.scale_equations import ScaleOptions
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
-]
+pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")]
 
 
 def on_cuda(case: Case) -> Case:

@@ -407,9 +407,7 @@ def test_what_determines_matches_is_in_their_name() -> None:
     assert Matcher(replace(usual, query_ratio=0.5)).matching() == Matcher(usual).matching()
 
 
-def test_the_cache_is_bounded_and_drops_the_least_recently_used(
-    matched_pairs: list[tuple[Features, Features]],
-) -> None:
+def test_the_cache_is_bounded_and_drops_the_least_recently_used(matched_pairs: list[tuple[Features, Features]]) -> None:
     scene = make_scene(random_for("bounded"), SceneOptions(reference_count=4, point_count=50))
     a, b, c, d = scene.references
     matcher = Matcher(CorrespondOptions(remembered_pairs=2))

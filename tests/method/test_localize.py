@@ -424,10 +424,7 @@ def test_gate_is_the_reason(seed: int) -> None:
     ids=["more inliers", "as many", "a claim as wide as a room", "instead of none", "none"],
 )
 def test_the_better_of_strict_and_wide_answer_is_returned(
-    strict: tuple[int, float] | None,
-    wide: tuple[int, float] | None,
-    wide_wins: bool,
-    monkeypatch: pytest.MonkeyPatch,
+    strict: tuple[int, float] | None, wide: tuple[int, float] | None, wide_wins: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def made(claim: tuple[int, float] | None) -> Answer:
         if claim is None:
@@ -487,11 +484,7 @@ def test_pnp_failed_is_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
 # Many queries, in three parts
 
 
-def prepared_of(
-    pipeline: Pipeline,
-    options: LocalizeOptions | None = None,
-    query: View | None = None,
-) -> Prepared:
+def prepared_of(pipeline: Pipeline, options: LocalizeOptions | None = None, query: View | None = None) -> Prepared:
     context = StageContext()
     prepared = prepare(query or SCENE.query, SCENE.references, pipeline, options or LocalizeOptions(), context)
     assert isinstance(prepared, Prepared), prepared

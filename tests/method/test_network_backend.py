@@ -587,11 +587,7 @@ def test_the_unit_of_poses_is_the_metre_as_the_scene_says() -> None:
     backend = grey_backend(runner)
     query, references = grey_request(1, 50, 60)
     same_place = [replace(it, world_from_camera=references[0].world_from_camera) for it in references]
-    requests = [
-        Request(query, references),
-        Request(query, references, is_metric=False),
-        Request(query, same_place),
-    ]
+    requests = [Request(query, references), Request(query, references, is_metric=False), Request(query, same_place)]
     backend.reconstruct_many(requests)
     (given,) = runner.given
     poses, posed, metric = given

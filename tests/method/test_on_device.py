@@ -141,11 +141,7 @@ def test_one_to_one_equals_the_hosts() -> None:
 def arguments_of(case: Case, variant: str) -> tuple[DeviceReconstruction, Inputs, Options]:
     options = Options(ScaleOptions(), *VARIANTS[variant])
     job = prepare(
-        case.reconstruction.reference_cameras,
-        case.scene.query,
-        case.scene.references,
-        case.correspondences,
-        options,
+        case.reconstruction.reference_cameras, case.scene.query, case.scene.references, case.correspondences, options
     )
     return case.reconstruction, job.inputs, options
 

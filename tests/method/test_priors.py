@@ -198,12 +198,7 @@ def test_priors_shift_with_the_world() -> None:
     priors = Priors(**{kind: planted(kind, POSE, rng) for kind in KINDS})  # type: ignore[arg-type]
     there = priors.shifted(offset)
     assert there.cost(POSE.shifted(offset)) == pytest.approx(priors.cost(POSE), rel=1e-6)
-    assert [prior.kind for prior in there] == [
-        PriorKind.POSITION,
-        PriorKind.HEADING,
-        PriorKind.GRAVITY,
-        PriorKind.POSE,
-    ]
+    assert [prior.kind for prior in there] == [PriorKind.POSITION, PriorKind.HEADING, PriorKind.GRAVITY, PriorKind.POSE]
 
 
 def test_empty_priors_are_false() -> None:

@@ -88,11 +88,7 @@ def test_a_chain_of_matches_is_one_track() -> None:
 
 def test_separate_matches_are_separate_tracks() -> None:
     tracks = build_tracks(pairs_of({(0, 1): [(0, 1), (1, 0)], (1, 2): [(2, 2)]}), [3, 3, 3])
-    assert as_sets(tracks) == {
-        frozenset({(0, 0), (1, 1)}),
-        frozenset({(0, 1), (1, 0)}),
-        frozenset({(1, 2), (2, 2)}),
-    }
+    assert as_sets(tracks) == {frozenset({(0, 0), (1, 1)}), frozenset({(0, 1), (1, 0)}), frozenset({(1, 2), (2, 2)})}
 
 
 def test_a_conflict_keeps_the_better_connected_keypoint() -> None:

@@ -28,11 +28,7 @@ TOLERANCE = 5e-5
 METRIC_TOLERANCE = 1e-5
 
 SMALL_CASES = sorted(path.stem for path in HERE.glob("*.npz"))
-FULL_CASES = [
-    ("pi3", "pi3_full"),
-    ("pi3x", "pi3x_full_plain"),
-    ("pi3x", "pi3x_full_pose_refs"),
-]
+FULL_CASES = [("pi3", "pi3_full"), ("pi3x", "pi3x_full_plain"), ("pi3x", "pi3x_full_pose_refs")]
 
 
 @pytest.fixture(scope="module")

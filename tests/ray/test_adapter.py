@@ -144,11 +144,7 @@ async def test_tls_is_rejected_behind_serve(settings: Settings) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    [
-        "RAY_SERVE_ENABLE_HA_PROXY",
-        "RAY_SERVE_RUN_USER_CODE_IN_SEPARATE_THREAD",
-        "RAY_SERVE_GRPC_MAX_MESSAGE_SIZE",
-    ],
+    ["RAY_SERVE_ENABLE_HA_PROXY", "RAY_SERVE_RUN_USER_CODE_IN_SEPARATE_THREAD", "RAY_SERVE_GRPC_MAX_MESSAGE_SIZE"],
 )
 def test_a_variable_that_is_missing_or_wrong_is_named(settings: Settings, name: str) -> None:
     good = variables(settings.max_message_mib)

@@ -19,15 +19,7 @@ pytest.importorskip("ray.serve", reason="needs Ray Serve: the extra `ray`")
 from ray.serve.autoscaling_policy import _apply_autoscaling_config
 from ray.serve.config import AutoscalingConfig, AutoscalingContext
 
-from mapless_ray.scaling import (
-    BUSY,
-    QUEUED,
-    TARGET_BUSY,
-    TARGET_QUEUED_S,
-    Reporter,
-    by_device_seconds,
-    replicas_for,
-)
+from mapless_ray.scaling import BUSY, QUEUED, TARGET_BUSY, TARGET_QUEUED_S, Reporter, by_device_seconds, replicas_for
 
 shares = st.lists(st.floats(0, 1), min_size=1, max_size=20)
 queues = st.lists(st.floats(0, 2), min_size=1, max_size=20)

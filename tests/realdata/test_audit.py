@@ -81,8 +81,7 @@ def check_fault(found: ReferenceAudit, fault: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "scene",
-    [FOUNTAIN, *map(nightly, (KITCHEN, "herz-jesus-P8", "tum-fr3-office", "kitti-drive-a"))],
+    "scene", [FOUNTAIN, *map(nightly, (KITCHEN, "herz-jesus-P8", "tum-fr3-office", "kitti-drive-a"))]
 )
 def test_nothing_is_found_where_nothing_was_planted(photographs: Photographs, scene: str) -> None:
     """On the drive the first poses are off by 6 to 11 cm themselves: there may be doubt, but no fault."""

@@ -50,10 +50,7 @@ def test_among_the_references_one_is_localized(scene: SyntheticScene, pairs: Pai
     ],
 )
 def test_where_no_reference_looks_one_is_not_localized(
-    scene: SyntheticScene,
-    pairs: PairMatches,
-    centre: tuple[float, float, float],
-    target: tuple[float, float, float],
+    scene: SyntheticScene, pairs: PairMatches, centre: tuple[float, float, float], target: tuple[float, float, float]
 ) -> None:
     coverage = check(scene, pairs, look_at(centre, target))
     assert coverage.verdict is CoverageVerdict.NOT_LOCALIZABLE

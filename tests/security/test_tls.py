@@ -296,11 +296,7 @@ class TestFilesAtTheStart:
             ("key", b"-----BEGIN PRIVATE KEY-----\nAAAA\n-----END PRIVATE KEY-----\n", "no private key in PEM form"),
             ("key", AUTHORITY.certificate_pem, "no private key in PEM form"),
             ("key", AUTHORITY.key_pem, "is not that of the first certificate"),
-            (
-                "key",
-                AUTHORITY.key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, PASSWORD),
-                "encrypted",
-            ),
+            ("key", AUTHORITY.key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, PASSWORD), "encrypted"),
             ("client_ca", AUTHORITY.key_pem, "holds no certificate in PEM form"),
         ],
     )

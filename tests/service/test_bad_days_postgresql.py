@@ -20,15 +20,7 @@ from support.postgres import Cluster, require
 from support.servers import CAMERA, PHOTO, pose, serving
 from support.waiting import wait_until
 
-from mapless import (
-    AlreadyExists,
-    Client,
-    ConnectOptions,
-    LocalizationResult,
-    MaplessError,
-    NewReference,
-    Unavailable,
-)
+from mapless import AlreadyExists, Client, ConnectOptions, LocalizationResult, MaplessError, NewReference, Unavailable
 from mapless.geometry import Camera
 from mapless_server.store import Store
 
@@ -134,9 +126,7 @@ def test_without_room_for_its_tables_changes_alone_are_refused(tmp_path: Path) -
         assert {it.reference_id for it in client.list_references("s")} == stored
 
 
-def test_a_full_log_disk_loses_nothing_acknowledged(
-    tmp_path: Path,
-) -> None:
+def test_a_full_log_disk_loses_nothing_acknowledged(tmp_path: Path) -> None:
     with _filled(tmp_path, lambda disk: Cluster(log_on=disk)) as (client, database, stored, refusal):
         assert refusal.reason in {"STORE_FULL", "STORE_UNAVAILABLE"}
         with pytest.raises(Unavailable) as caught:

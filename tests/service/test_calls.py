@@ -14,14 +14,7 @@ import pytest
 from support.servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, localize_request, pose, serving
 from support.waiting import wait_until
 
-from mapless import (
-    Client,
-    ConnectOptions,
-    DeadlineExceeded,
-    LocalizationResult,
-    NewReference,
-    ResourceExhausted,
-)
+from mapless import Client, ConnectOptions, DeadlineExceeded, LocalizationResult, NewReference, ResourceExhausted
 from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.observability.logs import JsonFormatter

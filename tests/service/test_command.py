@@ -336,11 +336,7 @@ class TestOnATerminal:
         return begin
 
     def test_a_photograph_is_a_few_lines(
-        self,
-        run: Run,
-        scene: str,
-        folder: Path,
-        terminal: Callable[[], None],
+        self, run: Run, scene: str, folder: Path, terminal: Callable[[], None]
     ) -> None:
         terminal()
         photo = str(folder / "images" / "0.png")
@@ -353,11 +349,7 @@ class TestOnATerminal:
         assert run("localize", scene, photo, "--camera", FOUR_NUMBERS, "--json")[1]["inlier_count"] == 90
 
     def test_a_folder_is_a_table_and_a_bar(
-        self,
-        run: Run,
-        scene: str,
-        folder: Path,
-        terminal: Callable[[], None],
+        self, run: Run, scene: str, folder: Path, terminal: Callable[[], None]
     ) -> None:
         terminal()
         code, printed, report = run("localize", scene, folder)

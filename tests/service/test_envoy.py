@@ -374,11 +374,7 @@ def test_servers_get_the_callers_metadata_and_address(tmp_path: Path) -> None:
     service = health.HealthServicer()
     service.set("mapless.v1.LocalizationService", health_pb2.HealthCheckResponse.SERVING)
     add = partial(health_pb2_grpc.add_HealthServicer_to_server, service)
-    with (
-        hosted(echo, add=add) as address,
-        gateway(tmp_path, [address]) as running,
-        channel_to(running) as channel,
-    ):
+    with hosted(echo, add=add) as address, gateway(tmp_path, [address]) as running, channel_to(running) as channel:
         call = channel.unary_unary("/mapless.v1.LocalizationService/Localize")
         call(b"", timeout=50)
         said = [

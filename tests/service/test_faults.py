@@ -87,10 +87,7 @@ class TestClients:
         """
         photo = tmp_path / "photo.png"
         photo.write_bytes(PHOTO)
-        with (
-            serving(tmp_path / "data", metrics=True, metrics_port=0) as server,
-            Client(server.address) as client,
-        ):
+        with serving(tmp_path / "data", metrics=True, metrics_port=0) as server, Client(server.address) as client:
             make_scene(client)
             with server.method.held():
                 victim = subprocess.Popen([sys.executable, "-c", caller, server.address, str(photo)])

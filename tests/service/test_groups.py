@@ -241,11 +241,7 @@ BAD_SEQUENCES: dict[str, Case] = {
     "no frame": ("frames", None),
     "17 frames": ("frames", [sequence_request("").frames[0]] * 14),
     "no pose": ("frames[1].session_from_camera", None),
-    "NaN rotation": (
-        "frames[1].session_from_camera.rotation.w",
-        math.nan,
-        "frames[1].session_from_camera.rotation",
-    ),
+    "NaN rotation": ("frames[1].session_from_camera.rotation.w", math.nan, "frames[1].session_from_camera.rotation"),
     "unknown axes": ("options.axes", 77),
     "other size": ("frames[2].intrinsics.width_px", 97),
 }

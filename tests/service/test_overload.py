@@ -29,14 +29,7 @@ from support.servers import (
 )
 from support.waiting import wait_until
 
-from mapless import (
-    Client,
-    ConnectOptions,
-    DeadlineExceeded,
-    LocalizationResult,
-    Rejected,
-    ResourceExhausted,
-)
+from mapless import Client, ConnectOptions, DeadlineExceeded, LocalizationResult, Rejected, ResourceExhausted
 from mapless.errors import from_rpc_error
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.engine.stages import Method

@@ -14,10 +14,7 @@ STAGES = ["decode", "features", "coarse", "pnp"]
 
 @pytest.mark.parametrize(
     ("trust", "answered", "stages"),
-    [
-        (0.9, "cheap", STAGES),
-        (0.01, "strong", [*STAGES, *(f"strong/{it}" for it in ("features", "coarse", "pnp"))]),
-    ],
+    [(0.9, "cheap", STAGES), (0.01, "strong", [*STAGES, *(f"strong/{it}" for it in ("features", "coarse", "pnp"))])],
     ids=["sure", "doubtful"],
 )
 def test_an_answer_names_its_features_and_the_time_of_all(

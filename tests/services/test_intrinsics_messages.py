@@ -22,10 +22,7 @@ from mapless_server.store import SceneAttributes
 
 def sigma_of(uncertainty: pb.IntrinsicsUncertainty | None) -> IntrinsicsSigma | None:
     request = pb.LocalizeRequest(
-        scene="scenes/hall",
-        image=PHOTO,
-        intrinsics=wire.camera_to_message(CAMERA),
-        intrinsics_uncertainty=uncertainty,
+        scene="scenes/hall", image=PHOTO, intrinsics=wire.camera_to_message(CAMERA), intrinsics_uncertainty=uncertainty
     )
     return query_from_message(request, "", EngineOptions(), SceneAttributes()).options.intrinsics
 

@@ -95,9 +95,7 @@ def test_a_captured_answer_is_marked(served: tuple[Client, LocalizationServiceSt
     assert kept.request_id == answer.diagnostics.request_id
 
 
-def test_a_captured_final_answer_of_a_stream_is_marked(
-    served: tuple[Client, LocalizationServiceStub, Path],
-) -> None:
+def test_a_captured_final_answer_of_a_stream_is_marked(served: tuple[Client, LocalizationServiceStub, Path]) -> None:
     _, stub, folder = served
     final = list(stub.LocalizeProgressively(localize_request("s"), timeout=30))[-1].answer
     assert final.diagnostics.captured
@@ -105,9 +103,7 @@ def test_a_captured_final_answer_of_a_stream_is_marked(
     assert decode_call(captured_in(folder)[0].read_bytes()).response == final.SerializeToString()
 
 
-def test_each_photograph_of_a_captured_group_is_marked(
-    served: tuple[Client, LocalizationServiceStub, Path],
-) -> None:
+def test_each_photograph_of_a_captured_group_is_marked(served: tuple[Client, LocalizationServiceStub, Path]) -> None:
     _, stub, folder = served
     about: dict[str, Any] = {"image": PHOTO, "intrinsics": wire.camera_to_message(CAMERA)}
     poses = [wire.transform_to_message(pose(x_m)) for x_m in (0.0, 0.1)]

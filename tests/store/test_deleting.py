@@ -12,16 +12,7 @@ from typing import Any
 
 import pytest
 from sqlalchemy import Connection
-from support.stores import (
-    EXTRACTOR,
-    Folder,
-    Place,
-    Shared,
-    assert_same_view,
-    faults_of,
-    make_reference,
-    view_of,
-)
+from support.stores import EXTRACTOR, Folder, Place, Shared, assert_same_view, faults_of, make_reference, view_of
 
 from mapless_server import errors
 from mapless_server.security import DEFAULT_TENANT, SceneKey

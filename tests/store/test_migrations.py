@@ -10,15 +10,7 @@ import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 from sqlalchemy import Connection, insert, text
-from support.stores import (
-    EXTRACTOR,
-    Folder,
-    Place,
-    Shared,
-    assert_same_view,
-    make_reference,
-    view_of,
-)
+from support.stores import EXTRACTOR, Folder, Place, Shared, assert_same_view, make_reference, view_of
 
 from mapless_server.security import SceneKey
 from mapless_server.store import SceneAttributes, Store, StoreError, rows

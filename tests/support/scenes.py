@@ -152,9 +152,7 @@ def observe(
 
     order = random.permutation(len(points))
     features = Features(
-        keypoints[order].astype(np.float32),
-        observed[order].astype(np.float32),
-        np.full(len(order), 8.0, np.float32),
+        keypoints[order].astype(np.float32), observed[order].astype(np.float32), np.full(len(order), 8.0, np.float32)
     )
     return View(camera, features), points[order].astype(np.int64)
 

@@ -60,11 +60,7 @@ class TestSplit:
     def test_leaves_some_out_if_fewer_queries_are_wanted(self) -> None:
         assert split_frames(11, EvaluationOptions(query_count=3)).queries == (0, 5, 10)
 
-    @given(
-        frames=st.integers(2, 700),
-        references=st.integers(2, 60),
-        queries=st.integers(1, 80),
-    )
+    @given(frames=st.integers(2, 700), references=st.integers(2, 60), queries=st.integers(1, 80))
     def test_gives_existing_frames_and_no_query_among_references(
         self, frames: int, references: int, queries: int
     ) -> None:

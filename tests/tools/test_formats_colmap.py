@@ -139,11 +139,7 @@ def test_images_may_lie_anywhere(tmp_path: Path) -> None:
             (80, 81, 47.75, 31.25, 0.1, -0.2, 0.3, 0.4),
             replace(CAMERA, distortion=Fisheye(0.1, -0.2, 0.3, 0.4)),
         ),
-        (
-            "SIMPLE_RADIAL_FISHEYE",
-            (80, 47.75, 31.25, 0.1),
-            replace(CAMERA, focal_y_px=80.0, distortion=Fisheye(0.1)),
-        ),
+        ("SIMPLE_RADIAL_FISHEYE", (80, 47.75, 31.25, 0.1), replace(CAMERA, focal_y_px=80.0, distortion=Fisheye(0.1))),
         (
             "RADIAL_FISHEYE",
             (80, 47.75, 31.25, 0.1, 0.2),
@@ -257,8 +253,7 @@ def test_several_models_are_named_rather_than_one_guessed(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    "lens",
-    [None, RadialTangential(0.1, -0.2, 0.01, 0.02), RadialTangential(0.1, k3=0.3), Fisheye(0.1, 0.2, 0.3, 0.4)],
+    "lens", [None, RadialTangential(0.1, -0.2, 0.01, 0.02), RadialTangential(0.1, k3=0.3), Fisheye(0.1, 0.2, 0.3, 0.4)]
 )
 def test_what_is_written_reads_back(tmp_path: Path, lens: RadialTangential | Fisheye | None) -> None:
     planted = Truth(TRUTH.poses, replace(CAMERA, distortion=lens))

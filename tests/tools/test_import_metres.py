@@ -115,9 +115,7 @@ def test_umeyama_is_least_squares() -> None:
 
     for step in 1e-3 * generator.standard_normal((200, 7)):
         near = Similarity(
-            found.scale * (1 + step[0]),
-            rotation_from_vector(step[1:4]) @ found.rotation,
-            found.translation + step[4:],
+            found.scale * (1 + step[0]), rotation_from_vector(step[1:4]) @ found.rotation, found.translation + step[4:]
         )
         assert cost(near) > cost(found)
 

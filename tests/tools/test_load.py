@@ -154,9 +154,7 @@ def test_how_a_call_ended_for_its_caller(code: str, detail: str, kind: Kind, too
 
 
 @given(st.lists(st.tuples(st.sampled_from(Fate), st.floats(0, 9.99), st.floats(0, 3)), max_size=40))
-def test_every_call_is_counted_once_within_the_offered_rate(
-    calls: list[tuple[Fate, float, float]],
-) -> None:
+def test_every_call_is_counted_once_within_the_offered_rate(calls: list[tuple[Fate, float, float]]) -> None:
     records = [record(fate, at_s, took_s) for fate, at_s, took_s in calls]
     account = account_of(records, 10.0, 2.0)
     assert sum(account.fates.values()) == sum(account.outcomes.values()) == account.sent == len(records)
@@ -503,9 +501,7 @@ def test_the_file_of_figures_keeps_earlier_parts(tmp_path: Path) -> None:
     assert len(verdicts) == len(content["pipeline"]["checks"])
 
 
-async def test_a_step_uses_the_servers_account_of_its_time_only(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_a_step_uses_the_servers_account_of_its_time_only(monkeypatch: pytest.MonkeyPatch) -> None:
     pages = iter([Scrape(10, {"OK": 10}, {}, {}), Scrape(13, {"OK": 13}, {}, {})])
     monkeypatch.setattr("mapless_tools.load.watch.read_metrics", lambda _: next(pages))
 
