@@ -19,6 +19,7 @@ from mapless_server.method.correspond import (
     OPTIONS,
     CorrespondOptions,
     Matcher,
+    best_of_both,
     epipolar_distance_px,
     epipolar_distances_px,
     make_matcher,
@@ -71,6 +72,27 @@ def test_mutual_matches_equal_brute_force(n: int, m: int, noise: float, ratio: f
     if either:
         turned = mutual_matches(second, first, ratio, either)
         assert sorted(turned[:, ::-1].tolist()) == matches.tolist()
+
+
+@pytest.mark.parametrize(("n", "m"), [(2, 3), (130, 500), (300, 128)])
+def test_products_of_whole_numbers_are_those_of_floats(n: int, m: int) -> None:
+    """To the last bit, since sums of up to 127^2 64 are exact as float32; largest numbers included."""
+    torch = pytest.importorskip("torch", reason="the networks extra is not installed")
+    if not correspond._multiplies_exactly(torch):
+        pytest.skip("the processor has no products of int8 that do not saturate")
+    random = random_for("whole", n, m)
+    first, second = (
+        replace(features(np.empty((k, 64))), descriptors=random.integers(-127, 128, (k, 64)).astype(np.int8))
+        for k in (n, m)
+    )
+    first.descriptors[0] = second.descriptors[-1] = 127
+    a, b = (it.descriptors.astype(np.float32) for it in (first, second))
+    expected = a @ b.T * correspond._inverse_lengths(second) * correspond._inverse_lengths(first)[:, None]
+    assert np.concatenate([*correspond.cosine_blocks(first, second)]).tobytes() == expected.tobytes()
+    plain = first.unit_descriptors() @ second.unit_descriptors().T
+    for either in (False, True):
+        matches = mutual_matches(first, second, 0.99, either)
+        assert matches.tolist() == best_of_both(plain.copy(), 0.99, either=either).tolist()
 
 
 def test_matches_are_one_to_one_and_grow_with_the_ratio() -> None:

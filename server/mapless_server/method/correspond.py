@@ -13,15 +13,17 @@ queries that fail otherwise.
 
 from __future__ import annotations
 
+import sys
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import cache
 from itertools import combinations
 from pathlib import Path
 from threading import Lock
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +34,9 @@ from .choices import EDGEPOINT2
 from .options import check_bounds
 from .tracks import Tracks, build_tracks
 from .views import Features, Matches, PosedView, View
+
+_ROWS_AT_ONCE = 128
+"""With 2,000 columns a block of cosines has 1 MB, as the second-level cache of a core."""
 
 _PAIRS_THAT_COUNT = 10
 """For `Matcher.pair_s`, about."""
@@ -444,7 +449,55 @@ def mutual_matches(first: Features, second: Features, ratio: float, either: bool
     """
     if len(first) < 2 or len(second) < 2:
         return np.empty((0, 2), np.int32)
-    return best_of_both(first.unit_descriptors() @ second.unit_descriptors().T, ratio, either=either)
+    if either:
+        return best_of_both(np.concatenate([*cosine_blocks(first, second)]), ratio, either=True)
+    nearest, best, second_best = np.empty(len(first), np.intp), *np.empty((2, len(first)), np.float32)
+    best_of_column, begin = np.full(len(second), -np.inf, np.float32), 0
+    for cosines in cosine_blocks(first, second):
+        part, rows = slice(begin, begin + len(cosines)), np.arange(len(cosines))
+        nearest[part] = cosines.argmax(axis=1)
+        best[part] = cosines[rows, nearest[part]]
+        np.maximum(best_of_column, cosines.max(axis=0), out=best_of_column)
+        cosines[rows, nearest[part]] = -1.0
+        second_best[part] = cosines.max(axis=1)
+        begin = part.stop
+    mutual = best >= best_of_column[nearest]
+    keep = np.flatnonzero(mutual & (best > -1.0) & (1 - best < ratio**2 * (1 - second_best)))
+    return np.stack([keep, nearest[keep]], axis=1).astype(np.int32)
+
+
+def cosine_blocks(first: Features, second: Features) -> Iterator[NDArray[np.float32]]:
+    """The matrix (N, M) of cosines, in blocks of rows.
+
+    Descriptors of int8 are multiplied as whole numbers where torch is loaded and the processor has instructions for
+    that, in half to four fifths of the time of float32. The processor's cache holds a block.
+    """
+    torch = sys.modules.get("torch")
+    is_whole = first.descriptors.dtype == second.descriptors.dtype == np.int8
+    if torch is None or not is_whole or not _multiplies_exactly(torch):
+        yield first.unit_descriptors() @ second.unit_descriptors().T
+        return
+    a, b = torch.tensor(first.descriptors), torch.tensor(second.descriptors).T
+    inverse, other_inverse = (torch.from_numpy(_inverse_lengths(it)) for it in (first, second))
+    for i in range(0, len(a), _ROWS_AT_ONCE):
+        block = slice(i, i + _ROWS_AT_ONCE)
+        cosines = torch._int_mm(a[block], b) * other_inverse
+        yield cosines.mul_(inverse[block, None]).numpy()
+
+
+@cache
+def _multiplies_exactly(torch: Any) -> bool:
+    """Whether torch has fast products of int8 here: processors without AVX-VNNI or AVX512-VNNI saturate their sums."""
+    if not torch.backends.cpu.get_cpu_capability().startswith("AVX"):
+        return False
+    largest = torch.full((_ROWS_AT_ONCE, 64), 127, dtype=torch.int8)
+    return bool((torch._int_mm(largest, largest.T) == 64 * 127**2).all())
+
+
+def _inverse_lengths(features: Features) -> NDArray[np.float32]:
+    """(N,) of descriptors of whole numbers."""
+    numbers = features.descriptors.astype(np.float32)
+    return np.asarray(1 / np.sqrt(np.maximum(np.einsum("nd,nd->n", numbers, numbers), 1)), np.float32)
 
 
 def best_of_both(
