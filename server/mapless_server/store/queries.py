@@ -1,4 +1,7 @@
-"""Statements that several operations of the store share; each runs in the caller's transaction."""
+"""Statements that several operations of the store share; each runs in the caller's transaction.
+
+And what has changed in a scene since a generation, so that indexes in memory are updated without reading it again.
+"""
 
 from __future__ import annotations
 
@@ -33,6 +36,10 @@ _DETACHED_END = "-0"
 """The first text, by code point, after all of them."""
 _IDS_PER_STATEMENT = 500
 """Databases bound the number of parameters of a statement."""
+_ROWS_AT_A_TIME = 2000
+"""A few megabytes, so that a scene that is read whole is not in memory twice."""
+_Found = tuple[tuple[IndexedReference, ...], tuple[str, ...]]
+"""References, and the ids of damaged ones; both ordered by id."""
 
 
 def select_scenes() -> Select[Any]:
@@ -272,13 +279,6 @@ def _upsert(connection: Connection, table: Table) -> Any:
 def _portions(ids: Sequence[str]) -> Iterator[Sequence[str]]:
     for start in range(0, len(ids), _IDS_PER_STATEMENT):
         yield ids[start : start + _IDS_PER_STATEMENT]
-
-
-_ROWS_AT_A_TIME = 2000
-"""A few megabytes, so that a scene that is read whole is not in memory twice."""
-
-_Found = tuple[tuple[IndexedReference, ...], tuple[str, ...]]
-"""References, and the ids of damaged ones; both ordered by id."""
 
 
 def read_changes(

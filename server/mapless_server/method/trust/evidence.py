@@ -26,6 +26,18 @@ from ..results import PointMatches, Structure, Support
 from ..two_view.matches import TwoViewMatches
 from ..views import Matches, PosedView, View
 
+MOST_POINTS = 2000
+"""The shares that references find are computed from so many points, evenly thinned."""
+
+LEAST_SHARE, LEAST_HULL_SHARE, LEAST_EPIPOLAR_SHARE, LEAST_DISAGREEMENT = 0.01, 0.002, 0.0004, 0.001
+"""Below these evidence is not better or worse. A right pose's halves are apart by a thousandth of the distance."""
+
+EPIPOLAR_PX = 2.0
+"""Largest Sampson distance of a match that agrees with a pose; keypoints are accurate to about a pixel."""
+
+NO_AGREEMENT = 1.0
+"""The disagreement of halves that give no pose: as far apart as what they see is away."""
+
 
 @dataclass(frozen=True, eq=False)
 class Votes:
@@ -75,20 +87,6 @@ def votes_on(
     keypoint = pairs[known, 0]
     pixels = query.features.keypoints[keypoint].astype(np.float64)
     return Votes(reference[known], keypoint, structure.x_in_world[point[known]], pixels)
-
-
-MOST_POINTS = 2000
-"""The shares that references find are computed from so many points, evenly thinned."""
-
-LEAST_SHARE, LEAST_HULL_SHARE, LEAST_EPIPOLAR_SHARE, LEAST_DISAGREEMENT = 0.01, 0.002, 0.0004, 0.001
-"""Below these evidence is not better or worse. A right pose's halves are apart by a thousandth of the distance."""
-
-EPIPOLAR_PX = 2.0
-"""Largest Sampson distance of a match that agrees with a pose; keypoints are accurate to about a pixel."""
-
-
-NO_AGREEMENT = 1.0
-"""The disagreement of halves that give no pose: as far apart as what they see is away."""
 
 
 @dataclass(frozen=True)
