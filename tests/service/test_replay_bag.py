@@ -1,4 +1,4 @@
-"""`mapless-server replay-bag`: what it writes is read by Foxglove's own library, `mcap`."""
+"""`mapless-server replay-bag`: what it writes is read by Foxglove's own libraries, `mcap` and `mcap_ros2`."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from google.protobuf.json_format import MessageToJson
 from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 from support.bags import (
     BASE_FROM_CAMERA,
-    TYPES,
     Recorded,
     at,
     compressed,
@@ -60,12 +60,9 @@ def written(folder: Path) -> dict[str, list[tuple[int, Any]]]:
     (file,) = folder.glob("*.mcap")
     found: dict[str, list[tuple[int, Any]]] = {}
     with file.open("rb") as stream:
-        reader = make_reader(stream, validate_crcs=True)
+        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
         assert reader.get_header().profile == "ros2"
-        for schema, channel, message in reader.iter_messages():
-            assert schema is not None
-            assert (schema.encoding, channel.message_encoding) == ("ros2msg", "cdr")
-            decoded = TYPES.deserialize_cdr(message.data, schema.name)
+        for _, channel, message, decoded in reader.iter_decoded_messages():
             found.setdefault(channel.topic, []).append((message.log_time, decoded))
     return found
 
@@ -82,7 +79,7 @@ def test_poses_transforms_and_diagnostics_are_written(server: RunningServer, tmp
     assert [time_ns for time_ns, _ in poses] == [at(0.5 * number) for number in range(COUNT)]
     for number, ((_, message), (_, tf)) in enumerate(zip(poses, tfs, strict=True)):
         np.testing.assert_allclose(transform_from_pose(message.pose.pose).matrix(), map_from_base.matrix(), atol=1e-9)
-        assert np.linalg.eigvalsh(message.pose.covariance.reshape(6, 6)).min() > 0
+        assert np.linalg.eigvalsh(np.reshape(message.pose.covariance, (6, 6))).min() > 0
         first, second = tf.transforms
         names = [(it.header.frame_id, it.child_frame_id) for it in (first, second)]
         assert names == [("map", "odom"), ("odom", "base_link")]

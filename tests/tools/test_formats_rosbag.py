@@ -255,6 +255,8 @@ def test_frames_that_lead_nowhere_are_named(tmp_path: Path) -> None:
     check(read(bag, body_from_camera=BASE_FROM_CAMERA))
     two = [("/tf_static", at(0), transforms(at(0), (it, "camera", BASE_FROM_CAMERA))) for it in ("base_link", "arm")]
     assert "a frame has one parent" in refusal(write_bag(tmp_path / "two", messages + two))
+    joints = [("/tf", at(0.1), transforms(at(0.1), (it, "wheel", BASE_FROM_CAMERA))) for it in ("left", "right")]
+    check(read(write_bag(tmp_path / "joints", recorded() + joints)))  # nothing to do with the camera
 
 
 @pytest.mark.parametrize(

@@ -93,15 +93,16 @@ def open_poses(images: Images, options: BagOptions) -> Poses:
     """
     recording = images.recording
     topic = _pose_topic(recording, options)
-    static = _transforms(images, [STATIC_TF_TOPIC], options)
-    edges = static | _transforms(images, [TF_TOPIC], options) if TF_TOPIC in recording.types else dict(static)
+    edges = static = _transforms(images, [STATIC_TF_TOPIC], options)
     world, body = options.world_frame, options.body_frame
     if topic != TF_TOPIC:
         named_world, named_body, trajectory = _poses(images, topic, options)
-        world, body = world or named_world, body or named_body
-        body = body or _unnamed_body(images, topic, static, options)
-        edges[body] = Edge(named_world, trajectory)
+        world, body = world or named_world, body or named_body or _unnamed_body(images, topic, static, options)
+        edges = static | {body: Edge(named_world, trajectory)}
     tree = FrameTree(_with_extrinsics(edges, images, body, options))
+    if TF_TOPIC in recording.types and (topic == TF_TOPIC or world not in tree.lineage(images.frame)):
+        moving = _transforms(images, [TF_TOPIC], options)  # where it is not needed, nothing that is wrong in it matters
+        tree = FrameTree(moving | dict(tree.edges))
     world = world or tree.lineage(images.frame)[-1]
     _check_chain(tree, images, topic, world, body)
     return Poses(tree, topic, world, body)
