@@ -138,6 +138,39 @@ def test_an_initial_pose_is_moved_by_odometry_until_an_image_is_localized(client
     assert third is None
 
 
+def test_an_error_of_direction_grows_with_the_way(client: PlantedClient) -> None:
+    """A guess that is 0.1 rad off about z: the camera that odometry moves on is off as far as the prior allows."""
+    localizer = make(client)
+    base = MAP_FROM_ODOM.compose(drive(0.0))
+    turned = RigidTransform(rotation_from_vector([0, 0, 0.1]) @ base.rotation, base.translation)
+    given = np.diag([1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 0.01])
+    localizer.guess(pose_with_covariance(at(0.0), "map", turned, given), 0)
+    localizer.localize(shot(8.0), RosCamera(CAMERA))
+    (prior,) = client.priors
+    true = MAP_FROM_ODOM.compose(drive(8.0)).compose(BASE_FROM_CAMERA)
+    error_m = prior.world_from_camera.translation - true.translation
+    assert np.linalg.norm(error_m) > 0.7
+    sigmas = error_m[:2] @ np.linalg.solve(prior.covariance[:2, :2], error_m[:2])
+    assert 0.1 < sigmas < 1.2
+    along = error_m / np.linalg.norm(error_m)
+    assert along @ prior.covariance[:3, :3] @ along > 0.9 * 0.8**2
+
+
+def test_an_initial_pose_during_a_call_is_kept(client: PlantedClient) -> None:
+    localizer, answered = make(client), client.localize
+
+    def meanwhile(*positional: Any, **named: Any) -> Any:
+        localizer.guess(pose_with_covariance(at(1.0), "map", MAP_FROM_ODOM.compose(drive(1.0))), 0)
+        return answered(*positional, **named)
+
+    client.localize = meanwhile  # type: ignore[method-assign]
+    localizer.localize(shot(1.0), RosCamera(CAMERA))
+    client.localize = answered  # type: ignore[method-assign]
+    localizer.localize(shot(2.0), RosCamera(CAMERA))
+    localizer.localize(shot(3.0), RosCamera(CAMERA))
+    assert [it is None for it in client.priors] == [True, False, True]
+
+
 def test_the_last_pose_is_a_prior_only_where_asked(client: PlantedClient) -> None:
     localizer = make(client, use_last_pose=True)
     localizer.localize(shot(1.0), RosCamera(CAMERA))

@@ -22,7 +22,7 @@ from .cameras import RosCamera
 from .poses import pose_of_body, stamp_ns_of, time_of, transform_from_pose
 
 Lookup = Callable[[str, str, int], RigidTransform]
-"""target_from_source of two frames at a stamp, nanoseconds; LookupError if tf does not know it."""
+"""target_from_source of two frames at a stamp, nanoseconds, 0 for the latest; LookupError if tf does not know it."""
 
 _Answer = LocalizationResult | SequenceLocalization | Rejected
 
@@ -130,6 +130,7 @@ class Localizer:
         self._lookup = lookup
         self._lock = threading.Lock()
         self._guess: _Guess | None = None
+        self._used: _Guess | None = None
         self._last_ns: int | None = None
         self._recent: deque[SequenceFrame] = deque(maxlen=options.sequence_length)
 
@@ -138,7 +139,7 @@ class Localizer:
         if not self._options.rate_hz:
             return False
         since_ns = None if self._last_ns is None else stamp_ns - self._last_ns
-        # Half a frame early is nearer to the rate than a whole one late; cameras jitter.
+        # A little early is nearer to the rate than a whole image late; cameras jitter.
         return since_ns is None or since_ns < 0 or since_ns >= 0.95e9 / self._options.rate_hz
 
     def guess(self, message: Any, now_ns: int) -> None:
@@ -157,10 +158,11 @@ class Localizer:
         unstated = np.repeat([UNSTATED_SIGMA_M, UNSTATED_SIGMA_RAD], 3) ** 2
         covariance = covariance + np.diag(np.where(np.diag(covariance) == 0, unstated, 0.0))
         stamp_ns = stamp_ns_of(message.header.stamp) or now_ns
+        base = self._options.base_frame
+        # rviz stamps with now, which odometry may not have reached yet: then its latest is as good.
+        odom_from_base = self._odometry(base, stamp_ns) or self._odometry(base, 0)
         with self._lock:
-            self._guess = _Guess(
-                map_from_base, covariance, stamp_ns, self._odometry(self._options.base_frame, stamp_ns)
-            )
+            self._guess = _Guess(map_from_base, covariance, stamp_ns, odom_from_base)
 
     def localize(self, message: Any, camera: RosCamera) -> Outcome:
         """Localizes a sensor_msgs/Image or CompressedImage; what fails is an outcome, too."""
@@ -188,7 +190,9 @@ class Localizer:
             )
             if self._options.sequence_length and odom_from_body is not None:
                 tracked = odom_from_body.compose(extrinsics)
-                self._recent.append(SequenceFrame(photo, camera.camera, tracked, time_of(stamp_ns), priors=priors))
+                # The last answer as a prior of several would be counted several times.
+                own = Priors() if self._options.use_last_pose else priors
+                self._recent.append(SequenceFrame(photo, camera.camera, tracked, time_of(stamp_ns), priors=own))
                 if isinstance(answer, Rejected) and len(self._recent) > 1:
                     together = self._client.localize_sequence(
                         list(self._recent), self._options.scene, coverage=coverage, timeout_s=timeout_s
@@ -221,7 +225,9 @@ class Localizer:
             message, map_from_camera = f"localized by the last {len(map_from_camera)} images", map_from_camera[-1]
         pose, covariance = pose_of_body(map_from_camera, answer.covariance, body_from_camera)
         with self._lock:
-            self._guess = _Guess(pose, covariance, stamp_ns, odom_from_body) if self._options.use_last_pose else None
+            if self._guess is self._used:  # and not one that has come meanwhile
+                last = _Guess(pose, covariance, stamp_ns, odom_from_body)
+                self._guess = last if self._options.use_last_pose else None
         if any(check.conflict for check in checks):
             message += "; the photograph contradicts the initial or last pose, which was not used"
         edge: tuple[str, RigidTransform] | None = (body, pose)
@@ -247,7 +253,7 @@ class Localizer:
     ) -> PosePrior | None:
         """The guess, moved to now by odometry, with what that adds to its covariance; of the camera."""
         with self._lock:
-            guess = self._guess
+            guess = self._used = self._guess
         if guess is None:
             return None
         if odom_from_body is not None and guess.odom_from_body is not None:
@@ -259,8 +265,10 @@ class Localizer:
             if since_s > GUESS_LIFE_S:
                 return None
             sigmas = (LEAST_SIGMA_M + SPEED_M_S * since_s, LEAST_SIGMA_RAD + TURN_RAD_S * since_s)
-        covariance = guess.covariance + np.diag(np.repeat(sigmas, 3) ** 2)
-        return PosePrior(*pose_of_body(guess.map_from_body.compose(moved), covariance, body_from_camera.inverse()))
+        # An error of the guess's direction is one of the position, the farther the body has moved since.
+        pose, covariance = pose_of_body(guess.map_from_body, guess.covariance, moved.inverse())
+        covariance = covariance + np.diag(np.repeat(sigmas, 3) ** 2)
+        return PosePrior(*pose_of_body(pose, covariance, body_from_camera.inverse()))
 
 
 def _prior_checks(answer: LocalizationResult | SequenceLocalization) -> tuple[PriorCheck, ...]:
