@@ -243,6 +243,30 @@ def test_a_good_triangulated_scale_precedes_a_better_trajectory() -> None:
     assert strict.deviation < 1e-6
 
 
+def test_a_stage_that_contradicts_the_networks_metre_is_not_used() -> None:
+    """Depths too large, and a camera predicted so far away that the trajectory seems to be so, too."""
+    scene = make_scene(random_for("too large"), SceneOptions(reference_count=12, baseline_m=0.1))
+    faults = FakeNetworkOptions(bad_depth_share=1.0, bad_depth_factors=(1.2, 1.2), bad_pose_count=1, bad_pose_m=1.0)
+    network = FakeNetwork(scene, 11, faults)
+    network.world_from_local = replace(network.world_from_local, scale=1.0)
+    arbitrary, wide, metric = (scale_of(scene, network, ScaleOptions(metre_sigma=it)) for it in (None, 0.2, 0.05))
+    assert arbitrary.stage is wide.stage is ScaleStage.TRIANGULATION
+    assert metric.stage is ScaleStage.TRAJECTORY
+    assert abs(np.log(metric.metres_per_unit)) < 0.15 < abs(np.log(arbitrary.metres_per_unit))
+    alone = scale_of(scene, network, replace(TRIANGULATION, metre_sigma=0.05))
+    assert alone.metres_per_unit == arbitrary.metres_per_unit, "there is no other"
+
+
+@pytest.mark.parametrize("metre", [0.25, 1.4, 4.0])
+def test_two_stages_that_agree_outvote_the_networks_metre(metre: float) -> None:
+    scene = make_scene(random_for("metre"))
+    network = FakeNetwork(scene, 7, FakeNetworkOptions(depth_noise_m=0.01, pose_noise_m=0.002))
+    network.world_from_local = replace(network.world_from_local, scale=metre)
+    found = [scale_of(scene, network, ScaleOptions(metre_sigma=sigma)) for sigma in (None, 0.2)]
+    assert found[0].metres_per_unit == found[1].metres_per_unit == pytest.approx(metre, rel=0.02)
+    assert found[0].stage is found[1].stage is ScaleStage.TRIANGULATION
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_bad_poses_do_not_change_the_trajectory_scale(seed: int) -> None:
     scene = make_scene(random_for("bad poses", seed), SceneOptions(point_count=200, reference_count=10))

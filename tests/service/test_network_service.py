@@ -16,14 +16,16 @@ from numpy.typing import NDArray
 pytest.importorskip("torch", reason="the networks' extra is not installed")
 pytest.importorskip("PIL", reason="the networks' extra is not installed")
 
+import grpc
 import torch
 from support.images import encode, textured
-from support.servers import RunningServer, serving
+from support.servers import RunningServer, failure_of, localize_request, serving
 from support.small_networks import GRIDS, small_network
 from support.waiting import wait_until
 
-from mapless import Client, DeadlineExceeded, LocalizationResult, NewReference, Rejected
+from mapless import Client, DeadlineExceeded, LocalizationResult, NewReference, Rejected, Unavailable, wire
 from mapless.geometry import Camera, RigidTransform
+from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.engine.query import Tier
 from mapless_server.engine.stages import Method
 from mapless_server.method import pipeline
@@ -165,6 +167,56 @@ def test_a_call_whose_deadline_passes_in_the_network_fails_alone(tmp_path: Path,
         finally:
             gate.set()
         assert isinstance(client.localize(photograph, CAMERA, "wall", NAMES), LocalizationResult | Rejected)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_too_little_memory_fails_the_call_alone(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A query that does not fit alone is UNAVAILABLE; a batch that does not fit is split, and answered."""
+    photograph, most = encode(".png", photograph_at(0.7)), [0]
+    reconstruct = NetworkRunner.reconstruct
+
+    def limited(runner: NetworkRunner, tokens: torch.Tensor, *others: Any) -> Any:
+        if len(tokens) > most[0]:
+            raise torch.OutOfMemoryError("too little")
+        return reconstruct(runner, tokens, *others)
+
+    monkeypatch.setattr(NetworkRunner, "reconstruct", limited)
+    entered, gate = threading.Semaphore(0), threading.Event()
+    gate.set()
+
+    def wait(batch: Any) -> Any:
+        entered.release()
+        assert gate.wait(60)
+        return pipeline.reconstruct(batch)
+
+    options = {"workers": 2, "max_batch": 4, "max_queued_s": 60.0}
+    with (
+        ThreadPoolExecutor(4) as pool,
+        on_network(tmp_path, small_network(name), name, Method(reconstruct=wait), **options) as (client, _, server),
+    ):
+        with grpc.insecure_channel(server.address) as channel:  # the client would try again
+            request = localize_request("wall")
+            request.image = photograph
+            request.intrinsics.CopyFrom(wire.camera_to_message(CAMERA))
+            error = failure_of(LocalizationServiceStub(channel).Localize, request)
+        assert isinstance(error, Unavailable)
+        assert error.reason == "OUT_OF_MEMORY"
+        most[0] = 1
+        gate.clear()
+        assert entered.acquire(timeout=30)
+
+        def localize() -> Any:
+            return client.localize(photograph, CAMERA, "wall", NAMES, timeout_s=60)
+
+        calls = [pool.submit(localize)]
+        try:
+            assert entered.acquire(timeout=30)
+            calls += [pool.submit(localize) for _ in range(3)]
+            wait_until(lambda: server.value("mapless_queue_depth", stage="coarse") == 3)
+        finally:
+            gate.set()
+        assert all(isinstance(call.result(60), LocalizationResult | Rejected) for call in calls)
+        assert server.value("mapless_gpu_oom_total") >= 2
 
 
 def test_a_scene_of_unknown_unit_has_no_metric_poses(tmp_path: Path) -> None:

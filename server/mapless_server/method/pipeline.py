@@ -268,7 +268,6 @@ def _each(work: Callable[..., T], *columns: Sequence[Any]) -> list[T | Exception
 def _launch_scale(prepared: Prepared, reconstruction: Outcome) -> Callable[[], Coarse]:
     """Launches the metric scale on the device of the reconstruction; the returned function waits for the result."""
     references, correspondences, context = prepared.references, prepared.correspondences, prepared.context
-    options = ScaleOptions(prepared.options.scale_strategy)
     coarse = partial(Coarse, prepared, reconstruction)
     if isinstance(reconstruction, Rejection):
         return partial(coarse, reconstruction)
@@ -276,6 +275,7 @@ def _launch_scale(prepared: Prepared, reconstruction: Outcome) -> Callable[[], C
         with context.stage("scale"):
             fetched = reconstruction if isinstance(reconstruction, Reconstruction) else reconstruction.fetch()
             return partial(Coarse, prepared, fetched, network_scale(fetched, references[0]))
+    options = ScaleOptions(prepared.options.scale_strategy, metre_sigma=reconstruction.metre_sigma)
     if isinstance(reconstruction, Reconstruction):
         with context.stage("scale"):
             return partial(coarse, estimate_scale(reconstruction, references, correspondences, options))

@@ -57,6 +57,10 @@ class ScaleOptions:
             1 cm.
         min_radius_per_depth: the same for the predicted trajectory, as a share of the scene's depth. At 0.002 the
             references' images differ by a parallax of 1.6 px at a focal length of 800 px: the noise of a keypoint.
+        metre_sigma: relative standard deviation of the reconstruction's unit, if that is about the metre: a stage whose
+            scale is off from 1 by more than `max_metre_sigmas` of it is not used where the other's is not. Where both
+            are off, they are two against one, and stand. None if the unit is arbitrary, as in the paper.
+        max_metre_sigmas: see there; with 20 %, three are a factor of 1.8.
     """
 
     strategy: ScaleStrategy = ScaleStrategy.TWO_STAGE
@@ -70,6 +74,8 @@ class ScaleOptions:
     max_pair_cameras: int = 32
     min_radius_m: float = 0.01
     min_radius_per_depth: float = 0.002
+    metre_sigma: float | None = None
+    max_metre_sigmas: float = 3.0
 
     def __post_init__(self) -> None:
         check_bounds(self, "min_baseline_m", above=0, at_most=self.max_baseline_m)
@@ -78,6 +84,9 @@ class ScaleOptions:
         check_bounds(self, "max_deviation min_radius_per_depth", at_least=0)
         check_bounds(self, "inlier_distance_m min_radius_m", above=0)
         check_bounds(self, "max_pair_cameras", at_least=2)
+        check_bounds(self, "max_metre_sigmas", above=0)
+        if self.metre_sigma is not None:
+            check_bounds(self, "metre_sigma", above=0)
 
     @property
     def by_triangulation(self) -> bool:
@@ -231,6 +240,11 @@ def scale_candidates(known: Known, predicted: Predicted, options: ScaleOptions) 
     of_first, of_second = (trajectory_deviation(scale, radius, radius_m) for scale in (first, second))
     # Stage 1 if d_tri is below the bound; otherwise the stage with the smaller d, stage 1 of equals.
     by_triangulation = (of_first < options.max_deviation) | (of_first <= of_second) | xp.isnan(of_second)
+    if options.metre_sigma is not None:
+        limit = options.max_metre_sigmas * options.metre_sigma
+        # Neither for NaN, of a stage without a scale.
+        first_agrees, second_agrees = (abs(xp.log(scale)) <= limit for scale in (first, second))
+        by_triangulation = (by_triangulation & (first_agrees | ~second_agrees)) | (first_agrees & ~second_agrees)
 
     scale = xp.where(by_triangulation, first, second)
     world_from_local = align(scale, rotation, world_from_anchor[1], local_from_anchor[1])
