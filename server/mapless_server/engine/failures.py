@@ -1,4 +1,4 @@
-"""What an exception of a computation means for the work queue. Knows torch's by name: it need not be installed."""
+"""Classifies exceptions of a computation for the work queue. Knows torch's by name, since it need not be installed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _FULL = re.compile(r"CUDA out of memory|_STATUS_ALLOC_FAILED|CUDA error: out of 
 
 
 def failure_of(error: BaseException) -> Failure:
-    """What failed: the input, this job, memory, or the device."""
+    """Returns what failed: the input, this job, memory, or the device."""
     if isinstance(error, _CALLERS):
         return Failure.BAD_INPUT
     names = {kind.__name__ for kind in type(error).__mro__}

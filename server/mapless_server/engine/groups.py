@@ -21,12 +21,12 @@ MIN_FRAMES, MAX_FRAMES = 2, 16
 
 @dataclass(frozen=True, eq=False)
 class GroupResult:
-    """The photographs of a group, each by itself.
+    """The results of a group's photographs, each localized alone.
 
     Attributes:
         results: in the order of the queries.
-        queued_s: how long each waited before anything was computed for it.
-        seconds: from when each began until it was done.
+        queued_s: time that each waited before its computation began.
+        seconds: time from the beginning of each computation to its end.
     """
 
     results: tuple[Result, ...]
@@ -35,19 +35,19 @@ class GroupResult:
 
 
 class PhotoGroup:
-    """The photographs of a call that are localized each by itself.
+    """The photographs of a call that are localized one by one.
 
     Attributes:
-        records: of each photograph, the stages that it has been through; also where one fails.
+        records: the stages that each photograph has been through, also if one of them fails.
     """
 
     def __init__(self, engine: Engine, queries: Sequence[Query], caller: Caller, list_name: str) -> None:
-        """A group that has not begun.
+        """Makes a group whose computation has not begun.
 
         Args:
-            engine: which computes.
+            engine: the engine that computes.
             queries: the photographs.
-            caller: of them all.
+            caller: the caller of the group.
             list_name: the field of the request that holds them, for messages about one of them.
         """
         self.records: tuple[list[StageRecord], ...] = tuple([] for _ in queries)
@@ -60,13 +60,13 @@ class PhotoGroup:
         self._done: dict[int, tuple[Result, float]] = {}
 
     async def localize(self) -> GroupResult:
-        """Localizes the photographs, as many at a time as the engine computes.
+        """Localizes the photographs, as many concurrently as the engine can compute.
 
-        All of them at once would be more than a caller may have waiting. A photograph that there is no room for waits
-        until another one of the group is done; only the first one is refused.
+        All of them together would exceed the number that a caller may have waiting. A photograph for which the queue
+        has no room waits until another one of the group is done; only the first one can be refused.
 
         Raises:
-            RequestError: as of `Engine.run`, its field within the list.
+            RequestError: as in `Engine.run`, with the field's path in the list.
         """
         count = min(len(self._queries), self._engine.parallel_queries)
         workers = [asyncio.ensure_future(self._work()) for _ in range(count)]
@@ -82,7 +82,7 @@ class PhotoGroup:
         return GroupResult(results, queued_s, seconds)
 
     async def _work(self) -> None:
-        """Localizes what waits, until nothing does or there is no room for as many at a time."""
+        """Localizes waiting photographs until none waits or the queue has room for fewer concurrent ones."""
         while self._waiting:
             index = self._waiting.popleft()
             self._running += 1
@@ -111,7 +111,7 @@ class PhotoGroup:
         self._done[index] = result, time.monotonic() - start_s
 
     async def _wait(self, refused: Overloaded) -> None:
-        """Until there may be room; raises the refusal if nothing was computed or there is no time."""
+        """Waits until there may be room; raises the refusal if nothing was computed or no time is left."""
         pause_s = refused.retry_after_s
         if not self._done or pause_s is None or time.monotonic() + pause_s > self._caller.deadline_s:
             raise refused

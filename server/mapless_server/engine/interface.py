@@ -1,4 +1,4 @@
-"""The engine as services see it: `queue_engine.QueueEngine` when serving, captured calls without a queue in replay."""
+"""The engine as services see it: `queue_engine.QueueEngine` when serving; without a queue when replaying calls."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ class EngineOptions:
     """Limits of the engine.
 
     Attributes:
-        workers: threads that compute on the CPU.
-        max_batch: queries that a network reconstructs at a time.
-        image_limits: what is decoded.
-        index_cache_bytes: memory for what is held of scenes to choose references by.
+        workers: number of threads that compute on the CPU.
+        max_batch: largest number of queries that a network reconstructs together.
+        image_limits: limits of the images that are decoded.
+        index_cache_bytes: memory for the scenes' indexes, by which references are chosen.
         escalation: when stronger features are tried.
         coverage: share of right answers to accept where a request does not say.
-        queue: of the work queue.
+        queue: options of the work queue.
     """
 
     workers: int = 2
@@ -55,30 +55,31 @@ class EngineOptions:
 class Engine(Protocol):
     """Computes for the services; its methods are called on one event loop.
 
-    Those that compute raise RequestError: a bad image, an unknown scene or reference, a full queue, a passed deadline.
+    The methods that compute raise RequestError for a bad image, an unknown scene or reference, a full queue, or a
+    passed deadline.
     """
 
     @property
     def options(self) -> EngineOptions:
-        """Limits, and defaults of requests."""
+        """Limits of the engine, and defaults of requests."""
         ...
 
     @property
     def tiers(self) -> Sequence[Tier]:
-        """Features and what works on them, the cheapest first."""
+        """The tiers, the cheapest first."""
         ...
 
     @property
     def parallel_queries(self) -> int:
-        """How many queries of one call are worth computing at a time."""
+        """How many queries of one call are worth computing concurrently."""
         ...
 
     def query_job(self, query: Query, caller: Caller, *, on_coarse: Callable[[Result], None] | None = None) -> Job:
-        """The job of localizing a photograph; its `records` list the stages that it has been through."""
+        """Makes the job of localizing a photograph; its `records` list the stages that it has been through."""
         ...
 
     async def run(self, job: Job) -> Result:
-        """The result of a query's job."""
+        """Computes a query's job and returns its result."""
         ...
 
     async def pose_rig(
@@ -88,7 +89,7 @@ class Engine(Protocol):
         rig_from_camera: Sequence[RigidTransform],
         caller: Caller,
     ) -> RigEstimate | Rejection:
-        """The pose of the rig that took the photographs, however full the queue is."""
+        """Estimates the pose of the rig that took the photographs; not refused by a full queue."""
         ...
 
     async def pose_sequence(
@@ -99,35 +100,35 @@ class Engine(Protocol):
         estimate_scale: bool,
         caller: Caller,
     ) -> SequenceEstimate | Rejection:
-        """The poses of the frames of a sequence, however full the queue is; OpenCV's axes."""
+        """Estimates the poses of a sequence's frames, in OpenCV's axes; not refused by a full queue."""
         ...
 
     def hold(self, queries: Sequence[Query], caller: Caller) -> AbstractContextManager[None]:
-        """Counts the memory of a group's photographs for as long as its call lasts."""
+        """Reserves the memory of a group's photographs for the duration of its call."""
         ...
 
     def check_room(self) -> None:
-        """Raises RequestError if no query would be admitted now, whatever it is."""
+        """Raises RequestError if no query of any kind would be admitted now."""
         ...
 
     async def describe(self, photos: Sequence[Photo], caller: Caller) -> list[Description]:
-        """Features and descriptors of photographs, in order."""
+        """Computes features and descriptors of photographs, in order."""
         ...
 
     async def retrieve(
         self, scene_key: SceneKey, photo: Photo, count: int, narrowing: Narrowing, caller: Caller
     ) -> Choice:
-        """The references of a scene that resemble a photograph most."""
+        """Chooses the references of a scene that resemble a photograph most."""
         ...
 
     async def audit(
         self, scene_key: SceneKey, reference_ids: Sequence[str], caller: Caller, are_listed: bool = False
     ) -> tuple[int, list[ReferenceAudit]]:
-        """The scene's generation, and the audits of some of its references by their neighbours, in order."""
+        """Audits references of a scene by their neighbours; returns the scene's generation and the audits, in order."""
         ...
 
     async def check_coverage(self, scene_key: SceneKey, view: Viewpoint, caller: Caller) -> tuple[int, Coverage]:
-        """The scene's generation, and whether a photograph would be localized there."""
+        """Predicts whether a photograph would be localized at a viewpoint; also returns the scene's generation."""
         ...
 
     def contradictions(
@@ -145,5 +146,5 @@ class Engine(Protocol):
         ...
 
     def drain(self) -> None:
-        """Refuses every further job; those admitted are computed."""
+        """Refuses all new jobs; admitted ones are still computed."""
         ...

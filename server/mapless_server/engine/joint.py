@@ -1,4 +1,4 @@
-"""The poses of a rig and of a sequence, from what each photograph gave by itself."""
+"""The poses of a rig and of a sequence, from the results of the single photographs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .query import Query, Result
 def pose_rig(
     queries: Sequence[Query], results: Sequence[Result], rig_from_camera: Sequence[RigidTransform]
 ) -> RigEstimate | Rejection:
-    """The pose of the rig that took the photographs, in order."""
+    """Estimates the pose of the rig that took the photographs, given in order."""
     options = RigOptions(coverage=queries[0].options.coverage)
     found = solve_rig(_images(queries, results), rig_from_camera, options)
     if not isinstance(found, Rejection):
@@ -36,7 +36,7 @@ def pose_sequence(
     session_from_camera: Sequence[RigidTransform],
     estimate_scale: bool,
 ) -> SequenceEstimate | Rejection:
-    """The poses of the frames of a sequence, in order; OpenCV's axes."""
+    """Estimates the poses of a sequence's frames, in order, in OpenCV's axes."""
     options = SequenceOptions(coverage=queries[0].options.coverage)
     found = solve_sequence(_images(queries, results), session_from_camera, estimate_scale, options)
     if not isinstance(found, Rejection) and not estimate_scale:
@@ -49,7 +49,7 @@ def pose_sequence(
 
 
 def _beyond_limits(queries: Sequence[Query], poses: Mapping[int, RigidTransform], list_name: str) -> Rejection | None:
-    """A rejection if a photograph's joint pose is beyond a hard limit of its priors."""
+    """Rejects a group if a photograph's joint pose is beyond a hard limit of its priors."""
     for i, pose in poses.items():
         if contradiction := queries[i].narrowing.contradiction(pose):
             return Rejection(RejectionReason.PRIOR_CONFLICT, f"{list_name}[{i}]: {contradiction}")

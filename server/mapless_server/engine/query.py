@@ -1,4 +1,4 @@
-"""What goes into the engine and what comes out of it."""
+"""Inputs and results of the engine."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Tier:
 
     @property
     def features(self) -> str:
-        """Name of the local features, with their options: "sift-2048-1024px-0.02"."""
+        """Name of the local features with their options, "sift-2048-1024px-0.02"."""
         return self.extractor.name
 
     @property
@@ -55,13 +55,13 @@ class Tier:
 
     @property
     def kind(self) -> str:
-        """Of its answers, see `calibration_kind`."""
+        """Kind of its answers, see `calibration_kind`."""
         backend = f"{self.backend}+depth" if self.uses_depths else self.backend
         return calibration_kind(self.features, backend, __version__)
 
     @property
     def weights_sha256(self) -> str:
-        """Of the backend's weights; empty without any."""
+        """SHA-256 of the backend's weights; empty without any."""
         return self.pipeline.reconstructor.weights_sha256
 
 
@@ -70,8 +70,8 @@ class Caller:
     """The caller of the engine.
 
     Attributes:
-        flow: with whom the queue shares its time fairly.
-        deadline_s: after which the answer is useless, `time.monotonic`.
+        flow: the tenant and its caller, among which the queue shares computing time.
+        deadline_s: time after which the answer is useless, by `time.monotonic`.
     """
 
     flow: Flow
@@ -80,7 +80,7 @@ class Caller:
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """An encoded image and its camera; `field` is its path in the request, for messages about it."""
+    """An encoded image and its camera; `field` is its path in the request, for error messages."""
 
     image: bytes
     camera: Camera
@@ -93,16 +93,16 @@ class Query:
 
     Attributes:
         scene_key: the scene.
-        reference_ids: references to compare it with; if none, `reference_count` of the scene's are chosen.
+        reference_ids: references to compare it with; if empty, `reference_count` references of the scene are chosen.
         photo: the photograph.
         narrowing: limits of the camera's pose, for choosing references and for checking the answer.
         reference_count: how many references are chosen.
-        options: of the method.
-        allow_coarse: whether the coarse pose is an answer where there is no time to refine it.
+        options: options of the method.
+        allow_coarse: whether the coarse pose is the answer if there is no time to refine it.
         rerank: whether `reference_count` of the named references are chosen.
-        priors: on the pose, each with its uncertainty, in the scene's world.
-        is_part: whether it belongs to a rig or a sequence: then its matches are wanted even where it cannot be
-            localized alone.
+        priors: priors on the pose, each with its uncertainty, in the scene's world.
+        is_part: whether it belongs to a rig or a sequence, which needs its matches even if it cannot be localized
+            alone.
     """
 
     scene_key: SceneKey
@@ -125,19 +125,19 @@ class Query:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """The answer to a query, and what it was computed from.
+    """The answer to a query, and the data that it was computed from.
 
     Attributes:
-        answer: of the method.
-        tier: the features that gave it.
-        references: those it used, in order.
-        generation: of the scene when they were read.
+        answer: the answer of the method.
+        tier: the tier that computed it.
+        references: the references that were used, in order.
+        generation: generation of the scene when the references were read.
         processed: the camera of the reduced image that features were found in.
-        choice: how the references were chosen; None if they were used as they were named.
-        attributes: of the scene.
-        stage_seconds: time of all that was computed, in order, whichever tier gave the answer. A stage of another tier
-            than the first begins with its extractor's name and a slash. Such a tier has only "unfinished" if it failed,
-            was ended for lack of time, or has yet to describe the references.
+        choice: how the references were chosen; None if the caller named them.
+        attributes: attributes of the scene.
+        stage_seconds: time of every stage that was computed, in order, of all tiers. The name of a stage of a later
+            tier begins with its extractor's name and a slash. Such a tier has only "unfinished" if it failed, was ended
+            for lack of time, or has not described the references yet.
     """
 
     answer: Answer
@@ -152,11 +152,11 @@ class Result:
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """What is stored of a photograph beside the photograph.
+    """What the store keeps of a photograph besides the photograph itself.
 
     Attributes:
         views: camera and features by the extractor's name, the first tier's first; without the pixels.
-        descriptors: global ones, by name.
+        descriptors: global descriptors, by name.
     """
 
     views: Mapping[str, View]

@@ -1,4 +1,4 @@
-"""The engine on the work queue: localizes photographs, describes and audits references in its threads."""
+"""The engine on the work queue: localizes photographs, and describes and audits references, in the queue's threads."""
 
 from __future__ import annotations
 
@@ -62,11 +62,12 @@ class QueueEngine:
     """The engine that computes through one work queue. Its coroutines run on one event loop.
 
     Attributes:
-        tiers: features and what works on them, the cheapest first.
-        options: limits.
-        references: of all scenes.
-        queue: of the work.
-        background: matches references when the queue is empty, once it is started; None where nothing does.
+        tiers: the tiers, the cheapest first.
+        options: limits of the engine.
+        references: references of all scenes.
+        queue: the work queue.
+        background: matches references when the queue is empty, once it is started; None if references are not matched
+            in the background.
     """
 
     def __init__(
@@ -78,14 +79,14 @@ class QueueEngine:
         quota: Quota | None = None,
         method: Method | None = None,
     ) -> None:
-        """An engine whose queue begins to compute with the first job.
+        """Makes an engine; its queue begins to compute with the first job.
 
         Args:
-            tiers: the cheapest first; usually there is one.
-            references: with features of every tier.
-            options: limits.
+            tiers: the tiers, the cheapest first; usually there is one.
+            references: references with features of every tier.
+            options: limits of the engine.
             observer: is notified of what the queue does.
-            quota: of computing time, for each tenant.
+            quota: quota of computing time for each tenant.
             method: replaces the method's parts in tests.
 
         Raises:
@@ -121,15 +122,15 @@ class QueueEngine:
         *,
         on_coarse: Callable[[Result], None] | None = None,
     ) -> Job:
-        """The job of localizing a photograph, for `run`; its `records` list the stages that it has been through.
+        """Makes the job of localizing a photograph, for `run`; its `records` list the stages that it has been through.
 
         Args:
             query: the photograph and what to compare it with.
-            caller: of the query.
-            source: of the references; None for those of the scene.
-            on_coarse: called on the event loop, before the answer, with the result that is known before it is refined,
-                where there is one: a localization of the first tier, checked by nothing. More than once if references
-                are deleted while they are used. The answer does not depend on it.
+            caller: the caller of the query.
+            source: source of the references; None for those of the scene.
+            on_coarse: called on the event loop, before the answer, with the first tier's localization before its
+                refinement, if there is one; nothing has checked it. Called again if references are deleted while they
+                are used. The answer does not depend on it.
         """
         views = QueryViews(query.photo, self.options.image_limits)
         run = QueryRun(query, source or self.references, views, caller.deadline_s)
@@ -140,7 +141,7 @@ class QueueEngine:
         return Job(caller.flow, run.first_step, caller.deadline_s, size_bytes)
 
     async def run(self, job: Job) -> Result:
-        """The result of a query's job.
+        """Computes a query's job and returns its result.
 
         Raises:
             RequestError: a bad image, unknown scene or reference, a full queue, a passed deadline.
@@ -150,10 +151,10 @@ class QueueEngine:
 
     @contextmanager
     def hold(self, queries: Sequence[Query], caller: Caller) -> Iterator[None]:
-        """Counts the memory of a group's photographs for as long as its call lasts, whichever of them are queued.
+        """Reserves the memory of a group's photographs for the duration of its call, however many of them are queued.
 
         Raises:
-            RequestError: there is no room for them.
+            RequestError: the queue has no room for them.
         """
         with ExitStack() as stack:
             with _as_request_errors():
@@ -162,12 +163,12 @@ class QueueEngine:
             yield
 
     def check_room(self) -> None:
-        """Raises RequestError if no query would be admitted now, whatever it is: then its message need not be read."""
+        """Raises RequestError if no query of any kind would be admitted now, so that its message need not be read."""
         with _as_request_errors():
             self.queue.check_room(Step(PREPARE, "", "", None))
 
     async def describe(self, photos: Sequence[Photo], caller: Caller) -> list[Description]:
-        """Features and descriptors of photographs, in order.
+        """Computes features and descriptors of photographs, in order.
 
         Raises:
             RequestError: a bad image, a full queue, a passed deadline.
@@ -178,7 +179,7 @@ class QueueEngine:
     async def retrieve(
         self, scene_key: SceneKey, photo: Photo, count: int, narrowing: Narrowing, caller: Caller
     ) -> Choice:
-        """The references of a scene that resemble a photograph most.
+        """Chooses the references of a scene that resemble a photograph most.
 
         Raises:
             RequestError: a bad image, an unknown scene, a full queue, a passed deadline.
@@ -194,9 +195,9 @@ class QueueEngine:
     async def audit(
         self, scene_key: SceneKey, reference_ids: Sequence[str], caller: Caller, are_listed: bool = False
     ) -> tuple[int, list[ReferenceAudit]]:
-        """The scene's generation, and the audits of some of its references by their neighbours, in order.
+        """Audits references of a scene by their neighbours; returns the scene's generation and the audits, in order.
 
-        Missing ones are left out if they were listed, not named by the caller.
+        References that do not exist any more are left out if `are_listed`, that is, if the caller did not name them.
 
         Raises:
             RequestError: an unknown scene or named reference, a full queue, a passed deadline.
@@ -206,7 +207,7 @@ class QueueEngine:
         return auditor.generation, [audit for audit in audits if audit is not None]
 
     async def check_coverage(self, scene_key: SceneKey, view: Viewpoint, caller: Caller) -> tuple[int, Coverage]:
-        """The scene's generation, and whether a photograph would be localized there.
+        """Predicts whether a photograph would be localized at a viewpoint; also returns the scene's generation.
 
         Raises:
             RequestError: an unknown scene, a full queue, a passed deadline.
@@ -217,7 +218,7 @@ class QueueEngine:
 
     @property
     def parallel_queries(self) -> int:
-        """How many queries of one call are worth computing at a time."""
+        """How many queries of one call are worth computing concurrently."""
         return max(self.options.workers, self.options.max_batch)
 
     async def pose_rig(
@@ -227,7 +228,7 @@ class QueueEngine:
         rig_from_camera: Sequence[RigidTransform],
         caller: Caller,
     ) -> RigEstimate | Rejection:
-        """The pose of the rig that took the photographs."""
+        """Estimates the pose of the rig that took the photographs."""
         return await self.join(lambda: joint.pose_rig(queries, results, rig_from_camera), caller)
 
     async def pose_sequence(
@@ -238,12 +239,12 @@ class QueueEngine:
         estimate_scale: bool,
         caller: Caller,
     ) -> SequenceEstimate | Rejection:
-        """The poses of the frames of a sequence, OpenCV's axes."""
+        """Estimates the poses of a sequence's frames, in OpenCV's axes."""
         work = partial(joint.pose_sequence, queries, results, session_from_camera, estimate_scale)
         return await self.join(work, caller)
 
     async def join(self, compute: Callable[[], Joined], caller: Caller) -> Joined:
-        """Computes from several photographs' answers, in its turn, however full the queue is.
+        """Computes from several photographs' answers, in its turn in the queue, which does not refuse it.
 
         Raises:
             RequestError: a passed deadline.
@@ -266,7 +267,7 @@ class QueueEngine:
         jobs: int | None = None,
         continues: bool = False,
     ) -> list[ResultT]:
-        """Computes items by several jobs, or as many as there are threads; other jobs are computed in between."""
+        """Computes items in several jobs, at most as many as there are threads, so that other jobs run in between."""
         work = ItemList(items, compute)
         jobs = min(jobs or self.options.workers, len(items))
         step = Step(stage, stage, stage, work)
@@ -304,11 +305,11 @@ class QueueEngine:
         self.references.forget_scene(scene_key)
 
     def drain(self) -> None:
-        """Refuses every further job; those admitted are computed."""
+        """Refuses all new jobs; admitted ones are still computed."""
         self.queue.drain()
 
     async def close(self) -> None:
-        """Ends running computations at their next step, and drops waiting ones."""
+        """Ends running computations at their next step, and drops waiting jobs."""
         await self.queue.close()
         await asyncio.to_thread(self._close)
 
@@ -339,7 +340,7 @@ async def _unless_refused(submission: Awaitable[Any]) -> Refused | None:
 
 @contextmanager
 def _as_request_errors() -> Iterator[None]:
-    """Turns what the queue raises into errors of requests."""
+    """Converts the queue's exceptions to errors of requests."""
     try:
         yield
     except Refused as refused:

@@ -1,4 +1,4 @@
-"""Photographs and references as the stages of a query see them: decoded and described once, loaded, chosen."""
+"""Photographs and references for the stages of a query: decoded and described once, loaded, chosen."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from .query import Description, Photo
 
 
 class QueryViews:
-    """Decodes a photograph once, and has it described once by each extractor, when first asked."""
+    """Decodes a photograph once, and describes it once with each extractor, when first needed."""
 
     def __init__(self, photo: Photo, limits: ImageLimits) -> None:
         self._photo = photo
@@ -33,7 +33,7 @@ class QueryViews:
         self._views: dict[str, View] = {}
 
     def view(self, extractor: FeatureExtractor, context: StageContext) -> View:
-        """The view with its photograph; InvalidArgument if the image is bad."""
+        """The photograph's view with this extractor's features; InvalidArgument if the image is bad."""
         if extractor.name not in self._views:
             photograph = self._decoded(context)
             with context.stage("features"):
@@ -52,7 +52,7 @@ class QueryViews:
 
 
 class ReferenceSource(Protocol):
-    """Where a query's references come from: `References`, or what was recorded or rendered."""
+    """Source of a query's references: `References`, or recorded or rendered ones."""
 
     def load(
         self,
@@ -62,11 +62,11 @@ class ReferenceSource(Protocol):
         context: StageContext,
         waits: bool,
     ) -> Loaded:
-        """The scene's generation and references of it, in the order given."""
+        """Loads references of a scene, in the order given, with the scene's generation."""
         ...
 
     def attributes(self, scene_key: SceneKey) -> SceneAttributes:
-        """The attributes of a scene as a whole."""
+        """Returns the attributes of a scene."""
         ...
 
     def choose(
@@ -76,11 +76,11 @@ class ReferenceSource(Protocol):
         selection: Selection,
         context: StageContext,
     ) -> Choice:
-        """The selected references for a photograph."""
+        """Chooses references for a photograph."""
         ...
 
     def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
-        """Notes that a chosen reference is not used because it is damaged."""
+        """Reports that a chosen reference is not used because it is damaged."""
         ...
 
 
@@ -96,7 +96,7 @@ class References:
         audit_tools: AuditTools,
         limits: ImageLimits,
     ) -> None:
-        """The first extractor's features are those that the descriptor is made of; ValueError if they are not."""
+        """Raises ValueError unless the descriptor is computed from the first extractor's features."""
         if descriptor.extractor not in (None, extractors[0].name):
             raise ValueError(f"{descriptor.name} is made of {descriptor.extractor}, not of {extractors[0].name}")
         self._library = library
@@ -118,7 +118,7 @@ class References:
         return self._library.load(scene_key, reference_ids, extractor, context, waits)
 
     def attributes(self, scene_key: SceneKey) -> SceneAttributes:
-        """The attributes of a scene as a whole."""
+        """Returns the attributes of a scene."""
         return self._library.attributes(scene_key)
 
     def choose(
@@ -128,13 +128,13 @@ class References:
         selection: Selection,
         context: StageContext,
     ) -> Choice:
-        """The selected references for a photograph, by its global descriptor.
+        """Chooses references for a photograph by its global descriptor.
 
         Args:
             scene_key: the scene.
             views: the photograph.
-            selection: how many references, and of which.
-            context: cancels and times.
+            selection: how many references to choose, and among which.
+            context: cancels the computation and measures its time.
 
         Raises:
             NotFound: there is no such scene (field "scene") or reference (field "references[i]").
@@ -161,11 +161,11 @@ class References:
         return Choice(tuple(ranked), self._descriptor.name, entries.generation)
 
     def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
-        """Logs, once while the scene is in memory, that a chosen reference is not used because it is damaged."""
+        """Logs that a chosen reference is not used because it is damaged; once while the scene is in memory."""
         self._indexes.report_damaged(scene_key, reference_id, error)
 
     def describe(self, photo: Photo, check: Callable[[], None]) -> Description:
-        """Everything that is stored of a photograph: every tier's features; InvalidArgument if it is bad."""
+        """Computes all that the store keeps of a photograph, every tier's features; InvalidArgument if it is bad."""
         decoded, context = QueryViews(photo, self._limits), StageContext(check)
         views = {it.name: decoded.view(it, context) for it in self._extractors}
         vector = self._descriptor.describe(views[self._extractors[0].name])
@@ -174,16 +174,16 @@ class References:
         return Description(without_pixels, {self._descriptor.name: vector})
 
     def auditor(self, scene_key: SceneKey, named: Sequence[str] = ()) -> SceneAuditor:
-        """Audits references of a scene, of which the caller named some."""
+        """Makes an auditor of a scene's references; the caller named those in `named`."""
         return SceneAuditor(self._audit_tools, scene_key, named)
 
     def forget_scene(self, scene_key: SceneKey) -> None:
-        """Frees what is in memory of a deleted scene."""
+        """Frees the memory of a deleted scene."""
         self._indexes.forget(scene_key)
 
     @property
     def index_bytes(self) -> int:
-        """Memory of the retrieval indexes."""
+        """Memory of the retrieval indexes, bytes."""
         return self._indexes.size_bytes
 
     def close(self) -> None:

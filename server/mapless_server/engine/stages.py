@@ -1,7 +1,7 @@
-"""The stages of a query in the worker queue: prepare, coarse, refine; and again with stronger features if doubtful.
+"""The stages of a query in the work queue: prepare, coarse, refine; and again with stronger features if doubtful.
 
-The method computes. Around it, here: the references, the photograph's features, the checks against priors, the choice
-between the answers of two tiers, and the answer that is given when time runs out.
+The method computes the pose. This module loads the references, finds the photograph's features, checks the pose against
+hard priors, chooses between the answers of two tiers, and gives an answer when time runs out.
 """
 
 from __future__ import annotations
@@ -60,9 +60,9 @@ _COUNTS = (2, 5, 10, 20, 64)
 
 @dataclass(frozen=True)
 class Method:
-    """The parts of the method; see `method.localize`.
+    """The parts of the method, see `method.localize`; tests replace them.
 
-    `tracked_support` is what a photograph without a pose can still give to the others of its rig or sequence.
+    `tracked_support` makes the support that a photograph without a pose can still give to its rig or sequence.
     """
 
     prepare: Callable[..., Prepared | Answer] = method.prepare
@@ -74,29 +74,30 @@ class Method:
 
 @dataclass(frozen=True, eq=False)
 class QueryRun:
-    """A query on its way through the stages, in one tier.
+    """The state of a query between its stages, in one tier.
 
     Attributes:
         query: the query.
-        source: of the references.
+        source: source of the references.
         views: the photograph.
-        deadline_s: after which the answer is useless, `time.monotonic`.
+        deadline_s: time after which the answer is useless, by `time.monotonic`.
         on_coarse: called with the first tier's coarse result as soon as there is one, in the computing thread.
         tier: index of the tier that computes.
-        best: the result of the tiers before; None in the first.
-        start_s: when this tier began, `time.monotonic`.
-        give_up_s: when `best` is the answer, if this tier has none by then.
+        best: best result of the earlier tiers; None in the first.
+        start_s: when this tier began, by `time.monotonic`.
+        give_up_s: time after which `best` is the answer, if this tier has none by then.
         listings: how often the scene was listed in this tier.
         context: cancels and times this tier's stages; from here on set by the stage `prepare`.
-        references: those that are used, in order.
-        generation: of the scene when they were read.
-        attributes: of the scene.
+        references: the references that are used, in order.
+        generation: generation of the scene when they were read.
+        attributes: attributes of the scene.
         view: the photograph with this tier's features; None until the tier's first step has found them.
-        choice: how the references were chosen; None if they were used as they were named.
-        query_matches: of the photograph with each reference, where they were chosen by these, or are made one by one.
-        unmatched: indices of the references with which the photograph is to be matched again (`Matcher.rematch`), each
-            in a step of its own, so that a busy server computes for other callers in between.
-        part: of the method, between two stages.
+        choice: how the references were chosen; None if the caller named them.
+        query_matches: matches of the photograph with each reference, if references were chosen by these or are matched
+            one by one.
+        unmatched: indices of the references that the photograph is still to be matched with again (`Matcher.rematch`),
+            each in a step of its own, so that a busy server computes for other callers in between.
+        part: the method's intermediate result between two stages.
     """
 
     query: Query
@@ -121,14 +122,14 @@ class QueryRun:
 
     @property
     def kind(self) -> str:
-        """Queries of one kind take about as long."""
+        """Kind of the query's jobs; jobs of one kind take about the same time."""
         ids = self.query.reference_ids
         count = next((count for count in _COUNTS if len(ids) <= count), _COUNTS[-1])
         return f"tier {self.tier}, {'chosen' if self.query.chooses else f'up to {count}'}"
 
     @property
     def first_step(self) -> Step:
-        """What the query needs first in its tier."""
+        """The first step of the query in its tier."""
         return Step(PREPARE, self.kind, self.kind, self)
 
 
@@ -136,27 +137,27 @@ class QueryStages:
     """Computes the three stages; its methods run in the queue's threads."""
 
     def __init__(self, tiers: Sequence[Tier], escalation: EscalationOptions, method: Method | None = None) -> None:
-        """The tiers, the cheapest first; see `EngineOptions`."""
+        """Uses these tiers, the cheapest first; see `EngineOptions` for the options."""
         self._tiers = tiers
         self._escalation = escalation
         self._method = method or Method()
 
     def prepare(self, jobs: Sequence[Job]) -> list[StageResult]:
-        """References, features and correspondences."""
+        """Loads references, finds features and computes correspondences."""
         return [self._stage_result(job.step.payload, self._prepare, job) for job in jobs]
 
     def coarse(self, jobs: Sequence[Job]) -> list[StageResult]:
-        """The reconstruction and its metric scale, of many queries in one go."""
+        """Reconstructs many queries together, and estimates the metric scale of each."""
         runs: list[QueryRun] = [job.step.payload for job in jobs]
         parts = self._method.reconstruct([run.part for run in runs])
         return [self._stage_result(run, self._after_coarse, part) for run, part in zip(runs, parts, strict=True)]
 
     def refine(self, jobs: Sequence[Job]) -> list[StageResult]:
-        """Structure, matches, pose."""
+        """Computes structure, matches and pose."""
         return [self._stage_result(job.step.payload, self._refine) for job in jobs]
 
     def _stage_result(self, run: QueryRun, compute: Callable[..., StageResult], *arguments: Any) -> StageResult:
-        """What is computed, or what its failure means for a query that may have an answer already."""
+        """Computes a stage; a failure ends the query, or returns the answer that an earlier tier has given."""
         try:
             return compute(run, *arguments)
         except Exception as error:
@@ -206,7 +207,7 @@ class QueryStages:
         return self._matched_further(run)
 
     def _rematched(self, run: QueryRun) -> QueryRun:
-        """With the photograph matched again with one reference."""
+        """Matches the photograph again with the next reference."""
         assert run.view is not None
         assert run.query_matches is not None
         index, *others = run.unmatched
@@ -216,7 +217,7 @@ class QueryStages:
         return replace(run, query_matches=tuple(matches), unmatched=tuple(others))
 
     def _matched_further(self, run: QueryRun) -> StageResult:
-        """Matches with the next reference, or goes on if they are all, or there is no time for more."""
+        """Matches the next reference, or goes on with the query if all are matched or no time is left for more."""
         tier, query = self._tiers[run.tier], run.query
         assert run.view is not None
         if self._has_time_to_rematch(run, tier):
@@ -234,7 +235,7 @@ class QueryStages:
         return self._next(run, Step(COARSE, run.kind, str(part.bucket), replace(run, part=part)))
 
     def _has_time_to_rematch(self, run: QueryRun, tier: Tier) -> bool:
-        """Whether another reference is to be matched, and can be before the tier must compute the pose."""
+        """Whether another reference is left to be matched, and time for it before the tier must compute the pose."""
         if not run.unmatched:
             return False
         until_s = run.give_up_s if run.best is not None else run.deadline_s
@@ -242,14 +243,14 @@ class QueryStages:
         return time.monotonic() + (tier.pipeline.matcher.pair_s or 0.0) <= until_s
 
     def _with_named(self, run: QueryRun, tier: Tier) -> QueryRun:
-        """With the references that the caller named."""
+        """Loads the references that the caller named."""
         # References come first: a wrong name is found before the photograph is described.
         generation, references = self._load(run, run.query.reference_ids, tier)
         view = run.views.view(tier.extractor, run.context)
         return replace(run, generation=generation, references=references, view=view)
 
     def _with_chosen(self, run: QueryRun, tier: Tier) -> QueryRun:
-        """With the references that have the most matches, among those that resemble the photograph most."""
+        """Chooses, among the references that resemble the photograph most, those with the most matches."""
         query, context = run.query, run.context
         count = SHORTLIST * query.reference_count
         selection = Selection(count, query.narrowing, query.reference_ids, THINNED_LATER)
@@ -266,7 +267,7 @@ class QueryStages:
         )
 
     def _load_chosen(self, run: QueryRun, reference_ids: Sequence[str], tier: Tier) -> Loaded:
-        """Without those that are damaged, which were not the caller's choice; unless the caller named them."""
+        """Loads chosen references without damaged ones; a damaged reference that the caller named is an error."""
         if run.query.reference_ids:
             return self._load(run, reference_ids, tier)
         report = partial(run.source.report_damaged, run.query.scene_key)
@@ -294,7 +295,7 @@ class QueryStages:
         return Next(step, Fallback(lambda: done, run.deadline_s - ANSWER_MARGIN_S))
 
     def _coarse_result(self, run: QueryRun, part: Coarse) -> Result | None:
-        """The first tier's result if no more is computed, where the caller may want it."""
+        """The first tier's coarse result, if the caller may want it and computation goes on."""
         if run.best is not None or not (run.query.allow_coarse or run.on_coarse is not None):
             return None
         coarse = self._method.coarse_answer(part)
@@ -307,7 +308,7 @@ class QueryStages:
         return self._conclude(run, answer)
 
     def _conclude(self, run: QueryRun, answer: Answer) -> StageResult:
-        """A tier has its answer: the better of two is given, or a stronger tier tries to improve it."""
+        """Ends a tier: returns the better of two answers, or starts a stronger tier to improve a doubtful one."""
         result = self._result(run, answer)
         if run.best is not None:
             result = replace(better_of(run.best, result, self._escalation), stage_seconds=result.stage_seconds)
@@ -320,7 +321,7 @@ class QueryStages:
         return Done(result, _ending(result))
 
     def _doubt_in(self, run: QueryRun) -> EscalationOptions:
-        """The options for the trust of this scene's answers: those are tried again that would be in another scene."""
+        """Adapts the options to the scene's quantiles of trust, so that the same answers are doubtful in all scenes."""
         options, calibration = self._escalation, run.attributes.self_calibration(self._tiers[run.tier].kind)
         if calibration is None:
             return options
@@ -328,7 +329,7 @@ class QueryStages:
         return replace(options, doubtful_trust=doubtful_trust)
 
     def _next(self, run: QueryRun, step: Step, alternative: Step | None = None) -> Next:
-        """Where there is an answer, it is given in time if neither step leads to a better one."""
+        """Goes on to a step; an earlier tier's answer is returned in time if neither step leads to a better one."""
         if run.best is None:
             return Next(step)
         return Next(step, Fallback(lambda: self._unfinished(run), run.give_up_s), alternative)
@@ -340,7 +341,7 @@ class QueryStages:
         return Done(result, _ending(result))
 
     def _result(self, run: QueryRun, answer: Answer) -> Result:
-        """What the tier's answer is to the caller, after the checks against what is known of the camera."""
+        """Makes the result for the caller from a tier's answer, after checking it against hard priors."""
         if not _is_finite(answer):  # a pose of NaN must never leave the server
             raise ArithmeticError(f"the method's answer is not finite: {answer.outcome}, {answer.scale}")
         assert run.view is not None
@@ -374,7 +375,7 @@ def _is_finite(answer: Answer) -> bool:
 
 
 def _checked_against(narrowing: Narrowing, answer: Answer) -> Answer:
-    """The answer, rejected if its pose contradicts what is known of the camera."""
+    """Rejects the answer if its pose is beyond a hard prior."""
     if not isinstance(answer.outcome, Localization):
         return answer
     contradiction = narrowing.contradiction(answer.outcome.world_from_camera)

@@ -1,8 +1,8 @@
-"""When a query is tried with stronger features, and which of the two answers is better.
+"""Decides when a query is tried with stronger features, and which of two answers is better.
 
-Cheap features answer nearly every query. Where they find little, stronger ones often find enough, at many times the
-cost; so a tier is tried only when the answer of the one before is a rejection that better matches could change,
-or a pose with little support.
+Cheap features suffice for nearly every query. Stronger ones often find enough matches where these do not, at many times
+the cost; so a tier is tried only if the previous tier's answer is a rejection that better matches could change, or a
+pose with little support.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class EscalationOptions:
     """Options of trying stronger features.
 
     Attributes:
-        doubtful_trust: a pose that is trusted less is doubtful. Of 2,528 photographs, many with few references, SIFT
+        doubtful_trust: a pose with less trust is doubtful. Of 2,528 photographs, many with few references, SIFT
             and EdgePoint2 had 115 off by over 5 % of the distance, 5 degrees or 25 cm; trying again below this trust
             tries 393, 114 of these among them; below 0.2 it tries 335, 109 of these among them.
         doubtful_radius_m: a pose whose claimed 68 % radius is larger is doubtful: what a robot needs to pass a door.
@@ -39,11 +39,12 @@ class EscalationOptions:
             photograph shows: that is as far as a right pose may be off. Of 12 right poses of ALIKED with
             LightGlue two were further from a rejected one of EdgePoint2, with over twice its inliers; of nine wrong
             ones all were, seven of them with less than 1.5 times its inliers.
-        clearly_more: so many times the inliers of a contradicting pose make the stronger features' pose believed.
-        time_share: of the time left, what a stronger tier may take. After that the first answer is given: better a
-            doubtful one than none, and the rest is enough to send it.
-        rematch_share: of a tier's time, when it stops to match the photograph again by a slow network (see
-            `Matcher.rematch`): the rest is for the pose, which takes a second where matches are few.
+        clearly_more: if two poses contradict each other, that of the stronger features is accepted if it has this many
+            times the inliers of the other.
+        time_share: share of the remaining time that a stronger tier may take. After that the first answer is returned,
+            since a doubtful answer is better than none; the rest of the time suffices to send it.
+        rematch_share: share of a tier's time after which it stops matching the photograph again by a slow network (see
+            `Matcher.rematch`); the rest is for the pose, which takes a second if matches are few.
     """
 
     doubtful_trust: float = 0.25
@@ -65,8 +66,9 @@ class EscalationOptions:
 def is_doubtful(answer: Answer, options: EscalationOptions) -> bool:
     """Whether stronger features could improve the answer.
 
-    Not if the intrinsics are wrong: other features do not correct them, but may determine them too little to notice. A
-    pose that nothing has checked (`Variant.COARSE`) has no trust and claims nothing, so there is nothing to doubt.
+    They cannot if the intrinsics are wrong: other features do not correct them, but may determine them too little to
+        detect it. A pose that nothing has checked (`Variant.COARSE`) has no trust and claims nothing, so there is
+        nothing to doubt.
     """
     outcome = answer.outcome
     if isinstance(outcome, Rejection):
@@ -80,11 +82,12 @@ def is_doubtful(answer: Answer, options: EscalationOptions) -> bool:
 def better_of(cheaper: Result, stronger: Result, options: EscalationOptions) -> Result:
     """The better of a doubtful result and one with stronger features.
 
-    A localization is better than a rejection, and of two rejections the stronger features' says more. Of two poses that
-    agree, within the sum of their 95 % radii or what the options let pass, the one with the smaller claimed radius is
-    better. Of two that contradict each other at least one is wrong, and the cheaper features' was doubtful: that of the
-    stronger ones is answered if it has clearly more inliers, and neither otherwise. A pose that was rejected for lack
-    of evidence, or beside a second one, is evidence, too: it contradicts a pose that is too far from it.
+    A localization is better than a rejection, and of two rejections that of the stronger features says more. Of two
+    poses that agree, within the sum of their 95 % radii or what the options let pass, the one with the smaller claimed
+    radius is better. Of two that contradict each other at least one is wrong, and the cheaper features' was doubtful:
+    that of the stronger ones is answered if it has clearly more inliers, and neither otherwise. A pose that was
+    rejected for lack of evidence, or beside a second one, is evidence, too: it contradicts a pose that is too far from
+    it.
     """
     first, second = cheaper.answer.outcome, stronger.answer.outcome
     if isinstance(second, Rejection):
@@ -116,7 +119,7 @@ def better_of(cheaper: Result, stronger: Result, options: EscalationOptions) -> 
 
 
 def _rejected_pose(answer: Answer) -> tuple[RigidTransform, int] | None:
-    """The pose that was found and rejected, and its number of inliers; None if no pose was rejected by its evidence."""
+    """The pose that was found and rejected by its evidence, with its number of inliers; None if there was none."""
     outcome, support = answer.outcome, answer.support
     judged = isinstance(outcome, Rejection) and outcome.reason in (RejectionReason.GATE, RejectionReason.AMBIGUOUS)
     if not judged or support is None or support.estimate is None:
@@ -125,7 +128,7 @@ def _rejected_pose(answer: Answer) -> tuple[RigidTransform, int] | None:
 
 
 def _places_apart(result: Result) -> Hint:
-    """What helps where two kinds of features find two places."""
+    """The hint for two kinds of features that find two places."""
     matches = result.answer.reference_match_counts
     best = result.references[int(np.argmax(matches))].name if result.references and any(matches) else None
     message = (
@@ -136,7 +139,7 @@ def _places_apart(result: Result) -> Hint:
 
 
 def _claim(localization: Localization) -> Accuracy:
-    """The claimed radii; infinite where nothing is claimed."""
+    """The radii that the answer claims; infinite without a covariance."""
     if localization.covariance is None:
         return Accuracy(math.inf, math.inf, math.inf, math.inf)
     return accuracy_from_covariance(localization.covariance)

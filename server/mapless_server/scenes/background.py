@@ -53,17 +53,17 @@ class BackgroundOptions:
     """Options of matching in the background.
 
     Attributes:
-        pairs: references that each is matched with, at most, of those before it. In the kitchen of 7-Scenes (75
+        pairs: largest number of earlier references that each reference is matched with. In the kitchen of 7-Scenes (75
             references, 25 queries, 10 references a query) a query finds 90 % of its pairs with 20, 96 % with 30, 99 %
             with 40, for which 17, 24 and 29 pairs are made for each reference.
-        strong_pairs: the same for pairs that a slow network matches, 0.6 to 0.7 s of processor time each. Those that
-            nearest neighbours match well are left out: of 100 references of the kitchen 75 pairs remain of 490.
-        busy_share: of one core while the server computes for callers.
+        strong_pairs: the same number for pairs that a slow network matches, 0.6 to 0.7 s of processor time each. Those
+            that nearest neighbours match well are left out: of 100 references of the kitchen 75 pairs remain of 490.
+        busy_share: share of one core that is used while the server computes for callers.
         quiet_s: only after this time without work for a caller the server counts as idle, so that a device that sends a
             photograph every second is not slowed by steps that begin in its gaps. With 0.05 its photographs took
             1.15 times as long.
         poll_s: time between two looks into the store for new references, also those that other servers have added.
-        longest_poll_s: the same after repeated failures of the store.
+        longest_poll_s: the same time after repeated failures of the store.
     """
 
     pairs: int = 30
@@ -127,7 +127,7 @@ class BackgroundMatching:
     def start(self, makes_pairs: bool = True) -> None:
         """Starts the thread, unless the store can only be read.
 
-        If it does not make pairs, it still deletes damaged ones that queries find, and those without use.
+        Without `makes_pairs`, it still deletes damaged pairs that queries find, and unused ones.
         """
         if self._store.database.only_reads:
             log.warning("references are not matched in the background: the store can only be read")
@@ -163,7 +163,7 @@ class BackgroundMatching:
         return self._calibrations is not None and self._calibrations.calibrate_next(self._wait_for_callers)
 
     def match_waiting(self) -> None:
-        """Matches the references that may be claimed now, until there are none; raises if the store fails."""
+        """Matches the references that may be claimed now, until none is left; raises if the store fails."""
         self._step_begin_s = time.monotonic()
         found = self._claim()
         if found is None:
@@ -181,7 +181,7 @@ class BackgroundMatching:
         self._count_waiting()
 
     def maintain(self) -> None:
-        """Deletes damaged pairs, and those of matchings without use, unless the last time is less than an hour ago."""
+        """Deletes damaged pairs and those of unused matchings, at most once an hour."""
         for matching, finder in self._matchings.items():
             damaged = finder.take_damaged(matching.name)
             if damaged:
@@ -210,7 +210,7 @@ class BackgroundMatching:
             poll_s = min(2 * poll_s, self.options.longest_poll_s) if has_failed else self.options.poll_s
 
     def _fails(self, work: Callable[[], None]) -> bool:
-        """Does the work; whether the store failed."""
+        """Calls `work` and returns whether the store failed."""
         try:
             work()
         except Closed:
@@ -260,7 +260,7 @@ class BackgroundMatching:
     def _match(
         self, library: ReferenceLibrary, matching: Matching, claim: Claim, until_s: float
     ) -> tuple[dict[Pair, Matches], bool]:
-        """Pairs of a reference, and whether they are all; those that were made until a time, or until it is closed."""
+        """Matches a reference's pairs until a time or until closed; returns the pairs, and whether these are all."""
         made: dict[Pair, Matches] = {}
         self._let_callers_first()
         self._check()
@@ -286,7 +286,7 @@ class BackgroundMatching:
         return made, True
 
     def _match_pair(self, matching: Matching, first: PosedView, second: PosedView) -> dict[Pair, Matches]:
-        """The pair, unless it needs no matches of this kind."""
+        """Matches a pair, unless it needs no matches of this kind."""
         base = matching.base
         begun = None if base is None else self._matchings[matching].find_one(base.name, first, second)
         matches = matching.match_pair(first, second, begun, self._pause)
@@ -295,7 +295,7 @@ class BackgroundMatching:
     def _nearest(self, matching: Matching, claim: Claim) -> list[str]:
         """Ids of the references that a query from the claimed one's place would choose first, without stored pairs.
 
-        A scene that is added at once has half of its references before and half after the claimed one.
+        In a scene whose references were added at once, half of them precede the claimed one on average.
         """
         entries = self._indexes.entries(claim.scene_key, StageContext(self._check))
         (row,) = entries.rows([claim.reference_id]) if claim.reference_id in entries else (None,)
@@ -318,7 +318,7 @@ class BackgroundMatching:
     def _load_usable(
         self, library: ReferenceLibrary, matching: Matching, claim: Claim, reference_id: str
     ) -> tuple[PosedView, ...]:
-        """A reference, or nothing if it is damaged or deleted, which is no fault of the claimed one."""
+        """Loads a reference; empty if it is damaged or deleted, which is not a failure of the claimed one."""
         context = StageContext(self._check)
 
         def report(damaged_id: str, error: Exception) -> None:
@@ -341,14 +341,14 @@ class BackgroundMatching:
         self._let_callers_first()
 
     def _pause(self) -> None:
-        """In the middle of a pair that takes long; a pair has some ten steps."""
+        """Pauses in the middle of a slow pair, which has about ten steps."""
         self._check()
         self._let_callers_first(1 / 30)
 
     def _let_callers_first(self, share_of_claim: float = 1 / 4) -> None:
-        """Ends a step: waits while the server computes for callers, as long as a busy server's share demands.
+        """Ends a step: waits while the server computes for callers, as long as `busy_share` demands.
 
-        But for no longer than this share of the time that a claim holds, so that it does not end meanwhile.
+        It waits at most this share of the time that a claim holds, so that the claim does not end meanwhile.
         """
         options, now_s = self.options, time.monotonic()
         until_s = now_s + min((now_s - self._step_begin_s) / options.busy_share, CLAIM_S * share_of_claim)

@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 
 class SceneIndexes:
-    """Indexes of scenes, the least recently used evicted; thread-safe."""
+    """Indexes of scenes, of which the least recently used are evicted; thread-safe."""
 
     def __init__(
         self,
@@ -31,14 +31,14 @@ class SceneIndexes:
         extractor: FeatureExtractor,
         capacity_bytes: int,
     ) -> None:
-        """No indexes yet.
+        """Makes the object without any index.
 
         Args:
-            store: of the references.
+            store: store of the references.
             library: loads references that have no descriptor yet.
-            descriptor: what the indexes contain.
-            extractor: of the features that the descriptor is made of.
-            capacity_bytes: of all indexes; the most recently used one is kept however large it is.
+            descriptor: global descriptor that the indexes contain.
+            extractor: extractor of the features that the descriptor is computed from.
+            capacity_bytes: largest size of all indexes; the most recently used one is kept however large it is.
         """
         self._store = store
         self._library = library
@@ -51,15 +51,15 @@ class SceneIndexes:
 
     @property
     def size_bytes(self) -> int:
-        """Memory of all indexes."""
+        """Memory of all indexes, bytes."""
         with self._lock:
             return self._size_bytes
 
     def entries(self, scene_key: SceneKey, context: StageContext) -> Entries:
-        """The references of a scene as it is now.
+        """Returns the references of a scene as it is now.
 
-        References without a descriptor are described now, one by one, and those done are kept if the context is
-        cancelled. One that cannot be described because it is damaged stays without.
+        References without a descriptor are described now, one by one, and finished ones are kept if the context is
+        cancelled. A reference that cannot be described because it is damaged remains without a descriptor.
 
         Raises:
             NotFound: there is no such scene (field "scene").
@@ -83,7 +83,7 @@ class SceneIndexes:
             self._drop(scene_key, cached)
 
     def is_damaged(self, scene_key: SceneKey, reference_id: str) -> bool:
-        """Whether a reference is in the scene but not among its entries, because its pose or descriptor is damaged."""
+        """Whether a reference is missing from the entries of its scene because its pose or descriptor is damaged."""
         cached = self._find(scene_key)
         if cached is None or reference_id not in cached.damaged_ids:
             return False
@@ -97,7 +97,7 @@ class SceneIndexes:
         return True
 
     def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
-        """Logs, once while the scene is in memory, that a reference is not used because it is damaged."""
+        """Logs that a reference is not used because it is damaged; once while the scene is in memory."""
         cached = self._find(scene_key)
         if cached is None or reference_id not in cached.reported_ids:
             if cached is not None:
@@ -144,7 +144,7 @@ class SceneIndexes:
             return self._cached.get(scene_key)
 
     def _get(self, scene_key: SceneKey) -> _CachedIndex:
-        """The scene's index, created if missing, as the most recently used one."""
+        """Returns the scene's index, created if missing, as the most recently used one."""
         with self._lock:
             cached = self._cached.get(scene_key)
             if cached is None:
@@ -175,11 +175,11 @@ class _CachedIndex:
     """An index, and the lock of the thread that updates it.
 
     Attributes:
-        index: of the scene.
+        index: index of the scene.
         counted_bytes: its size when it was last counted.
-        damaged_ids: of references that are not in the index; some may have been deleted.
+        damaged_ids: ids of references that are not in the index; some may have been deleted.
         undescribable: keys of references that were found damaged when they were to be described.
-        reported_ids: of references whose damage has been logged.
+        reported_ids: ids of references whose damage has been logged.
     """
 
     def __init__(self, index: SceneIndex) -> None:
@@ -191,7 +191,7 @@ class _CachedIndex:
         self._updating = threading.Lock()
 
     def describable(self, entries: Entries) -> list[tuple[str, str]]:
-        """Id and key of the entries that have no descriptor and may get one."""
+        """Id and key of the entries that have no descriptor but may get one."""
         return [(reference_id, key) for reference_id, key in entries.undescribed() if key not in self.undescribable]
 
     def refresh(self, store: Store, scene_key: SceneKey, descriptor: str) -> Entries:

@@ -1,7 +1,7 @@
 """Stored references as the pipeline needs them: with the requested features, and with photographs that load lazily.
 
-Features are computed once, when a reference is added. A store that was filled with other features lacks those of a new
-extractor: the first calls that need them compute them from the stored photographs, and store them.
+Features are computed once, when a reference is added. If a store lacks the features of a new extractor, the first calls
+that need them compute them from the stored photographs, and store them.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ class FeaturesMissing(Exception):
 
 
 class Closed(Exception):
-    """The server is being closed: what is done in the background ends."""
+    """The server is being closed, so work in the background ends."""
 
 
 class KeyedLocks:
-    """A lock for each key in use, so that threads do nothing twice."""
+    """A lock for each key in use, so that two threads do not compute the same thing."""
 
     def __init__(self) -> None:
         self._locked: set[tuple[str, str]] = set()
@@ -80,7 +80,7 @@ class ReferenceLibrary:
     """Loads references from the store; thread-safe.
 
     Attributes:
-        locks: of what threads are computing, by the reference's key and the name of the extractor or descriptor.
+        locks: locks of what threads are computing, by the reference's key and the name of the extractor or descriptor.
     """
 
     def __init__(self, store: Store, depths: DepthFinder | None = None) -> None:
@@ -106,17 +106,17 @@ class ReferenceLibrary:
         context: StageContext,
         waits: bool = True,
     ) -> Loaded:
-        """The scene's generation and references of it, in the order given.
+        """Loads references of a scene, in the order given, with the scene's generation.
 
-        References without features of the extractor are described now, one by one, and those done are kept if the
-        context is cancelled; with `waits` False they are described in the background. Photographs are read when their
+        References without features of the extractor are described now, one by one, and finished ones are kept if the
+        context is cancelled; if `waits` is False, they are described in the background. Photographs are read when their
         pixels are first used.
 
         Raises:
             FeaturesMissing: references lack features and `waits` is False.
             NotFound: there is no such scene (field "scene") or reference (field "references[i]").
             Abandoned: the context is cancelled.
-            DataLoss: what is stored of one of them is damaged.
+            DataLoss: stored data of one of them are damaged.
         """
         while True:
             snapshot = self._store.load_references(scene_key, reference_ids, extractor.name)
@@ -133,7 +133,7 @@ class ReferenceLibrary:
                 self._describe_all(snapshot.undescribed, extractor, context.check)
 
     def attributes(self, scene_key: SceneKey) -> SceneAttributes:
-        """Attributes of a scene as a whole; errors as `Store.get_attributes`."""
+        """Returns the attributes of a scene; errors as in `Store.get_attributes`."""
         return self._store.get_attributes(scene_key)
 
     def _describe_later(self, records: Sequence[ReferenceRecord], extractor: FeatureExtractor) -> None:
@@ -186,7 +186,7 @@ class ReferenceLibrary:
         )
 
     def _pixels(self, record: ReferenceRecord) -> NDArray[np.uint8]:
-        """The photograph, (H, W, 3) RGB. Raises NotFound if the reference was deleted, DataLoss if it is damaged."""
+        """Reads the photograph, (H, W, 3) RGB; NotFound if the reference was deleted, DataLoss if it is damaged."""
         data = self._store.read_image_of(record.key)
         try:
             return decode_image(data, STORED_IMAGES)
@@ -200,14 +200,14 @@ def load_usable(
     unusable: tuple[type[RequestError], ...],
     report: Callable[[str, RequestError], None],
 ) -> Loaded:
-    """References with these ids, in order, except those that cannot be loaded.
+    """Loads references with these ids, in order, except those that cannot be loaded.
 
-    All are read at one moment; if some cannot be loaded, the others are read again, at one moment.
+    All are read at one moment. If some cannot be loaded, the others are read again, also at one moment.
 
     Args:
-        load: loads some references; fails if one of them fails.
-        reference_ids: of the references.
-        unusable: errors of a reference that is to be omitted; those about the scene are raised.
+        load: function that loads some references, and fails if one of them fails.
+        reference_ids: ids of the references.
+        unusable: errors for which a reference is omitted; errors about the scene are raised.
         report: called for each reference that is omitted.
     """
 

@@ -1,4 +1,4 @@
-"""Events of what is done in the background, ahead of queries, for metrics."""
+"""Events of the work in the background, ahead of queries, for metrics."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class PairObserver:
         """Matching a reference in the background failed; it is tried again."""
 
     def references_wait(self, count: int) -> None:
-        """So many references wait to be matched in the background."""
+        """Reports how many references wait to be matched in the background."""
 
     def depths_looked_up(self, stored: int, absent: int, damaged: int) -> None:
         """A query looked for the depths of references; it does without those that are absent or damaged."""
@@ -40,10 +40,10 @@ class PairObserver:
         """So many references wait for a network to predict their depth."""
 
     def scene_calibrated(self, cpu_seconds: float) -> None:
-        """References of a scene were localized against the others, and what they say was stored."""
+        """References of a scene were localized against the others, and the calibration was stored."""
 
     def calibration_failed(self) -> None:
         """Calibrating a scene from its references failed; it is tried again."""
 
     def scenes_wait(self, count: int) -> None:
-        """So many scenes have changed since they were calibrated from their references."""
+        """Reports how many scenes have changed since they were calibrated from their references."""

@@ -1,10 +1,10 @@
-"""Whether a scene's datum, direction of gravity and unit of length can be those of its references, by poses alone.
+"""Checks by poses alone whether a scene's datum, direction of gravity and unit of length fit its references.
 
 People hold cameras upright, so the cameras' horizons show which way is down: their x axes are level. Where cameras
 look in many directions, down is the direction perpendicular to these; where they look in one, their y axes show it
 more coarsely, since they may all be inclined. A camera on its side has its x axis along gravity instead.
 
-The unit shows only where it makes positions impossible: a wrong scale leaves all angles as they are.
+A wrong unit is found only if it makes positions impossible, since scale does not change any angle.
 """
 
 from __future__ import annotations
@@ -61,14 +61,14 @@ of the same place, and parts of a place differ by less."""
 
 @dataclass(frozen=True, eq=False)
 class TypicalDown:
-    """Down as the cameras show it: a unit vector (3,) in the world, and the largest angle that contradicts nothing."""
+    """Down as the cameras show it: a unit vector (3,) in the world, and the largest angle that is no contradiction."""
 
     direction: Array
     bound_deg: float
 
 
 def typical_down(poses: Sequence[RigidTransform]) -> TypicalDown | None:
-    """Down as upright cameras show it; None where they are too few or do not agree."""
+    """The direction down as upright cameras show it; None if they are too few or do not agree."""
     if len(poses) < MIN_CAMERAS:
         return None
     x_axes, y_axes = (np.array([pose.rotation[:, axis] for pose in poses]) for axis in (0, 1))
@@ -84,10 +84,10 @@ def typical_down(poses: Sequence[RigidTransform]) -> TypicalDown | None:
 def contradictions(
     poses: Sequence[RigidTransform], attributes: SceneAttributes, added: Sequence[RigidTransform] = ()
 ) -> list[str]:
-    """What a scene's attributes contradict in the poses of its references: one sentence each, with what was found.
+    """Contradictions of a scene's attributes and the poses of its references, one sentence each with its numbers.
 
-    Poses of references that are added are examined together with the others, and alone if that shows nothing: they
-    may be too few to matter among the others.
+    Poses of added references are examined together with the others, and alone if that finds nothing, since they may be
+    too few to matter among the others.
     """
     together = [*poses, *added]
     if not together:
@@ -101,7 +101,7 @@ def contradictions(
 
 
 def another_unit(stored: Sequence[RigidTransform], added: Sequence[RigidTransform]) -> str:
-    """One sentence if poses spread hundreds of times as far as others of the scene, or less; empty if they do not."""
+    """One sentence if added poses spread hundreds of times as far as the scene's others, or less; else empty."""
     if min(len(stored), len(added)) < MIN_COMPARED:
         return ""
     radii = [radius_m(np.array([pose.translation for pose in poses])) for poses in (stored, added)]
@@ -144,7 +144,7 @@ def _down(poses: Sequence[RigidTransform], attributes: SceneAttributes) -> str:
 
 
 def _origin(poses: Sequence[RigidTransform], attributes: SceneAttributes) -> str:
-    """Positions that are not about the datum's origin."""
+    """The contradiction of positions that are far from the datum's origin."""
     datum = attributes.datum
     if datum is None:
         return ""
@@ -166,7 +166,7 @@ def _origin(poses: Sequence[RigidTransform], attributes: SceneAttributes) -> str
 
 
 def _unit(positions: Array) -> str:
-    """Positions that no photographer visits, if they are in metres."""
+    """The contradiction of positions that nobody can have visited if they are in metres."""
     if len(positions) < 2:
         return ""
     text = _degrees(positions)
@@ -183,7 +183,7 @@ def _unit(positions: Array) -> str:
 
 
 def _degrees(positions: Array) -> str:
-    """Two coordinates that are latitudes and longitudes: hardly different, far from 0, the third spread much more."""
+    """The contradiction of two coordinates that are latitudes and longitudes: nearly constant, unlike the third."""
     centre, spread = np.median(positions, axis=0), np.ptp(positions, axis=0)
     for third in range(3):
         pair = [axis for axis in range(3) if axis != third]

@@ -1,4 +1,4 @@
-"""What queries find of the pairs of references that were matched before."""
+"""Lets queries find pairs of references that were matched before."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Matching:
-    """One of the ways in which references are matched.
+    """A way in which references are matched.
 
     Attributes:
-        extractor: of the features.
-        matcher: of the queries.
+        extractor: extractor of the features.
+        matcher: matcher of the queries.
         wide: whether the matches are wide ones.
         strong: whether they are those of `Matcher.pair_matching`.
     """
@@ -35,12 +35,12 @@ class Matching:
 
     @property
     def name(self) -> str:
-        """As `PairStore` expects it."""
+        """Name of the matching, as `PairStore` expects it."""
         return matching_name(self.extractor.name, self.matcher.matching(self.wide, self.strong))
 
     @property
     def base(self) -> Matching | None:
-        """The one whose matches of a pair this one begins with."""
+        """The matching whose matches of a pair this one begins with."""
         if self.wide:
             return replace(self, wide=False)
         return replace(self, strong=False) if self.strong else None
@@ -48,12 +48,12 @@ class Matching:
     def match_pair(
         self, first: PosedView, second: PosedView, begun: Matches | None, pause: Callable[[], None]
     ) -> Matches | None:
-        """Matches of two references `in_order`, or None if the pair needs none of this kind.
+        """Matches two references, given `in_order`; None if the pair needs no matches of this kind.
 
         Args:
-            first: reference.
+            first: a reference.
             second: another one.
-            begun: those of `base`, if they are stored.
+            begun: matches by `base`, if they are stored.
             pause: see `PairMatching`.
         """
         if self.strong and not self.wide:
@@ -67,7 +67,7 @@ class Matching:
 
 
 def matching_name(extractor: str, rule: str) -> str:
-    """Names the features and the rule by which they are matched, see `Matcher.matching`."""
+    """Returns a name for the features and the rule by which they are matched, see `Matcher.matching`."""
     return f"{extractor}/{rule}"
 
 
@@ -83,7 +83,7 @@ class PairFinder:
         self._guard = threading.Lock()
 
     def find(self, matching: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> list[Matches | None]:
-        """See StoredPairs.find."""
+        """See `StoredPairs.find`."""
         try:
             found, damaged_count = self._read(matching_name(self._extractor, matching), pairs)
         except Exception as error:  # the query can do without
@@ -99,7 +99,7 @@ class PairFinder:
         return self._read(name, [(first, second)])[0][0]
 
     def _read(self, name: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> tuple[list[Matches | None], int]:
-        """The matches of each pair that are stored and whole, and how many are damaged."""
+        """Reads the stored, undamaged matches of each pair; also returns the number of damaged ones."""
         keys = [(first.key, second.key) for first, second in pairs]
         stored = self._pairs.load(name, keys)
         found = {
@@ -115,12 +115,12 @@ class PairFinder:
         return [found.get(key) for key in keys], len(damaged)
 
     def take_damaged(self, name: str) -> Collection[Pair]:
-        """The pairs of a matching that were found damaged since the last call."""
+        """Returns the pairs of a matching that were found damaged since the last call."""
         with self._guard:
             return self._damaged.pop(name, set())
 
 
 def _is_within(matches: Matches, first: PosedView, second: PosedView) -> bool:
-    """Whether both photographs have the matched keypoints."""
+    """Whether all matched keypoints exist in both photographs."""
     counts = len(first.view.features), len(second.view.features)
     return bool(((matches >= 0) & (matches < counts)).all())

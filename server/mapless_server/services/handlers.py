@@ -41,7 +41,7 @@ LOCALIZE_METHODS = frozenset(
 
 
 class _Health(health.aio.HealthServicer):  # type: ignore[name-defined,misc]
-    """Health with the list of all services, which grpc's own lacks."""
+    """Health service with the method List, which grpc's own implementation lacks."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -59,10 +59,10 @@ class _Health(health.aio.HealthServicer):  # type: ignore[name-defined,misc]
 
 
 class Services:
-    """All services of a server: they answer UNAVAILABLE until `open` sets the engine, and `drain` ends them in order.
+    """All services of a server. They answer UNAVAILABLE until `open` sets the engine; `drain` ends them in order.
 
     Attributes:
-        handlers: by service and method, for the server that listens.
+        handlers: handlers by service and method, for the server that listens.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class Services:
             self._add_reflection((*SERVICE_NAMES, health.SERVICE_NAME, reflection.SERVICE_NAME))
 
     def add_to(self, server: Any) -> None:
-        """Adds the handlers to a grpc.aio.Server that does not run yet."""
+        """Adds the handlers to a grpc.aio.Server that has not been started."""
         for service, methods in self.handlers.items():
             server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(service, methods),))
 
@@ -111,10 +111,10 @@ class Services:
         }
 
     def add_generic_rpc_handlers(self, handlers: object) -> None:
-        """Ignores the second registration of generated code, which is for older servers."""
+        """Ignores the second registration of generated code, which is meant for older servers."""
 
     def _add_reflection(self, service_names: tuple[str, ...]) -> None:
-        """Adds both versions of the protocol: the package has v1alpha alone; v1 is the same under another name."""
+        """Adds both versions of reflection: the package has only v1alpha; v1 is the same under another name."""
         method = grpc.stream_stream_rpc_method_handler(
             ReflectionServicer(service_names).ServerReflectionInfo,
             request_deserializer=reflection_pb2.ServerReflectionRequest.FromString,
@@ -129,7 +129,7 @@ class Services:
         await self.set_serving(True)
 
     async def drain(self, delay_s: float, grace_s: float) -> None:
-        """Reports that it stops serving; after a delay refuses new calls, and waits for the running ones.
+        """Reports that the server stops serving; after a delay, refuses new calls and waits for the running ones.
 
         Args:
             delay_s: time for load balancers to notice, which send calls until their next health check.
@@ -158,7 +158,7 @@ class Services:
         self._metrics.set_serving(is_serving)
 
     async def set_changeable(self, is_changeable: bool) -> None:
-        """Sets whether the ReferenceService is healthy: queries are served even while the store cannot be written."""
+        """Sets the health of the ReferenceService: queries are answered even while the store cannot be written."""
         self._is_changeable = is_changeable
         if self._is_serving:
             await self.set_serving(True)

@@ -51,12 +51,12 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         watchers: Watchers,
         recorder: Recorder | None = None,
     ) -> None:
-        """Computes nothing yet.
+        """Makes the service; computes nothing yet.
 
         Args:
-            engine: returns the engine; raises Unavailable while the server starts.
+            engine: function that returns the engine; raises Unavailable while the server starts.
             metrics: count answers and their quality.
-            store: of the scenes' attributes.
+            store: the store of the scenes' attributes.
             watchers: receive each answer of a single photograph.
             recorder: captures answered calls; None to capture none.
         """
@@ -79,7 +79,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         return coarse_then_final(partial(self._answer, request, query, frames, call))
 
     async def _query(self, request: pb.LocalizeRequest, call: Call) -> tuple[Query, AnswerFrames]:
-        """The query of a request; FieldError or RequestError names what is wrong with it."""
+        """Converts a request to a query; FieldError or RequestError names the wrong field."""
         options, tenant = self._engine().options, call.principal.tenant
         frames, attributes = answer_frames_of(request), SceneAttributes()
         if needs_attributes(request):
@@ -97,7 +97,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         call: Call,
         coarse: asyncio.Future[pb.LocalizeResponse] | None = None,
     ) -> pb.LocalizeResponse:
-        """The final answer; before it, `coarse` is set to the coarse pose if there is one."""
+        """Computes the final answer; before, sets `coarse` to the coarse pose, if there is one."""
         engine = self._engine()
 
         def to_message(result: Result) -> pb.LocalizeResponse:
@@ -183,7 +183,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         bounds: tuple[int, int],
         call: Call,
     ) -> tuple[Query, ...]:
-        """The photographs of a request, each as a query; FieldError or RequestError names what is wrong with it."""
+        """Converts the photographs of a request to queries; FieldError or RequestError names the wrong field."""
         tenant, attributes = call.principal.tenant, SceneAttributes()
         if any(map(needs_attributes, getattr(request, list_name))):
             scene_key = scene_key_from_name(request.scene, "scene", tenant)
@@ -213,7 +213,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         call: Call,
         scale: MetricScale | None = None,
     ) -> None:
-        """Reports an answer to the log and the metrics: a Rejection, or the message of a localization of any kind."""
+        """Reports an answer, a rejection or the message of any localization, to the log and the metrics."""
         for result in results:
             self._metrics.stages(result.stage_seconds)
         if isinstance(outcome, Rejection):
@@ -240,13 +240,13 @@ async def localize_photographs(engine: Engine, queries: Sequence[Query], call: C
     """Localizes each photograph of a rig or a sequence, and records their stages even if one of them fails.
 
     Args:
-        engine: which computes.
+        engine: the engine that computes.
         queries: the photographs, of one scene.
-        call: to which they belong.
+        call: the call that they belong to.
         list_name: the field of the request that holds them.
 
     Raises:
-        RequestError: as of `PhotoGroup.localize`.
+        RequestError: as in `PhotoGroup.localize`.
     """
     call.note(scene=queries[0].scene_key, images=len(queries))
     group = PhotoGroup(engine, queries, call.caller, list_name)
@@ -266,10 +266,10 @@ async def coarse_then_final(
     the generator cancels the answer, and frees its place in the queue.
 
     Args:
-        answer: returns the final answer; before, it may set its argument to the coarse answer.
+        answer: function that returns the final answer; before, it may set its argument to the coarse answer.
 
     Raises:
-        Exception: as `answer`, after the coarse message if there was one.
+        Exception: any exception of `answer`, after the coarse message if there was one.
     """
     coarse: FutureCoarseAnswer = asyncio.get_running_loop().create_future()
     answering = asyncio.ensure_future(answer(coarse))

@@ -1,4 +1,4 @@
-"""ReferenceService: scenes and references as resources; images are described before anything is stored."""
+"""ReferenceService: scenes and references as resources; images are described before they are stored."""
 # ruff: noqa: N802  methods carry the names of their RPCs
 
 from __future__ import annotations
@@ -237,7 +237,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
     async def _audit_page(
         self, request: pb.AuditSceneRequest, scene_key: SceneKey, call: Call
     ) -> tuple[Sequence[str], str]:
-        """Ids of the references to audit, and the token of the next page."""
+        """Returns the ids of the references to audit, and the token of the next page."""
         if request.references:
             return reference_ids_from_names(request.references, scene_id_of(scene_key), MAX_AUDITS), ""
         page = Page(request, call.principal.tenant, f"{request.scene} audit", DEFAULT_AUDITS, MAX_AUDITS)
@@ -260,7 +260,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         return message
 
     def _draft(self, request: pb.CreateReferenceRequest, path: str) -> Draft:
-        """A reference to create, all checked except the pixels; FieldError or InvalidArgument names the field."""
+        """Reads a reference and checks all but its pixels; FieldError or InvalidArgument names the wrong field."""
         reference_id = wire.checked_id(request.reference_id, wire.joined(path, "reference_id"))
         path = wire.joined(path, "reference")
         if not request.HasField("reference"):
@@ -277,7 +277,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
     async def _add(
         self, scene_key: SceneKey, drafts: Sequence[Draft], call: Call
     ) -> tuple[Sequence[ReferenceRecord], list[str]]:
-        """Stores references; what they are now, and what contradicts the scene's attributes."""
+        """Stores references; returns their records, and contradictions of the scene's attributes."""
         # Describing takes long, so an unknown scene is rejected before. The store checks again when it adds.
         added = [world_from_camera for _, _, world_from_camera in drafts]
         warnings = await self._stored(self._contradictions_of_added, scene_key, added, call)
@@ -299,5 +299,5 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
 
 
 async def _many(to_message: Callable[[Record], M], records: Sequence[Record]) -> list[M]:
-    """The messages of a page; a thousand take tens of milliseconds, too long for the event loop."""
+    """Converts a page of records to messages in a thread; a thousand take tens of milliseconds."""
     return await asyncio.to_thread(lambda: [to_message(record) for record in records])

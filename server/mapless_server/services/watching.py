@@ -40,7 +40,7 @@ class Watcher:
     """The messages to one watcher of a scene, an asynchronous iterator; ends with Unavailable when the server stops."""
 
     def __init__(self, unregister: Callable[[Watcher], None], max_message_bytes: int) -> None:
-        """`unregister` is called when it is closed; messages above the limit are sent without their photograph."""
+        """Calls `unregister` when closed; messages above the limit are sent without their photograph."""
         self._unregister = unregister
         self._max_message_bytes = max_message_bytes
         self._waiting: deque[WatchedAnswer] = deque(maxlen=QUEUE_LENGTH)
@@ -56,7 +56,7 @@ class Watcher:
         self._changed.set()
 
     def end(self) -> None:
-        """Ends it, after the server has begun to stop."""
+        """Ends the iterator, after the server has begun to stop."""
         self._has_ended = True
         self._changed.set()
 
@@ -64,7 +64,7 @@ class Watcher:
         return self
 
     async def __anext__(self) -> pb.WatchQueriesResponse:
-        """The oldest answer that waits, with the number of those that were missed before it."""
+        """Returns the oldest waiting answer, with the number of answers that were dropped before it."""
         while not (self._waiting or self._has_ended):
             self._changed.clear()
             await self._changed.wait()
@@ -80,7 +80,7 @@ class Watcher:
         return message
 
     async def aclose(self) -> None:
-        """Ends it from the watcher's side."""
+        """Ends the iterator on behalf of the watcher."""
         self._unregister(self)
 
 
@@ -88,7 +88,7 @@ class Watchers:
     """The watchers of all scenes."""
 
     def __init__(self, are_allowed: bool, max_message_bytes: int = 32 * 2**20) -> None:
-        """Has no watchers at first.
+        """Makes the object without watchers.
 
         Args:
             are_allowed: the setting `allow_watching`: whether callers' photographs may be shown to others.
@@ -99,7 +99,7 @@ class Watchers:
         self._by_scene: dict[SceneKey, set[Watcher]] = {}
 
     def is_watched(self, scene_key: SceneKey) -> bool:
-        """Whether the scene has a watcher, so that its answers are wanted with their matches."""
+        """Whether the scene has a watcher, so that its answers need their matches."""
         return scene_key in self._by_scene
 
     def publish(
@@ -109,9 +109,9 @@ class Watchers:
 
         Args:
             scene_key: the scene.
-            request: with the photograph.
-            response: to the caller; it is copied, not changed.
-            debug: the matches; None where the computation did not come so far.
+            request: the request with the photograph.
+            response: the response to the caller; it is copied, not changed.
+            debug: the matches; None if the computation ended before.
         """
         watchers = self._by_scene.get(scene_key)
         if watchers is None:
@@ -145,7 +145,7 @@ class Watchers:
             raise Overloaded("there are too many watchers", reason="TOO_MANY_WATCHERS", retry_after_s=5.0)
 
     def watch(self, scene_key: SceneKey) -> Watcher:
-        """A watcher of the scene's answers from now on, until it is closed.
+        """Makes a watcher of the scene's answers from now on, until it is closed.
 
         Raises:
             FailedPrecondition, Overloaded: see `check`.

@@ -1,7 +1,7 @@
 """Backups: a store is copied to a file while it is served, and from a file into an empty store of either database.
 
-A backup is one SQLite file, from whichever database, so it also moves a store from one to the other. It shows one
-moment, and gets its name only after every row of it has been read again and found to be as stored.
+A backup is one SQLite file, from either database, so it also moves a store from one to the other. It shows one moment,
+and gets its name only after every row of it has been read again and verified.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _NOT_RESTORED = (store_version, alembic_version, scene_generation, removed_refer
 def back_up(database: Database, path: Path, on_progress: Progress = ignore_progress) -> Verification:
     """Copies a store to a file, as of one moment; servers may go on reading and writing it.
 
-    What is damaged in the store is damaged in the copy, too, and listed in the result.
+    Data that are damaged in the store are damaged in the copy, too, and listed in the result.
 
     Raises:
         StoreError: the file exists or cannot be written, or differs from the store.
@@ -68,10 +68,10 @@ def back_up(database: Database, path: Path, on_progress: Progress = ignore_progr
 
 
 def restore(path: Path, database: Database, on_progress: Progress = ignore_progress) -> Verification:
-    """Copies a backup into a store without scenes: all of it, or nothing.
+    """Copies a backup into a store without scenes, either completely or not at all.
 
     Raises:
-        StoreError: the backup is damaged, of a newer program or no backup; the store has scenes or cannot be written.
+        StoreError: the file is damaged, of a newer program or no backup; or the store has scenes or cannot be written.
     """
     with (
         _faults_as_store_errors(f"backup {path} cannot be restored"),
@@ -100,7 +100,7 @@ def restore(path: Path, database: Database, on_progress: Progress = ignore_progr
 
 
 def _copy_pages(source: Connection, path: Path, on_progress: Progress) -> None:
-    """Copies with SQLite's backup API; `source` has begun to read, so the copy does not see later changes."""
+    """Copies with SQLite's backup API; `source` has begun to read, so the copy has no later changes."""
     raw = source.connection.driver_connection
     assert raw is not None
 
@@ -134,7 +134,7 @@ def _tables_of(copy: Connection, omitted: Sequence[Table] = ()) -> list[Table]:
 
 
 def _portions(source: Connection, table: Table) -> Iterator[list[dict[str, Any]]]:
-    """Rows, some megabytes at a time."""
+    """Yields rows, some megabytes at a time."""
     portion: list[dict[str, Any]] = []
     size_bytes = 0
     for row in source.execute(select(table), execution_options={"yield_per": BLOBS_AT_A_TIME}).mappings():
@@ -148,7 +148,7 @@ def _portions(source: Connection, table: Table) -> Iterator[list[dict[str, Any]]
 
 
 def _skip_generations(source: Connection, target: Connection) -> None:
-    """Raises the generations above those of both databases, so that callers which know either read the whole scene."""
+    """Raises the generations above those of both databases, so that callers read the whole scene again."""
     column = scene_generation.c
     former, saved = queries.read_generations(target), queries.read_generations(source)
     target.execute(delete(scene_generation).where(column.scene_id.in_(saved.keys() & former.keys())))
@@ -160,7 +160,7 @@ def _skip_generations(source: Connection, target: Connection) -> None:
 
 
 def _verify_copy(source: Connection, path: Path, on_progress: Progress) -> Verification:
-    """Verifies a copy; StoreError if it differs from the store."""
+    """Verifies a copy; raises StoreError if it differs from the store."""
     with closing(SqliteDatabase.open_as_is(path)) as database, database.read() as copy:
         found = verify(copy, on_progress)
         counts = [select(func.count()).select_from(table) for table in _tables_of(copy)]
@@ -174,7 +174,7 @@ def _verify_copy(source: Connection, path: Path, on_progress: Progress) -> Verif
 
 @contextmanager
 def _in_current_schema(backup: SqliteDatabase, path: Path, version: int) -> Iterator[Database]:
-    """The backup itself, or, if it is of an older program, a migrated copy."""
+    """The backup itself or, if it is from an older program, a migrated copy."""
     if version == SCHEMA_VERSION:
         yield backup
         return

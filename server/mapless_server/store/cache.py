@@ -14,7 +14,7 @@ class LruCache(Generic[Value]):
     """Holds values whose sizes, in bytes or in any other unit, add up to at most a capacity; 0 holds nothing.
 
     Attributes:
-        hits, misses: of `get`.
+        hits, misses: numbers of calls of `get` that found or missed a value.
         evictions: values dropped for lack of room.
         used: sum of the sizes of the values held.
     """
@@ -29,7 +29,7 @@ class LruCache(Generic[Value]):
         self._lock = threading.Lock()
 
     def get(self, key: Hashable) -> Value | None:
-        """The value, which becomes the most recently used, or None."""
+        """Returns the value, which becomes the most recently used, or None."""
         with self._lock:
             entry = self._entries.get(key)
             if entry is None:
@@ -40,7 +40,7 @@ class LruCache(Generic[Value]):
             return entry[0]
 
     def forget(self, is_gone: Callable[[Any, Value], bool]) -> list[Any]:
-        """Drops the entries whose key and value `is_gone` accepts, looking at each; returns their keys.
+        """Drops the entries for which `is_gone(key, value)` is true; returns their keys.
 
         They are not counted as evictions.
         """
@@ -52,7 +52,7 @@ class LruCache(Generic[Value]):
         return gone
 
     def put(self, key: Hashable, value: Value, size: int = 1) -> None:
-        """Holds a value, unless it is larger than the whole cache."""
+        """Stores a value, unless it is larger than the whole cache."""
         if size > self._capacity:
             return
         with self._lock:

@@ -1,10 +1,10 @@
-"""What the references of a scene say of its answers, and which scenes wait for that, by any of the servers.
+"""Self-calibrations of scenes, and which scenes wait for one, of any server.
 
 There is one calibration for each *kind* of answers: features, backend and server version, see `calibration_kind`. It
 belongs to a generation of its scene; a later one makes the scene due again, and until then the last calibration is
-used. A server claims a scene, localizes its references and stores what it finds; a claim ends by itself after `CLAIM_S`
-unless it is renewed, so a scene whose server is killed is calibrated by another one, or by the next. A server that lost
-its claim, because it was too slow or the scene was deleted, stores nothing.
+used. A server claims a scene, localizes its references and stores the result; a claim ends by itself after `CLAIM_S`
+unless it is renewed, so a scene whose server is killed is calibrated by another server, or after a restart. A server
+that lost its claim, because it was too slow or the scene was deleted, stores nothing.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class CalibrationClaim:
     """A scene that one server calibrates.
 
     Attributes:
-        scene_key: of the scene.
-        kind: of the answers.
+        scene_key: key of the scene.
+        kind: kind of the answers.
         until_us: when the claim ends; no other server's claim ends at the same microsecond.
     """
 
@@ -50,7 +50,7 @@ class CalibrationClaim:
 
 
 def claim_scene(database: Database, kind: str) -> CalibrationClaim | None:
-    """Claims a scene that has changed since its calibration; None if there is none that may be claimed now."""
+    """Claims a scene that has changed since its calibration; None if none may be claimed now."""
     with database.read() as connection:
         due = connection.execute(_select_due(kind).limit(_CANDIDATES)).all()
     for row in random.sample(due, len(due)):
@@ -62,7 +62,7 @@ def claim_scene(database: Database, kind: str) -> CalibrationClaim | None:
 
 
 def renew(database: Database, claim: CalibrationClaim) -> CalibrationClaim | None:
-    """The claim, which ends later now; None if it was lost."""
+    """Renews a claim, so that it ends later; None if it was lost."""
     renewed = replace(claim, until_us=max(_now_us() + _us(CLAIM_S), claim.until_us + 1))
     with database.write() as connection:
         is_ours = connection.execute(_of(claim).values(due_time_us=renewed.until_us)).rowcount == 1
@@ -70,7 +70,7 @@ def renew(database: Database, claim: CalibrationClaim) -> CalibrationClaim | Non
 
 
 def postpone(database: Database, claim: CalibrationClaim) -> float:
-    """Ends the claim of a scene that failed; returns after how long it may be claimed again, seconds."""
+    """Ends the claim of a scene that failed; returns the seconds until it may be claimed again."""
     column = scene_calibration.c
     count = select(column.failure_count).where(column.scene_id == claim.scene_key, column.kind == claim.kind)
     with database.write() as connection:
@@ -91,10 +91,10 @@ def add(store: Store, claim: CalibrationClaim, calibration: SelfCalibration, wai
     """Stores the calibration of a claimed scene, and ends the claim; False if the claim was lost.
 
     Args:
-        store: in which the scene is, so that what it caches of the scene is forgotten.
-        claim: of the scene.
-        calibration: to store; no change of the scene.
-        wait_s: the scene is not due again before, however often it changes.
+        store: store of the scene, whose cached values of the scene are dropped.
+        claim: claim of the scene.
+        calibration: the calibration; storing it is not a change of the scene.
+        wait_s: time until the scene may be calibrated again, however often it changes.
     """
     data = codec.encode_calibration(calibration)
     sha256 = codec.sha256_for(rows.calibration_owner(claim.scene_key, claim.kind), data)

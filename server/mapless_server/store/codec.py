@@ -62,11 +62,11 @@ _STEPS = 2**24
 
 
 class Damaged(Exception):
-    """Stored bytes are not what was stored."""
+    """Stored bytes are damaged."""
 
 
 def sha256_for(owner: str, data: bytes) -> str:
-    """Hexadecimal SHA-256 of `data` and its owner, so that bytes of another row do not pass the check."""
+    """Hexadecimal SHA-256 of `data` and its owner, so that bytes of another row fail the check."""
     digest = hashlib.sha256(owner.encode() + b"\0")
     digest.update(data)
     return digest.hexdigest()
@@ -193,7 +193,7 @@ def _blob(version: int, view: View, how: dict[str, Any], arrays: Sequence[NDArra
 
 
 def decode_view(owner: str, blob: bytes, sha256: str) -> View:
-    """The view that `encode_view` was given, but for what format 2 rounds; read-only arrays that may share the memory.
+    """The view that `encode_view` was given, apart from the rounding of format 2; read-only arrays.
 
     Raises:
         Damaged: the checksum does not match, or the format is unknown.
@@ -333,7 +333,7 @@ def decode_depth(owner: str, blob: bytes, sha256: str) -> KeptDepth:
 
 
 def check(owner: str, data: object, sha256: str, what: str) -> None:
-    """Raises Damaged if these are not the bytes that were stored for this owner."""
+    """Raises Damaged unless these are the bytes that were stored for this owner."""
     # One flipped bit can make SQLite take a blob for text, so the type is checked, too.
     if not isinstance(data, bytes) or sha256_for(owner, data) != sha256:
         raise Damaged(what)
@@ -341,7 +341,7 @@ def check(owner: str, data: object, sha256: str, what: str) -> None:
 
 @contextmanager
 def _checked_form(what: str) -> Iterator[None]:
-    """Raises Damaged for data that another program wrote with a correct checksum."""
+    """Raises Damaged for data that have a correct checksum, but a wrong form."""
     try:
         yield
     except (AttributeError, KeyError, TypeError, ValueError, RecursionError, struct.error, zlib.error) as error:

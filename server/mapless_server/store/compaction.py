@@ -25,10 +25,10 @@ _AT_ONCE = 64
 
 
 def compact_features(database: Database, pause: Callable[[], None]) -> list[tuple[str, str]]:
-    """Rewrites all that are stored as float32; returns the references' keys and extractors.
+    """Rewrites all features that are stored as float32; returns the references' keys and extractors.
 
-    Damaged ones stay as they are. Several servers may do this at once. Calls `pause`, which may wait or raise, before
-    each: what was rewritten until then is stored.
+    Damaged ones are not changed. Several servers may do this at once. Calls `pause`, which may wait or raise, before
+    each one; what was rewritten until then is stored.
     """
     rewritten: list[tuple[str, str]] = []
     after = ("", "")
@@ -77,14 +77,14 @@ def _rewrite(database: Database, key: str, extractor: str) -> bool:
 
 
 def in_8_bits(given: Features) -> Features:
-    """The features with descriptors in 8 bits: the histograms that they were made of, or rounded."""
+    """Converts descriptors to 8 bits: to the histograms that they were made of, or rounded."""
     histograms = _histograms(given.descriptors) if given.descriptors.dtype == np.float32 else given.descriptors
     small = rounded_descriptors(given.unit_descriptors()) if histograms is None else histograms
     return replace(given, descriptors=small)
 
 
 def _histograms(descriptors: NDArray[Any]) -> NDArray[np.uint8] | None:
-    """Whole numbers (N, D) of which these are the square roots of the shares, to the last bit; None if there are none.
+    """Whole numbers (N, D) whose shares have these square roots, to the last bit; None if there are none.
 
     The smallest share is that of a small whole number, mostly 1, which determines the sum.
     """

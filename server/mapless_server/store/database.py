@@ -1,4 +1,4 @@
-"""What the store needs of a database: SQLite in a folder, or a PostgreSQL that several servers share."""
+"""The interface of the store's databases: SQLite in a folder, or a PostgreSQL that several servers share."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class Database(Protocol):
 
     Attributes:
         is_shared: whether other processes may change it; then cached rows are valid for their generation only.
-        only_reads: whether every change is refused.
-        name: for messages.
+        only_reads: whether all changes are refused.
+        name: name in messages.
     """
 
     is_shared: bool
@@ -30,7 +30,7 @@ class Database(Protocol):
         ...
 
     def write(self) -> AbstractContextManager[Connection]:
-        """A transaction that is on the disk, whole, when the block is left, or not at all if it raises.
+        """A transaction that is on the disk, as a whole, at the end of the block; or not at all if the block raises.
 
         Where the database admits several writers, each statement sees what was committed before it began. The changes
         of a scene are ordered by its generation, which each raises before it reads anything: that row is their lock.
@@ -46,5 +46,5 @@ class Database(Protocol):
         ...
 
     def close(self) -> None:
-        """Closes all connections; nothing may be reading or writing."""
+        """Closes all connections; no transaction may be running."""
         ...

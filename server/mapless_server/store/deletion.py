@@ -1,4 +1,4 @@
-"""Deletion of scenes: a scene is detached at once, so that no reader finds it, and its rows are deleted in portions.
+"""Deletion of scenes: a scene is detached at once, so that readers do not find it; its rows are deleted in portions.
 
 Detaching changes one short row per reference; deleting means megabytes. If the server is stopped in between, the rows
 that are left are deleted when the store is opened again, or with the next scene that is deleted.
@@ -69,10 +69,10 @@ class PendingDeletions:
             self._thread.join()
 
     def run(self) -> None:
-        """Deletes the rows of all detached scenes. References on pages that cannot be freed are moved aside.
+        """Deletes the rows of all detached scenes; references on pages that cannot be freed are moved aside.
 
         Raises:
-            Overloaded: the disk has not even the space to delete one reference.
+            Overloaded: the disk has too little space even to delete one reference.
         """
         if not self._is_pending():
             return
@@ -102,7 +102,7 @@ class PendingDeletions:
             return is_pending(connection)
 
     def _delete_portion(self, count: int, keys: list[str]) -> bool:
-        """Whether there is more to delete; `keys` receives those of the portion before it is deleted."""
+        """Deletes a portion; returns whether more is left. `keys` receives those of the portion before its deletion."""
         with self._database.write() as connection:  # changes nothing that readers see
             keys += next_portion(connection, count)
             delete_references(connection, *keys)
@@ -130,7 +130,7 @@ def _log_failure(error: Exception) -> None:
 
 
 def detach_scene(connection: Connection, scene_key: SceneKey) -> str:
-    """Deletes a scene but keeps its references' rows, under the returned key; the caller has the scene's lock."""
+    """Deletes a scene, but keeps its references' rows under the returned key; the caller has the scene's lock."""
     key = f"{DETACHED}{uuid.uuid4().hex}"
     # It gets no generation, so no other statement takes it for a scene.
     connection.execute(insert(scene).values(scene_id=key, create_time_us=0))
@@ -153,9 +153,9 @@ def is_pending(connection: Connection) -> bool:
 
 
 def next_portion(connection: Connection, at_most: int) -> Sequence[str]:
-    """Keys of the references to delete next: at most so many, and not more than `PORTION_BYTES` together.
+    """Keys of the references to delete next: at most this many, and together at most `PORTION_BYTES`.
 
-    What another server is deleting at this moment is skipped.
+    References that another server is deleting are skipped.
     """
     column = reference.c
     pending = select(column.key).where(is_detached(column.scene_id), column.scene_id != _DAMAGED).order_by(column.key)
@@ -169,7 +169,7 @@ def next_portion(connection: Connection, at_most: int) -> Sequence[str]:
 
 
 def _size_bytes(owner: Column[str]) -> ScalarSelect[int]:
-    """Size of a reference's rows in the table with this column of keys; the bytes themselves are not read for it."""
+    """Size of a reference's rows in the table with this column of keys, without reading the bytes."""
     total = select(func.coalesce(func.sum(func.length(owner.table.c.data)), 0))
     return total.where(owner == reference.c.key).scalar_subquery()
 

@@ -1,6 +1,6 @@
-"""Faults of the databases, as errors that a caller can act on; all others become INTERNAL.
+"""Converts faults of the databases to errors that a caller can act on; all others become INTERNAL.
 
-`sqlite` and `postgresql` translate their own.
+`sqlite` and `postgresql` convert their own faults.
 
 A damaged page fails every statement that reads it, so one damaged photograph would fail all references that are read
 together with it. Where a statement about many rows fails like this, the rows are read one by one (`unless_damaged`).
@@ -28,7 +28,7 @@ _POSTGRESQL_DAMAGED = ("XX001", "XX002")
 
 
 class DamagedPages(DataLoss):
-    """The database cannot read some of its pages; which rows they hold is not known yet."""
+    """The database cannot read some of its pages; the rows on them are not known yet."""
 
     def __init__(self) -> None:
         super().__init__("the store is damaged")
@@ -41,7 +41,7 @@ def is_damage(error: DBAPIError) -> bool:
 
 
 def unless_damaged(connection: Connection, read: Callable[[], T], otherwise: Callable[[], T]) -> T:
-    """Reads in the connection's transaction; the result of `otherwise` if that meets a damaged page."""
+    """Reads in the connection's transaction; returns the result of `otherwise` if a page is damaged."""
     try:
         with connection.begin_nested():
             return read()
@@ -57,5 +57,5 @@ def disk_full() -> Overloaded:
 
 
 def unavailable(message: str) -> Unavailable:
-    """The error of a database that may be there again soon."""
+    """The error of a database that may be available again soon."""
     return Unavailable(message, reason="STORE_UNAVAILABLE", retry_after_s=RETRY_AFTER_S)

@@ -1,4 +1,4 @@
-"""One server at a time: locks on a data folder and on its database file, held until released or the process ends.
+"""Locks for one server at a time: on a data folder and its database file, until released or the process ends.
 
 The folder's lock file names the process that holds it. The lock on the database file also excludes a server that uses
 the same file by another name (a hard or symbolic link in another folder): SQLite keeps its journal beside the name that
@@ -49,7 +49,7 @@ class FolderLock:
 
     @staticmethod
     def share(path: Path) -> FolderLock:
-        """The lock for one of several servers that only read a database file.
+        """Takes the lock for one of several servers that only read a database file.
 
         Raises:
             StoreError: a server that may write has it.
@@ -72,7 +72,7 @@ def _open(stack: ExitStack, path: Path, flags: int) -> int:
 
 
 def _is_locked(descriptor: int, kind: int) -> bool:
-    """Whether the lock was taken."""
+    """Tries to take a lock; returns whether it was taken."""
     try:
         fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -29,7 +29,7 @@ _REFERENCES_AT_A_TIME = 50
 
 
 def record_use(database: Database, matchings: Collection[str]) -> None:
-    """Records that a server uses these matchings now; to be repeated far more often than every `KEPT_S`."""
+    """Records that a server uses these matchings now; to be called much more often than every `KEPT_S`."""
     with database.write() as connection:
         for name in sorted(matchings):
             row = {"matching": name, "used_time_us": _now_us()}
@@ -38,7 +38,7 @@ def record_use(database: Database, matchings: Collection[str]) -> None:
 
 
 def delete_unused(database: Database, check: Callable[[], None]) -> None:
-    """Deletes the pairs of matchings without use for `KEPT_S`, a portion at a time; calls `check` between portions."""
+    """Deletes pairs of matchings that were not used for `KEPT_S`, in portions; calls `check` between portions."""
     limit_us = _now_us() - round(KEPT_S * 1e6)
     with database.read() as connection:
         unused = list(connection.scalars(select(matching_use.c.matching).where(matching_use.c.used_time_us < limit_us)))

@@ -5,7 +5,7 @@ stored once, under the reference whose keypoints come first in it.
 
 The pairs of a reference are those with references that precede it in its scene: every pair belongs to one reference,
 also if others are added later. A server claims a reference, matches its pairs and stores them; a claim ends by itself
-after `CLAIM_S`, so what a server leaves when it is killed is done by another one, or by the next.
+after `CLAIM_S`, so the unfinished work of a killed server is done by another server, or after a restart.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ class Progress:
     """What a server knows of the claims of one matching, so that it reads only what has changed.
 
     Attributes:
-        generations: until which every reference of a scene has been claimed.
-        generation_sum: of all scenes that ever existed, when every reference of all scenes had been claimed.
+        generations: by scene, the generation up to which every reference has been claimed.
+        generation_sum: sum of the generations of all scenes that ever existed, when every reference had been claimed.
     """
 
     generations: dict[SceneKey, int] = field(default_factory=dict)
@@ -61,9 +61,9 @@ class Claim:
     """A reference whose pairs one server matches.
 
     Attributes:
-        scene_key: of its scene.
-        reference_id: unique within the scene.
-        key: of the reference.
+        scene_key: key of its scene.
+        reference_id: its id, unique within the scene.
+        key: its key.
     """
 
     scene_key: SceneKey
@@ -72,7 +72,7 @@ class Claim:
 
 
 class PairStore:
-    """Matches of pairs in a store's database; thread-safe. Errors are those of `Store`."""
+    """Matches of pairs in a store's database; thread-safe. Raises the same errors as `Store`."""
 
     def __init__(self, database: Database, claim_s: float = CLAIM_S) -> None:
         """`database` is that of the references; a claim ends by itself after `claim_s`."""
@@ -80,7 +80,7 @@ class PairStore:
         self._claim_s = claim_s
 
     def load(self, matching: str, pairs: Collection[Pair]) -> dict[Pair, Matches | None]:
-        """The matches of those of these pairs that are stored; None for damaged ones."""
+        """Loads the stored matches of these pairs; None for damaged ones."""
         column = reference_pair.c
         first, second = ({pair[side] for pair in pairs} for side in (0, 1))
         stored: Select[Any] = select(column.first_key, column.second_key, column.data, column.sha256)
@@ -91,11 +91,11 @@ class PairStore:
         return {_pair(row): _decoded(matching, row) for row in found if _pair(row) in wanted}
 
     def claim(self, matching: str, progress: Progress) -> Claim | None:
-        """Claims a reference whose pairs are not matched; None if there is none that may be claimed now.
+        """Claims a reference whose pairs are not matched; None if none may be claimed now.
 
         Args:
-            matching: its name.
-            progress: of this server with this matching, new at first; updated.
+            matching: name of the matching.
+            progress: this server's progress with this matching, new at first; it is updated.
         """
         while True:
             with self._database.read() as connection:
@@ -123,7 +123,7 @@ class PairStore:
             return connection.execute(is_free).rowcount == 1 or queries.insert_new(connection, reference_matching, row)
 
     def list_missing(self, matching: str, claim: Claim, others: Sequence[str], at_most: int) -> list[str]:
-        """The first `at_most` of these keys that precede the claimed reference in its scene, without stored pairs."""
+        """The first `at_most` of these keys that precede the claimed reference in its scene and have no stored pair."""
         column, pair = reference.c, reference_pair.c
         generation = select(column.generation).where(column.key == claim.key).scalar_subquery()
         precedes = or_(column.generation < generation, (column.generation == generation) & (column.key < claim.key))
@@ -141,7 +141,7 @@ class PairStore:
         return [key for key in [key for key in others if key in preceding][:at_most] if key not in found]
 
     def add(self, matching: str, claim: Claim, matches: Mapping[Pair, Matches], is_complete: bool) -> None:
-        """Stores pairs of a claimed reference, and ends the claim: it is complete, or others may claim it at once.
+        """Stores pairs of a claimed reference and ends the claim; if not complete, others may claim it at once.
 
         Pairs of references that were deleted meanwhile, and pairs that are stored already, are ignored.
         """
@@ -156,7 +156,7 @@ class PairStore:
             connection.execute(_of_claim(matching, claim).values(due_time_us=due_us, failure_count=0))
 
     def postpone(self, matching: str, claim: Claim) -> float:
-        """Ends the claim of a reference that failed; returns after how long it may be claimed again, seconds."""
+        """Ends the claim of a reference that failed; returns the seconds until it may be claimed again."""
         column = reference_matching.c
         count = select(column.failure_count).where(column.reference_key == claim.key, column.matching == matching)
         with self._database.write() as connection:
@@ -192,7 +192,7 @@ class PairStore:
 
 
 def _due(connection: Connection, matching: str) -> Sequence[Row[Any]]:
-    """References whose claim, or wait after a failure, is over."""
+    """References whose claim, or whose wait after a failure, has ended."""
     column = reference_matching.c
     due: Select[Any] = (
         select(reference.c.key, reference.c.scene_id, reference.c.reference_id)
@@ -239,7 +239,7 @@ def _new(connection: Connection, matching: str, progress: Progress) -> Sequence[
 
 
 def _locked(connection: Connection, keys: Collection[str]) -> set[str]:
-    """Those of these references that exist; they are not deleted before the transaction ends."""
+    """Those of these references that exist; they cannot be deleted before the transaction ends."""
     existing = select(reference.c.key).where(reference.c.key.in_(keys)).order_by(reference.c.key)
     return set(connection.scalars(existing.with_for_update(read=True, key_share=True)))
 

@@ -89,7 +89,7 @@ class PostgresqlDatabase:
         """Connects to a store without migrating it.
 
         Raises:
-            StoreError: as `open`, or the database is empty.
+            StoreError: as in `open`, or the database is empty.
         """
         return PostgresqlDatabase._opened(database_url, migrates=False)
 
@@ -150,7 +150,7 @@ class PostgresqlDatabase:
 
 
 def parse_url(database_url: str) -> URL:
-    """The URL with this program's driver. Raises StoreError, which does not repeat the text, if it is invalid."""
+    """The URL with this program's driver; raises StoreError, without the URL's text, if it is invalid."""
     try:
         url = make_url(database_url)
     except (ArgumentError, ValueError):
@@ -212,7 +212,7 @@ def _first_line(error: object) -> str:
 
 @contextmanager
 def _faults_translated() -> Iterator[None]:
-    """Raises faults of PostgreSQL as RequestError where a caller can act on them."""
+    """Converts faults of PostgreSQL to RequestError where a caller can act on them."""
     try:
         yield
     except PoolTimeoutError as error:

@@ -52,7 +52,7 @@ def select_scenes() -> Select[Any]:
 
 
 def select_scenes_of(tenant: str, after: str) -> Select[Any]:
-    """The same for the scenes of one tenant with ids greater than `after`, ordered by id."""
+    """The same columns for the scenes of one tenant with ids greater than `after`, ordered by id."""
     key = scene.c.scene_id
     # Not LIKE: to SQLite, "acme/%" is "ACME/%".
     is_theirs = ~key.contains(KEY_SEPARATOR) if tenant == DEFAULT_TENANT else key < end_of_keys(tenant)
@@ -60,18 +60,18 @@ def select_scenes_of(tenant: str, after: str) -> Select[Any]:
 
 
 def find_scene(connection: Connection, scene_key: SceneKey) -> Row[Any]:
-    """The row of `select_scenes` for one scene. Raises NotFound."""
+    """The row of `select_scenes` for one scene; raises NotFound."""
     return _one(connection, select_scenes().where(scene.c.scene_id == scene_key), lambda: _scene_not_found(scene_key))
 
 
 def find_attributes(connection: Connection, scene_key: SceneKey) -> Row[Any]:
-    """Columns `scene_id`, `attributes` and `attributes_sha256` of a scene. Raises NotFound."""
+    """Columns `scene_id`, `attributes` and `attributes_sha256` of a scene; raises NotFound."""
     statement: Select[Any] = select(scene.c.scene_id, scene.c.attributes, scene.c.attributes_sha256)
     return _one(connection, statement.where(scene.c.scene_id == scene_key), lambda: _scene_not_found(scene_key))
 
 
 def find_calibrations(connection: Connection, scene_key: SceneKey) -> Sequence[Row[Any]]:
-    """Columns of `scene_calibration` of a scene, where it has been calibrated."""
+    """Columns of `scene_calibration` of a scene; empty if it has not been calibrated."""
     column = scene_calibration.c
     stored: Select[Any] = select(column.scene_id, column.kind, column.data, column.sha256)
     return connection.execute(stored.where(column.scene_id == scene_key, column.data.is_not(None))).all()
@@ -118,7 +118,7 @@ def begin_change(connection: Connection, scene_key: SceneKey, added_count: int =
 
 
 def forget_removals(connection: Connection, scene_key: SceneKey, until_generation: int) -> None:
-    """Deletes the tombstones up to a generation: callers that know an earlier one then read the whole scene."""
+    """Deletes the tombstones up to a generation; callers that know an earlier one then read the whole scene."""
     removed = removed_reference.c
     old = delete(removed_reference).where(removed.scene_id == scene_key, removed.generation <= until_generation)
     if connection.execute(old).rowcount:
@@ -127,7 +127,7 @@ def forget_removals(connection: Connection, scene_key: SceneKey, until_generatio
 
 
 def find_keys(connection: Connection, scene_key: SceneKey, reference_ids: Sequence[str]) -> dict[str, str]:
-    """Keys by id, of those of these references that exist."""
+    """Keys, by id, of those of these references that exist."""
     statement = select(reference.c.reference_id, reference.c.key).where(reference.c.scene_id == scene_key)
     keys: dict[str, str] = {}
     for ids in _portions(reference_ids):
@@ -185,7 +185,7 @@ def features_by_key(connection: Connection, keys: Sequence[str], extractor: str)
 
 
 def find_by_key(connection: Connection, key: str, *columns: ColumnElement[Any]) -> Row[Any]:
-    """Columns of the reference with this key. Raises NotFound if it was deleted."""
+    """Columns of the reference with this key; raises NotFound if it was deleted."""
     return _one(connection, select(*columns).where(_exists(key)), _reference_deleted)
 
 
@@ -199,7 +199,7 @@ def lock_reference(connection: Connection, key: str) -> Row[Any]:
 
 
 def find_image(connection: Connection, key: str) -> Row[Any]:
-    """Columns `reference_id`, `image_sha256` and `data` of a reference. Raises NotFound if it was deleted."""
+    """Columns `reference_id`, `image_sha256` and `data` of a reference; raises NotFound if it was deleted."""
     statement: Select[Any] = (
         select(reference.c.reference_id, reference.c.image_sha256, image.c.data)
         .outerjoin(image, image.c.reference_key == reference.c.key)
@@ -230,7 +230,7 @@ def is_detached(scene_id: ColumnElement[str]) -> ColumnElement[bool]:
 
 
 def insert_new(connection: Connection, table: Table, row: Mapping[str, Any]) -> bool:
-    """Inserts a row unless one with its primary key exists; whether it was inserted."""
+    """Inserts a row unless one with its primary key exists; returns whether it was inserted."""
     addition = _upsert(connection, table).values(row).on_conflict_do_nothing()
     return connection.execute(addition, execution_options={"preserve_rowcount": True}).rowcount == 1
 
@@ -272,7 +272,7 @@ def _exists(key: str) -> ColumnElement[bool]:
 
 
 def _upsert(connection: Connection, table: Table) -> Any:
-    """An INSERT that supports ON CONFLICT, which both dialects have as a class of their own."""
+    """An INSERT that supports ON CONFLICT; each of the two dialects has its own class for it."""
     return postgresql.insert(table) if connection.dialect.name == "postgresql" else sqlite.insert(table)
 
 
@@ -284,7 +284,7 @@ def _portions(ids: Sequence[str]) -> Iterator[Sequence[str]]:
 def read_changes(
     connection: Connection, scene_key: SceneKey, since_generation: int | None, descriptor_name: str
 ) -> SceneChanges:
-    """See `Store.list_changes`; in the caller's transaction, which must see one moment."""
+    """See `Store.list_changes`; runs in the caller's transaction, which must see one moment."""
     row = find_scene(connection, scene_key)
     generation: int = row.generation
     # A later generation than the scene's is that of a database which has been replaced by a backup.

@@ -43,11 +43,11 @@ class StoreObserver(Protocol):
         """An operation ended, successfully or not."""
 
     def store_failed(self) -> None:
-        """It failed by a fault that is not the caller's: damage, a full disk, a database that is busy."""
+        """An operation failed by a fault that is not the caller's: damage, a full disk, a busy database."""
 
 
 def observed(operation: Callable[Concatenate[Any, P], T]) -> Callable[Concatenate[Any, P], T]:
-    """Reports a method of the store to its observer, under the method's name."""
+    """Decorator that reports a method of the store to its observer, under the method's name."""
 
     @wraps(operation)
     def wrapper(self: StoreReader, /, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -66,7 +66,7 @@ def observed(operation: Callable[Concatenate[Any, P], T]) -> Callable[Concatenat
 
 
 class _Resolved(NamedTuple):
-    """What a scene's reference ids meant in a state of the store: the scene's generation, and a key for each id."""
+    """Keys of a scene's reference ids in a state of the store, with the scene's generation."""
 
     state: object
     generation: int
@@ -103,12 +103,12 @@ class StoreReader:
 
     @property
     def reference_cache(self) -> LruCache[DescribedReference]:
-        """The features held in memory."""
+        """The cache of features in memory."""
         return self._described
 
     @contextmanager
     def changing(self) -> Iterator[Connection]:
-        """A transaction that writes; invalidates what is cached by `_state`, however it ends."""
+        """A transaction that writes; invalidates the cached `_state`, however it ends."""
         try:
             with self._database.write() as connection:
                 yield connection
@@ -122,7 +122,7 @@ class StoreReader:
 
     @observed
     def get_scene(self, scene_key: SceneKey) -> SceneRecord:
-        """A scene.
+        """Returns a scene.
 
         Raises:
             NotFound: there is no such scene.
@@ -133,19 +133,19 @@ class StoreReader:
 
     @observed
     def get_generation(self, scene_key: SceneKey) -> int:
-        """Generation of a scene, even if its attributes are damaged. Raises NotFound."""
+        """Generation of a scene, also if its attributes are damaged; raises NotFound."""
         with self._database.read() as connection:
             return queries.read_generation(connection, scene_key)
 
     @observed
     def get_attributes(self, scene_key: SceneKey) -> SceneAttributes:
-        """Attributes of a scene as a whole, with its self-calibrations.
+        """Attributes of a scene, with its self-calibrations.
 
-        They are cached where this process alone writes, since every query needs them.
+        They are cached if only this process writes, since every query needs them.
 
         Raises:
             NotFound: there is no such scene.
-            DataLoss: they are damaged.
+            DataLoss: the attributes are damaged.
         """
         state = self._state
         cached = None if self._database.is_shared else self._attributes.get(scene_key)
@@ -178,7 +178,7 @@ class StoreReader:
 
     @observed
     def get_reference(self, scene_key: SceneKey, reference_id: str) -> ReferenceRecord:
-        """A reference without its image.
+        """Returns a reference without its image.
 
         Raises:
             NotFound: there is no such scene or reference.
@@ -191,7 +191,7 @@ class StoreReader:
 
     @observed
     def read_image(self, scene_key: SceneKey, reference_id: str) -> bytes:
-        """The image's bytes as they were added.
+        """Reads the image's bytes as they were added.
 
         Raises:
             NotFound: there is no such scene or reference.
@@ -202,7 +202,7 @@ class StoreReader:
 
     @observed
     def read_image_of(self, key: str) -> bytes:
-        """The image's bytes as they were added, by the reference's key.
+        """Reads the image's bytes as they were added, by the reference's key.
 
         Raises:
             NotFound: the reference was deleted.
@@ -224,7 +224,7 @@ class StoreReader:
 
     @observed
     def list_reference_ids(self, scene_key: SceneKey, limit: int, after: str = "") -> list[str]:
-        """The ids alone, of damaged references too.
+        """Ids of at most `limit` references, including damaged ones.
 
         Raises:
             NotFound: there is no such scene.
@@ -241,7 +241,7 @@ class StoreReader:
 
     @observed
     def find_keys(self, scene_key: SceneKey, reference_ids: Sequence[str]) -> dict[str, str]:
-        """Keys by id, of those of these references that exist, damaged ones too.
+        """Keys, by id, of those of these references that exist, including damaged ones.
 
         Raises:
             NotFound: there is no such scene.
@@ -254,14 +254,14 @@ class StoreReader:
     def load_references(
         self, scene_key: SceneKey, reference_ids: Sequence[str] | None, extractor: str
     ) -> SceneSnapshot:
-        """References with their features, which of them have none, and the generation, all read at one moment.
+        """Loads references with their features, those without features, and the generation, all read at one moment.
 
         References that were loaded before come from memory.
 
         Args:
             scene_key: the scene.
             reference_ids: which references, in the order wanted; None for all, ordered by id.
-            extractor: whose features.
+            extractor: name of the extractor of the features.
 
         Raises:
             NotFound: there is no such scene (field "scene") or reference (field "references[i]").
@@ -315,12 +315,12 @@ class StoreReader:
 
     @observed
     def list_changes(self, scene_key: SceneKey, since_generation: int | None, descriptor_name: str) -> SceneChanges:
-        """What has changed in a scene since a generation, read at one moment.
+        """Reads what has changed in a scene since a generation, at one moment.
 
         Args:
             scene_key: the scene.
-            since_generation: the one that the caller knows; None for the whole scene.
-            descriptor_name: whose global descriptors.
+            since_generation: the generation that the caller knows; None for the whole scene.
+            descriptor_name: name of the global descriptor.
 
         Raises:
             NotFound: there is no such scene.
@@ -331,7 +331,7 @@ class StoreReader:
     def _cached(
         self, resolved: _Resolved, extractor: str
     ) -> tuple[dict[str, DescribedReference | None], SceneSnapshot | None]:
-        """What is cached of references, by key; and as a snapshot, if all of them are."""
+        """The cached features of references, by key; also as a snapshot, if all of them are cached."""
         cached = {key: self._described.get((key, extractor)) for key in resolved.keys}
         found = tuple(it for it in map(cached.get, resolved.keys) if it is not None)
         is_complete = len(found) == len(resolved.keys)
@@ -347,7 +347,7 @@ def _read_image(connection: Connection, key: str) -> bytes:
 
 
 def _read_features(connection: Connection, id_of: Mapping[str, str], extractor: str) -> dict[str, Row[Any]]:
-    """Rows of `queries.features_by_key`, by key. Raises DataLoss that names the first reference that cannot be read."""
+    """Rows of `queries.features_by_key`, by key; raises DataLoss that names the first reference that cannot be read."""
 
     def read(keys: Sequence[str]) -> dict[str, Row[Any]]:
         return queries.features_by_key(connection, keys, extractor)
@@ -366,5 +366,5 @@ def _read_features(connection: Connection, id_of: Mapping[str, str], extractor: 
 
 
 def _raise_damaged() -> NoReturn:
-    """Not the data of one reference are damaged, but the table or index in which references are looked up."""
+    """Raises DataLoss for a damaged table or index, where no single reference is damaged."""
     raise DamagedPages

@@ -34,16 +34,17 @@ CALIBRATION_MODEL = 2
 
 @dataclass(frozen=True)
 class SelfCalibration:
-    """What the references of a scene say of its answers: some of them, each localized against the others.
+    """What the references of a scene, some of them localized against the others, show about its answers.
 
     Attributes:
-        kind: of the answers that it holds for, see `calibration_kind`.
-        generation: of the scene when its references were read.
-        answer_count: n, number of references whose answers it is from; 0: too few, and the rest is as without it.
-        position_factor, rotation_factor: of radii at the usual gap (see `viewpoint_gap`), 0.01 to 1000.
-        reference_noise_m, reference_noise_deg: errors of the references' own poses, not exceeded in 68 % of cases: no
-            answer is free of them.
-        trust_quantiles: of the generic trust of right answers, at the levels of `method.trust.judge`; empty: unknown.
+        kind: kind of the answers that it holds for, see `calibration_kind`.
+        generation: generation of the scene when its references were read.
+        answer_count: number of references whose answers were used; 0 if there were too few, then it changes nothing.
+        position_factor, rotation_factor: factors of radii at the usual gap (see `viewpoint_gap`), 0.01 to 1000.
+        reference_noise_m, reference_noise_deg: errors of the references' own poses, not exceeded in 68 % of cases,
+            which every answer contains.
+        trust_quantiles: quantiles of the generic trust of right answers, at the levels of `method.trust.judge`; empty
+            if unknown.
     """
 
     kind: str
@@ -66,24 +67,24 @@ class SelfCalibration:
 
 
 def calibration_kind(features: str, backend: str, server_version: str) -> str:
-    """Names what computes answers: a self-calibration holds for answers of its own kind only."""
+    """Name of what computes answers; a self-calibration holds only for answers of its own kind."""
     return f"{features}/{backend}/{server_version}/{CALIBRATION_MODEL}"
 
 
 @dataclass(frozen=True)
 class SceneAttributes:
-    """Attributes of a scene as a whole; None where unknown.
+    """Attributes of a scene; None where unknown.
 
     Attributes:
-        datum: where its world is on the Earth.
-        down_in_world: unit vector in the direction of gravity; None for the datum's, if there is one.
-        calibration: measured errors of answers.
+        datum: position of its world on the Earth.
+        down_in_world: unit vector in the direction of gravity; None for that of the datum, if there is one.
+        calibration: measured factors of the radii of answers.
         arbitrary_unit: whether the unit of length is arbitrary instead of the metre.
-        self_calibrations: from its own references, one for each kind of answers; only where answers need them.
+        self_calibrations: calibrations from its own references, one for each kind of answers; only filled for answers.
 
     Raises:
         ContradictingDown: datum and down_in_world do not belong to the same world.
-        DatumWithoutMetres: there is a datum, and the unit is arbitrary.
+        DatumWithoutMetres: there is a datum, but the unit is arbitrary.
     """
 
     datum: Datum | None = None
@@ -106,7 +107,7 @@ class SceneAttributes:
             )
 
     def self_calibration(self, kind: str) -> SelfCalibration | None:
-        """That of this kind of answers, if there is one."""
+        """The self-calibration of this kind of answers, if there is one."""
         return next((it for it in self.self_calibrations if it.kind == kind), None)
 
     def down(self) -> Array | None:
@@ -121,14 +122,14 @@ class SceneRecord:
     """A stored scene.
 
     Attributes:
-        scene_key: unique among the scenes that exist.
+        scene_key: its key, unique among the scenes that exist.
         generation: raised by every change of the scene or its references. A scene that is deleted and created again
             continues its count, so (scene_key, generation) never identifies two different contents. Adding features of
             another extractor is no change: they follow from the image and the extractor's name. Adding a global
             descriptor is one: the references that are retrieved depend on which of them have it.
         reference_count: number of references.
-        create_time: UTC.
-        attributes: of the scene as a whole.
+        create_time: when it was created, UTC.
+        attributes: attributes of the scene.
     """
 
     scene_key: SceneKey
@@ -139,7 +140,7 @@ class SceneRecord:
 
     @property
     def scene_id(self) -> str:
-        """The tenant's name of it."""
+        """The scene's id within its tenant."""
         return scene_id_of(self.scene_key)
 
 
@@ -148,13 +149,13 @@ class NewReference:
     """A reference to be stored.
 
     Attributes:
-        reference_id: unique within its scene.
+        reference_id: its id, unique within its scene.
         image: the image file's bytes, unchanged.
-        camera: in pixels of that image.
+        camera: its camera, in pixels of that image.
         world_from_camera: its pose, metric.
-        views: by the name of the extractor, "sift-2048-1024px-0.02": processed camera and features, float32 arrays. At
+        views: processed camera and features (float32 arrays) by the name of the extractor, "sift-2048-1024px-0.02". At
             least one; the features of the first are counted.
-        descriptors: global descriptors by name, (D,) each; kept as float16.
+        descriptors: global descriptors (D,) by name; stored as float16.
     """
 
     reference_id: str
@@ -170,14 +171,14 @@ class ReferenceRecord:
     """A stored reference without its image and features.
 
     Attributes:
-        scene_key: of its scene.
-        reference_id: unique within the scene.
-        key: unique for ever; a reference that is deleted and added again has another key.
-        camera: in pixels of the stored image.
+        scene_key: key of its scene.
+        reference_id: its id, unique within the scene.
+        key: its key, never used again; a reference that is deleted and added again has another key.
+        camera: its camera, in pixels of the stored image.
         world_from_camera: its pose, metric.
-        image_sha256: of the image's bytes, hexadecimal.
+        image_sha256: hash of the image's bytes, hexadecimal.
         feature_count: number of features that the first extractor found when it was added.
-        create_time: UTC.
+        create_time: when it was created, UTC.
     """
 
     scene_key: SceneKey
@@ -191,7 +192,7 @@ class ReferenceRecord:
 
     @property
     def scene_id(self) -> str:
-        """The tenant's name of the scene."""
+        """The scene's id within its tenant."""
         return scene_id_of(self.scene_key)
 
 
@@ -208,9 +209,9 @@ class SceneSnapshot:
     """References and the generation of their scene, read at one moment.
 
     Attributes:
-        generation: of the scene.
-        references: those that have features of the requested extractor, in the order requested.
-        undescribed: those that have none, likewise.
+        generation: generation of the scene.
+        references: references that have features of the requested extractor, in the order requested.
+        undescribed: references without such features, in the order requested.
     """
 
     generation: int
@@ -220,13 +221,13 @@ class SceneSnapshot:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class IndexedReference:
-    """What retrieval needs of a reference.
+    """The data of a reference that retrieval needs.
 
     Attributes:
-        reference_id: unique within the scene.
-        key: unique for ever.
+        reference_id: its id, unique within the scene.
+        key: its key, never used again.
         world_from_camera: its pose, metric; read-only arrays.
-        descriptor: the requested global descriptor, (D,), read-only, rounded to float16; None where there is none.
+        descriptor: the requested global descriptor, (D,), read-only, rounded to float16; None if there is none.
     """
 
     reference_id: str
@@ -240,8 +241,9 @@ class SceneChanges:
     """What has changed in a scene since a generation, read at one moment.
 
     Attributes:
-        generation: of the scene at that moment, for the next request.
-        added: references to add, ordered by id. One that the caller knows already has got a descriptor and is replaced.
+        generation: generation of the scene at that moment, for the next request.
+        added: references to add, ordered by id. One that the caller knows already now has a descriptor, and is
+            replaced.
         removed: keys of references that were deleted; the caller may not know some of them.
         is_whole: whether `added` is the whole scene, and replaces everything that the caller knows.
         damaged: ids of references that are omitted because their pose or descriptor is damaged, ordered.

@@ -35,30 +35,30 @@ SMALL_FEATURES = "+8bit"
 
 
 def time_us(time: datetime) -> int:
-    """Microseconds since 1970: databases differ in how they store time zones."""
+    """Converts a time to microseconds since 1970; databases differ in how they store time zones."""
     return (time - _EPOCH) // _MICROSECOND
 
 
 def time_of(time_us: int) -> datetime:
-    """The inverse."""
+    """Inverse of `time_us`."""
     return _EPOCH + time_us * _MICROSECOND
 
 
 def scene_record(row: Row[Any]) -> SceneRecord:
-    """From a row of `queries.select_scenes`. Raises DataLoss if the attributes are damaged."""
+    """Makes the record of a row of `queries.select_scenes`; raises DataLoss if the attributes are damaged."""
     key, created = SceneKey(row.scene_id), time_of(row.create_time_us)
     return SceneRecord(key, row.generation, row.reference_count, created, scene_attributes(row))
 
 
 def attributes_row(scene_key: SceneKey, attributes: SceneAttributes) -> dict[str, Any]:
-    """Columns of the table `scene`."""
+    """Makes columns of the table `scene`."""
     data = codec.encode_attributes(attributes)
     sha256 = None if data is None else codec.sha256_for(attributes_owner(scene_key), data)
     return {"attributes": data, "attributes_sha256": sha256}
 
 
 def scene_attributes(row: Row[Any]) -> SceneAttributes:
-    """From a row of the table `scene`. Raises DataLoss if they are damaged."""
+    """Reads attributes from a row of the table `scene`; raises DataLoss if they are damaged."""
     try:
         return codec.decode_attributes(attributes_owner(row.scene_id), row.attributes, row.attributes_sha256)
     except codec.Damaged as error:
@@ -69,7 +69,7 @@ def scene_attributes(row: Row[Any]) -> SceneAttributes:
 
 
 def self_calibration(row: Row[Any]) -> SelfCalibration | None:
-    """From a row of the table `scene_calibration`; None if it is damaged, since answers can do without."""
+    """Reads a row of the table `scene_calibration`; None if it is damaged, since answers are possible without it."""
     try:
         return codec.decode_calibration(calibration_owner(row.scene_id, row.kind), row.data, row.sha256)
     except codec.Damaged:
@@ -77,7 +77,7 @@ def self_calibration(row: Row[Any]) -> SelfCalibration | None:
 
 
 def self_calibrations(found: Sequence[Row[Any]]) -> tuple[SelfCalibration, ...]:
-    """From rows of that table, without damaged ones."""
+    """Reads rows of that table, without damaged ones."""
     return tuple(it for it in map(self_calibration, found) if it is not None)
 
 
@@ -108,7 +108,7 @@ def new_record(scene_key: SceneKey, new: NewReference, create_time: datetime) ->
 
 
 def reference_row(record: ReferenceRecord) -> dict[str, Any]:
-    """For the table `reference`, except the generation. Raises ValueError if a number is not finite."""
+    """Makes a row of the table `reference`, without the generation; raises ValueError if a number is not finite."""
     geometry = codec.encode_geometry(record.camera, record.world_from_camera)
     return {
         "key": record.key,
@@ -123,7 +123,7 @@ def reference_row(record: ReferenceRecord) -> dict[str, Any]:
 
 
 def reference_record(row: Row[Any]) -> ReferenceRecord:
-    """From a row of the table `reference`. Raises DataLoss if it is damaged."""
+    """Reads a row of the table `reference`; raises DataLoss if it is damaged."""
     try:
         camera, world_from_camera = codec.decode_geometry(row.key, row.geometry, row.geometry_sha256)
     except codec.Damaged as error:
@@ -141,12 +141,12 @@ def reference_record(row: Row[Any]) -> ReferenceRecord:
 
 
 def feature_names(extractor: str) -> tuple[str, str]:
-    """What an extractor's features are stored as: in 8 bits, and as float32, which 0.2.0 wrote."""
+    """Names under which an extractor's features are stored: in 8 bits, and as float32 by version 0.2.0."""
     return extractor + SMALL_FEATURES, extractor
 
 
 def features_row(key: str, extractor: str, view: View) -> dict[str, Any]:
-    """For the table `features`. Raises ValueError as `codec.encode_view`."""
+    """Makes a row of the table `features`; raises ValueError as `codec.encode_view` does."""
     data = codec.encode_view(view)
     small, large = feature_names(extractor)
     name = small if view.features.descriptors.dtype.itemsize == 1 else large
@@ -159,7 +159,7 @@ def features_row(key: str, extractor: str, view: View) -> dict[str, Any]:
 
 
 def descriptor_row(key: str, name: str, vector: NDArray[np.float32]) -> dict[str, Any]:
-    """For the table `global_descriptor`. Raises ValueError if it is no vector or a number not finite."""
+    """Makes a row of the table `global_descriptor`; raises ValueError unless it is a finite vector."""
     data = codec.encode_descriptor(vector)
     return {
         "reference_key": key,
@@ -180,7 +180,7 @@ def descriptor_owner(key: str, name: str) -> str:
 
 
 def indexed_references(found: Sequence[Row[Any]], descriptor_name: str) -> tuple[list[IndexedReference], list[str]]:
-    """From rows of `queries.read_changes`, all at once for speed; and the ids of those that are damaged."""
+    """Reads rows of `queries.read_changes`, all at once for speed; also returns the ids of damaged ones."""
     intact = [row for row in found if _is_intact(row, descriptor_name)]
     poses = codec.decode_poses([row.geometry for row in intact])
     vectors = iter(codec.decode_descriptors([row.data for row in intact if row.sha256 is not None]))
@@ -203,7 +203,7 @@ def _is_intact(row: Row[Any], descriptor_name: str) -> bool:
 
 
 def described_reference(row: Row[Any]) -> DescribedReference:
-    """From a row of `queries.features_by_key`. Raises DataLoss if it is damaged."""
+    """Reads a row of `queries.features_by_key`; raises DataLoss if it is damaged."""
     record = reference_record(row)
     try:
         view = codec.decode_view(features_owner(row.key, row.extractor), row.data, row.sha256)
@@ -213,7 +213,7 @@ def described_reference(row: Row[Any]) -> DescribedReference:
 
 
 def image(row: Row[Any]) -> bytes:
-    """From a row of `queries.find_image`. Raises DataLoss if it is damaged."""
+    """Reads the image of a row of `queries.find_image`; raises DataLoss if it is damaged."""
     data: object = row.data
     if not isinstance(data, bytes) or hashlib.sha256(data).hexdigest() != row.image_sha256:
         raise data_loss(row.reference_id, "image")
@@ -221,5 +221,5 @@ def image(row: Row[Any]) -> bytes:
 
 
 def data_loss(reference_id: str, what: str) -> DataLoss:
-    """The error for a reference whose bytes are not what was stored."""
+    """The error of a reference whose stored bytes are damaged."""
     return DataLoss(f"reference {reference_id!r} is damaged in the store ({what}); delete it and add it again")

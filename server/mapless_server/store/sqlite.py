@@ -1,4 +1,4 @@
-"""The store's database on SQLite: which library, how each connection is configured, who may write.
+"""The store's database on SQLite: choice of the library, configuration of connections, and locking.
 
 The file must be on a local disk (network file systems break SQLite's locks) and is used by one server at a time. From a
 read-only disk, any number of servers may read it.
@@ -77,7 +77,7 @@ class SqliteDatabase:
     def open(folder: Path) -> SqliteDatabase:
         """Opens the database of a data folder, migrated to this program's schema; creates both if missing.
 
-        From a read-only disk it is read, and every change is refused.
+        A database on a read-only disk can be read; changes are refused.
 
         Raises:
             StoreError: the folder or file cannot be used, is in use, or contains something else.
@@ -118,16 +118,16 @@ class SqliteDatabase:
 
     @staticmethod
     def open_scratch(path: Path, version: int = SCHEMA_VERSION) -> SqliteDatabase:
-        """Opens a file that is worthless until it is complete, without waiting for the disk; creates it if missing.
+        """Opens a file that may be lost until it is complete, without waiting for the disk; creates it if missing.
 
         Raises:
-            StoreError: as `open`.
+            StoreError: as in `open`.
         """
         return SqliteDatabase._opened(path, None, version, is_scratch=True)
 
     @staticmethod
     def open_as_is(path: Path) -> SqliteDatabase:
-        """Opens a database for reading without migrating it: that of a server that is running, or a backup.
+        """Opens a database for reading without migrating it: a running server's, or a backup.
 
         Raises:
             StoreError: there is no such file, or it contains something else.
@@ -226,7 +226,7 @@ def _execute(connection: Connection, statement: str) -> None:
 
 
 def _explain(error: DBAPIError, name: str) -> str:
-    """The database's text, and what an operator can do about it."""
+    """The database's text, and what an operator can do about the fault."""
     fault = str(error.orig)
     if is_damage(error):
         return f"{fault}; restore a backup into a new folder"
@@ -240,7 +240,7 @@ def _explain(error: DBAPIError, name: str) -> str:
 def create_sqlite_engine(
     path: Path, only_reads: bool = False, is_scratch: bool = False, never_changes: bool = False
 ) -> Engine:
-    """Connections to a file, each configured for a store that must not lose anything.
+    """Makes connections to a file, each configured for a store that must not lose anything.
 
     Args:
         path: the file, created if missing.
@@ -315,7 +315,7 @@ def choose_library() -> ModuleType:
 
 @contextmanager
 def _faults_translated() -> Iterator[None]:
-    """Raises faults of SQLite as RequestError where a caller can act on them."""
+    """Converts faults of SQLite to RequestError where a caller can act on them."""
     try:
         yield
     except DBAPIError as error:

@@ -1,4 +1,4 @@
-"""The store as other rooms use it: opened, read and changed."""
+"""The store as other rooms use it: opening, reading and changing it."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ class Store(StoreReader):
     Thread-safe. Each method is one transaction: readers see all of a change or nothing. A scene's key includes its
     tenant; messages name it by its id, which is all that the tenant knows.
 
-    DataLoss is raised where stored bytes are not what was stored; other references are still served, and the damaged
-    one can be deleted. Unavailable is raised while the database is away or busy; the next call tries again. A change
-    that ends so may have been made: trying again then raises AlreadyExists.
+    DataLoss is raised if stored bytes are damaged; other references are still served, and the damaged
+    one can be deleted. Unavailable is raised while the database is unreachable or busy; the next call tries again. A
+    change that ends so may have been made: trying again then raises AlreadyExists.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Store(StoreReader):
 
         Args:
             data_dir: a folder on a local disk that no other server uses.
-            cache_bytes: bound of the features held in memory, 0 or more.
+            cache_bytes: largest size of the features cached in memory, 0 or more.
 
         Raises:
             StoreError: the folder or the database cannot be used, with one sentence that says why.
@@ -77,7 +77,7 @@ class Store(StoreReader):
 
         Args:
             database_url: "postgresql://user:password@host:5432/database"; libpq's options may follow after "?".
-            cache_bytes: bound of the features held in memory, 0 or more.
+            cache_bytes: largest size of the features cached in memory, 0 or more.
 
         Raises:
             StoreError: the database cannot be reached or used, with one sentence that says why, without the password.
@@ -93,13 +93,13 @@ class Store(StoreReader):
         return store
 
     def uncached(self, cache_bytes: int = 0) -> Store:
-        """The same database without caches, for reading what queries do not: the caches and their counts are kept.
+        """The same database without caches, for reading what queries do not; the caches and their counts do not change.
 
-        It is valid as long as this store and is not closed. Only features are written through it, which invalidate
-        nothing that is cached here.
+        It is valid as long as this store, and need not be closed. Only features are written through it, which does not
+        invalidate this store's caches.
 
         Args:
-            cache_bytes: bound of a cache of features of its own.
+            cache_bytes: largest size of a cache of features of its own.
         """
         return Store(self._database, LruCache(cache_bytes), name_cache_bytes=0)
 
@@ -144,7 +144,7 @@ class Store(StoreReader):
         calibration: Calibration | UnchangedType | None = UNCHANGED,
         arbitrary_unit: bool | UnchangedType = UNCHANGED,
     ) -> SceneRecord:
-        """Changes attributes of a scene; None removes one.
+        """Changes attributes of a scene; None deletes an attribute.
 
         Damaged attributes are replaced if datum, down_in_world and calibration are given; then the unit is the metre
         unless it is given.
@@ -177,15 +177,16 @@ class Store(StoreReader):
     def delete_scene(self, scene_key: SceneKey) -> frozenset[str]:
         """Deletes a scene and all its references.
 
-        It is gone after one transaction. Its rows are then deleted in portions, so that others need not wait; if that
-        is interrupted, it is completed when the store is opened again, or by the next call of this method.
+        The scene does not exist any more after one transaction. Its rows are then deleted in portions, so that other
+        calls need not wait; if that is interrupted, it is completed when the store is opened again, or by the next call
+        of this method.
 
         Returns:
-            Keys of those of its references that were in memory.
+            Keys of its references that were cached in memory.
 
         Raises:
             NotFound: there is no such scene.
-            Overloaded: the disk is full; the scene may be gone all the same, and some of its rows left.
+            Overloaded: the disk is full; the scene may be deleted all the same, with some of its rows left.
         """
         try:
             with self.changing() as connection:
@@ -205,7 +206,7 @@ class Store(StoreReader):
 
     @observed
     def add_references(self, scene_key: SceneKey, references: Sequence[NewReference]) -> list[ReferenceRecord]:
-        """Adds references, all or none, each with all its features and descriptors; one change of the scene.
+        """Adds all of the references or none, each with all its features and descriptors, as one change of the scene.
 
         Returns:
             The new references in the order given.
@@ -239,11 +240,11 @@ class Store(StoreReader):
 
     @observed
     def add_features(self, key: str, extractor: str, view: View) -> None:
-        """Stores another extractor's features of a reference's image; no change of the scene, see SceneRecord.
+        """Stores another extractor's features of a reference's image; not a change of the scene, see SceneRecord.
 
         Args:
-            key: of the reference; its id may by now be that of another image.
-            extractor: whose features.
+            key: key of the reference; its id may now be that of another image.
+            extractor: name of the extractor of the features.
             view: processed camera and features.
 
         Raises:
@@ -265,13 +266,13 @@ class Store(StoreReader):
         `list_changes` then lists the reference among those added.
 
         Args:
-            key: of the reference.
-            name: of the global descriptor.
-            vector: (D,), finite.
+            key: key of the reference.
+            name: name of the global descriptor.
+            vector: (D,) the descriptor, finite.
 
         Raises:
             NotFound: the reference was deleted.
-            ValueError: it is no vector, or a number is not finite as float16.
+            ValueError: the descriptor is not a vector, or a number is not finite as float16.
         """
         row = rows.descriptor_row(key, name, vector)
         reference = tables.reference
@@ -287,10 +288,10 @@ class Store(StoreReader):
 
     @observed
     def delete_reference(self, scene_key: SceneKey, reference_id: str) -> str:
-        """Deletes a reference with its image and features, even a damaged one, whose pages are then lost.
+        """Deletes a reference with its image and features, also a damaged one, whose pages are then lost.
 
         Returns:
-            Its key.
+            The reference's key.
 
         Raises:
             NotFound: there is no such scene or reference.
@@ -317,7 +318,7 @@ class Store(StoreReader):
 
     @observed
     def try_writing(self) -> None:
-        """Writes what changes nothing; raises as every change does if the store cannot be written."""
+        """Writes without changing anything; raises as every change does if the store cannot be written."""
         version = tables.store_version
         with self.changing() as connection:
             connection.execute(update(version).values(schema_version=version.c.schema_version))

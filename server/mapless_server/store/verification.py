@@ -1,4 +1,4 @@
-"""Verification: reads every row of a store and lists what is not as it was stored."""
+"""Verification: reads every row of a store and lists damaged ones."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ _DATABASE = "database"
 
 @dataclass(frozen=True)
 class Verification:
-    """What was found.
+    """The result of a verification.
 
     Attributes:
-        version: of the schema.
-        counts: number of rows by table, of scenes, references and their parts.
-        faults: one line each; none if every byte is as it was stored. Those of the file as a whole begin with
+        version: version of the schema.
+        counts: number of rows of scenes, references and their parts, by table.
+        faults: one line for each fault; empty if nothing is damaged. Faults of the file as a whole begin with
             "database: ".
     """
 
@@ -54,17 +54,17 @@ class Verification:
 
 
 def ignore_progress(what: str, done: int, total: int) -> None:
-    """A Progress that does nothing."""
+    """A `Progress` that does nothing."""
 
 
 def verify(connection: Connection, on_progress: Progress = ignore_progress) -> Verification:
     """Checks the whole store, in the caller's transaction, which must see one moment.
 
-    The rows that are left of a deleted scene are counted, but not checked. Matches of references are not checked: they
-    are when they are used, and damaged ones are made again.
+    Remaining rows of a deleted scene are counted, but not checked. Matches of references are not checked here, but when
+    they are used; damaged ones are made again.
 
     Raises:
-        ValueError: it is no store, or one of a newer program.
+        ValueError: the database is no store, or one of a newer program.
         DataLoss: the database itself is damaged, so that not even its version can be read.
     """
     version = read_version(connection)
@@ -203,7 +203,7 @@ def _stream_parts(
 def _stream(
     connection: Connection, statement: Select[Any], what: str, total: int, on_progress: Progress
 ) -> Iterator[tuple[str, Row[Any] | None]]:
-    """References' names and rows; one by one where some are on damaged pages, with None for those."""
+    """Names and rows of references, read one by one if some are on damaged pages, with None for those."""
     column = reference.c
     statement = statement.where(~is_detached(column.scene_id))
     try:

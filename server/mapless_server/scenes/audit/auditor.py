@@ -1,4 +1,4 @@
-"""Audits references against their neighbours, and finds out which of them is wrong.
+"""Audits references against their neighbours, and determines which of them is wrong.
 
 A first comparison is with the neighbours that share the most matches, which tolerates a few wrong ones among them. If
 it finds a fault, three other causes are excluded before the reference is reported:
@@ -35,11 +35,11 @@ _CACHED_COMPARISONS = 10
 
 @dataclass(frozen=True)
 class _Finding:
-    """What is kept of a first comparison, which itself takes megabytes.
+    """The part of a first comparison that is cached; the comparison itself takes megabytes.
 
     Attributes:
-        is_usable, offset_m, turn_deg, excess: of the comparison; zeros where it is not usable.
-        is_alarm: whether its verdict is.
+        is_usable, offset_m, turn_deg, excess: values of the comparison; zeros if it is not usable.
+        is_alarm: whether its verdict is an alarm.
     """
 
     is_usable: bool
@@ -58,14 +58,14 @@ class _Finding:
 
 @dataclass(frozen=True)
 class _Twin:
-    """The reference most like another one among those that it was compared with; no name without one."""
+    """The reference most like another one, among those that it was compared with; an empty name if there is none."""
 
     name: str = ""
     likeness: Likeness = Likeness.DIFFERENT
 
 
 class Auditor:
-    """Audits references; of one thread. The verdict on one does not depend on which others are audited.
+    """Audits references; for use by one thread. A verdict does not depend on which other references are audited.
 
     Neighbours are compared again and again, so findings of first comparisons are cached, some hundred bytes each. The
     last few comparisons are cached whole, about 2 MiB each with their references; the finder caches more references.
@@ -79,11 +79,11 @@ class Auditor:
         check: Callable[[], None] = lambda: None,
         cached_findings: int = 3000,
     ) -> None:
-        """An auditor of a scene.
+        """Makes the auditor of a scene.
 
         Args:
-            finder: of the scene's references.
-            options: see there.
+            finder: finder of the scene's references.
+            options: options of the audit.
             pairs: caches matches between calls.
             check: called before each comparison; may raise.
             cached_findings: number of findings that are kept.
@@ -93,7 +93,7 @@ class Auditor:
         self._comparisons: LruCache[tuple[Comparison, _Twin]] = LruCache(_CACHED_COMPARISONS)
 
     def audit(self, name: str) -> ReferenceAudit:
-        """The result for one reference. Raises ReferenceGone if it or a neighbour cannot be loaded any more."""
+        """Audits one reference; raises ReferenceGone if it or a neighbour cannot be loaded any more."""
         found, twin = self._first_comparison(name)
         is_wide = False
         if not found.is_usable:
@@ -123,7 +123,7 @@ class Auditor:
         return report(found, AuditVerdict.CONSISTENT, change=change)
 
     def _first_comparison(self, name: str) -> tuple[Comparison, _Twin]:
-        """With the neighbours by pose; cached."""
+        """Compares a reference with its neighbours by pose; cached."""
         cached = self._comparisons.get(name)
         if cached is None:
             cached = self._compare(name, self._finder.near(name, self._options.candidate_count))
@@ -131,7 +131,7 @@ class Auditor:
         return cached
 
     def _finding(self, name: str) -> _Finding:
-        """Of the first comparison; cached."""
+        """Finding of the first comparison; cached."""
         finding = self._findings.get(name)
         if finding is None:
             finding = _Finding.of(self._first_comparison(name)[0])
@@ -139,7 +139,7 @@ class Auditor:
         return finding
 
     def _compare(self, name: str, candidates: Sequence[str]) -> tuple[Comparison, _Twin]:
-        """With the candidates that share the most matches, except copies of the photograph, which share its errors."""
+        """Compares a reference with the candidates that share the most matches, except copies of its photograph."""
         self._check()
         subject, twin = self._finder.view(name), _Twin()
         counts: dict[str, int] = {}
@@ -168,7 +168,7 @@ class Auditor:
     def _without_suspects(
         self, found: Comparison, verdict: AuditVerdict, is_wide: bool
     ) -> tuple[Comparison, AuditVerdict, str]:
-        """Comparison and verdict without neighbours that seem wrong; and the worst of these, if too few are left."""
+        """Comparison and verdict without neighbours that seem wrong; if too few are left, also the worst of those."""
         names = [reference.name for reference in found.neighbourhood.references]
         suspects = [name for name in names if self._finding(name).is_alarm]
         if not suspects:
@@ -187,7 +187,7 @@ class Auditor:
         return second, AuditVerdict.UNVERIFIABLE, worst
 
     def _swapped_with(self, found: Comparison) -> str:
-        """The reference at whose pose the photograph was taken, if that one's was taken here; empty if none is."""
+        """The reference with which this one has swapped its photograph; empty if there is none."""
         options, sigma = self._options, self._options.significance_sigma
         reach_m = options.swap_reach * max(options.position_tolerance_m, sigma * found.largest_sigma_m)
         reach_deg = options.swap_reach * max(options.rotation_tolerance_deg, sigma * found.sigma_deg)
@@ -201,7 +201,7 @@ class Auditor:
         return ""
 
     def _fits(self, photographed: PosedView, posed: PosedView) -> bool:
-        """Whether one reference's photograph fits another's pose, by the neighbours of that pose."""
+        """Whether one reference's photograph fits another's pose, judged by the neighbours of that pose."""
         names = self._finder.near(posed.name, self._options.candidate_count)
         others = [view for view in self._finder.views(names) if view.name != photographed.name]
         others.sort(key=lambda other: -len(self._pairs.match(photographed, other)))
@@ -210,7 +210,7 @@ class Auditor:
         return self._judge(found) is AuditVerdict.CONSISTENT
 
     def _find_change(self, found: Comparison, verdict: AuditVerdict) -> Change | None:
-        """Which part of the image does not show what the neighbours show; None where that cannot be decided."""
+        """Finds which part of the image does not show what the neighbours show; None if that cannot be decided."""
         subject, options = found.subject, ChangeOptions()
         if verdict is AuditVerdict.UNVERIFIABLE:
             nearest = self._finder.views(self._finder.near(subject.name, self._options.neighbour_count))

@@ -26,14 +26,14 @@ from .neighbourhood import Neighbourhood, VisibilityOptions, Visible, visible_po
 
 @dataclass(frozen=True)
 class ChangeOptions:
-    """Options of looking for changes.
+    """Options of detecting changes.
 
     Attributes:
-        columns, rows: of the grid.
+        columns, rows: size of the grid of cells.
         max_turn_deg, max_scale: points are expected only where they are seen about as a neighbour sees them.
         radius_px: a point is found if a similar keypoint is this near to its projection.
         min_similarity: smallest cosine of their descriptors.
-        missing_share: a cell has changed if fewer than this share of the usual share of its points is found,
+        missing_share: a cell has changed if less than this share of the usual share of its points is found,
         max_chance: and if the probability of that by chance is smaller than this.
         min_points: with fewer expected points in the whole image nothing is decided.
         alarm_share: a connected region of changed cells with at least this share of the judged image is an alarm. Of

@@ -1,6 +1,6 @@
-"""Comparison of a reference with neighbours: whether its pose and focal length fit, and if not, which would.
+"""Comparison of a reference with neighbours: whether its pose and focal length fit, and if not, which would fit.
 
-And of two references: whether they are the same photograph, or add nothing to one another.
+It also compares two references: whether they are the same photograph, or show the same view.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ class Comparison:
 
     Attributes:
         subject: the reference.
-        neighbourhood: the others, and their points.
-        points: those that are matched in the subject.
-        fits: by what they may change; empty with too few matches.
-        options: of the audit.
+        neighbourhood: the neighbours and their points.
+        points: points that are matched in the subject.
+        fits: fits by what they may change; empty with too few matches.
+        options: options of the audit.
     """
 
     subject: PosedView
@@ -109,12 +109,12 @@ class Comparison:
         return float(_INFLATION / np.sqrt(max(information, 1e-12)))
 
     def excess(self, free: Free) -> float:
-        """Robust cost per match of a fit above that of the freest one."""
+        """Robust cost per match of a fit, minus that of the fit that may change everything."""
         best = self.fits[Free.BOTH]
         return (self.fits[free].cost - best.cost) / max(best.inlier_count, 1)
 
     def verdict(self, noise_m: float = 0.0, noise_deg: float = 0.0) -> AuditVerdict:
-        """The smallest change that fits the matches; the noise is the median offset of the neighbours."""
+        """Verdict by the smallest change that fits the matches; the noise is the median offset of the neighbours."""
         if not self.is_usable:
             return AuditVerdict.UNVERIFIABLE
         options = self.options
@@ -135,7 +135,7 @@ class Comparison:
     def severity(
         self, noise_m: float = 0.0, noise_deg: float = 0.0, world_from_camera: RigidTransform | None = None
     ) -> float:
-        """Distance of a pose, by default the fitted one, from the given one, divided by what is tolerated."""
+        """Distance of a pose, by default the fitted one, from the given one, as a multiple of the tolerance."""
         options = self.options
         sigma, noise = options.significance_sigma, options.neighbour_noise
         allowed_m = max(options.position_tolerance_m, sigma * self.sigma_m, noise * noise_m)
@@ -152,7 +152,7 @@ class Comparison:
 def compare(
     subject: PosedView, neighbours: Sequence[PosedView], pairs: PairMatches, options: AuditOptions
 ) -> Comparison:
-    """Compares a reference with neighbours, whose poses are trusted as far as they agree with one another."""
+    """Compares a reference with neighbours, whose poses are used as far as they agree with one another."""
     neighbourhood = build_neighbourhood(neighbours, pairs, options.epipolar_px, options.structure)
     points = match_points(subject, neighbourhood, pairs)
     fits = {}
@@ -181,7 +181,7 @@ class Likeness(Enum):
 
 
 def likeness(first: PosedView, second: PosedView, matches: Matches, options: AuditOptions) -> Likeness:
-    """Compares the image positions of two photographs' matches, whatever their poses.
+    """Compares the image positions of two photographs' matches; their poses are not used.
 
     Photographs of different sizes differ: positions are compared in the pixels that features were found in.
     """

@@ -26,23 +26,24 @@ from .verdict import Coverage, CoverageVerdict
 
 @dataclass(frozen=True)
 class CoverageOptions:
-    """Options of the prediction; the repeatability was measured with SIFT on kitchen, office, fountain and church.
+    """Options of the prediction; repeatability was measured with SIFT on kitchen, office, fountain and church.
 
     Attributes:
         neighbour_count: references that are used, nearest by position and heading; as many as a query has.
         epipolar_px: as for matching references.
         repeatability: share of the points that are matched when seen from the same direction and distance; with the two
             below it follows what was found of 60,000 points at less than 15 degrees and 15,000 beyond.
-        turn_deg: angle between the rays at which the share has decreased to 1/e: it is 0.45 up to 15, 0.22 at 25, 0.1
+        turn_deg: angle between the rays at which this share has decreased to 1/e: it is 0.45 up to 15, 0.22 at 25, 0.1
             at 35.
-        log_scale: logarithm of the ratio of scales at which it has: a ratio of 1.35 costs half.
-        sigma_px: of a match, each coordinate, including errors of the references' poses.
+        log_scale: logarithm of the ratio of scales at which this share has decreased to 1/e: a ratio of 1.35 costs
+            half.
+        sigma_px: standard deviation of each coordinate of a match, including errors of the references' poses.
         error_inflation: factor on standard deviations, because errors of neighbouring keypoints and of one reference's
             points are correlated. On scenes with known poses true errors were 1.5 to 2.8 times those of independent
             ones.
-        enough_matches: with so many expected a photograph is localized: 130 of 140 real ones were, the others blurred
-            or occluded.
-        least_matches: with fewer it is not: 31 of 35 were not.
+        enough_matches: number of expected matches with which a photograph is localized: 130 of 140 real ones were, the
+            others were blurred or occluded.
+        least_matches: with fewer a photograph is not localized: 31 of 35 were not.
         enough_image_share, max_radius_m: a pose from a smaller share of the image, or less accurate, is doubtful.
         columns, rows: of the grid that the image is divided into.
         visibility: bounds beyond which nothing is matched.
@@ -77,14 +78,14 @@ def check_coverage(
     pairs: PairMatches,
     options: CoverageOptions | None = None,
 ) -> Coverage:
-    """Whether a photograph taken by a camera at a pose would be localized.
+    """Predicts whether a photograph taken by a camera at a pose would be localized.
 
     Args:
-        camera: of the processed image, no distortion.
+        camera: camera of the processed image, without distortion.
         world_from_camera: its pose, metric.
-        finder: of the scene's references.
+        finder: finder of the scene's references.
         pairs: caches matches between calls.
-        options: see there.
+        options: options of the prediction.
     """
     options = options or CoverageOptions()
     world_from_camera = world_from_camera.shifted(-finder.origin)
@@ -146,7 +147,7 @@ def _radius_m(
     found: Array,
     options: CoverageOptions,
 ) -> float | None:
-    """Radius that the position error does not exceed in 68 % of cases; points are weighted by their probability."""
+    """Radius that the position error does not exceed in 68 % of cases, metres; points are weighted by probability."""
     if found.sum() < options.least_matches:
         return None
     camera_from_world = world_from_camera.inverse()

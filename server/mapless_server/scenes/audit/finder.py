@@ -50,11 +50,11 @@ class ReferenceFinder:
         similar: Similar,
         cached_views: int = 500,
     ) -> None:
-        """Finds references among rows of a scene's entries.
+        """Makes a finder of references among rows of a scene's entries.
 
         Args:
             scene_id: the scene, of which the references' names are made.
-            entries: of the scene.
+            entries: entries of the scene.
             rows: (N,) the rows to be found, ascending.
             load: loads references by name, in order, except those that have been deleted or damaged.
             similar: finds similar references.
@@ -69,7 +69,7 @@ class ReferenceFinder:
         self._gone: set[str] = set()
 
     def view(self, name: str) -> PosedView:
-        """The reference of this name. Raises ReferenceGone."""
+        """The reference of this name; raises ReferenceGone."""
         views = self.views([name])
         if not views:
             raise ReferenceGone(name)
@@ -105,7 +105,7 @@ class ReferenceFinder:
         return [self._name(i) for i in index[order[:count]].tolist()]
 
     def similar(self, name: str, count: int) -> list[str]:
-        """Names of references that may show the same as one, wherever they are."""
+        """Names of references that may show the same as this one, wherever they are."""
         return [other for other in self._similar(name, count + 1) if other != name][:count]
 
     def pose(self, name: str) -> RigidTransform:

@@ -1,6 +1,6 @@
 """The neighbourhood of a reference: points that its neighbours triangulate among themselves.
 
-The audited reference takes no part, so its errors cannot affect the points by which it is judged. A neighbour that is
+The audited reference is not used, so its errors cannot affect the points by which it is judged. A neighbour that is
 wrong itself loses its matches in the epipolar check or its points by their residuals, as long as most are right.
 
 Which points a camera should show: a local feature is matched when it is seen from about the same direction and
@@ -40,12 +40,12 @@ class PairMatches:
     """
 
     def __init__(self, ratio: float = 0.9, cached_pairs: int = 20_000) -> None:
-        """`ratio` is that of the features, see `CorrespondOptions`."""
+        """Uses the `ratio` of the features, see `CorrespondOptions`."""
         self._ratio = ratio
         self._cache: LruCache[Matches] = LruCache(cached_pairs)
 
     def match(self, first: PosedView, second: PosedView) -> Matches:
-        """Matches (M, 2): keypoints of the first and of the second."""
+        """Matches (M, 2): keypoints of the first and of the second photograph."""
         if first.key > second.key:
             return np.ascontiguousarray(self.match(second, first)[:, ::-1])
         key = first.key, second.key
@@ -74,7 +74,7 @@ class Neighbourhood:
 def build_neighbourhood(
     references: Sequence[PosedView], pairs: PairMatches, epipolar_px: float, options: StructureOptions
 ) -> Neighbourhood:
-    """Triangulates the matches among the references; there may be none."""
+    """Triangulates the matches among the references; the result may have no points."""
     if len(references) < 2:
         nothing = np.empty(0, np.intp)
         structure = Structure(np.empty((0, 3)), Tracks(nothing, nothing, nothing), options.first_noise)
@@ -96,7 +96,7 @@ def build_neighbourhood(
 
 
 def match_points(subject: PosedView, neighbourhood: Neighbourhood, pairs: PairMatches) -> ObservedPoints:
-    """The neighbourhood's points that are matched in the subject's photograph, by descriptors alone."""
+    """Matches the neighbourhood's points with the subject's photograph, by descriptors alone."""
     if not len(neighbourhood.structure.x_in_world):
         return ObservedPoints(np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0))
     matches = tuple(pairs.match(subject, reference) for reference in neighbourhood.references)
@@ -139,7 +139,7 @@ class Visible:
 
     Attributes:
         point: (V,) indices into the structure.
-        pixel: (V, 2) where.
+        pixel: (V, 2) their projections.
         turn_deg: (V,) angle to the viewing ray of the most similar observation.
         scale: (V,) ratio of the point's sizes in that reference's image and here, 1 or more.
         reference: (V,) index of that reference.

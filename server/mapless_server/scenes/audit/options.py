@@ -17,28 +17,30 @@ class AuditOptions:
     Attributes:
         position_tolerance_m: smaller offsets are no fault. Of unaltered kitchen, fountain, church and office references
             the worst is off by 0.027, and faults of 0.05 are found to be 0.043 to 0.059.
-        rotation_tolerance_deg: the same: 0.65, and faults of 2 are found to be 1.8 to 2.15.
-        focal_tolerance: the same as a share: 0.007, and faults of 0.05 are found to be 0.045 to 0.055.
-        significance_sigma: an offset must also be so many standard deviations, its own (from the matches, doubled as in
-            the method's final adjustment) along its direction.
-        neighbour_noise: and so many times the median offset of its neighbours: where all poses are off by 10 cm, as at
+        rotation_tolerance_deg: smaller rotations are no fault: the worst unaltered one is 0.65, and faults of 2 are
+            found to be 1.8 to 2.15.
+        focal_tolerance: smaller errors of the focal length, as a share, are no fault: the worst unaltered one is 0.007,
+            and faults of 0.05 are found to be 0.045 to 0.055.
+        significance_sigma: an offset must also exceed this many of its own standard deviations along its direction
+            (from the matches, doubled as in the method's final adjustment).
+        neighbour_noise: and this many times the median offset of its neighbours: if all poses are off by 10 cm, as at
             one end of a drive with GPS poses, no single one is at fault.
-        candidate_count: nearest references by position and heading that are matched.
-        neighbour_count: of these, how many with the most matches are used. Points need two, a verdict needs more.
-        wide_count: references that are matched when the nearest by pose do not show what the photograph shows.
+        candidate_count: number of references, nearest by position and heading, that are matched.
+        neighbour_count: number of these, with the most matches, that are used. Points need two, a verdict needs more.
+        wide_count: number of references that are matched if the nearest by pose do not show what the photograph shows.
         epipolar_px: as for matching references.
         min_inliers: with fewer there is no verdict. Repeated texture has given up to 23 wrong ones.
-        max_log10_false_alarms: as of the pose solver, with a reserve: an audit makes thousands of decisions.
-        swap_reach: a reference within so many tolerances of where a photograph was taken may be its partner in a swap.
-            So many, because that pose was fitted to neighbours of the wrong place.
-        both_excess: robust cost per match that a changed pose or focal length alone must leave for both to be wrong.
-            One true cause leaves up to 0.75, two leave 4.
+        max_log10_false_alarms: as in `GateOptions`, with a reserve, since an audit makes thousands of decisions.
+        swap_reach: a reference within this many tolerances of where a photograph was taken may be its partner in a
+            swap; many, because that pose was fitted to neighbours of the wrong place.
+        both_excess: if a changed pose alone and a changed focal length alone leave more robust cost per match than
+            this, both are wrong. One true cause leaves up to 0.75, two leave 4.
         same_photograph_px: median shift of the keypoints of one photograph, recompressed, is smaller.
         same_photograph_share: and the share of them that match is larger.
         same_view_share: median shift of the keypoints of equivalent views is smaller, as a share of the image's width,
         same_view_matched_share: and the share of them that match is larger.
-        structure: of the neighbours' points.
-        resection: of the reference's fits.
+        structure: options of the neighbours' points.
+        resection: options of the reference's fits.
     """
 
     position_tolerance_m: float = 0.035

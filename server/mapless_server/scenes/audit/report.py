@@ -1,4 +1,4 @@
-"""The result of an audit from the comparison that it is based on, with a sentence for the operator."""
+"""The result of an audit, from the comparison that it is based on, with a sentence for the operator."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def report(
     is_same_photograph: bool = False,
     change: Change | None = None,
 ) -> ReferenceAudit:
-    """The result for a reference.
+    """Makes the result for a reference.
 
     Args:
-        comparison: on which the verdict is based.
-        verdict: on the reference.
+        comparison: the comparison on which the verdict is based.
+        verdict: the verdict on the reference.
         other: partner of a swap or duplicate, or the neighbour that it contradicts.
-        is_same_photograph: of a duplicate, whether it is the same photograph or only the same view.
-        change: of the scene, if one was looked for.
+        is_same_photograph: whether a duplicate is the same photograph, not only the same view.
+        change: change of the scene, if one was searched for.
     """
     fit = _fitted(comparison, verdict)
     best = comparison.fits.get(Free.BOTH)
@@ -51,7 +51,7 @@ def report(
 
 @dataclass(frozen=True)
 class _Fitted:
-    """Differences between the given camera and the fit on which a verdict is based; see `ReferenceAudit`."""
+    """Differences between the given camera and the fit that a verdict is based on; see `ReferenceAudit`."""
 
     error_px: float
     offset_m: float

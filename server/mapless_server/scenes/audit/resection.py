@@ -40,7 +40,7 @@ class ResectionOptions:
     Attributes:
         loss_scale_sigma: residual at which the loss flattens; a little wider than in the method's own final adjustment,
             because the neighbours' poses are not adjusted here.
-        iterations: maximal number of Levenberg-Marquardt steps; from a pose that is off by metres it takes about 20.
+        iterations: largest number of Levenberg-Marquardt steps; from a pose that is off by metres about 20 are needed.
         min_decrease: stops when a step lowers the cost by a smaller share.
         inlier_sigma: largest residual of an inlier.
     """
@@ -59,7 +59,7 @@ class ObservedPoints:
     """Known points matched in a photograph.
 
     Attributes:
-        pixel: (M, 2) where they are in the image.
+        pixel: (M, 2) their positions in the image.
         x_in_world: (M, 3) metres.
         point_covariance: (M, 3, 3) of the points, square metres, world axes.
         keypoint_sigma_px: (M,) of each coordinate of the pixels.
@@ -79,8 +79,8 @@ class CameraFit:
     """A fitted camera.
 
     Attributes:
-        camera: as given, but for the focal length where that was free.
-        world_from_camera: as given, or as fitted.
+        camera: the given camera, with the fitted focal length if that was free.
+        world_from_camera: the fitted pose; the given one if it was not free.
         cost: the robust sum; infinite where a fit was impossible.
         inliers: (M,) which matches agree with it.
         error_px: (M,) reprojection errors; NaN for points behind the camera.
@@ -103,7 +103,7 @@ class CameraFit:
 def fit_camera(
     points: ObservedPoints, camera: Camera, starts: tuple[RigidTransform, ...], free: Free, options: ResectionOptions
 ) -> CameraFit:
-    """The best of the fits from each start; where the pose is not free, the first start is the pose."""
+    """Fits from each start and returns the best fit; if the pose is not free, it is the first start."""
     if free in (Free.NOTHING, Free.FOCAL):
         starts = starts[:1]
     return min((_fit(points, camera, start, free, options) for start in starts), key=lambda fit: fit.cost)
@@ -143,12 +143,12 @@ def _fit(
 
 
 def with_focal(camera: Camera, ratio: float) -> Camera:
-    """The camera with both focal lengths multiplied by `ratio`."""
+    """Returns the camera with both focal lengths multiplied by `ratio`."""
     return replace(camera, focal_x_px=camera.focal_x_px * ratio, focal_y_px=camera.focal_y_px * ratio)
 
 
 def _sigma_px(points: ObservedPoints, camera: Camera, camera_from_world: RigidTransform) -> Array:
-    """(M,) of each match's residual: keypoint noise plus the larger axis of the projected point's ellipse."""
+    """Standard deviation (M,) of each match's residual: keypoint noise plus the larger axis of the point's ellipse."""
     x_in_camera = camera_from_world.apply(points.x_in_world)
     focal = np.array([camera.focal_x_px, camera.focal_y_px])
     jacobian = normalize_jacobian(x_in_camera) * focal[:, None] @ camera_from_world.rotation

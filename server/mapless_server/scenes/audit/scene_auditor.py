@@ -50,13 +50,13 @@ PROCESSED_SIDE_PX = 1024
 
 @dataclass(frozen=True, eq=False)
 class AuditTools:
-    """What auditing needs, for all scenes.
+    """What audits need, for all scenes.
 
     Attributes:
         library: loads references.
-        indexes: of all scenes.
-        descriptor: in the indexes.
-        extractor: of the first tier, whose features every reference has.
+        indexes: indexes of all scenes.
+        descriptor: global descriptor of the indexes.
+        extractor: extractor of the first tier, whose features every reference has.
         pairs: caches matches, for all calls together.
     """
 
@@ -68,13 +68,13 @@ class AuditTools:
 
 
 class SceneAuditor:
-    """Audits references of a scene as it was when first used; of one thread at a time.
+    """Audits references of a scene as it was when first used; for use by one thread at a time.
 
     If a reference that it uses is deleted meanwhile, it reads the scene again.
     """
 
     def __init__(self, tools: AuditTools, scene_key: SceneKey, named: Sequence[str] = ()) -> None:
-        """`named` are ids of references that the caller named, so that it is an error if one of them is missing."""
+        """`named` has the ids that the caller named; it is an error if one of these references is missing."""
         self._tools = tools
         self._scene_key = scene_key
         self._named = named
@@ -84,11 +84,11 @@ class SceneAuditor:
 
     @property
     def generation(self) -> int:
-        """Of the scene as it was read; 0 before that."""
+        """Generation of the scene as it was read; 0 before that."""
         return self._entries.generation if self._entries else 0
 
     def audit(self, reference_id: str, check: Callable[[], None]) -> ReferenceAudit | None:
-        """The result for a reference; None if it is missing and was not named.
+        """Audits a reference; None if it is missing and was not named.
 
         Raises:
             NotFound: there is no such scene (field "scene") or reference that was named (field "references[i]").
@@ -98,7 +98,7 @@ class SceneAuditor:
         return self._retried(lambda: self._audit(reference_id))
 
     def check_coverage(self, view: Viewpoint, check: Callable[[], None]) -> Coverage:
-        """Whether a photograph taken there would be localized.
+        """Predicts whether a photograph taken at a viewpoint would be localized.
 
         Raises:
             NotFound: there is no such scene (field "scene").
@@ -164,7 +164,7 @@ class SceneAuditor:
         return tools.library.load(self._scene_key, reference_ids, tools.extractor, StageContext(self._check))
 
     def _load(self, names: Sequence[str]) -> Sequence[PosedView]:
-        """The references of these names that exist and are not damaged."""
+        """Loads the references of these names that exist and are not damaged."""
         reference_ids = [parse_reference_name(name)[1] for name in names]
         try:
             return load_usable(self._load_exactly, reference_ids, (DataLoss, NotFound), self._report)[1]

@@ -1,4 +1,4 @@
-"""What an audit finds of a reference, and what a coverage check expects of a camera at a viewpoint."""
+"""Results of an audit of a reference, and of a coverage check of a camera at a viewpoint."""
 
 from __future__ import annotations
 
@@ -47,16 +47,16 @@ class ReferenceAudit:
 
     Attributes:
         reference: its name.
-        verdict: see there.
+        verdict: what is wrong with it.
         message: the verdict as a sentence, with the numbers.
         neighbour_count: references that it was compared with.
-        match_count: of its keypoints with points that these triangulate.
+        match_count: matches of its keypoints with points that these references triangulate.
         inlier_count: matches that agree with the best fit.
         error_px: median reprojection error of these inliers with the given pose and intrinsics, pixels of the
             processed image; None without inliers.
-        position_offset_m: distance of the fitted pose from the given one; None where not judged.
+        position_offset_m: distance of the fitted pose from the given one; None if not judged.
         rotation_offset_deg: the same for the rotation.
-        focal_ratio: fitted by given focal length; 1 where the given one fits.
+        focal_ratio: fitted over given focal length; 1 if the given one fits.
         changed_share: share of the image that does not show what it should; None where not judged.
         other: name of the partner of a swap or duplicate; empty if there is none.
     """
@@ -88,12 +88,12 @@ class Coverage:
     """The prediction for one pose.
 
     Attributes:
-        verdict: see there.
+        verdict: whether a photograph would be localized.
         message: the verdict as a sentence, with the numbers.
         expected_match_count: matches that agree with the pose.
         image_share: share of the image's cells in which at least one is expected.
-        position_68_m: position error that is not exceeded in 68 % of cases; None where no pose is expected.
-        references: names of those that would be used, those with the most matches first.
+        position_68_m: position error that is not exceeded in 68 % of cases; None if no pose is expected.
+        references: names of the references that would be used, those with the most matches first.
     """
 
     verdict: CoverageVerdict
@@ -106,7 +106,7 @@ class Coverage:
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """A camera and its pose: world_from_camera, metric."""
+    """A camera and its pose world_from_camera, metric."""
 
     camera: Camera
     world_from_camera: RigidTransform

@@ -1,4 +1,4 @@
-"""What the references of a scene say of its answers: some are localized against the others, in the background.
+"""Self-calibration: some references of a scene are localized against the others, in the background.
 
 Begin with `fit` (the model), then `calibrator` (one scene) and `calibrations` (the scenes that wait). Results
 are in `store.calibrations`.

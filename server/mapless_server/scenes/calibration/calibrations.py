@@ -1,4 +1,4 @@
-"""Calibrates the scenes that have changed, one after the other, for all servers of a database together."""
+"""Calibrates the scenes that have changed, one after the other, for all servers of a database."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class _Lost(Exception):
 
 
 class SceneCalibrations:
-    """Calibrates scenes of a store; of one thread."""
+    """Calibrates the scenes of a store; for use by one thread."""
 
     def __init__(
         self, store: Store, calibrator: Calibrator, observer: PairObserver, depths: DepthFinder | None = None
@@ -55,11 +55,11 @@ class SceneCalibrations:
 
     @property
     def kind(self) -> str:
-        """Of the answers that it calibrates."""
+        """Kind of the answers that it calibrates."""
         return self._calibrator.kind
 
     def calibrate_next(self, pause: Callable[[], None]) -> bool:
-        """Calibrates one scene that may be claimed now; False if there is none. Raises if the store fails.
+        """Calibrates one scene that may be claimed now; returns False if there is none. Raises if the store fails.
 
         Args:
             pause: called in the middle of the work; may raise, which ends it.
@@ -74,7 +74,7 @@ class SceneCalibrations:
         return True
 
     def maintain(self) -> None:
-        """Deletes damaged calibrations, which are made again."""
+        """Deletes damaged calibrations, so that they are made again."""
         count = discard_damaged(self._store.database, self.kind)
         if count:
             log.error("%d damaged calibrations of scenes are made again", count)

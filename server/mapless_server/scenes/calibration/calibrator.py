@@ -41,12 +41,12 @@ class CalibratorOptions:
     """Options of localizing references against the others.
 
     Attributes:
-        sample: references that are localized, at most.
-        max_cpu_s: no further reference is begun after so much processor time of the calling thread, for each thousand
-            references, begun or whole, that the scene has. With the matcher's threads it is 2.4 times as much at most,
-            if the matches of the references are stored.
-        reference_count: others that each is localized with, as queries are by default.
-        shortlist: so many times the others wanted are matched with it, as for queries.
+        sample: largest number of references that are localized.
+        max_cpu_s: processor time of the calling thread after which no further reference is begun, for each (also
+            incomplete) thousand references of the scene. With the matcher's threads the total is at most 2.4 times as
+            much, if the matches of the references are stored.
+        reference_count: number of references that each is localized with, as for queries by default.
+        shortlist: size of the shortlist, as a multiple of `reference_count`, as for queries.
     """
 
     sample: int = 40
@@ -83,7 +83,7 @@ class Calibrator:
         """Localizes references of a scene, and fits the model to the results.
 
         Args:
-            scene_key: of the scene.
+            scene_key: key of the scene.
             library: loads its references.
             newest: ids of its latest references, the latest first.
             pause: called between the stages of each; may raise, which ends it.
@@ -126,7 +126,7 @@ class Calibrator:
         reference_id: str,
         context: StageContext,
     ) -> LeftOut | None:
-        """The result for one reference; None if it has too few others, or is deleted or damaged."""
+        """Localizes one reference; None if it has too few others, or is deleted or damaged."""
         loaded = self._load(scene_key, library, [reference_id], context)
         if not loaded:
             return None
@@ -155,7 +155,7 @@ class Calibrator:
     def _load(
         self, scene_key: SceneKey, library: ReferenceLibrary, reference_ids: Sequence[str], context: StageContext
     ) -> tuple[PosedView, ...]:
-        """Those that exist and are not damaged."""
+        """Loads those of the references that exist and are not damaged."""
 
         def report(damaged_id: str, error: RequestError) -> None:
             if isinstance(error, DataLoss):
@@ -170,7 +170,7 @@ class Calibrator:
 
 
 def left_out(subject: PosedView, answer: Answer) -> LeftOut | None:
-    """The answer to a reference beside its pose; None if it was rejected."""
+    """Compares the answer to a reference with its pose; None if it was rejected."""
     outcome, support = answer.outcome, answer.support
     if not isinstance(outcome, Localization) or outcome.covariance is None or support is None:
         return None
@@ -186,6 +186,6 @@ def left_out(subject: PosedView, answer: Answer) -> LeftOut | None:
 
 
 def _is_copy(first: PosedView, second: PosedView) -> bool:
-    """Whether two references are the same photograph, which would answer with its own pose."""
+    """Whether two references are the same photograph, which would be localized by its own pose."""
     one, other = first.view.photograph, second.view.photograph
     return one is not None and other is not None and one.sha256 == other.sha256

@@ -1,8 +1,9 @@
-"""The model: from references that were localized against the others to the radii and the trust of answers.
+"""The model of self-calibration: from references localized against the others to radii and trust of answers.
 
-A reference's result is its error beside the radius that its answer claims, and the trust of the answer. Right answers
-only count: what judges the others is trust, and a reference whose own pose is wrong gives no right answer, so that it
-changes nothing here (the audit names it). What is right is a share of the distance and an angle, whatever the unit.
+A reference's result is its error beside the radius that its answer claims, and the trust of the answer. Only right
+answers count: wrong ones are the subject of trust, and a reference whose own pose is wrong gives no right answer, so it
+changes nothing here (the audit reports it). An answer is right within a share of the distance and an angle, independent
+of the unit.
 
 An error of position or angle is modelled as
 
@@ -51,13 +52,14 @@ class FitOptions:
     """Options of the model.
 
     Attributes:
-        median_ratio: median of errors by their radius of 68 %, if it is right.
-        scatter: standard deviation of the logarithm of errors by their radius; that of a normal error's length.
-        mismatch: so many answers count as one, because neighbours share errors, and left-out references are no queries.
+        median_ratio: median ratio of errors to their 68 % radius, if the radius is right.
+        scatter: standard deviation of the logarithm of this ratio; that of the length of a normal error.
+        mismatch: number of answers that count as one, because neighbours share errors, and left-out references differ
+            from queries.
         factor_log: standard deviation of ln f between scenes.
-        noise_share: standard deviation of s, by the median radius.
+        noise_share: standard deviation of s, as a share of the median radius.
         trust_prior: n0 of the quantiles of trust.
-        least_answers: with fewer right answers, nothing is known of the scene.
+        least_answers: with fewer right answers, the calibration changes nothing.
     """
 
     median_ratio: float = 0.72
@@ -79,11 +81,11 @@ class LeftOut:
 
     Attributes:
         error_m, error_deg: difference to its given pose.
-        claimed: radii, generic.
-        trust: of the answer, generic.
-        gap: distance of the answer to its nearest reference by the depth of what it sees.
+        claimed: generic radii of the answer.
+        trust: generic trust of the answer.
+        gap: distance of the answer to its nearest reference, as a share of the depth that it sees.
         depth_m: that depth.
-        lens: what it says of the errors of the intrinsics; None if nothing.
+        lens: evidence of errors of the intrinsics; None if there is none.
     """
 
     error_m: float
@@ -101,13 +103,13 @@ class LeftOut:
 
 
 def fit(results: Sequence[LeftOut], kind: str, generation: int, options: FitOptions | None = None) -> SelfCalibration:
-    """The calibration of a scene; without enough right answers it changes nothing.
+    """Fits the calibration of a scene; without enough right answers it changes nothing.
 
     Args:
-        results: of the references that gave an answer.
-        kind: of the answers.
-        generation: of the scene.
-        options: see there.
+        results: results of the references that were localized.
+        kind: kind of the answers.
+        generation: generation of the scene.
+        options: options of the model.
     """
     options = options or FitOptions()
     right = [it for it in results if it.is_right]
@@ -134,7 +136,7 @@ def fit(results: Sequence[LeftOut], kind: str, generation: int, options: FitOpti
 
 
 def _factor_and_noise(error: Array, radius: Array, grown: Array, options: FitOptions) -> tuple[float, float]:
-    """F and s of errors (N,) with claimed radii (N,) at gaps that make them grow (N,)."""
+    """The f and s of errors (N,) with claimed radii (N,), at gaps that multiply the errors by `grown` (N,)."""
     unit = max(float(np.median(radius)), np.finfo(float).tiny)
     scaled = _FACTORS[:, None, None] * (radius * grown / unit)
     expected = options.median_ratio * np.hypot(scaled, _NOISES[:, None])  # (F, S, N)
@@ -150,8 +152,9 @@ def _factor_and_noise(error: Array, radius: Array, grown: Array, options: FitOpt
 def _trust_quantiles(right: Array, highest_wrong: float, options: FitOptions) -> Array:
     """Quantiles of the generic trust of the scene's right answers at `LEVELS`.
 
-    Never above the generic ones: references are often taken on one walk, and do not show how much harder photographs
-    from elsewhere are. Nor so low that a wrong answer of the scene's own would be accepted that otherwise is not.
+    They are never above the generic ones: references are often taken on one walk, and do not show how much harder
+        photographs from elsewhere are. Nor are they so low that a wrong answer in this scene would be accepted that is
+        rejected otherwise.
     """
     trust = np.linspace(0, 1, 1001)
     of_scene = np.searchsorted(np.sort(right), trust, side="right") / len(right)
@@ -162,10 +165,10 @@ def _trust_quantiles(right: Array, highest_wrong: float, options: FitOptions) ->
 
 
 def lens_contradictions(results: Sequence[LeftOut]) -> list[str]:
-    """What the references together contradict in their intrinsics, a phrase for each parameter.
+    """Finds contradictions of the references' intrinsics by all of them together, a phrase for each parameter.
 
-    A parameter is named whose error is more than three standard deviations of it, both of what the references say and
-    of what calibrated lenses have. Pixels are those of the reduced image.
+    A parameter is named if its error exceeds three standard deviations, both of the estimate and of calibrated lenses.
+    Pixels are those of the reduced image.
     """
     evidence = [it.lens for it in results if it.is_right and it.lens is not None]
     if not evidence:
@@ -184,10 +187,10 @@ def lens_contradictions(results: Sequence[LeftOut]) -> list[str]:
 
 
 def _lens(evidence: Sequence[IntrinsicsEvidence]) -> tuple[list[float], list[float]]:
-    """What the references together say of the errors of their intrinsics, and its standard deviations; both (4,).
+    """Errors of the intrinsics by all references together, and their standard deviations; both (4,).
 
-    The median over the references, so that one wrong pose does not count, and the spread about it: references of one
-    lens that disagree do not become certain by their number alone.
+    The error is the median over the references, so that a single wrong pose does not matter; the standard deviation
+    follows from their spread, so that references that disagree do not become certain by their number alone.
     """
     values = np.array([it.value for it in evidence])
     middle = np.median(values, axis=0)

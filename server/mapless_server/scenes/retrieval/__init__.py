@@ -1,4 +1,4 @@
-"""Retrieval: which references resemble a photograph.
+"""Retrieval: choosing the references that resemble a photograph.
 
 descriptor   the interface of global descriptors: one vector per photograph, whose dot products are similarities
 vlad         the descriptor that is made of local features, and its vocabularies

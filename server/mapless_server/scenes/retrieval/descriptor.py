@@ -19,7 +19,7 @@ class GlobalDescriptor(Protocol):
     Attributes:
         name: identifies the descriptor and everything that changes its vectors; the key of stored vectors.
         dimension: D, the length of its vectors.
-        extractor: name of the local features that it is made of; None if it uses pixels.
+        extractor: name of the local features that it is computed from; None if it uses pixels.
     """
 
     name: str
@@ -27,7 +27,7 @@ class GlobalDescriptor(Protocol):
     extractor: str | None
 
     def describe(self, view: View) -> Vector:
-        """The vector (D,) of a view, which needs its photograph if the descriptor uses pixels.
+        """Computes the vector (D,) of a view, which needs its photograph if the descriptor uses pixels.
 
         A view without features (a blank wall) gives zeros, which are similar to nothing.
         """

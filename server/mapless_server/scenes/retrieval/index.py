@@ -39,14 +39,14 @@ _GROWTH = 1.5
 
 @dataclass(frozen=True, eq=False)
 class _Table:
-    """One row per reference. Rows are appended beyond those that any Entries use, and not changed except as stated.
+    """One row per reference. Rows are appended after those that any Entries use, and not changed except as stated.
 
     Attributes:
         vectors: (capacity, D) int8. A row is written once, before its norm is set.
         poses: (capacity, 3, 4), world_from_camera.
-        ids, keys: of the references; as many as there are rows.
-        row_of_key: of every row.
-        row_of_id: the newest row of an id.
+        ids, keys: ids and keys of the references, one for each row.
+        row_of_key: row of each key.
+        row_of_id: newest row of each id.
     """
 
     vectors: NDArray[np.int8]
@@ -58,11 +58,11 @@ class _Table:
 
     @staticmethod
     def empty(dimension: int, capacity: int) -> _Table:
-        """Room for so many rows."""
+        """Makes a table with room for this many rows."""
         return _Table(np.empty((capacity, dimension), np.int8), np.empty((capacity, 3, 4)), [], [], {}, {})
 
     def size_bytes(self) -> int:
-        """Size of the arrays, and of the names by that of the first."""
+        """Size of the arrays and, estimated by the first ones, of the names, bytes."""
         containers = sum(map(sys.getsizeof, (self.ids, self.keys, self.row_of_key, self.row_of_id)))
         names = sum(map(sys.getsizeof, (*self.ids[:1], *self.keys[:1]))) + sys.getsizeof(1 << 20)
         return self.vectors.nbytes + self.poses.nbytes + containers + names * len(self.ids)
@@ -73,7 +73,7 @@ class Entries:
     """The references of a scene at one generation; not changed by later updates.
 
     Attributes:
-        generation: of the scene.
+        generation: generation of the scene.
     """
 
     generation: int
@@ -91,14 +91,14 @@ class Entries:
         return isinstance(reference_id, str) and self._find(reference_id) is not None
 
     def rows(self, among: Collection[str] | None = None) -> Rows:
-        """Rows (N,) of the references, ascending; of those among these ids, in the order stored."""
+        """Rows (N,) of the references, ascending; only of these ids if given."""
         if among is None:
             return np.flatnonzero(self._alive)
         found = (self._find(reference_id) for reference_id in among)
         return np.array(sorted({row for row in found if row is not None}), np.intp)
 
     def similarities(self, vector: Vector, rows: Rows) -> NDArray[np.float32]:
-        """Similarity (N,) of a unit vector (D,) with rows; NaN for references that have no descriptor."""
+        """Similarity (N,) of a unit vector (D,) with rows; NaN for references without a descriptor."""
         vectors = self._table.vectors
         # If most rows are wanted, all are read in order; otherwise the wanted ones are gathered.
         is_dense = len(rows) > len(self._alive) // 2
@@ -148,24 +148,24 @@ class SceneIndex:
     """One scene in memory: updated by one thread at a time, read by any number without locks."""
 
     def __init__(self, dimension: int) -> None:
-        """An empty index of descriptors of `dimension` numbers."""
+        """Makes an empty index of descriptors with `dimension` numbers."""
         self._dimension = dimension
         self._lock = threading.Lock()
         self._entries = self._empty(-1, 0)
 
     @property
     def generation(self) -> int:
-        """Of the scene at the last update; -1 before the first."""
+        """Generation of the scene at the last update; -1 before the first."""
         return self._entries.generation
 
     @property
     def size_bytes(self) -> int:
-        """Memory of the index."""
+        """Memory of the index, bytes."""
         entries = self._entries
         return entries._table.size_bytes() + entries._inverse_norms.nbytes + entries._alive.nbytes
 
     def entries(self) -> Entries:
-        """The scene as it is now."""
+        """Returns the scene as it is now."""
         return self._entries
 
     def apply(self, changes: SceneChanges) -> None:
@@ -206,7 +206,7 @@ class SceneIndex:
 
 
 def _without(entries: Entries, keys: Collection[str]) -> Entries:
-    """The entries without some keys; copied to a new table where most rows have been removed."""
+    """Returns the entries without some keys, copied to a new table if most rows have been removed."""
     row_of_key = entries._table.row_of_key
     rows = [row_of_key[key] for key in keys if key in row_of_key]
     if not rows:
@@ -229,7 +229,7 @@ def _compacted(entries: Entries) -> Entries:
 
 
 def _described(entries: Entries, vectors: Mapping[str, Vector]) -> Entries:
-    """The entries with vectors of references that had none."""
+    """Returns the entries with vectors for references that had none."""
     norms = entries._inverse_norms.copy()
     for key, vector in vectors.items():
         row = entries._table.row_of_key.get(key)
@@ -240,7 +240,7 @@ def _described(entries: Entries, vectors: Mapping[str, Vector]) -> Entries:
 
 
 def _with(entries: Entries, added: Collection[IndexedReference], generation: int) -> Entries:
-    """The entries and new ones, at the next generation."""
+    """Returns the entries with new ones added, at the next generation."""
     first = len(entries._alive)
     count = first + len(added)
     table = _grown(entries._table, count)
@@ -258,7 +258,7 @@ def _with(entries: Entries, added: Collection[IndexedReference], generation: int
 
 
 def _grown(table: _Table, count: int) -> _Table:
-    """The table with room for so many rows; names are shared, because they are only appended."""
+    """Returns the table with room for this many rows; names are shared, because they are only appended."""
     capacity, dimension = table.vectors.shape
     if count <= capacity:
         return table
@@ -274,7 +274,7 @@ def _name(table: _Table, reference_id: str, key: str, row: int) -> None:
 
 
 def _quantized(vector: Vector) -> tuple[NDArray[np.int8], float]:
-    """A vector in units of a 127th of its largest number, and the inverse of its norm in these units; 0 for zeros."""
+    """Quantizes a vector to a 127th of its largest number; also returns the inverse of its norm, 0 for zeros."""
     largest = float(np.abs(vector).max(initial=0.0))
     if not largest > 0:
         return np.zeros(vector.shape, np.int8), 0.0

@@ -1,4 +1,4 @@
-"""The global descriptor of the paper: MegaLoc on the photograph's pixels, reduced to 1056 numbers.
+"""The paper's global descriptor: MegaLoc on the photograph's pixels, reduced to 1056 numbers.
 
 MegaLoc gives 8448 numbers. As float16 that is 17 KB a reference, 1.7 GB for 100,000 and 17 GB for a million, and exact
 search reads all of it for every query. So descriptors are reduced to 1056 by random sums of eight (`MegaLoc.reduce`):
@@ -46,10 +46,10 @@ class MegaLocOptions:
     """Options of the descriptor.
 
     Attributes:
-        dimension: of the vectors, a divisor of 8448, which is the network's own; see the module about 1056.
-        batch: photographs that `describe_many` computes together; 16 are 8,480 tokens, enough to occupy a device, and
-            take about 0.3 GB beside the weights by calculation.
-        dtype: what the transformer computes in; None is bfloat16 on a CUDA device that has flash attention, else
+        dimension: length of the vectors, a divisor of 8448, the network's own; the module explains 1056.
+        batch: number of photographs that `describe_many` computes together; 16 are 8,480 tokens, enough to occupy a
+            device, and take about 0.3 GB beside the weights by calculation.
+        dtype: type of the transformer's computation; None for bfloat16 on a CUDA device with flash attention, else
             float32. Not part of the name, so that servers with and without a GPU can share references: it changes
             similarities by a thousandth of what they differ by among photographs of one scene (random weights).
     """
@@ -67,19 +67,19 @@ class MegaLocDescriptor:
 
     Attributes:
         name: e.g. "megaloc-1056-322px-d4f9f2bc-1"; the letters are the beginning of the weights' SHA-256.
-        dimension: of the vectors.
+        dimension: length of the vectors.
         extractor: None, since it uses pixels.
-        dtype: what the transformer computes in.
+        dtype: type of the transformer's computation.
 
     Args:
         weights: safetensors file, the names of the authors' checkpoint.
         device: "cpu" or a CUDA device.
-        options: see there.
-        sizes: of the network; None is that of the authors' weights.
+        options: options of the descriptor.
+        sizes: sizes of the network; None for those of the authors' weights.
 
     Raises:
         CheckpointError: the weights do not fit.
-        ValueError: the dimension is no divisor of the network's own.
+        ValueError: the dimension does not divide the network's own.
     """
 
     extractor: str | None = None
@@ -115,9 +115,9 @@ class MegaLocDescriptor:
 
     @torch.inference_mode()
     def describe_many(self, views: Sequence[View]) -> NDArray[np.float32]:
-        """Vectors (N, D) of views, computed in batches, with one photograph in memory at a time.
+        """Computes vectors (N, D) of views in batches, with one photograph in memory at a time.
 
-        Batching changes a vector by rounding only. Errors as `describe`.
+        Batching changes a vector by rounding only. Errors as in `describe`.
         """
         described = np.empty((len(views), self.dimension), np.float32)
         for begin in range(0, len(views), self.options.batch):
@@ -128,10 +128,10 @@ class MegaLocDescriptor:
 
 
 def _picture(view: View) -> Tensor:
-    """The photograph resized to a square, (3, SIDE_PX, SIDE_PX) float32 in [0, 1]: bilinear with antialiasing.
+    """Resizes the photograph to a square (3, SIDE_PX, SIDE_PX), float32 in [0, 1]: bilinear with antialiasing.
 
-    Horizontally first, some rows at a time, then vertically. Both at once give the same bits in three times the time,
-    from a float copy of the whole photograph, four times its size.
+    It is resized horizontally first, some rows at a time, then vertically. Both at once give the same bits in three
+    times the time, and need a float copy of the whole photograph, four times its size.
     """
     if view.photograph is None:
         raise ValueError("MegaLoc uses pixels, and the view has no photograph")

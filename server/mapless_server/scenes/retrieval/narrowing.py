@@ -1,4 +1,4 @@
-"""What is known of a camera's pose before its photograph is compared with any: limits and likely values.
+"""What is known of a camera's pose before its photograph is compared with references: limits and likely values.
 
 Limits are hard: references beyond them are not considered, and a pose beyond them is rejected. Likely values narrow the
 choice of references, too, but not to nothing, and never reject a pose.
@@ -35,11 +35,11 @@ class Sphere:
     radius_m: float
 
     def distance_m(self, position: Array) -> float:
-        """How far from the sphere's surface a position lies; negative inside."""
+        """Distance of a position from the sphere's surface, metres; negative inside."""
         return float(np.linalg.norm(position - self.position)) - self.radius_m
 
     def keeps(self, centres: Array, margin_m: float) -> NDArray[np.bool_]:
-        """Which centres (N, 3) lie no further outside than the margin, (N,)."""
+        """Which centres (N, 3) are outside by at most the margin."""
         # Not squared: a radius may be any number.
         return np.asarray(np.linalg.norm(centres - self.position, axis=1) <= self.radius_m + margin_m)
 
@@ -56,7 +56,7 @@ class Ellipsoid:
     covariance: Array
 
     def keeps(self, centres: Array, margin_m: float) -> NDArray[np.bool_]:
-        """Which centres (N, 3) lie in the ellipsoid with each half-axis longer by the margin, (N,)."""
+        """Which centres (N, 3) are in the ellipsoid with each half-axis longer by the margin."""
         variances, axes = np.linalg.eigh(self.covariance)
         half_axes_m = REACH_SIGMA * np.sqrt(variances.clip(min=0)) + margin_m
         away = (centres - self.position) @ axes / half_axes_m
@@ -65,7 +65,7 @@ class Ellipsoid:
 
 @dataclass(frozen=True, eq=False)
 class Cone:
-    """The camera looks along `forward` (3,), unit length, world, give or take `max_angle_deg`."""
+    """The camera looks along `forward` (3,), unit length, world, within `max_angle_deg`."""
 
     forward: Array
     max_angle_deg: float
@@ -80,7 +80,7 @@ class Cone:
         return float(np.degrees(np.arccos(np.clip(self.forward @ axis, -1.0, 1.0)))) - self.max_angle_deg
 
     def keeps(self, axes: Array, margin_deg: float) -> NDArray[np.bool_]:
-        """Which optical axes (N, 3) are no further outside the cone than the margin, (N,)."""
+        """Which optical axes (N, 3) are outside the cone by at most the margin."""
         widest_deg = self.max_angle_deg + margin_deg
         if widest_deg >= 180:
             return np.ones(len(axes), bool)
@@ -90,7 +90,7 @@ class Cone:
 
 @dataclass(frozen=True, eq=False)
 class Narrowing:
-    """Which references are considered; all if nothing is known.
+    """Defines which references are considered; all if nothing is known.
 
     Attributes:
         position: limit of the camera's position.
@@ -110,7 +110,7 @@ class Narrowing:
 
     @staticmethod
     def of(priors: Priors) -> Narrowing:
-        """The likely values of priors; gravity gives none."""
+        """Makes the likely values of priors; gravity gives none."""
         positions, headings = [], []
         for prior in priors:
             if isinstance(prior, PositionPrior):
@@ -131,13 +131,13 @@ class Narrowing:
 
     @property
     def centre(self) -> Array | None:
-        """About where the camera is, (3,) world; None if unknown."""
+        """Approximate position (3,) of the camera in the world; None if unknown."""
         if self.position is not None:
             return self.position.position
         return self.likely_positions[0].position if self.likely_positions else None
 
     def contradiction(self, world_from_camera: RigidTransform) -> str:
-        """Which limit a pose of the camera violates, without the margins; empty if none."""
+        """Names the limit, without margins, that a pose of the camera violates; empty if none."""
         if self.position is not None:
             outside_m = self.position.distance_m(world_from_camera.translation)
             if outside_m > 0:
@@ -150,7 +150,7 @@ class Narrowing:
         return ""
 
     def keeps(self, centres: Array, axes: Array) -> NDArray[np.bool_]:
-        """Whether cameras are considered, (N,), by centres (N, 3) and optical axes (N, 3), world."""
+        """Which cameras are considered, by centres (N, 3) and optical axes (N, 3) in the world."""
         kept = np.ones(len(centres), bool)
         if self.position is not None:
             kept &= self.position.keeps(centres, self.margin_m)

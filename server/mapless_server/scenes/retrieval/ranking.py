@@ -1,4 +1,4 @@
-"""Selection of references for a photograph: by similarity, spread in space, within what is known of the camera's pose.
+"""Selection of references for a photograph: by similarity, spread in space, within what is known of its pose.
 
 Two references at one place that look the same way see the same and triangulate nothing, so after the first of them is
 chosen the second counts for less. It is not excluded: in a dense sequence, strictly spread references see so little of
@@ -33,16 +33,16 @@ class RankOptions:
     Attributes:
         apart_m: references closer together than this triangulate nothing (the paper's baseline),
         apart_deg: if their optical axes are closer than this, too: otherwise they see different things.
-        nearby_weight: what remains of a reference's lead over the scene's typical similarity when one nearby is chosen
-            already. 1 does not thin, 0 spreads at any price. In the kitchen of 7-Scenes (100 references, 60 queries)
-            the median errors with 1, 0.75 and 0.5 are 0.13, 0.15 and 0.15 cm, and 90 % lie below 0.27, 0.29 and 0.32;
-            with 0 the chosen share half as many matches with the query.
+        nearby_weight: share that remains of a reference's lead over the scene's typical similarity if one nearby is
+            chosen already. 1 does not thin, 0 spreads at any price. In the kitchen of 7-Scenes (100 references, 60
+            queries) the median errors with 1, 0.75 and 0.5 are 0.13, 0.15 and 0.15 cm, and 90 % lie below 0.27, 0.29
+            and 0.32; with 0 the chosen share half as many matches with the query.
         same_place_m: references closer together than this, looking the same way, are about equally similar to any
             photograph, and ten of them determine no depth. A video at walking speed has two or three.
-        per_place: so many of them are chosen, but no more than half of what is wanted, before all others.
-        pool: so many times the wanted references are considered, the most similar ones. Less similar ones are never
-            chosen instead of a nearby one, unless too few of the pool stand at different places.
-        smallest_pool: but at least so many.
+        per_place: number of them that are chosen before all others, but at most half of the wanted references.
+        pool: number of most similar references that are considered, as a multiple of the wanted ones. Less similar ones
+            are never chosen instead of a nearby one, unless too few of the pool stand at different places.
+        smallest_pool: least number of references that are considered.
     """
 
     apart_m: float = 0.3
@@ -65,10 +65,10 @@ class Selection:
     """Which references to select.
 
     Attributes:
-        count: how many at most.
+        count: largest number of references.
         narrowing: limits of the camera's pose.
         among: ids of the candidates, unknown ones ignored; empty for the whole scene.
-        options: of the ranking.
+        options: options of the ranking.
     """
 
     count: int
@@ -82,9 +82,9 @@ class RankedReference:
     """A selected reference.
 
     Attributes:
-        reference_id: unique in its scene.
-        key: unique for ever.
-        similarity: cosine of the descriptors, -1 to 1; NaN where the reference or the photograph has none.
+        reference_id: its id, unique in its scene.
+        key: its key, never used again.
+        similarity: cosine of the descriptors, -1 to 1; NaN if the reference or the photograph has none.
         world_from_camera: its pose, metric.
     """
 
@@ -101,7 +101,7 @@ class Choice:
     Attributes:
         references: in order, the most similar first except for those that see the same as an earlier one.
         descriptor: name of the global descriptor that was compared.
-        generation: of the scene.
+        generation: generation of the scene.
     """
 
     references: tuple[RankedReference, ...]
@@ -110,13 +110,13 @@ class Choice:
 
 
 def rank_references(entries: Entries, vector: Vector | None, selection: Selection) -> list[RankedReference]:
-    """The selected references in the order of choice.
+    """Selects references, in the order of choice.
 
-    References without a descriptor come last. They, and all if the photograph has none, are ordered by their distance
-    from the likely position of the camera, or as they were stored.
+    References without a descriptor come last. These, or all references if the photograph has no descriptor, are ordered
+    by their distance from the likely position of the camera, or as they were stored.
 
     Args:
-        entries: of the scene.
+        entries: entries of the scene.
         vector: the photograph's descriptor, (D,); None if it has none.
         selection: which references to select.
     """
@@ -146,17 +146,17 @@ def rank_references(entries: Entries, vector: Vector | None, selection: Selectio
 def spread(
     scores: ArrayLike, centres: ArrayLike, axes: ArrayLike, count: int, typical: float, options: RankOptions
 ) -> list[int]:
-    """Chooses the best score repeatedly, where one near a chosen one has less of a lead; ties go to the first.
+    """Chooses the best score repeatedly; a reference near a chosen one loses a part of its lead. Ties go to the first.
 
     Once enough are chosen at one place, the others there are skipped.
 
     Args:
-        scores: (N,) finite, or -inf.
+        scores: (N,) scores, finite or -inf.
         centres: (N, 3) camera centres, metres.
         axes: (N, 3) optical axes, unit length.
         count: how many to choose.
-        typical: score without a lead: lower ones lose nothing.
-        options: see there.
+        typical: score without a lead; lower scores lose nothing.
+        options: options of the ranking.
 
     Returns:
         Indices in the order of choice; fewer than `count` if the others are skipped.
@@ -184,7 +184,7 @@ def spread(
 
 
 def _scores(similarity: NDArray[np.float32], entries: Entries, rows: Rows, narrowing: Narrowing) -> Array:
-    """Similarities (N,), and lower scores for those that are unknown: the lower, the further from the prior."""
+    """Similarities (N,); unknown ones get lower scores, the lower, the further from the prior."""
     scores = similarity.astype(np.float64)
     unknown = np.flatnonzero(np.isnan(similarity))
     scores[unknown] = -2.0
@@ -195,7 +195,7 @@ def _scores(similarity: NDArray[np.float32], entries: Entries, rows: Rows, narro
 
 
 def _best(score: Array, count: int) -> Rows:
-    """Indices of the `count` best scores, the best first; ties in order."""
+    """Indices of the `count` best scores, the best first; ties keep their order."""
     if count >= len(score):
         return np.argsort(-score, kind="stable")
     # Partitioning keeps any of those that tie with the last one, so the first of them are taken.
@@ -238,7 +238,7 @@ def spread_choice(
         match_counts: (N,) matches with the query.
         centres: (N, 3) camera centres, metres.
         count: how many to choose.
-        options: see there.
+        options: options of the choice.
     """
     options = options or RetrieveOptions()
     score: NDArray[np.float64] = np.asarray(match_counts, float)

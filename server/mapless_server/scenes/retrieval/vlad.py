@@ -47,10 +47,10 @@ SEED = 20260101
 
 @dataclass(frozen=True, eq=False)
 class Vocabulary:
-    """Where the descriptors of one kind of features lie.
+    """The distribution of the descriptors of one kind of features.
 
     Attributes:
-        mean: (d,) of the descriptors.
+        mean: (d,) mean of the descriptors.
         projection: (d, REDUCED), the directions in which they differ most.
         words: (WORDS, REDUCED), centroids of the projected descriptors.
     """
@@ -74,7 +74,7 @@ class Vocabulary:
 
 @lru_cache
 def shipped(kind: str) -> Vocabulary | None:
-    """The vocabulary of a kind of features; None if there is none."""
+    """Loads the vocabulary of a kind of features; None if there is none."""
     if kind not in LEARNED:
         return None
     with files(__package__).joinpath(FILE).open("rb") as file, np.load(file) as arrays:
@@ -84,7 +84,7 @@ def shipped(kind: str) -> Vocabulary | None:
 
 @lru_cache
 def dataless(dimension: int) -> Vocabulary:
-    """One for unit descriptors of any kind, from seeded random numbers: they are taken to point anywhere."""
+    """Makes a vocabulary for unit descriptors of any kind, assumed to point anywhere, from seeded random numbers."""
     random = np.random.default_rng([SEED, dimension])
     projection = random.standard_normal((dimension, REDUCED)) / np.sqrt(dimension)
     # Centroids of evenly distributed descriptors are close to the mean; their directions distinguish the cells.
@@ -95,7 +95,7 @@ def dataless(dimension: int) -> Vocabulary:
 
 
 def nearest_words(points: NDArray[np.floating], words: NDArray[np.floating]) -> NDArray[np.intp]:
-    """For each of N points (N, REDUCED) the nearest of W words (W, REDUCED)."""
+    """Index of the nearest of W words (W, REDUCED) for each of N points (N, REDUCED)."""
     return np.asarray((points @ words.T - 0.5 * (words * words).sum(axis=1)).argmax(axis=1))
 
 
@@ -106,10 +106,10 @@ DIMENSION = WORDS * REDUCED
 
 
 class VladDescriptor:
-    """VLAD of one extractor's features, with the vocabulary of their kind, or with one that needs no data.
+    """VLAD of one extractor's features, with the vocabulary of their kind, or with one made without data.
 
     Without a shipped vocabulary (SuperPoint, whose weights were not available; variants of EdgePoint2 that `auto` does
-    not use) three times as many of the first ten references see something else; see the module.
+    not use) three times as many of the first ten references show something else; see the module.
 
     Attributes:
         name: for example "vlad-1-0123abcd-sift-2048-1024px-0.02": version, vocabulary, extractor.
@@ -117,7 +117,7 @@ class VladDescriptor:
     """
 
     def __init__(self, extractor: str, vocabulary: Vocabulary | None) -> None:
-        """Of the extractor of that name; without a vocabulary one is made for the length of its descriptors."""
+        """`extractor` is its name; without a vocabulary, one is made for the length of its descriptors."""
         used = "dataless" if vocabulary is None else vocabulary.digest()
         self.name = f"vlad-{RULE}-{used}-{extractor}"
         self.dimension = DIMENSION
@@ -126,7 +126,7 @@ class VladDescriptor:
 
     @staticmethod
     def of(extractor: FeatureExtractor) -> VladDescriptor:
-        """With the vocabulary that is shipped for the kind of features, which the extractor's name begins with."""
+        """Makes the descriptor with the shipped vocabulary of the features, whose kind begins the extractor's name."""
         kind = next((it for it in LEARNED if extractor.name.startswith(f"{it}-")), "")
         return VladDescriptor(extractor.name, shipped(kind))
 
@@ -149,7 +149,7 @@ class VladDescriptor:
 
 
 def vlad(descriptors: Vector, vocabulary: Vocabulary) -> Vector:
-    """The vector (DIMENSION,), unit length, of descriptors (N, d); zeros if each of them is a word."""
+    """Computes the vector (DIMENSION,), unit length, of descriptors (N, d); zeros if each of them is a word."""
     points = (descriptors - vocabulary.mean) @ vocabulary.projection
     nearest = nearest_words(points, vocabulary.words)
     residuals = points - vocabulary.words[nearest]

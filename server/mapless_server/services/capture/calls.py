@@ -32,7 +32,7 @@ class CaptureError(Exception):
 
 
 class DamagedCapture(CaptureError):
-    """A captured call is not what was written: it was cut or changed, or a part of it is missing."""
+    """A captured call is damaged: it was cut or changed, or a part of it is missing."""
 
 
 class BlobDeleted(Exception):
@@ -44,7 +44,7 @@ Response = pb.LocalizeResponse | pb.LocalizeRigResponse | pb.LocalizeSequenceRes
 
 
 def diagnostics_of(response: Response) -> list[pb.Diagnostics]:
-    """The diagnostics of each photograph, in order."""
+    """Returns the diagnostics of each photograph, in order."""
     if isinstance(response, pb.LocalizeResponse):
         return [response.diagnostics]
     return [image.diagnostics for image in response.images]
@@ -59,12 +59,12 @@ class CapturedReference:
     """A reference that a photograph was compared with.
 
     Attributes:
-        reference_id: unique within its scene.
-        key: unique for all time; a reference that replaces it has another.
-        camera: in pixels of its photograph.
+        reference_id: its id, unique within its scene.
+        key: its key, never used again; a reference that replaces it has another.
+        camera: its camera, in pixels of its photograph.
         world_from_camera: its pose, metric.
-        image_sha256: its photograph's blob.
-        views: blobs of its features, by the name of the extractor.
+        image_sha256: name of its photograph's blob.
+        views: names of the blobs of its features, by the name of the extractor.
     """
 
     reference_id: str
@@ -81,9 +81,9 @@ class CapturedPart:
 
     Attributes:
         field: path of the photograph in the request, "image" or "images[2].image".
-        generation: of the scene when its references were read.
-        references: those that were named or ranked.
-        choice: how they were chosen; None if they were used as named.
+        generation: generation of the scene when its references were read.
+        references: the references that were named or ranked.
+        choice: how they were chosen; None if the caller named them.
     """
 
     field: str
@@ -100,11 +100,11 @@ class CapturedCall:
         request_id: finds it in the log; callers may use one twice.
         time_s: when it was answered, Unix seconds.
         method: "Localize", "LocalizeRig" or "LocalizeSequence".
-        tenant: whose call.
-        scene_id: of the scene, as its tenant knows it.
+        tenant: tenant of the caller.
+        scene_id: id of the scene within its tenant.
         scene_created_us: when the scene was created, Unix microseconds; distinguishes scenes of one name.
-        circumstances: what else decides an answer, by name: versions, settings, weights.
-        attributes: of the scene.
+        circumstances: what else decides an answer (versions, settings, weights), by name.
+        attributes: attributes of the scene.
         parts: one for each photograph.
         request: the message as it was received.
         response: the message as it was sent.
@@ -129,13 +129,13 @@ class CapturedCall:
 
     @property
     def blobs(self) -> frozenset[str]:
-        """Names of the blobs that belong to it."""
+        """Names of the blobs that the call needs."""
         references = [it for part in self.parts for it in part.references]
         return frozenset(name for it in references for name in (it.image_sha256, *it.views.values()))
 
 
 def encode_call(call: CapturedCall) -> bytes:
-    """The file of a call."""
+    """Encodes a call as the content of its file."""
     header = {
         "format": FORMAT_VERSION,
         "request_id": call.request_id,
@@ -154,13 +154,13 @@ def encode_call(call: CapturedCall) -> bytes:
 
 
 def decode_call(data: bytes) -> CapturedCall:
-    """The call of a file.
+    """Decodes the content of a call's file.
 
-    All names, times and blobs are checked: a digest shows damage, not who wrote the file.
+    All names, times and blobs are checked, since a digest shows damage, but not who wrote the file.
 
     Raises:
-        DamagedCapture: it is cut or changed.
-        CaptureError: its format is that of another version.
+        DamagedCapture: the file is cut or changed.
+        CaptureError: the file has the format of another version.
     """
     digest, body = data[:_DIGEST_BYTES], data[_DIGEST_BYTES:]
     if hashlib.sha256(body).digest() != digest:

@@ -25,14 +25,14 @@ class ReferencesDeleted(Exception):
 
 @dataclass(frozen=True, eq=False)
 class UsedReferences:
-    """What a photograph was compared with, by key, so that a queued call holds nothing large in memory.
+    """What a photograph was compared with, by key only, so that a queued call needs little memory.
 
     Attributes:
         field: path of the photograph in the request.
-        generation: of the scene when its references were read.
-        used: keys of those that the answer was computed from.
-        wanted: keys by id of those that were named or ranked.
-        choice: how they were chosen; None if they were used as named.
+        generation: generation of the scene when its references were read.
+        used: keys of the references that the answer was computed from.
+        wanted: keys, by id, of the references that were named or ranked.
+        choice: how they were chosen; None if the caller named them.
     """
 
     field: str
@@ -43,7 +43,7 @@ class UsedReferences:
 
 
 def used_references(query: Query, result: Result) -> UsedReferences:
-    """What an answered photograph was compared with."""
+    """Extracts what an answered photograph was compared with."""
     choice = result.choice
     if choice is not None:
         wanted = {it.reference_id: it.key for it in choice.references}
@@ -54,10 +54,10 @@ def used_references(query: Query, result: Result) -> UsedReferences:
 
 
 class Collector:
-    """Reads references from the store, except what the folder has already. For one thread."""
+    """Reads references from the store, except what the folder has already; for use by one thread."""
 
     def __init__(self, store: Store, folder: CaptureFolder) -> None:
-        """`store` is `uncached`, since the cache is for the references of queries."""
+        """Uses a store that is `uncached`, since the cache is for the references of queries."""
         self._store = store
         self._folder = folder
         self._records: dict[str, ReferenceRecord] = {}  # by key; references never change
@@ -66,13 +66,13 @@ class Collector:
     def part(
         self, scene: SceneRecord, used: UsedReferences, extractors: Sequence[str], blobs: dict[str, bytes]
     ) -> CapturedPart:
-        """What a photograph was compared with.
+        """Reads what a photograph was compared with.
 
         Args:
-            scene: as it is now.
-            used: the photograph's references.
-            extractors: names of all that the server has, since a replay may try each of them.
-            blobs: receives those that the folder lacks.
+            scene: the scene as it is now.
+            used: the photograph's used references.
+            extractors: names of all the server's extractors, since a replay may use each of them.
+            blobs: receives the blobs that the folder lacks.
 
         Raises:
             ReferencesDeleted: a reference that was used was deleted or replaced meanwhile; or none was used and the
@@ -111,7 +111,7 @@ class Collector:
         return CapturedPart(used.field, used.generation, tuple(references), used.choice)
 
     def _read(self, scene_key: SceneKey, wanted: Mapping[str, str], extractor: str, blobs: dict[str, bytes]) -> None:
-        """Reads the features of an extractor, as far as they exist and their blobs are not there yet."""
+        """Reads an extractor's features that exist and whose blobs are missing."""
         tenant = tenant_of(scene_key)
 
         def has_blob(key: str) -> bool:
@@ -124,7 +124,7 @@ class Collector:
         self._load(scene_key, missing, extractor, blobs)
 
     def _load(self, scene_key: SceneKey, reference_ids: Sequence[str], extractor: str, blobs: dict[str, bytes]) -> None:
-        """Reads all at once; where one is damaged or deleted, one by one."""
+        """Loads all references together; if one is damaged or deleted, one by one."""
         if not reference_ids:
             return
         try:

@@ -1,6 +1,6 @@
-"""Deletes captured calls on time, in two threads of its own, whatever happens to new calls.
+"""Deletes captured calls on time, in two threads of its own, independent of new calls.
 
-- One deletes expired calls. It needs the folder alone, so it works whether the store answers or not.
+- One deletes expired calls. It needs only the folder, so it also works if the store does not answer.
 - One deletes calls whose scene or references were deleted by any server, within `STORE_CHECK_S` or as soon as the store
   can be read, and drops what was deleted from the folder by hand.
 
@@ -34,17 +34,17 @@ _MIN_PAUSE_S = 0.01
 
 
 class StaleCalls:
-    """Finds calls whose scene or references were deleted; asks the store once a scene's generation. For one thread."""
+    """Finds calls whose scene or references were deleted; reads each generation of a scene once. For one thread."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
         self._known: dict[SceneKey, tuple[int, References]] = {}
 
     def delete(self, folder: CaptureFolder) -> int:
-        """Deletes them; a fault of one scene or file does not keep those of the others.
+        """Deletes these calls; a fault of one scene or file does not keep those of the others.
 
         Returns:
-            How many calls were deleted.
+            The number of calls that were deleted.
 
         Raises:
             Unavailable: the store cannot be read; nothing more is found until it can.
@@ -83,7 +83,7 @@ class StaleCalls:
         return [it for it in calls if it.scene_created_us != created_us or not it.references <= existing]
 
     def _existing(self, scene: SceneRecord, wanted: References) -> References:
-        """References that exist, all of the wanted ones that do among them; each is looked up once a generation."""
+        """Returns existing references, among them all of the wanted ones that exist; each generation is read once."""
         generation, existing = self._known.get(scene.scene_key, (scene.generation, References()))
         if generation != scene.generation:
             existing = References()
@@ -95,15 +95,15 @@ class StaleCalls:
 
 
 class Deletion:
-    """Deletes the calls of one folder on time until it is closed."""
+    """Deletes the calls of one folder on time, until it is closed."""
 
     def __init__(self, folder: CaptureFolder, store: Store, report_fault: Callable[[str, Exception], None]) -> None:
         """Starts its threads.
 
         Args:
-            folder: of the calls.
-            store: of the scenes; read in one of the threads alone.
-            report_fault: is called with what failed and the error; from any thread, and again at every attempt.
+            folder: the folder of the calls.
+            store: the store of the scenes; only one of the threads reads it.
+            report_fault: called with what failed and the error, from any thread, and again after every attempt.
         """
         self._folder = folder
         self._stale = StaleCalls(store)
@@ -117,7 +117,7 @@ class Deletion:
             thread.start()
 
     def close(self) -> None:
-        """Ends the threads; returns when a deletion in progress is done."""
+        """Ends the threads; returns when a running deletion is done."""
         self._closing.set()
         for thread in self._threads:
             thread.join()

@@ -1,4 +1,4 @@
-"""The files of a capture folder: their paths, the folder's lock, writing and deleting; readable by their owner alone.
+"""The files of a capture folder, readable by their owner alone: paths, the folder's lock, writing and deleting.
 
     mapless-capture.json            marks the folder as a capture folder, with its format
     lock                            held by the server that writes
@@ -45,7 +45,7 @@ def open_folder(folder: Path) -> int:
     """Creates the folder, or checks that it is a capture folder, and locks it until the descriptor is closed.
 
     Raises:
-        CaptureError: it cannot be written, holds other files, is in use, or has the format of another version.
+        CaptureError: the folder cannot be written, has other files, is in use, or has the format of another version.
     """
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -61,7 +61,7 @@ def open_folder(folder: Path) -> int:
 
 
 def is_locked_by(folder: Path, lock: int) -> bool:
-    """Whether a descriptor is that of the folder's lock, and not of one that was deleted with the folder."""
+    """Whether a descriptor is that of the folder's lock, not of a lock that was deleted with the folder."""
     try:
         return os.path.samestat(os.fstat(lock), os.lstat(folder / LOCK_FILE))
     except FileNotFoundError:
@@ -72,7 +72,7 @@ def check_format(folder: Path) -> None:
     """Checks that a folder is a capture folder that this version can read.
 
     Raises:
-        CaptureError: it does not exist, is no capture folder, or has the format of another version.
+        CaptureError: the folder does not exist, is no capture folder, or has the format of another version.
     """
     try:
         found = json.loads((folder / MARKER_FILE).read_bytes())["format"]
@@ -85,40 +85,40 @@ def check_format(folder: Path) -> None:
 
 
 def calls_of(folder: Path) -> Iterator[Path]:
-    """Files of calls, not yet checked."""
+    """Yields the files of calls, which are not checked."""
     return (it for it in _files(folder) if _is_call(*_parts(folder, it)))
 
 
 def blobs_of(folder: Path) -> Iterator[Path]:
-    """Files of blobs."""
+    """Yields the files of blobs."""
     return (it for it in _files(folder) if _is_blob(*_parts(folder, it)))
 
 
 def unfinished_in(folder: Path) -> Iterator[Path]:
-    """Unfinished files of a server that was killed."""
+    """Yields unfinished files, which a killed server has left."""
     return (it for it in _files(folder) if _is_unfinished(*_parts(folder, it)))
 
 
 def foreign_in(folder: Path) -> Iterator[Path]:
-    """Files that are not part of a capture folder; the server never deletes them."""
+    """Yields files that are not part of a capture folder; the server never deletes them."""
     kinds = (_is_call, _is_blob, _is_unfinished, _is_about_the_folder)
     return (it for it in _all(folder) if not (_is_regular(it) and any(kind(*_parts(folder, it)) for kind in kinds)))
 
 
 def call_path(folder: Path, tenant: str, scene_id: str, name: str) -> Path:
-    """The file of a call; the names must be valid."""
+    """Path of a call's file; the names must be valid."""
     return folder / TENANTS / tenant / CALLS / scene_id / f"{name}{CALL_SUFFIX}"
 
 
 def blob_path(folder: Path, tenant: str, sha256: str) -> Path:
-    """The file of a blob."""
+    """Path of a blob's file."""
     return folder / TENANTS / tenant / BLOBS / sha256
 
 
 def write_whole(path: Path, data: bytes) -> None:
     """Writes a file so that no reader ever sees a part of it.
 
-    It is not forced to the disk: after a power failure a file may be empty or cut, which its checksum reveals.
+    The file is not synchronized to the disk: after a power failure it may be empty or cut, which its checksum reveals.
     """
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     unfinished = path.with_name(path.name + UNFINISHED_SUFFIX)
@@ -133,7 +133,7 @@ def write_whole(path: Path, data: bytes) -> None:
 
 
 def do_each(actions: Iterable[Callable[[], object]]) -> None:
-    """Does all of the actions; then raises the first OSError, if some failed."""
+    """Executes all of the actions, then raises the first OSError, if any failed."""
     faults = [fault for it in actions if (fault := _fault_of(it)) is not None]
     if faults:
         raise faults[0]
@@ -156,7 +156,7 @@ def _is_regular(path: Path) -> bool:
 
 
 def _all(folder: Path) -> Iterator[Path]:
-    """All files in the folder, in order; OSError if a folder in it cannot be read, or is a link to elsewhere."""
+    """Yields all files in the folder, in order; OSError if a folder in it cannot be read, or is a link to elsewhere."""
     for place, folders, files in os.walk(folder, onerror=_raise_unless_missing):
         folders.sort()
         for name in folders:
@@ -194,13 +194,13 @@ def _is_about_the_folder(*parts: str) -> bool:
 
 
 def _is_marked(folder: Path) -> bool:
-    """Whether it has the marker of a capture folder; a power failure may leave the marker empty."""
+    """Whether the folder has the marker of a capture folder, which may be empty after a power failure."""
     marker = folder / MARKER_FILE
     return marker.exists() and marker.stat().st_size > 0
 
 
 def _lock(folder: Path) -> int:
-    """Locks the folder, and then marks it, so that no other server does at the same time."""
+    """Locks the folder and then marks it, so that two servers cannot do so at the same time."""
     lock = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o600)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -217,7 +217,7 @@ def _lock(folder: Path) -> int:
 
 
 class BlobLedger:
-    """The blobs of a folder by path, and how many calls need each; for one thread at a time.
+    """The blobs of a folder by path, with the number of calls that need each; for use by one thread.
 
     Attributes:
         disk_bytes: their size on the disk.
@@ -234,23 +234,23 @@ class BlobLedger:
         return path in self._sizes
 
     def load(self, folder: Path) -> None:
-        """Enters all that are there; the first `sweep` deletes those that no call needs by then."""
+        """Enters all existing blobs; the first `sweep` deletes those that no call needs by then."""
         for path in blobs_of(folder):
             self._enter(path, path.stat().st_size)
         self._unverified.update(self._sizes)
         self._unused.update(self._sizes)
 
     def disk_bytes_of(self, path: Path) -> int:
-        """The size of one on the disk; 0 if it is not there."""
+        """Size of a blob on the disk; 0 if it is missing."""
         return self._sizes.get(path, 0)
 
     def write(self, path: Path, data: bytes) -> None:
-        """Writes one; OSError as `write_whole`."""
+        """Writes a blob; OSError as in `write_whole`."""
         write_whole(path, data)
         self._enter(path, len(data))
 
     def is_intact(self, path: Path) -> bool:
-        """Whether the file has the content of its name; one of an earlier server is read once to find out."""
+        """Whether the file has the content of its name; a file of an earlier server is read once to check it."""
         if path in self._unverified:
             with suppress(OSError):
                 if hashlib.sha256(path.read_bytes()).hexdigest() == path.name:
@@ -258,16 +258,16 @@ class BlobLedger:
         return path not in self._unverified
 
     def missing(self) -> set[Path]:
-        """Those whose files were deleted by hand."""
+        """Returns the blobs whose files were deleted by hand."""
         return {path for path in self._sizes if not os.path.lexists(path)}
 
     def use(self, paths: Collection[Path]) -> None:
-        """Counts one more call that needs them."""
+        """Counts one more call for each of these blobs."""
         self._uses.update(list(paths))
         self._unused.difference_update(paths)
 
     def release(self, paths: Collection[Path]) -> None:
-        """Counts one call less that needs them."""
+        """Counts one call less for each of these blobs."""
         for path in paths:
             self._uses[path] -= 1
             if self._uses[path] <= 0:
@@ -276,7 +276,7 @@ class BlobLedger:
                     self._unused.add(path)
 
     def sweep(self) -> None:
-        """Deletes those that no call needs; OSError after the last if one could not be deleted."""
+        """Deletes blobs that no call needs; finally raises OSError if one could not be deleted."""
         do_each([partial(self._delete, it) for it in self._unused])
 
     def _enter(self, path: Path, size_bytes: int) -> None:

@@ -1,9 +1,9 @@
-"""Captured calls in a folder, with a limit of time and one of size that hold at every moment while the server runs.
+"""Captured calls in a folder, with a limit of age and one of size, which always hold while the server runs.
 
-A call expires when the clock says so, or when its time has passed since it was written or found, whichever is sooner:
-setting the clock cannot prolong it. `expire` deletes expired calls; `_make_room` deletes the oldest before a file is
-written. A file that cannot be deleted stays counted, and is tried again. Opening a folder deletes every call that is
-damaged, incomplete or outside the limits. Methods may be called from any thread.
+A call expires by the clock, or when its time has passed since it was written or found, whichever is earlier: setting
+    the clock cannot prolong it. `expire` deletes expired calls; `_make_room` deletes the oldest before a file is
+    written. A file that cannot be deleted stays counted, and is tried again. Opening a folder deletes every call that
+    is damaged, incomplete or outside the limits. Methods may be called from any thread.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Retention:
 
     Attributes:
         keep_s: age at which a call is deleted, seconds.
-        max_bytes: of all files together, in whole blocks of the disk.
+        max_bytes: largest size of all files together, in whole blocks of the disk.
     """
 
     keep_s: float
@@ -68,11 +68,11 @@ class CapturedEntry:
         path: its file.
         scene_key: its scene.
         scene_created_us: when the scene was created, Unix microseconds; distinguishes scenes of one name.
-        references: id and key of each.
-        blobs: files that it needs.
-        disk_bytes: of its own file.
-        expiry_s: when it is deleted, Unix seconds.
-        expiry_monotonic_s: the same by `time.monotonic`.
+        references: id and key of each reference.
+        blobs: files of the blobs that it needs.
+        disk_bytes: size of its own file.
+        expiry_s: time of its deletion, Unix seconds.
+        expiry_monotonic_s: the same time by `time.monotonic`.
     """
 
     path: Path
@@ -93,14 +93,14 @@ class CaptureFolder:
     """The captured calls of one server.
 
     Attributes:
-        path: of the folder.
+        path: path of the folder.
     """
 
     def __init__(self, path: Path, retention: Retention, clock: Callable[[], float] = time.time) -> None:
         """Opens and locks the folder, creates it if it does not exist, and applies the limits to what is in it.
 
         Raises:
-            CaptureError: see `files.open_folder`; or a file in it cannot be read or deleted.
+            CaptureError: as in `files.open_folder`, or a file in the folder cannot be read or deleted.
         """
         self.path = path
         self._retention = retention
@@ -133,12 +133,12 @@ class CaptureFolder:
             self._lock = -1
 
     def entries(self) -> list[CapturedEntry]:
-        """All calls, the oldest first."""
+        """Returns all calls, the oldest first."""
         with self._guard:
             return list(self._calls.values())
 
     def has_blob(self, tenant: str, sha256: str) -> bool:
-        """Whether an intact blob is there; a damaged one is deleted, with the calls that need it."""
+        """Whether the folder has an intact blob; a damaged one is deleted, with the calls that need it."""
         path = blob_path(self.path, tenant, sha256)
         with self._guard:
             if not self._blobs.is_intact(path):
@@ -147,17 +147,18 @@ class CaptureFolder:
             return path in self._blobs
 
     def add(self, call: CapturedCall, blobs: Mapping[str, bytes]) -> bool:
-        """Writes a call, after deleting the oldest ones as far as it needs their room.
+        """Writes a call, after deleting as many of the oldest ones as it needs room.
 
         Args:
-            call: its tenant and scene must be valid names.
-            blobs: those of its blobs that the folder lacks, by SHA-256.
+            call: the call; its tenant and scene must be valid names.
+            blobs: its blobs that the folder lacks, by SHA-256.
 
         Returns:
-            Whether it was written: a call that exceeds the limit alone is not, and nothing is deleted for it.
+            Whether the call was written. A call that exceeds the limit alone is not, and nothing is deleted for it.
 
         Raises:
-            OSError: the disk is full, or the like; nothing of the call is left in the folder.
+            OSError: the call cannot be written, for example because the disk is full; no part of it is left in the
+                folder.
             BlobDeleted: a blob that the folder had was deleted meanwhile; collect the call's blobs again.
             CaptureError: the folder was deleted by hand, and another server uses it now.
         """
@@ -193,7 +194,7 @@ class CaptureFolder:
             Seconds until the next call expires; the limit of time if there is none.
 
         Raises:
-            OSError: the first file that cannot be deleted; all others are deleted, and it is tried again next time.
+            OSError: a file cannot be deleted; all others are deleted, and it is tried again next time.
         """
         with self._guard:
             now_s, monotonic_s = self._clock(), time.monotonic()
@@ -202,14 +203,14 @@ class CaptureFolder:
             return min(remaining_s, default=self._retention.keep_s)
 
     def forget_deleted(self) -> None:
-        """Drops calls of which a file was deleted by hand, with their other files; OSError as `remove_all`."""
+        """Removes calls of which a file was deleted by hand, with their other files; OSError as in `remove_all`."""
         with self._guard:
             missing = self._blobs.missing()
             entries = self._calls.values()
             self.remove_all([it for it in entries if it.blobs & missing or not os.path.lexists(it.path)])
 
     def remove_all(self, entries: Collection[CapturedEntry]) -> None:
-        """Deletes calls and the blobs that no other call needs; OSError after the last if one could not be deleted."""
+        """Deletes calls and the blobs that no other call needs; finally raises OSError if one could not be deleted."""
         with self._guard:
             do_each([*(partial(self._remove, it) for it in entries), self._blobs.sweep])
 
@@ -229,7 +230,7 @@ class CaptureFolder:
         self._make_room(0)
 
     def _read(self, path: Path) -> CapturedEntry | None:
-        """The call of a file; None if it was damaged, and is deleted."""
+        """Returns the call of a file; a damaged file is deleted, and None is returned."""
         try:
             if path.stat().st_size > self._retention.max_bytes:
                 raise DamagedCapture("it is larger than all calls may be")
@@ -273,7 +274,7 @@ class CaptureFolder:
             self.forget_deleted()
 
     def _new_path(self, call: CapturedCall) -> Path:
-        """A free path for a call; an earlier server may have used the name, if the clock was set back since."""
+        """Path for a new call; an earlier server may have used the name, if the clock was set back since."""
         while True:
             self._number += 1
             name = f"{round(1e3 * call.time_s):014d}-{os.getpid()}-{self._number}"
@@ -286,7 +287,7 @@ class CaptureFolder:
         self._calls_bytes += entry.disk_bytes
 
     def _make_room(self, wanted_bytes: int) -> None:
-        """Deletes the oldest calls until so much more fits; OSError if files that cannot be deleted prevent it."""
+        """Deletes the oldest calls until this many bytes fit; OSError if files that cannot be deleted prevent it."""
         for entry in self.entries():
             if self._fits(wanted_bytes):
                 return

@@ -30,7 +30,7 @@ DECISIVE_SETTINGS = ("device", "coverage", "retrieval", "max_batch", "compiled_v
 
 
 def circumstances_of(settings: Settings, tiers: Sequence[Tier]) -> dict[str, str]:
-    """What decides the answers of a server with these settings and tiers on this machine, by name."""
+    """Collects what decides the answers of a server with these settings and tiers on this machine, by name."""
     found = {
         "mapless": __version__,
         "commit": commit_of(ROOT),
@@ -59,7 +59,7 @@ log = logging.getLogger(__name__)
 
 
 def open_recorder(settings: Settings, store: Store, metrics: Metrics) -> Recorder | None:
-    """The recorder, if the settings ask for one; with a warning in the log, since photographs are stored then.
+    """Opens the recorder if the settings want one; logs a warning, since photographs are then stored.
 
     Raises:
         CaptureError: the folder cannot be used, or capture_tenants has an invalid name.

@@ -46,29 +46,29 @@ class CaptureObserver(Protocol):
     """Counts what is captured; called from any thread, so it must return at once and never raise."""
 
     def captured(self) -> None:
-        """A call is written."""
+        """Counts a call that was written."""
 
     def capture_dropped(self, reason: str) -> None:
-        """A call that was to be captured is not: "queue", "size", "disk", "deleted", "store" or "fault".
+        """Counts a call that was not captured: "queue", "size", "disk", "deleted", "store" or "fault".
 
-        "queue" if too many were queued, or if it still was when the server stopped.
+        The reason is "queue" if too many calls were queued, or if the call was still queued when the server stopped.
         """
 
 
 @dataclass(frozen=True, eq=False)
 class QueuedCall:
-    """A call that waits for the disk.
+    """A call that waits to be written.
 
     Attributes:
         call: the call.
         scene_id: its scene.
         time_s: when it was answered, Unix seconds.
-        request: as it was received.
-        response: as it was sent.
-        size_bytes: of both messages.
+        request: the message as it was received.
+        response: the message as it was sent.
+        size_bytes: size of both messages.
         parts: the references of each photograph.
-        attributes: of the scene.
-        tiers: all that the server has.
+        attributes: attributes of the scene.
+        tiers: all tiers of the server.
     """
 
     call: Call
@@ -83,7 +83,7 @@ class QueuedCall:
 
 
 class RateLimitedLog:
-    """Logs faults, of each kind one line in `LOG_PERIOD_S`; from any thread."""
+    """Logs faults, at most one line of each kind in `LOG_PERIOD_S`; from any thread."""
 
     def __init__(self) -> None:
         self._guard = threading.Lock()
@@ -91,13 +91,13 @@ class RateLimitedLog:
         self._dropped: Counter[str] = Counter()
 
     def fault(self, what: str, error: Exception, request_id: str = "") -> None:
-        """Logs that something failed, for the call of this id if any; an unexpected error with its traceback."""
+        """Logs that something failed, with the call's id, if any; an unexpected error with its traceback."""
         if self._is_due(what):
             origin = None if isinstance(error, OSError) else error
             log.error("%s: %s", what, error, exc_info=origin, extra={"request_id": request_id} if request_id else None)
 
     def dropped(self, reason: str) -> None:
-        """Counts a call that was not captured, for the next line about such calls."""
+        """Counts a call that was not captured, for the next line in the log about such calls."""
         with self._guard:
             self._dropped[reason] += 1
         if self._is_due("dropped"):
@@ -123,7 +123,7 @@ class Recorder:
     """Captures the calls of one server.
 
     Attributes:
-        folder: of the calls.
+        folder: the folder of the calls.
     """
 
     def __init__(
@@ -137,11 +137,11 @@ class Recorder:
         """Starts the threads that write and delete; does not wait for the store.
 
         Args:
-            folder: of the calls; closed with the recorder.
-            store: of the references; to be closed after the recorder.
+            folder: the folder of the calls; closed with the recorder.
+            store: the store of the references; to be closed after the recorder.
             observer: counts calls.
-            circumstances: what else decides the answers of these tiers, see `circumstances_of`.
-            tenants: whose calls are captured; empty for those of all.
+            circumstances: function that returns what else decides the tiers' answers, see `circumstances_of`.
+            tenants: tenants whose calls are captured; empty for all.
         """
         self.folder = folder
         self._observer = observer
@@ -168,14 +168,15 @@ class Recorder:
         parts: Sequence[tuple[Query, Result]],
         tiers: Sequence[Tier],
     ) -> None:
-        """Queues an answered call; to be called on the event loop.
+        """Queues an answered call for writing; to be called on the event loop.
 
         Args:
-            request: as it was received.
-            response: its diagnostics say from now on if it is captured. Neither message may change afterwards.
+            request: the message as it was received.
+            response: the message; its diagnostics are set to say whether the call is captured. Neither message may
+                change later.
             call: the call.
             parts: its photographs, in order, with their results.
-            tiers: all that the server has.
+            tiers: all tiers of the server.
         """
         if self._tenants and call.principal.tenant not in self._tenants:
             return
@@ -195,7 +196,7 @@ class Recorder:
 
     @property
     def is_closing(self) -> bool:
-        """Whether only queued calls are still written."""
+        """Whether the recorder closes, so that only queued calls are still written."""
         return self._closing_s is not None
 
     def close(self) -> None:
@@ -209,7 +210,7 @@ class Recorder:
         self.folder.close()
 
     def _has_room(self, size_bytes: int) -> bool:
-        """Whether another call may be queued; only the event loop adds any."""
+        """Whether another call may be queued; only the event loop adds calls."""
         if self._is_paused():
             self._drop("disk")
             return False

@@ -1,4 +1,4 @@
-"""Messages of an answer: localization or rejection, frames, diagnostics."""
+"""Messages of an answer: localization or rejection, frames, and diagnostics."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from .radii import Conditions, ReportedRadii, reported_radii
 
 @dataclass(frozen=True, eq=False)
 class AnswerFrames:
-    """The frames in which a caller requests its answer, beside OpenCV's.
+    """The frames in which a caller requests its answer, besides OpenCV's.
 
     Attributes:
-        axes: of the caller's camera.
-        session_from_camera: at the time of capture, in these axes; None if the request has none.
+        axes: axes of the caller's camera.
+        session_from_camera: the device's pose at the time of capture, in these axes; None if the request has none.
     """
 
     axes: Axes
@@ -37,12 +37,12 @@ class AnswerFrames:
 
 
 def answer_frames_of(request: pb.LocalizeRequest) -> AnswerFrames:
-    """The frames of a request; FieldError names the field that is wrong."""
+    """Returns the frames of a request; FieldError names the wrong field."""
     return AnswerFrames(axes_from_message(request.options), session_from_message(request))
 
 
 def outcome_to_message(result: Result, options: LocalizeOptions, frames: AnswerFrames) -> pb.LocalizeResponse:
-    """The response with its outcome alone."""
+    """Makes the response, with the outcome only."""
     outcome = result.answer.outcome
     if isinstance(outcome, Rejection):
         return pb.LocalizeResponse(rejection=rejection_to_message(outcome))
@@ -161,7 +161,7 @@ def _hint_to_message(hint: Hint) -> pb.Hint:
 
 
 def diagnostics_to_message(result: Result, options: LocalizeOptions) -> pb.Diagnostics:
-    """Message of what was used and where the time went, except the call's id and durations."""
+    """Message of what was used and of the stages' times, without the call's id and durations."""
     answer, tier = result.answer, result.tier
     message = pb.Diagnostics(
         backend=tier.backend,
@@ -211,12 +211,12 @@ MAX_SESSION_COORDINATE_M = 1e7
 
 
 def axes_from_message(options: pb.LocalizeOptions) -> Axes:
-    """The axes of the caller's camera; FieldError if the number is not one of them."""
+    """Axes of the caller's camera; FieldError if the number is not one of them."""
     return enum_from_message(options.axes, pb.Axes, Axes.OPENCV, "options.axes")
 
 
 def session_from_message(request: pb.LocalizeRequest) -> RigidTransform | None:
-    """The camera's pose as the device tracked it, in the request's axes; FieldError if it is no pose."""
+    """The camera's pose as the device tracked it, in the request's axes; FieldError if it is not a pose."""
     if not request.HasField("session_from_camera"):
         return None
     return wire.transform_from_message(request.session_from_camera, "session_from_camera", MAX_SESSION_COORDINATE_M)
@@ -230,15 +230,15 @@ def set_frames(
     session_from_camera: RigidTransform | None,
     datum: Datum | None,
 ) -> None:
-    """Sets the pose in the caller's frames: `in_axes`, and `geo_pose` where there is a datum.
+    """Sets the pose in the caller's frames: `in_axes`, and `geo_pose` if there is a datum.
 
     Args:
-        message: the answer; it is changed.
-        world_from_camera: of the camera, in OpenCV's axes.
+        message: the answer, which is changed.
+        world_from_camera: pose of the camera in OpenCV's axes.
         covariance: (6, 6) as reported, so calibrated if the answer is; None if there is none.
-        axes: the caller's.
-        session_from_camera: at the time of capture, in these axes; None if the request has none.
-        datum: the scene's.
+        axes: axes of the caller.
+        session_from_camera: the device's pose at the time of capture, in these axes; None if the request has none.
+        datum: datum of the scene.
     """
     framed = message.in_axes
     framed.axes = enum_to_message(axes, pb.Axes)
@@ -253,7 +253,7 @@ def set_frames(
 
 
 def geo_pose_to_message(world_from_camera: RigidTransform, datum: Datum) -> pb.GeoPose:
-    """Message of a pose on the Earth; zeros are present as values."""
+    """Message of a pose on the Earth; zeros are set explicitly as values."""
     found = geopose(world_from_camera, datum)
     q = found.quaternion
     return pb.GeoPose(

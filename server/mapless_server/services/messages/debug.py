@@ -23,7 +23,7 @@ MAX_MATCHES = 2000
 
 
 def debug_to_message(support: Support) -> pb.Debug:
-    """The matches of a support; where there are too many, inliers are preferred, sampled evenly."""
+    """Message of a support's matches; if there are too many, inliers are preferred and sampled evenly."""
     estimate, matches = support.estimate, support.matches
     inlier = np.zeros(len(matches), bool) if estimate is None else estimate.inliers
     error_px = np.full(len(matches), np.nan) if estimate is None else estimate.errors_px
@@ -47,7 +47,7 @@ def debug_to_message(support: Support) -> pb.Debug:
 
 
 def sent_pixels(view: View, pixels: NDArray[np.floating]) -> Array:
-    """Pixels (N, 2) of a view in the photograph as it was sent, (N, 2)."""
+    """Converts pixels (N, 2) of a view to pixels (N, 2) of the photograph as it was sent."""
     if view.photograph is None:
         return np.asarray(pixels, np.float64)
     return view.photograph.camera.project(view.camera.rays(pixels))
@@ -67,7 +67,7 @@ def _thinned(rows: NDArray[np.intp], count: int) -> NDArray[np.intp]:
 
 
 def _best_observations(support: Support, points: NDArray[np.intp]) -> tuple[NDArray[np.intp], Array]:
-    """For each point, the reference whose keypoint is nearest to its projection, and that keypoint as it was sent."""
+    """For each point, the reference whose keypoint is nearest to its projection, and that keypoint as sent."""
     tracks, x_in_world = support.structure.tracks, support.structure.x_in_world
     error_px = np.full(len(tracks.point), np.inf)
     pixels = np.zeros((len(tracks.point), 2))

@@ -59,7 +59,7 @@ def queries_from_message(
     engine: EngineOptions,
     attributes: SceneAttributes,
 ) -> tuple[Query, ...]:
-    """The photographs of a request, each as a query.
+    """Converts the photographs of a request to queries.
 
     Args:
         request: the message.
@@ -67,10 +67,10 @@ def queries_from_message(
         bounds: least and largest number of photographs.
         tenant: the scene's owner.
         engine: limits and defaults.
-        attributes: of the scene; they may be empty unless `needs_attributes` of a photograph.
+        attributes: attributes of the scene; may be empty unless `needs_attributes` is true for a photograph.
 
     Raises:
-        FieldError, InvalidArgument: it names the field that is wrong, "images[2].intrinsics".
+        FieldError, InvalidArgument: names the wrong field, "images[2].intrinsics".
     """
     scene_id = wire.scene_id_from_name(request.scene, "scene")
     messages = getattr(request, list_name)
@@ -112,7 +112,7 @@ def queries_from_message(
 
 @contextmanager
 def _within(path: str) -> Iterator[None]:
-    """Names the field of an error within a message at this path."""
+    """Prepends this path to the field of an error."""
     try:
         yield
     except FieldError as error:
@@ -121,7 +121,7 @@ def _within(path: str) -> Iterator[None]:
 
 
 def poses_from_message(messages: Sequence[Any], list_name: str, pose_name: str) -> tuple[RigidTransform, ...]:
-    """The pose given with each photograph of a list; FieldError names the one that is missing or no pose."""
+    """Reads the pose of each photograph of a list; FieldError names one that is missing or not a pose."""
     poses = []
     for i, message in enumerate(messages):
         path = f"{list_name}[{i}].{pose_name}"
@@ -132,14 +132,14 @@ def poses_from_message(messages: Sequence[Any], list_name: str, pose_name: str) 
 
 
 def session_poses_from_message(request: pb.LocalizeSequenceRequest) -> tuple[Axes, tuple[RigidTransform, ...]]:
-    """The caller's axes, and the poses as its device tracked them, converted to OpenCV's axes."""
+    """Reads the caller's axes, and the poses that its device tracked, converted to OpenCV's axes."""
     axes = axes_from_message(request.options)
     poses = poses_from_message(request.frames, "frames", "session_from_camera")
     return axes, tuple(pose_from(axes, pose) for pose in poses)
 
 
 def session_from_rig_from_message(request: pb.LocalizeRigRequest) -> RigidTransform | None:
-    """The rig's pose as the device tracked it, in OpenCV's axes; FieldError if it is no pose."""
+    """Reads the rig's pose as the device tracked it, in OpenCV's axes; FieldError if it is not a pose."""
     if not request.HasField("session_from_rig"):
         return None
     return wire.transform_from_message(request.session_from_rig, "session_from_rig", MAX_SESSION_COORDINATE_M)
@@ -152,7 +152,7 @@ def rig_to_message(
     request: pb.LocalizeRigRequest,
     session_from_rig: RigidTransform | None,
 ) -> pb.LocalizeRigResponse:
-    """The response, except the call's id."""
+    """Makes the response, without the call's id."""
     if isinstance(outcome, Rejection):
         response = pb.LocalizeRigResponse(rejection=rejection_to_message(outcome))
     else:
@@ -181,7 +181,7 @@ def sequence_to_message(
     request: pb.LocalizeSequenceRequest,
     axes: Axes,
 ) -> pb.LocalizeSequenceResponse:
-    """The response, except the call's id."""
+    """Makes the response, without the call's id."""
     if isinstance(outcome, Rejection):
         response = pb.LocalizeSequenceResponse(rejection=rejection_to_message(outcome))
     else:

@@ -1,4 +1,4 @@
-"""From a LocalizeRequest to a Query; every field is checked that can be checked without the store.
+"""Conversion of a LocalizeRequest to a Query; checks every field that can be checked without the store.
 
 Priors, hard limits and soft ones, are converted to the scene's world. A geographic position becomes a position in the
 world here; no other module handles latitudes.
@@ -46,7 +46,7 @@ def enum_to_message(value: Enum, enum: wire.ProtoEnum) -> Any:
 
 
 def enum_from_message(number: int, enum: wire.ProtoEnum, default: E, field: str) -> E:
-    """The value of a protobuf number, the default for 0; FieldError if the number is unknown."""
+    """The value of a protobuf number, and the default for 0; FieldError if the number is unknown."""
     if number == 0:
         return default
     if number not in enum.values():
@@ -55,12 +55,12 @@ def enum_from_message(number: int, enum: wire.ProtoEnum, default: E, field: str)
 
 
 def scene_key_from_name(name: str, field: str, tenant: str) -> SceneKey:
-    """The key of a tenant's scene; FieldError if the name is not a scene's."""
+    """The key of a tenant's scene; FieldError if the name is not a scene's name."""
     return key_of(tenant, wire.scene_id_from_name(name, field))
 
 
 def reference_key_from_name(name: str, field: str, tenant: str) -> tuple[SceneKey, str]:
-    """The key of a tenant's scene, and the reference's id within it; FieldError if the name is not a reference's."""
+    """The key of a tenant's scene, and a reference's id within it; FieldError if the name is not a reference's."""
     scene_id, reference_id = wire.reference_ids_from_name(name, field)
     return key_of(tenant, scene_id), reference_id
 
@@ -69,7 +69,7 @@ def reference_ids_from_names(names_given: Sequence[str], scene_id: str, most: in
     """Ids of the references in a request's `references`, in order.
 
     Raises:
-        FieldError: there are more than `most`, or one is no reference's name, of another scene, or repeated.
+        FieldError: there are more than `most`, or a name is not a reference's, of another scene, or repeated.
     """
     if len(names_given) > most:
         more = f"; at most {MAX_CANDIDATES} with options.rerank_references (--rerank)" if most == MAX_REFERENCES else ""
@@ -87,7 +87,7 @@ def reference_ids_from_names(names_given: Sequence[str], scene_id: str, most: in
 
 
 def photo_from_message(message: Any, path: str, limits: ImageLimits) -> Photo:
-    """The photograph of a message's `image` and `intrinsics`; reads the image's header alone, so it is fast.
+    """Reads the photograph of a message's `image` and `intrinsics`; reads only the image's header, so it is fast.
 
     Raises:
         FieldError: the intrinsics are missing, out of range, or of another size than the image.
@@ -128,9 +128,9 @@ MAX_CANDIDATES = 1000
 def query_from_message(
     request: pb.LocalizeRequest, tenant: str, engine: EngineOptions, attributes: SceneAttributes
 ) -> Query:
-    """The query of a request; FieldError or InvalidArgument names the field that is wrong.
+    """Converts a request to a query; FieldError or InvalidArgument names the wrong field.
 
-    `attributes` are the scene's; they may be empty unless `needs_attributes`.
+    `attributes` are the scene's; they may be empty unless `needs_attributes` is true.
     """
     scene_id = wire.scene_id_from_name(request.scene, "scene")
     most = MAX_CANDIDATES if request.options.rerank_references else MAX_REFERENCES
@@ -152,7 +152,7 @@ def query_from_message(
 
 
 def _sigma_from(request: pb.LocalizeRequest, photo: Photo) -> IntrinsicsSigma | None:
-    """Standard deviations of the intrinsics; None for the defaults. FieldError names the one that is wrong."""
+    """Reads standard deviations of the intrinsics; None for the defaults. FieldError names a wrong field."""
     if not request.HasField("intrinsics_uncertainty"):
         return None
     message, camera, defaults = request.intrinsics_uncertainty, photo.camera, IntrinsicsSigma()
@@ -172,7 +172,7 @@ def _sigma_from(request: pb.LocalizeRequest, photo: Photo) -> IntrinsicsSigma | 
 
 
 def reference_count_from_message(message: pb.LocalizeOptions) -> int:
-    """How many references are chosen where none is named."""
+    """Number of references to choose if none is named."""
     count = message.reference_count
     if not 0 <= count <= MAX_REFERENCES:
         raise FieldError("options.reference_count", f"must be 0 to {MAX_REFERENCES}, is {count}")
@@ -180,10 +180,10 @@ def reference_count_from_message(message: pb.LocalizeOptions) -> int:
 
 
 def options_from_message(message: pb.LocalizeOptions, coverage: float) -> LocalizeOptions:
-    """Options of the method; FieldError names the one that is wrong.
+    """Reads the options of the method; FieldError names a wrong field.
 
     Args:
-        message: of the request.
+        message: the request's options.
         coverage: the default of the server.
     """
     if not 0 <= message.coverage < 1:
@@ -209,23 +209,23 @@ MIN_SIGMA_DEG, MAX_SIGMA_DEG = 1e-3, 90.0
 
 
 def needs_attributes(request: Any) -> bool:
-    """Whether its priors can be converted only with the scene's datum or down direction."""
+    """Whether the request's priors can be converted only with the scene's datum or down direction."""
     if _has(request, "geo_position_prior"):
         return True
     return _has(request, "gravity_prior") and not request.gravity_prior.HasField("down_in_world")
 
 
 def priors_from_message(request: Any, attributes: SceneAttributes) -> tuple[Narrowing, Priors]:
-    """The priors of a request: limits of the references to choose from, and priors of the pose.
+    """Reads the priors of a request: limits on the references to choose from, and priors on the pose.
 
     Args:
         request: any message with some of the fields position_prior, geo_position_prior, gravity_prior, heading_prior
             and pose_prior.
-        attributes: of its scene.
+        attributes: attributes of its scene.
 
     Raises:
         FieldError: a value is out of range; or a geo position is given together with a position or for a scene without
-            a datum, or gravity where neither the request nor the scene has a down direction in the world.
+            a datum, or gravity although neither the request nor the scene has a down direction in the world.
     """
     limits: dict[str, Any] = {}
     soft: dict[str, Any] = {}
@@ -265,7 +265,7 @@ def _position(message: pb.PositionPrior, field: str) -> tuple[Sphere | None, Pos
 
 
 def _geo_position(message: pb.GeoPositionPrior, attributes: SceneAttributes, field: str) -> PositionPrior:
-    """In the world; the axes of the covariance are east, north and up at the position."""
+    """Converts a geographic position to the world; its covariance is given in east, north and up at the position."""
     datum = attributes.datum
     if datum is None:
         raise FieldError(field, "needs a scene with a datum (UpdateScene sets one)")
@@ -321,7 +321,7 @@ def _pose(message: pb.PosePrior, field: str) -> PosePrior:
 
 
 def _direction(message: Any, name: str, field: str) -> Array:
-    """A vector of the message, (3,), normalized."""
+    """Reads a vector (3,) of the message and normalizes it."""
     if not message.HasField(name):
         raise FieldError(f"{field}.{name}", "is required")
     vector: geometry_pb2.Vector3 = getattr(message, name)

@@ -23,8 +23,8 @@ class Factors:
     """Factors of an answer's radii; 1 leaves them as they are.
 
     Attributes:
-        position_68, position_95: of the position's radii.
-        rotation_68, rotation_95: of the rotation's.
+        position_68, position_95: factors of the position's radii.
+        rotation_68, rotation_95: factors of the rotation's radii.
     """
 
     position_68: float = 1.0
@@ -49,7 +49,7 @@ class Factors:
 
     @classmethod
     def of_references(cls, calibration: SelfCalibration, accuracy: Accuracy, gap: float) -> Factors:
-        """The factors of a self-calibration for an answer with these radii at a gap, see `scenes.calibration.fit`."""
+        """Factors of a self-calibration for an answer with these radii at a gap, see `scenes.calibration.fit`."""
         position, rotation = growth(gap)
         factors = (
             _factor(position * calibration.position_factor, calibration.reference_noise_m, accuracy.position_68_m),
@@ -61,11 +61,11 @@ class Factors:
 
 @dataclass(frozen=True)
 class Conditions:
-    """What computed an answer; factors hold only under the conditions that they were measured under.
+    """What computed an answer; factors hold only for answers of the same conditions.
 
     Attributes:
         features: name of the local features, with their options: "sift-2048-1024px-0.02".
-        backend: of the coarse stage.
+        backend: backend of the coarse stage.
         variant: form of the method, as `Diagnostics` names it: "BEST".
         server_version: another version may report other radii.
     """
@@ -78,13 +78,13 @@ class Conditions:
 
 @dataclass(frozen=True, eq=False)
 class ReportedRadii:
-    """How uncertain an answer is, as reported.
+    """The reported uncertainty of an answer.
 
     Attributes:
-        accuracy: radii.
+        accuracy: the radii.
         covariance: (6, 6), order x y z rx ry rz, metres and radians.
-        calibration: what the factors come from: "GENERIC" for none, "SELF", "MEASURED".
-        count: of references that were localized against the others, or of photographs that were measured.
+        calibration: origin of the factors: "GENERIC" (no factors), "SELF" or "MEASURED".
+        count: number of references that were localized against the others, or of photographs that were measured.
     """
 
     accuracy: Accuracy
@@ -96,14 +96,14 @@ class ReportedRadii:
 def reported_radii(
     accuracy: Accuracy, covariance: Array, conditions: Conditions, attributes: SceneAttributes, gap: float | None
 ) -> ReportedRadii:
-    """Radii by the scene's measured calibration, else by its references, if made under the same conditions.
+    """Radii by the scene's measured calibration, else by its self-calibration, if made under the same conditions.
 
     Args:
-        accuracy: of the method.
+        accuracy: radii of the method.
         covariance: (6, 6) of the method.
         conditions: what computed the answer.
-        attributes: of the scene.
-        gap: of the answer, see `method.uncertainty.radii.viewpoint_gap`; None if unknown.
+        attributes: attributes of the scene.
+        gap: gap of the answer, see `method.uncertainty.radii.viewpoint_gap`; None if unknown.
     """
     measured = attributes.calibration
     if measured is not None and measured.is_of(*astuple(conditions)):
@@ -118,12 +118,12 @@ def reported_radii(
 
 
 def _factor(factor: float, noise: float, radius: float) -> float:
-    """By which a radius grows that gets a factor, and noise that does not depend on it."""
+    """Ratio by which a radius grows if a factor multiplies it and a constant noise is added."""
     return min(max(math.hypot(factor, noise / max(radius, sys.float_info.min)), MIN_FACTOR), MAX_FACTOR)
 
 
 def scaled_accuracy(accuracy: Accuracy, factors: Factors) -> Accuracy:
-    """Radii times factors; the 95 % radius is never smaller than the 68 % radius."""
+    """Multiplies radii by factors; the 95 % radius is never smaller than the 68 % radius."""
     position_68_m = factors.position_68 * accuracy.position_68_m
     rotation_68_deg = factors.rotation_68 * accuracy.rotation_68_deg
     return replace(

@@ -40,14 +40,14 @@ class PageRequest(Protocol):
 
     @property
     def page_token(self) -> str:
-        """The token that the page before returned; empty for the first page."""
+        """The token that the previous page returned; empty for the first page."""
 
 
 class Page:
-    """One page of a list: how many items to read, where to begin, and the token of the next page.
+    """One page of a list: number of items to read, where to begin, and the token of the next page.
 
-    A token is the tenant, the collection and the last id of the page before: opaque to callers, and valid for its own
-    list only.
+    A token contains the tenant, the collection and the last id of the previous page. It is opaque to callers, and valid
+    only for its own list.
 
     Raises:
         FieldError: a negative page size, or a token of another list.
@@ -69,7 +69,7 @@ class Page:
         self.after = self._read_token(request.page_token) if request.page_token else ""
 
     def cut(self, records: Sequence[Record], id_of: Callable[[Record], str]) -> tuple[Sequence[Record], str]:
-        """The records of this page, and the token of the next one."""
+        """Returns the records of this page, and the token of the next one."""
         if len(records) <= self._size:
             return records, ""
         token = f"{self._list}\n{id_of(records[self._size - 1])}"
@@ -111,7 +111,7 @@ def choice_to_message(choice: Choice, scene_id: str) -> pb.RetrieveReferencesRes
 
 
 def audit_to_message(audit: ReferenceAudit) -> pb.ReferenceAudit:
-    """Message of an audit; unknown values are 0."""
+    """Message of an audit; unknown values become 0."""
     return pb.ReferenceAudit(
         name=audit.reference,
         verdict=enum_to_message(audit.verdict, pb.AuditVerdict),
@@ -156,7 +156,7 @@ def scene_to_message(scene: SceneRecord) -> pb.Scene:
 
 
 def attributes_from_message(request: pb.CreateSceneRequest) -> SceneAttributes:
-    """Attributes of a scene to be created; FieldError names the one that is wrong."""
+    """Reads the attributes of a scene to be created; FieldError names a wrong field."""
     try:
         return SceneAttributes(
             datum_from_message(request.datum, "datum") if request.HasField("datum") else None,
@@ -172,7 +172,7 @@ def attributes_from_message(request: pb.CreateSceneRequest) -> SceneAttributes:
 
 
 def changes_from_message(request: pb.UpdateSceneRequest) -> dict[str, Any]:
-    """Arguments of ``Store.update_scene``: the fields in a request's mask, None for those that its scene lacks.
+    """Reads the arguments of `Store.update_scene`: the fields in a request's mask, None for those that its scene lacks.
 
     Raises:
         FieldError: the mask is empty or names a field that cannot be changed, or a value is wrong.
@@ -188,12 +188,12 @@ def changes_from_message(request: pb.UpdateSceneRequest) -> dict[str, Any]:
 
 
 def _optional(read: Callable[[Any, str], object]) -> Callable[[pb.Scene, str], object]:
-    """Reads a field of a scene that may be absent."""
+    """Makes a reader of a scene's field that may be absent."""
     return lambda scene, path: read(getattr(scene, path), joined("scene", path)) if scene.HasField(path) else None
 
 
 def _measured(message: pb.SceneCalibration, field: str) -> Calibration:
-    """A calibration with its conditions; the server sets its time itself."""
+    """Reads a calibration with its conditions; the server sets its time itself."""
     variants: wire.ProtoEnum = localization_pb.Variant
     if message.variant not in variants.values()[1:]:
         raise FieldError(joined(field, "variant"), f"must be one of Variant's values, is {message.variant}")

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 
 def read_version(connection: Connection) -> int | None:
-    """Version of the schema, or None in an empty database.
+    """Version of the schema; None for an empty database.
 
     Raises:
         ValueError: the database holds something else, or a store of a newer program.
@@ -47,14 +47,14 @@ def read_version(connection: Connection) -> int | None:
 def migrate(connection: Connection, to_version: int = SCHEMA_VERSION) -> int | None:
     """Migrates a database in the connection's transaction, which must be the only one.
 
-    An empty one gets the current schema at once, which is quicker; a test checks that the steps lead to the same. Only
-    copies of older databases need another version.
+    An empty database gets the current schema at once, which is quicker; a test checks that the steps lead to the same
+    schema. Only copies of older databases need another version.
 
     Returns:
-        The version found, None in an empty database.
+        The version before the migration; None for an empty database.
 
     Raises:
-        ValueError: as `read_version`.
+        ValueError: as in `read_version`.
     """
     found = read_version(connection)
     if found is None and to_version == SCHEMA_VERSION:

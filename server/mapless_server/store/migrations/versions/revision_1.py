@@ -1,4 +1,4 @@
-"""Scenes, references, their images and features."""
+"""Revision 1: scenes, references, their images and features."""
 
 from __future__ import annotations
 

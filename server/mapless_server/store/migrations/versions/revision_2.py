@@ -1,4 +1,4 @@
-"""Expand: global descriptors, changes since a generation, and the number of references."""
+"""Revision 2 (expand): global descriptors, changes since a generation, and the number of references."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Expand: attributes of a scene as a whole."""
+"""Revision 3 (expand): attributes of a scene."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ down_revision = "2"
 
 
 def upgrade() -> None:
-    """Adds columns that are null without attributes, as servers of revision 2 leave them."""
+    """Adds columns that are null without attributes; servers of revision 2 leave them so."""
     op.add_column("scene", sa.Column("attributes", sa.LargeBinary(), nullable=True))
     op.add_column("scene", sa.Column("attributes_sha256", sa.String(64), nullable=True))
     write_version(op.get_bind(), 3)

@@ -1,4 +1,4 @@
-"""Expand: matches of pairs of references, and which references are matched."""
+"""Revision 4 (expand): matches of pairs of references, and which references are matched."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _MATCHING = sa.String(255)
 
 
 def upgrade() -> None:
-    """Adds tables that servers of revision 3 ignore; their rows go with the references that those delete."""
+    """Adds tables that servers of revision 3 ignore; their rows are deleted with the references."""
     op.create_table(
         "reference_pair",
         sa.Column("first_key", _KEY, sa.ForeignKey("reference.key", ondelete="CASCADE"), primary_key=True),

@@ -1,4 +1,4 @@
-"""Expand: when each matching was last used."""
+"""Revision 5 (expand): when each matching was last used."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _MATCHING = sa.String(255)
 
 
 def upgrade() -> None:
-    """Adds a table that servers of revision 4 ignore; what is stored counts as used now."""
+    """Adds a table that servers of revision 4 ignore; existing matchings count as used now."""
     use = op.create_table(
         "matching_use",
         sa.Column("matching", _MATCHING, primary_key=True),

@@ -1,4 +1,4 @@
-"""Expand: what the references of a scene say of its answers."""
+"""Revision 6 (expand): self-calibrations of scenes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _SCENE_KEY = sa.String(257).with_variant(sa.String(257, collation="C"), "postgre
 
 
 def upgrade() -> None:
-    """Adds a table that servers of revision 5 ignore; its rows go with the scenes that those delete."""
+    """Adds a table that servers of revision 5 ignore; its rows are deleted with the scenes."""
     op.create_table(
         "scene_calibration",
         sa.Column("scene_id", _SCENE_KEY, sa.ForeignKey("scene.scene_id", ondelete="CASCADE"), primary_key=True),
