@@ -82,7 +82,7 @@ def test_products_of_whole_numbers_are_those_of_floats(n: int, m: int) -> None:
         pytest.skip("the processor has no products of int8 that do not saturate")
     random = random_for("whole", n, m)
     first, second = (
-        replace(features(np.empty((k, 64))), descriptors=random.integers(-127, 128, (k, 64)).astype(np.int8))
+        replace(features(np.zeros((k, 64))), descriptors=random.integers(-127, 128, (k, 64)).astype(np.int8))
         for k in (n, m)
     )
     first.descriptors[0] = second.descriptors[-1] = 127

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
@@ -322,7 +321,7 @@ class ViewColumns:
             point_gradient += weighted * self.planes.distance(bundle.points)
         return NormalEquations(
             self,
-            block_diag(*blocks),
+            _block_diagonal(blocks),
             np.concatenate(gradients),
             point_block,
             point_gradient,
@@ -406,6 +405,15 @@ class EliminatedPoints:
         z = z / zz
         y = (y - yz * z) / yy
         return np.stack([(x - xy * y - xz * z) / xx, y, z], axis=1)
+
+
+def _block_diagonal(blocks: Sequence[Array]) -> Array:
+    """SciPy's takes six times as long for a dozen of small blocks."""
+    ends = list(itertools.accumulate(map(len, blocks), initial=0))
+    matrix = np.zeros((ends[-1], ends[-1]))
+    for block, begin, end in zip(blocks, ends[:-1], ends[1:], strict=True):
+        matrix[begin:end, begin:end] = block
+    return matrix
 
 
 def _cholesky(matrices: Array) -> Array:
