@@ -453,8 +453,11 @@ async def test_bad_forms_are_told_what_and_where(server: RunningServer) -> None:
             answer = await requested(app, "POST", "/v1/localize", body, headers)
             assert answer.status in (400, 415)
             assert answer.json["error"]["field"] == field
+        large = form(image=PHOTO, intrinsics='{"a": [%s0]}' % ("0," * 100_000), scene="hall")
+        refused = await requested(app, "POST", "/v1/localize", *large)
         broken = await requested(app, "POST", "/v1/localize", b"--b0\r\nx", {"content-type": "multipart/form-data"})
         absent = await requested(app, "POST", "/v1/localize", *form(image=PHOTO, intrinsics=INTRINSICS, scene="../x"))
+    assert "intrinsics: the JSON has more than 100000 values" in refused.json["error"]["message"]
     assert broken.status == 400
     assert absent.status == 400
 
@@ -532,8 +535,14 @@ async def test_connect_calls_are_answered_in_json(server: RunningServer) -> None
     body = json.dumps({"pageSize": 1}).encode()
     async with gateway_of(server.address) as app:
         answer = await requested(app, "POST", "/mapless.v1.ReferenceService/ListScenes", body, JSON)
-    assert answer.status == 200
+        large = b'{"references": [%s""]}' % (b'"",' * 100_000)
+        refused = await requested(app, "POST", LOCALIZE, large, JSON)
+        unprintable = JSON | {"authorization": "Bearer a\tb", "x-request-id": "a\tb"}
+        unread = await requested(app, "POST", "/mapless.v1.ReferenceService/ListScenes", body, unprintable)
+    assert answer.status == unread.status == 200
     assert answer.json["scenes"][0]["name"] == "scenes/empty"
+    assert refused.status == 400
+    assert "more than 100000 values" in refused.json["message"]
 
 
 async def test_errors_of_calls_keep_their_details(server: RunningServer) -> None:

@@ -13,6 +13,7 @@ from mapless.names import scene_name
 from mapless.v1 import localization_service_pb2 as pb
 
 from .failures import Failure
+from .guard import check_json
 
 FIELDS = ("image", "intrinsics", "scene", "request")
 _MAX_PART_BYTES = 2**20
@@ -66,6 +67,7 @@ async def _parts(headers: Headers, body: AsyncGenerator[bytes, None]) -> dict[st
 
 
 def _parse(text: bytes, message: Any, field: str) -> None:
+    check_json(text, field)
     try:
         Parse(text, message)
     except (ParseError, UnicodeDecodeError, RecursionError) as error:

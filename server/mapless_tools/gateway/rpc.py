@@ -13,7 +13,7 @@ from typing import Any
 import grpc
 import grpc.aio
 from connectrpc.code import Code
-from connectrpc.compat import google_protobuf_codecs
+from connectrpc.compat import google_protobuf_binary_codec, google_protobuf_json_codec
 from connectrpc.errors import ConnectError, ErrorDetail
 from connectrpc.method import IdempotencyLevel, MethodInfo, StreamType
 from connectrpc.request import RequestContext
@@ -29,6 +29,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from mapless.v1 import localization_service_pb2, reference_service_pb2
 
 from .failures import Failure
+from .guard import check_json
 
 _PASSED_METADATA = ("authorization", "x-client-id", "x-mapless-scene", "x-request-id")
 _CONTENT_TYPES = ("application/grpc-web", "application/connect+", "application/proto", "application/json")
@@ -45,6 +46,19 @@ class _Application(ConnectASGIApplication[None]):
     """All methods of a server's interface."""
 
     path = "/"
+
+
+class _JsonCodec:
+    """The library's, for texts that are parsed in a moment: the gateway answers nobody else meanwhile."""
+
+    def __init__(self) -> None:
+        codec = google_protobuf_json_codec()
+        self.name, self.encode, self._decode = codec.name, codec.encode, codec.decode
+
+    def decode(self, data: bytes | bytearray, message_class: type[Any]) -> Any:
+        """Implements Codec."""
+        check_json(data)
+        return self._decode(data, message_class)
 
 
 def rpc_application(connect: Connect, max_message_bytes: int) -> ASGIApp:
@@ -73,7 +87,7 @@ def rpc_application(connect: Connect, max_message_bytes: int) -> ASGIApp:
         endpoints=endpoints,
         read_max_bytes=max_message_bytes,
         compressions=(),  # photographs are compressed, and all else is small
-        codecs=google_protobuf_codecs(),
+        codecs=(google_protobuf_binary_codec(), _JsonCodec()),
     )
 
     async def serve(scope: Scope, receive: Receive, send: Send) -> None:
@@ -86,12 +100,17 @@ def rpc_application(connect: Connect, max_message_bytes: int) -> ASGIApp:
         if wrong is not None:
             await wrong.response()(scope, receive, send)
             return
-        readable = [pair for pair in scope["headers"] if all(part.isascii() for part in pair)]
+        readable = [pair for pair in scope["headers"] if all(map(_is_printable, pair))]
         passed: Any = {**scope, "headers": readable}
         with suppress(Failure):  # of what is received: has been answered
             await application(passed, receive, send)
 
     return serve
+
+
+def _is_printable(text: bytes) -> bool:
+    """Whether it can be metadata of gRPC."""
+    return text.isascii() and text.decode("ascii").isprintable()
 
 
 def _endpoint(connected: Connect, service: ServiceDescriptor, method: MethodDescriptor) -> Any:
