@@ -10,7 +10,6 @@ import pytest
 import torch
 from support.parity_rule import images, mapanything_weights, ruled_network, weights
 from torch import Tensor
-from torch._dynamo.utils import counters
 
 from mapless_server.networks.blocks import Attention, flash_attention
 from mapless_server.networks.mapanything import MapAnything, MapAnythingSizes
@@ -87,6 +86,8 @@ def test_a_compiled_runner_does_not_compile_again(name: str) -> None:
     plain = NetworkRunner(shallow_network(name), name, "sha")
     compiled = NetworkRunner(shallow_network(name), name, "sha", options=RunnerOptions(compile_backend="eager"))
     compiled.warm_up([CompiledShape(GRID, 3), CompiledShape((3, 2), 3)])
+    from torch._dynamo.utils import counters  # takes a second to import
+
     counters.clear()
     # The last one was not warmed up, and is run as it is.
     for views, grid in ((3, GRID), (3, (3, 2)), (3, GRID), (4, (3, 3))):

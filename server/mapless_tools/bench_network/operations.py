@@ -10,7 +10,6 @@ from typing import Any
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
-from torch._dynamo.utils import counters
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.overrides import TorchFunctionMode
 from torch.utils._pytree import tree_leaves
@@ -153,4 +152,6 @@ def _is_new(tensor: Tensor, inputs: Sequence[Tensor]) -> bool:
 
 def compiled_graphs() -> int:
     """How many graphs torch has compiled in this process."""
+    from torch._dynamo.utils import counters  # takes a second to import
+
     return int(counters["stats"]["unique_graphs"])

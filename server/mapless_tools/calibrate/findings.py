@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import betaincinv
-from scipy.stats import rankdata
 
 from mapless_server.services.messages.radii import Conditions, Factors
 
@@ -179,6 +178,8 @@ def auroc(scores: Sequence[float], right: Sequence[bool]) -> float:
     rights, wrongs = int(is_right.sum()), int((~is_right).sum())
     if not rights or not wrongs:
         return math.nan
+    from scipy.stats import rankdata  # takes half a second to import
+
     ranks = rankdata(np.asarray(scores, float))
     return float((ranks[is_right].sum() - rights * (rights + 1) / 2) / (rights * wrongs))
 

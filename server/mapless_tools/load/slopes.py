@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import theilslopes
 
 from mapless.geometry import Array
 
@@ -75,6 +74,8 @@ def slope(times_s: Sequence[float], values: Sequence[float], confidence: float =
     count = len(y) // block
     medians = [np.median(part) for part in np.array_split(y, count)]
     middles = [part.mean() for part in np.array_split(hours, count)]
+    from scipy.stats import theilslopes  # takes half a second to import
+
     per_hour, _, low, high = theilslopes(medians, middles, confidence)
     span = float(hours[-1] - hours[0])
     return Slope(float(np.median(y)), float(per_hour), float(low), float(high), span, block)
