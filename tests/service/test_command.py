@@ -152,11 +152,12 @@ def test_a_wrong_name_gets_a_suggestion(run: Run, client: Client, arguments: tup
     assert "did you mean" not in run("scene", "get", "something-else")[2]
 
 
-def test_the_shell_completes_commands() -> None:
+@pytest.mark.parametrize(("typed", "meant"), [("reference sh", "show"), ("scene g", "get"), ("scene de", "delete")])
+def test_the_shell_completes_commands(typed: str, meant: str) -> None:
     script = subprocess.run([sys.executable, "-m", "mapless", "completion", "bash"], capture_output=True, text=True)
-    typed = 'COMP_WORDS=(mapless reference sh); COMP_CWORD=2; _shtab_mapless; echo "${COMPREPLY[@]}"'
-    done = subprocess.run(["bash", "-c", f"{script.stdout}\n{typed}"], capture_output=True, text=True)
-    assert (done.stdout, script.stderr + done.stderr) == ("show\n", "")
+    asked = f'COMP_WORDS=(mapless {typed}); COMP_CWORD=2; _shtab_mapless; echo "${{COMPREPLY[@]}}"'
+    done = subprocess.run(["bash", "-c", f"{script.stdout}\n{asked}"], capture_output=True, text=True)
+    assert (done.stdout, script.stderr + done.stderr) == (f"{meant}\n", "")
 
 
 @pytest.mark.parametrize(

@@ -210,8 +210,11 @@ def _add_scene(scene: argparse.ArgumentParser) -> None:
         help="property to delete; may be repeated",
     )
     update.set_defaults(run=commands.update_scene)
-    for action, run in (("get", commands.get_scene), ("delete", commands.delete_scene)):
-        one = actions.add_parser(action)
+    for action, run, text in (
+        ("get", commands.get_scene, "its number of references, datum, unit and calibration"),
+        ("delete", commands.delete_scene, "delete it with all of its references"),
+    ):
+        one = actions.add_parser(action, help=text)  # completion knows only those with a text
         one.add_argument("scene")
         one.set_defaults(run=run)
     listing = actions.add_parser("list", help="all scenes")
