@@ -1,4 +1,4 @@
-"""What is run beside the server, each a command of `mapless-server`; the server imports none of it.
+"""Tools beside the server, each a command of `mapless-server`; the server imports none of them.
 
 cli/            the command line
 evaluate/       accuracy on benchmarks, as in the paper

@@ -134,7 +134,7 @@ class Engine(Protocol):
     def contradictions(
         self, poses: Sequence[RigidTransform], attributes: SceneAttributes, added: Sequence[RigidTransform] = ()
     ) -> list[str]:
-        """What a scene's attributes contradict in the poses of its references and of added ones, one sentence each."""
+        """Contradictions of a scene's attributes and the poses of its and of added references, one sentence each."""
         ...
 
     def forget_references(self, keys: Collection[str]) -> None:

@@ -292,7 +292,7 @@ class QueueEngine:
     def contradictions(
         self, poses: Sequence[RigidTransform], attributes: SceneAttributes, added: Sequence[RigidTransform] = ()
     ) -> list[str]:
-        """What a scene's attributes contradict in the poses of its references and of added ones, one sentence each."""
+        """Contradictions of a scene's attributes and the poses of its and of added references, one sentence each."""
         return contradictions(poses, attributes, added)
 
     def forget_references(self, keys: Collection[str]) -> None:

@@ -1,4 +1,4 @@
-"""Encoded photographs of untrusted callers to pixels; rejected by their headers, before memory is allocated for them.
+"""Decodes photographs of untrusted callers; rejects them by their headers, before memory is allocated for them.
 
 Imports only `mapless_server.errors`. Begin with `decode`.
 """

@@ -1,10 +1,10 @@
-"""Bytes of an image file to pixels, and whatever is wrong with them.
+"""Decodes the bytes of an image file to pixels, and names what is wrong with a file.
 
 The header is read first, by the parsers below: decoders allocate for whatever size a header claims, and a file of 1 MB
 can claim 900 megapixels. Only JPEG, PNG and WebP are accepted, by their first bytes: a decoder library reads many
 more formats than have been hardened.
 
-The raster is the one stored in the file. EXIF orientation is a note to viewers; intrinsics and poses belong to the
+Pixels are returned as the file stores them. EXIF orientation is meant for viewers; intrinsics and poses refer to the
 sensor.
 """
 
@@ -46,11 +46,11 @@ _JPEG_WITHOUT_LENGTH = frozenset(range(0xD0, 0xD8)) | {0x01}
 
 @dataclass(frozen=True)
 class ImageLimits:
-    """What is accepted.
+    """Limits of the images that are accepted.
 
     Attributes:
-        max_bytes: of the encoded file.
-        max_pixels: width times height.
+        max_bytes: largest size of the encoded file.
+        max_pixels: largest product of width and height.
         min_side_px, max_side_px: bounds of width and height, inclusive.
     """
 
@@ -61,11 +61,11 @@ class ImageLimits:
 
 
 def image_size(data: bytes, limits: ImageLimits, field: str = "image") -> tuple[int, int]:
-    """Width and height of an image in pixels, from the header alone.
+    """Width and height of an image, pixels, from its header alone.
 
     Raises:
-        InvalidArgument: empty, too many bytes, not a JPEG, PNG or WebP, cut within its header, or of a size that is not
-            accepted; names `field`.
+        InvalidArgument: the file is empty, has too many bytes, is not a JPEG, PNG or WebP, is cut within its header, or
+            has a size that is not accepted; names `field`.
     """
     if not data:
         raise InvalidArgument("the image is empty", reason="IMAGE_EMPTY", field=field)
@@ -101,7 +101,7 @@ def decode_image(data: bytes, limits: ImageLimits, field: str = "image") -> NDAr
     """Pixels of an image, (H, W, 3) RGB, as the file stores them: EXIF orientation is not applied.
 
     Raises:
-        InvalidArgument: what `image_size` refuses, or the decoder cannot read the file to its end; names `field`.
+        InvalidArgument: as in `image_size`, or the decoder cannot read the file to its end; names `field`.
     """
     width, height = image_size(data, limits, field)
     if data.startswith(b"\xff\xd8") and _has_many_scans(data):
@@ -140,10 +140,9 @@ def _decoded(data: bytes) -> NDArray[Any] | None:
 
 
 def _decoded_without_end(file: bytes) -> NDArray[Any] | None:
-    """Pixels of a JPEG that lacks nothing but its end marker; None for any other file.
+    """Decodes a JPEG that lacks only its end marker; None for any other file.
 
-    Some cameras with MJPEG write such files. Whether anything else is missing shows in the pixels, which then depend on
-    what follows the data.
+    Some cameras with MJPEG write such files. If anything else is missing, the pixels depend on what follows the data.
     """
     scan_start = _unended_scan(file)
     kept = file.rstrip(b"\xff")
@@ -158,7 +157,7 @@ def _decoded_without_end(file: bytes) -> NDArray[Any] | None:
 
 
 def _unended_scan(data: bytes) -> int:
-    """Where the one sequential scan of a JPEG without an end marker begins; 0 for any other file."""
+    """Position at which the only, sequential scan of a JPEG without an end marker begins; 0 for any other file."""
     if not data.startswith(b"\xff\xd8"):
         return 0
     position, components, scan_start = 2, 0, 0
@@ -179,7 +178,7 @@ def _unended_scan(data: bytes) -> int:
 
 
 def _has_many_scans(data: bytes) -> bool:
-    """Whether a JPEG has more than _MAX_JPEG_SCANS, read from marker to marker up to the end of its image."""
+    """Whether a JPEG has more than _MAX_JPEG_SCANS scans, counted by its markers up to the end of its image."""
     position, scans = 2, 0
     while scans <= _MAX_JPEG_SCANS:
         # Within a scan's data FF is always followed by 00 or a restart marker.
@@ -198,7 +197,7 @@ class _Malformed(Exception):
 
 
 def _read_header(data: bytes) -> tuple[int, int]:
-    """Width and height; IndexError where the bytes end too early."""
+    """Width and height; raises IndexError if the bytes end too early."""
     if data.startswith(b"\xff\xd8\xff"):
         return _read_jpeg_header(data)
     if data.startswith(_PNG):
@@ -209,7 +208,7 @@ def _read_header(data: bytes) -> tuple[int, int]:
 
 
 def _read_jpeg_header(data: bytes) -> tuple[int, int]:
-    """Walks the segments to the frame header, which stands before the first scan."""
+    """Reads the segments up to the frame header, which precedes the first scan."""
     position = 2
     for _ in range(_MAX_JPEG_SEGMENTS):
         marker = _big_endian(data, position, 2)
@@ -230,7 +229,7 @@ def _read_jpeg_header(data: bytes) -> tuple[int, int]:
 
 
 def _read_png_header(data: bytes) -> tuple[int, int]:
-    """IHDR is the first chunk, always."""
+    """Reads the chunk IHDR, which is always the first."""
     width, height = _big_endian(data, 16, 4), _big_endian(data, 20, 4)
     if data[12:16] != b"IHDR":
         raise _Malformed("the PNG does not begin with its header", "IMAGE_UNDECODABLE")
@@ -238,7 +237,7 @@ def _read_png_header(data: bytes) -> tuple[int, int]:
 
 
 def _read_webp_header(data: bytes) -> tuple[int, int]:
-    """The first chunk is the frame itself (lossy or lossless) or the extended header."""
+    """Reads the first chunk: the frame itself (lossy or lossless) or the extended header."""
     kind = data[12:16]
     if kind == b"VP8 ":
         width, height = _little_endian(data, 26, 2) & 0x3FFF, _little_endian(data, 28, 2) & 0x3FFF

@@ -1,4 +1,4 @@
-"""The part of a PNG that the decoder gets: the chunks of its pixels, and nothing else.
+"""The chunks of a PNG's pixels, which alone are passed to the decoder.
 
 The decoder allocates for whatever length a chunk of text claims, gigabytes for a file of a kilobyte, and inflates every
 compressed text and profile, megabytes for kilobytes each; so it does not get them. Colour profiles, gamma and
@@ -24,10 +24,10 @@ _PIECE_BYTES = 2**20
 
 
 class BadChunks(Exception):
-    """A PNG is cut off, or has more in it than its pixels need; the message is for the caller.
+    """A PNG is cut off, or has more data than its pixels need; the message is for the caller.
 
     Attributes:
-        is_too_much: which of the two.
+        is_too_much: whether it has too much data.
     """
 
     def __init__(self, message: str, is_too_much: bool) -> None:
@@ -36,11 +36,11 @@ class BadChunks(Exception):
 
 
 def essential_png(data: bytes) -> bytes:
-    """The PNG with nothing but header, palette and pixels; its checksums are the decoder's to check.
+    """The PNG with only header, palette and pixels; the decoder checks their checksums.
 
     Raises:
-        BadChunks: a chunk reaches beyond the file's end, the file has no end, too many chunks, or more data than
-            pixels, which would be inflated all the same.
+        BadChunks: a chunk exceeds the file's end, the end is missing, there are too many chunks, or there are more data
+            than pixels, which would be inflated all the same.
     """
     view = memoryview(data)
     kept: list[memoryview | bytes] = [_SIGNATURE]
@@ -69,9 +69,9 @@ def essential_png(data: bytes) -> bytes:
 
 
 def _inflates_beyond(most_bytes: int, compressed: Iterable[memoryview]) -> bool:
-    """Whether there is more in a stream; no more than that is inflated, and nothing is held.
+    """Whether a stream inflates to more than this many bytes; it is inflated only so far, and nothing is kept.
 
-    The decoder inflates the stream to its end, wherever the pixels end: a megabyte of zeros a thousandfold.
+    The decoder inflates the stream to its end, even beyond the pixels: a megabyte of zeros becomes a gigabyte.
     """
     inflater, inflated_bytes = zlib.decompressobj(), 0
     try:
@@ -85,7 +85,7 @@ def _inflates_beyond(most_bytes: int, compressed: Iterable[memoryview]) -> bool:
 
 
 def _most_data_bytes(data: bytes) -> int:
-    """What the pixels of a valid file take at most, however badly they are compressed."""
+    """Largest size of the data of a valid file's pixels, however badly they are compressed."""
     width, height, depth, colour = struct.unpack_from(">IIBB", data, 16)
     row_bytes = (width * depth * _CHANNELS.get(colour, 4) + 7) // 8
     # Interlaced rows come in seven parts, each with its own filter byte and padding, and stored blocks have headers.

@@ -1,4 +1,4 @@
-"""The lag of the event loop: how late a periodic timer runs."""
+"""Measures the lag of the event loop: how late a periodic timer runs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class LoopObserver(Protocol):
 
 
 async def watch_event_loop(observer: LoopObserver, is_alive: Callable[[], bool] = lambda: True) -> None:
-    """Measures until it is cancelled, and beats as long as the scheduler is alive."""
+    """Measures until it is cancelled, and calls `beat` as long as the scheduler is alive."""
     while True:
         due_s = time.monotonic() + TICK_S
         await asyncio.sleep(TICK_S)

@@ -1,11 +1,11 @@
-"""The port of metrics and probes: HTTP, answered by threads of its own while the event loop is busy.
+"""The port of metrics and probes: HTTP in its own threads, so that it answers while the event loop is busy.
 
 "/metrics" is the registry. "/ready", for probes without gRPC, is 200 while the server serves, and 503 before, after,
 and when the heartbeat of event loop and queue is older than `READY_LIMIT_S`. "/live" is 503 when it is older than
 `LIVE_LIMIT_S`: the server hangs, and its supervisor should restart it.
 
 The server of prometheus_client starts a thread for every connection and waits for its request without a limit, so that
-a thousand idle connections take a thousand threads and file descriptors. This one holds a few connections, closes the
+a thousand idle connections need a thousand threads and file descriptors. This one accepts a few connections, closes the
 oldest for a new one, and limits the time of each.
 """
 
@@ -47,7 +47,7 @@ class State(Protocol):
 
     Attributes:
         is_serving: whether health reports SERVING.
-        beaten_s: time of the last heartbeat, `time.monotonic`; None while the server starts.
+        beaten_s: time of the last heartbeat, by `time.monotonic`; None while the server starts.
     """
 
     is_serving: bool
@@ -58,13 +58,13 @@ class MetricsServer:
     """Serves a registry and the probes until it is closed."""
 
     def __init__(self, registry: CollectorRegistry, host: str, port: int, state: State) -> None:
-        """Listens and serves.
+        """Begins to listen and to serve.
 
         Args:
             registry: the metrics.
             host: address to listen on.
-            port: 0 takes any free one.
-            state: of the server.
+            port: port to listen on; 0 for any free one.
+            state: state of the server.
 
         Raises:
             OSError: the address cannot be listened on.
@@ -122,7 +122,7 @@ class _Handler(WSGIRequestHandler):
 
 
 class _HttpServer(socketserver.ThreadingMixIn, WSGIServer):
-    """At most MAX_CONNECTIONS at a time, a thread each, which `server_close` waits for."""
+    """Serves at most MAX_CONNECTIONS concurrent connections, a thread each, which `server_close` waits for."""
 
     daemon_threads = False
     request_queue_size = 64  # with 5, the default, a few that connect at once make the next wait for seconds
@@ -135,13 +135,13 @@ class _HttpServer(socketserver.ThreadingMixIn, WSGIServer):
         super().__init__((str(address[0]), port), _Handler)
 
     def server_bind(self) -> None:
-        """As WSGIServer's, without a look-up of the host's name, which can take seconds."""
+        """Does the same as WSGIServer without looking up the host's name, which can take seconds."""
         socketserver.TCPServer.server_bind(self)
         self.server_name, self.server_port = self.server_address[:2]  # type: ignore[assignment]
         self.setup_environ()
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Overrides ThreadingMixIn's."""
+        """Overrides ThreadingMixIn: limits the number of connections."""
         with self._lock:
             if len(self._open) >= MAX_CONNECTIONS:
                 oldest, _ = self._open.popitem(last=False)
@@ -150,7 +150,7 @@ class _HttpServer(socketserver.ThreadingMixIn, WSGIServer):
         super().process_request(request, client_address)
 
     def shutdown_request(self, request: Any) -> None:
-        """Overrides TCPServer's."""
+        """Overrides TCPServer: also forgets the connection."""
         with self._lock:
             self._open.pop(request, None)
         super().shutdown_request(request)

@@ -1,7 +1,7 @@
 """The log: one JSON object a line for programs, or text for people; repeated warnings are counted, not written.
 
-A record's fields beside its message are given by `extra=`. No value of a field breaks the line, and bytes are never
-written. The thread that logs writes the line at once, so that the last lines of a server that dies are there.
+A record's fields besides its message are given by `extra=`. No value of a field can break the line, and bytes are never
+written. The thread that logs writes the line at once, so that the last lines before a crash are not lost.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _OWN_KEYS = frozenset({"ts", "level", "logger", "message", "exception", "stack"}
 
 
 class JsonFormatter(logging.Formatter):
-    """One object a line: ts (UTC), level, logger, message, the fields, and exception, where there is one."""
+    """Formats a record as one JSON object: ts (UTC), level, logger, message, its fields, and exception, if any."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Implements logging.Formatter."""
@@ -56,7 +56,7 @@ class JsonFormatter(logging.Formatter):
 
 
 class TextFormatter(logging.Formatter):
-    """Time, level, logger, message, and the fields as name=value; no record can look like two."""
+    """Formats a record as time, level, logger, message, and fields as name=value; no record can look like two."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Implements logging.Formatter."""
@@ -71,13 +71,13 @@ class TextFormatter(logging.Formatter):
 
 
 class RepeatFilter(logging.Filter):
-    """Limits the rate of warnings and errors from one place in the code; a later record has the number left out.
+    """Limits the rate of warnings and errors from one place in the code; a later record has the number of omitted ones.
 
-    A place is a line of code and, where there is an exception, its type. Records below a warning always pass.
+    A place is a line of code and, if there is an exception, its type. Records below a warning always pass.
     """
 
     def __init__(self, burst: int = 10, period_s: float = 60.0, clock: Callable[[], float] = time.monotonic) -> None:
-        """At most `burst` records of one place in every period, seconds."""
+        """Allows at most `burst` records of one place in each period, seconds."""
         super().__init__()
         self._burst = burst
         self._period_s = period_s
@@ -121,12 +121,12 @@ def configure_logging(settings: Settings, stream: TextIO | None = None) -> None:
 
 
 def as_extra(fields: Mapping[str, object]) -> dict[str, object]:
-    """Fields for `extra=`, which rejects some names: these get an underscore."""
+    """Renames fields for `extra=`, which rejects some names: these get an underscore."""
     return {f"{name}_" if name in _OWN_ATTRIBUTES else name: value for name, value in fields.items()}
 
 
 def fields_of(record: logging.LogRecord) -> dict[str, object]:
-    """The fields of a record beside its message, as values that JSON has."""
+    """The fields of a record besides its message, as JSON values."""
     return {
         name: plain(value)
         for name, value in vars(record).items()
@@ -135,9 +135,9 @@ def fields_of(record: logging.LogRecord) -> dict[str, object]:
 
 
 def plain(value: object) -> object:
-    """The value as JSON has it: text, finite numbers, lists and objects; cut where it is large.
+    """Converts a value to a JSON value: text, finite numbers, lists and objects; large ones are cut.
 
-    Other values become their `repr`, and bytes their number. Never raises.
+    Bytes become their count, other values their `repr`. Never raises.
     """
     try:
         return _plain(value, 0)
@@ -199,7 +199,7 @@ def _cut(text: str, length: int) -> str:
 
 
 def _visible(text: str) -> str:
-    """The text with control characters, and what cannot be encoded, escaped."""
+    """The text with control characters, and characters that cannot be encoded, escaped."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() or c == "\t" else c.encode("unicode_escape").decode("ascii") for c in text)

@@ -77,7 +77,7 @@ M = TypeVar("M", bound=MetricWrapperBase)
 
 
 class Registry(CollectorRegistry):
-    """A registry without the times at which series began, which double their number."""
+    """A registry without the creation times of series, which would double their number."""
 
     def collect(self) -> Iterable[Metric]:
         """Implements Collector."""
@@ -87,7 +87,7 @@ class Registry(CollectorRegistry):
 
 
 class _Children(Generic[M]):
-    """A metric by its labels' values, bounded in number; a dict, because every call looks into it."""
+    """The children of a metric by label values, limited in number; a dict, because every call looks up some."""
 
     def __init__(self, metric: M, known: Iterable[tuple[str, ...]] = ()) -> None:
         self._metric = metric
@@ -104,13 +104,13 @@ class _Children(Generic[M]):
 
 
 class Metrics(Observer, PairObserver):
-    """The metrics of one server. Implements `rpc.guard.CallObserver`, too; never raises.
+    """The metrics of one server. Implements also `rpc.guard.CallObserver`; never raises.
 
     Attributes:
-        registry: of all metrics.
+        registry: registry of all metrics.
         scraped: the metrics that are read from other objects at every scrape.
         is_serving: the last value of `set_serving`; False before.
-        beaten_s: time of the last `beat`, `time.monotonic`; None before.
+        beaten_s: time of the last `beat`, by `time.monotonic`; None before.
     """
 
     def __init__(self) -> None:
@@ -185,7 +185,7 @@ class Metrics(Observer, PairObserver):
     # Answers
 
     def stages(self, stage_seconds: Mapping[str, float]) -> None:
-        """Durations of an answer's stages; those of stronger features are named "extractor/stage"."""
+        """Records the durations of an answer's stages; those of stronger features are named "extractor/stage"."""
         for name, seconds in stage_seconds.items():
             extractor, _, stage = name.rpartition("/")
             self._stage_seconds(stage, "1" if extractor else "0").observe(seconds)
@@ -208,10 +208,10 @@ class Metrics(Observer, PairObserver):
 
         Args:
             outcome: LOCALIZED or the value of a RejectionReason.
-            inlier_count: 2D-3D matches that agree with the pose; None where none were counted.
+            inlier_count: 2D-3D matches that agree with the pose; None if they were not counted.
             match_count: 2D-3D matches from which the pose was estimated.
             reprojection_error_px: median of the inliers.
-            scale_deviation: relative, of the scaled trajectory.
+            scale_deviation: relative deviation of the scaled trajectory.
             accuracy_radius_m: the reported 68 % radius.
         """
         self._answers(outcome if outcome in self._outcomes else _OTHER).inc()
@@ -255,7 +255,7 @@ class Metrics(Observer, PairObserver):
         self._background_failures.inc()
 
     def references_wait(self, count: int) -> None:
-        """So many references wait to be matched in the background."""
+        """Sets how many references wait to be matched in the background."""
         self._background_waiting.set(count)
 
     def depths_looked_up(self, stored: int, absent: int, damaged: int) -> None:
@@ -282,7 +282,7 @@ class Metrics(Observer, PairObserver):
         self._depth_waiting.set(count)
 
     def scene_calibrated(self, cpu_seconds: float) -> None:
-        """References of a scene were localized against the others, and what they say was stored."""
+        """References of a scene were localized against the others, and the calibration was stored."""
         self._calibrations.inc()
         self._calibration_seconds.inc(max(0.0, cpu_seconds))
 
@@ -291,7 +291,7 @@ class Metrics(Observer, PairObserver):
         self._calibration_failures.inc()
 
     def scenes_wait(self, count: int) -> None:
-        """So many scenes have changed since they were calibrated from their references."""
+        """Sets how many scenes have changed since they were calibrated from their references."""
         self._calibration_waiting.set(count)
 
     def ran_out_of_memory(self) -> None:
@@ -311,12 +311,12 @@ class Metrics(Observer, PairObserver):
         self._capture_dropped(reason).inc()
 
     def watch_captures(self, read: Callable[[], int]) -> None:
-        """Calls are captured; `read` gives their size on the disk, bytes, at every scrape."""
+        """Registers a function that returns the size of captured calls on the disk, bytes, called at every scrape."""
         self._capture_enabled.set(1)
         self._capture_bytes.set_function(read)
 
     def set_serving(self, is_serving: bool) -> None:
-        """Health reports this of the server as a whole."""
+        """Sets the health of the server as a whole."""
         self.is_serving = is_serving
         self._serving.set(is_serving)
 
@@ -325,7 +325,7 @@ class Metrics(Observer, PairObserver):
         self._warm_up.set(seconds)
 
     def built(self, version: str, backend: str, features: str, weights_sha256: str) -> None:
-        """Version, backend, features and weights of the server; called once."""
+        """Sets version, backend, features and weights of the server; called once."""
         self._build.labels(version, backend, features, weights_sha256).set(1)
 
     def _make_call_metrics(self) -> None:

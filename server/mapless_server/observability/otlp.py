@@ -31,10 +31,10 @@ Attribute = str | bool | int | float
 
 
 def make_otlp_tracer(endpoint: str) -> OtlpTracer:
-    """A tracer that sends to an address such as "http://host:4317"; whether a collector listens there is not checked.
+    """Makes a tracer that sends to an address such as "http://host:4317"; does not check whether a collector listens.
 
     Raises:
-        ValueError: the endpoint is no such address.
+        ValueError: the endpoint is not such an address.
     """
     address = urlsplit(endpoint)
     if address.scheme not in ("http", "https") or not address.hostname:
@@ -44,7 +44,7 @@ def make_otlp_tracer(endpoint: str) -> OtlpTracer:
 
 
 class OtlpTracer:
-    """Implements Tracer. Holds 2048 spans at most, and drops further ones."""
+    """Implements Tracer. Buffers at most 2048 spans, and drops further ones."""
 
     def __init__(self, exporter: SpanExporter) -> None:
         resource = Resource({"service.name": "mapless", "service.version": __version__})
@@ -80,7 +80,7 @@ class OtlpTracer:
             flushing.join(_CANCEL_LIMIT_S)
 
     def record(self, parent: Span, steps: Sequence[TracedStep]) -> None:
-        """Adds a child span for each step, and below it one for each of its parts."""
+        """Adds a child span for each step, and below it one for each of the step's parts."""
         for step in steps:
             span = self._child(parent, step.name, step.start_s, step.attributes)
             part_start_s = step.start_s
@@ -119,7 +119,7 @@ class _OtlpSpan:
 
 
 def _attributes(fields: Mapping[str, object]) -> dict[str, Attribute]:
-    """Fields of the log as attributes named "mapless.*"; nested values as JSON."""
+    """Converts fields of the log to attributes named "mapless.*"; nested values become JSON."""
     attributes: dict[str, Attribute] = {}
     for name, field in fields.items():
         value = plain(field)
@@ -135,5 +135,5 @@ def _attributes(fields: Mapping[str, object]) -> dict[str, Attribute]:
 
 
 def _epoch_ns(monotonic_s: float) -> int:
-    """A time of `time.monotonic` as nanoseconds since 1970."""
+    """Converts a time of `time.monotonic` to nanoseconds since 1970."""
     return time.time_ns() - round(1e9 * (time.monotonic() - monotonic_s))

@@ -1,4 +1,4 @@
-"""The checkout's commit and the processor, for records of answers and measurements."""
+"""Commit of the checkout and name of the processor, for records of answers and measurements."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def cpu_model() -> str:
 
 
 def commit_of(root: Path) -> str:
-    """`git describe` of a checkout, "e18f3fc-dirty.1a2b3c4d" with a digest of the code's changes; else empty."""
+    """`git describe` of a checkout, "e18f3fc-dirty.1a2b3c4d" with a digest of changes; empty without git."""
     if not (root / ".git").exists():
         return ""
     try:

@@ -1,4 +1,4 @@
-"""Figures that other objects keep, read when Prometheus scrapes, in the thread that answers it."""
+"""Values of other objects, read when Prometheus scrapes, in the thread that answers it."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ log = logging.getLogger(__name__)
 
 
 class Scraped(Collector):
-    """Calls the functions that are set; the metrics of one that is not set, or fails, are described without a value.
+    """Calls the functions that are set; the metrics of a function that is not set, or fails, have no value.
 
     Attributes:
-        reference_cache: gives the cache of references' features.
-        retrieval_index: gives the size of the scenes in memory, bytes.
-        token_cache: gives the counters of the cache of references' tokens.
-        gpu_memory: gives bytes by kind: allocated, reserved, peak.
-        certificate_expiry: gives Unix seconds.
+        reference_cache: returns the cache of references' features.
+        retrieval_index: returns the size of the scenes in memory, bytes.
+        token_cache: returns the counters of the cache of references' tokens.
+        gpu_memory: returns bytes by kind: allocated, reserved, peak.
+        certificate_expiry: returns when the certificate expires, Unix seconds.
     """
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class Scraped(Collector):
         self.certificate_expiry: Callable[[], float] | None = None
 
     def describe(self) -> Iterable[Metric]:
-        """Implements Collector: names alone, when it is registered."""
+        """Implements Collector: only the names, when it is registered."""
         return Scraped().collect()
 
     def collect(self) -> Iterable[Metric]:

@@ -1,6 +1,6 @@
-"""What is recorded of one call, for its line in the log and its trace, and the interface of a tracer.
+"""The record of one call, for its line in the log and its trace; and the interface of a tracer.
 
-`NoTracer` traces nothing; the tracer that sends is in `otlp`.
+`NoTracer` traces nothing; `otlp` has the tracer that sends.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ class TracedStep:
 
     Attributes:
         name: "queue coarse", "coarse".
-        start_s: when it began, `time.monotonic`.
+        start_s: when it began, by `time.monotonic`.
         end_s: when it ended.
         attributes: further facts, such as "batch_id".
         part_seconds: durations of its parts, one after the other from its start.
@@ -34,7 +34,7 @@ class TracedStep:
 
 @dataclass
 class CallRecord:
-    """Grows while a call is answered.
+    """The record of a call, to which its steps are added.
 
     Attributes:
         notes: fields of its line in the log.
@@ -85,10 +85,10 @@ class Tracer(Protocol):
     """Traces calls; called on the event loop, so its methods return at once and never raise."""
 
     def begin(self, method: str, metadata: Metadata, start_s: float) -> CallSpan:
-        """Begins the span of a call to "/package.Service/Method", at `time.monotonic`."""
+        """Begins the span of a call of "/package.Service/Method", at a time of `time.monotonic`."""
 
     def close(self, limit_s: float) -> None:
-        """Sends what is left, and ends; blocks for `limit_s` at most."""
+        """Sends the remaining spans and ends; takes at most `limit_s`."""
 
 
 class _NoSpan:

@@ -1,4 +1,4 @@
-"""The call that a servicer answers: its id, its caller, its deadline, and the record of what was done for it."""
+"""The call that a servicer answers: its id, caller and deadline, and a record of its steps."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ _ID = re.compile(r"[A-Za-z0-9_.-]{1,64}", re.ASCII)  # it is logged: no line bre
 
 @dataclass(frozen=True)
 class Call:
-    """A call, as its servicer knows it.
+    """A call, for its servicer.
 
     Attributes:
         request_id: identifies it in the log; the caller's own if that is well-formed.
-        arrived_s: when its headers arrived, `time.monotonic`; its message may take longer.
-        deadline_s: when the servicer must have answered, `time.monotonic`.
-        principal: the caller, authenticated.
+        arrived_s: when its headers arrived, by `time.monotonic`; its message may arrive later.
+        deadline_s: when the servicer must have answered, by `time.monotonic`.
+        principal: the authenticated caller.
         client: distinguishes callers: the id that the caller gives, else the address of its connection.
-        history: what was done for it so far.
+        history: record of its steps so far.
     """
 
     request_id: str
@@ -52,52 +52,52 @@ class Call:
 
     @property
     def caller(self) -> Caller:
-        """The caller, as the engine knows it."""
+        """The caller in the engine's form."""
         return Caller(Flow(self.principal.tenant, self.client), self.deadline_s)
 
     @property
     def trailers(self) -> tuple[tuple[str, str], ...]:
-        """Of an answer that succeeds; its caller is authenticated, and may know the version."""
+        """Trailers of a successful answer: its caller is authenticated, and may know the version."""
         return (REQUEST_ID_KEY, self.request_id), (TIME_KEY, f"{time.time():.3f}"), (VERSION_KEY, __version__)
 
     def note(self, **fields: object) -> None:
-        """Adds fields to the call's line in the log and to its trace; they cannot replace those of every line."""
+        """Adds fields to the call's line in the log and to its trace; they cannot replace the standard fields."""
         self.history.notes.update(fields)
 
     def record(self, records: Iterable[StageRecord]) -> None:
-        """Records the stages of the queue that a job of the call passed."""
+        """Records the queue's stages that a job of the call has passed."""
         for it in records:
             self.waited(it.stage, it.queued_s, it.start_s)
             if it.jobs:
                 self.computed(it.stage, it.start_s, it.end_s, batch=it.batch, batch_size=it.jobs)
 
     def waited(self, stage: str, start_s: float, end_s: float) -> None:
-        """Records a wait for a stage of the queue, `time.monotonic`."""
+        """Records a wait for a stage of the queue; times by `time.monotonic`."""
         self.history.waited(stage, start_s, end_s)
 
     def computed(
         self, stage: str, start_s: float, end_s: float, part_seconds: Mapping[str, float] | None = None, **about: object
     ) -> None:
-        """Records the computation of a stage, `time.monotonic`, and of its parts, which followed each other."""
+        """Records the computation of a stage, and of its parts in sequence; times by `time.monotonic`."""
         self.history.computed(stage, start_s, end_s, part_seconds or {}, **about)
 
 
 @dataclass(frozen=True)
 class Deadlines:
-    """Time limits of calls; see the settings of these names."""
+    """Time limits of calls, from the settings of these names."""
 
     default_deadline_s: float = 30.0
     max_deadline_s: float = 600.0
 
     def given_s(self, asked_s: float | None, is_endless: bool) -> float:
-        """Time for a call that asks for `asked_s`, or for no limit; unlimited only for an endless method."""
+        """Time for a call that requests `asked_s`, or no limit; unlimited only for an endless method."""
         if is_endless:
             return math.inf if asked_s is None else asked_s
         return min(self.default_deadline_s if asked_s is None else asked_s, self.max_deadline_s)
 
 
 def begin_call(context: Context, deadlines: Deadlines, is_endless: bool) -> Call:
-    """The call whose headers have just arrived, not yet authenticated."""
+    """Makes the call whose headers have just arrived; it is not authenticated yet."""
     now_s = time.monotonic()
     given_s, margin_s = deadlines.given_s(context.time_remaining(), is_endless), 0.0
     if math.isfinite(given_s):
@@ -117,6 +117,6 @@ def metadata_of(context: Context) -> Metadata:
 
 
 def _well_formed(metadata: Metadata, wanted: str) -> str:
-    """The value of a key of the metadata; empty if there is none or it is not fit for the log."""
+    """The value of a key of the metadata; empty if it is missing or cannot be written to the log."""
     given = next((str(value) for key, value in metadata if key == wanted), "")
     return given if _ID.fullmatch(given) else ""

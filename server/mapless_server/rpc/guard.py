@@ -1,4 +1,4 @@
-"""Wraps the handlers of all methods: an id, authentication, a deadline, a log line, errors as google.rpc.Status."""
+"""Wraps the handlers of all methods: id, authentication, deadline, log line, and errors as google.rpc.Status."""
 
 from __future__ import annotations
 
@@ -57,9 +57,9 @@ class _Result:
 
 
 class CallGuard:
-    """Wraps the handlers of all methods but the open ones (health, reflection): servicers get a `Call`, not a context.
+    """Wraps the handlers of all methods except open ones (health, reflection): servicers get a `Call`, not a context.
 
-    This is no interceptor, because Ray Serve makes gRPC servers that accept handlers and no interceptors.
+    It is not an interceptor, because Ray Serve's gRPC servers accept handlers, but no interceptors.
     """
 
     def __init__(
@@ -75,9 +75,9 @@ class CallGuard:
         """Without `authenticate`, every caller is admitted.
 
         Args:
-            default_deadline_s: for calls without a deadline.
-            max_deadline_s: for calls with a later one.
-            authenticate: finds the caller of a method.
+            default_deadline_s: deadline of calls without one.
+            max_deadline_s: largest deadline; later ones are reduced to it.
+            authenticate: function that authenticates the caller of a method.
             check_admission: raises RequestError if no call of this method can be served now; called on the event loop,
                 before the message is read.
             observer: counts calls.
@@ -98,7 +98,7 @@ class CallGuard:
         quiet_ended_calls()
 
     def guarded(self, method: str, handler: Any) -> Any:
-        """The handler of "/package.Service/Method" as it is to be served."""
+        """Wraps the handler of "/package.Service/Method"."""
         if method in OPEN_METHODS:
             return self._open.guarded(handler)
         streams = handler.response_streaming
@@ -139,7 +139,7 @@ class CallGuard:
 
     @contextmanager
     def _recorded(self, method: str, call: Call, context: Context) -> Iterator[_Result]:
-        """Counts and traces a call, and logs it when it has ended, with the status of the result."""
+        """Counts and traces a call, and logs it at its end with the status of the result."""
         is_awaited = method not in ENDLESS_METHODS
         self._active += is_awaited
         if self._active:
@@ -167,7 +167,7 @@ class CallGuard:
         return self._authenticate(metadata_of(context), method, context.auth_context())
 
     async def _answer(self, handler: Any, method: str, call: Call, context: Context) -> bytes:
-        """The servicer's answer; every fault of the request is raised as RequestError."""
+        """Returns the servicer's answer; raises faults of the request as RequestError."""
         request, call = await self._request(handler, method, call, context)
         try:
             response = await self._in_time(lambda: handler.unary_unary(request, call), call.deadline_s)
@@ -178,9 +178,9 @@ class CallGuard:
         return data
 
     async def _stream(self, handler: Any, method: str, call: Call, context: Context) -> None:
-        """Sends the servicer's messages as they come, until servicer or caller end, or the deadline passes.
+        """Sends the servicer's messages until the servicer or the caller ends the call, or the deadline passes.
 
-        The servicer's method is a coroutine that gives an iterator of messages, with `aclose`.
+        The servicer's method is a coroutine that returns an iterator of messages, with `aclose`.
         """
         is_endless = method in ENDLESS_METHODS
         request, call = await self._request(handler, method, call, context)
@@ -205,7 +205,7 @@ class CallGuard:
     async def _endless(
         self, opening: Opening, method: str, handler: Any, context: Context
     ) -> AsyncGenerator[bytes, None]:
-        """A servicer's messages, each when the one before is sent; headers are sent when messages can come."""
+        """Yields a servicer's messages, each after the previous one is sent; sends headers when messages can come."""
         async with aclosing(await opening) as responses:
             await self._sender.headers(context)
             async for response in responses:
@@ -216,7 +216,7 @@ class CallGuard:
     async def _finite(
         self, opening: Opening, handler: Any, call: Call, context: Context
     ) -> AsyncGenerator[bytes, None]:
-        """A servicer's messages, a few, computed before the deadline however slowly the caller reads."""
+        """Yields a servicer's few messages, computed before the deadline however slowly the caller reads."""
         ready: asyncio.Queue[bytes | None] = asyncio.Queue()
 
         async def compute() -> None:
@@ -241,7 +241,7 @@ class CallGuard:
                 opening.close()
 
     async def _request(self, handler: Any, method: str, call: Call, context: Context) -> tuple[Any, Call]:
-        """The call's message, and the call with its principal."""
+        """Receives the call's message; returns it, and the call with its principal."""
         limit_s = call.deadline_s - time.monotonic()
         if method in ENDLESS_METHODS:  # which may have no deadline
             limit_s = min(limit_s, self._deadlines.default_deadline_s)
@@ -258,10 +258,10 @@ class CallGuard:
         return request, call
 
     async def _in_time(self, answer: Callable[[], Coroutine[Any, Any, T]], deadline_s: float) -> T:
-        """The answer, or DeadlineExceeded as soon as the deadline passes, however long the servicer takes to stop.
+        """Returns the answer, or raises DeadlineExceeded at the deadline, however long the servicer takes to stop.
 
-        Not asyncio.wait_for, which before Python 3.12 swallows a cancellation that comes together with the answer, nor
-        asyncio.timeout, which Python 3.10 lacks; and both wait for the servicer.
+        asyncio.wait_for cannot be used: before Python 3.12 it loses a cancellation that comes together with the answer.
+        asyncio.timeout is missing in Python 3.10. Both would wait for the servicer.
         """
         remaining_s = deadline_s - time.monotonic()
         if remaining_s > 0:

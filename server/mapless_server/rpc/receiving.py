@@ -1,8 +1,8 @@
 """Receives the one message of a call in limited time.
 
-For methods of one message grpc receives it before it calls the handler, however long that takes: a call whose caller
-sends only the headers would hold its place among the concurrent calls as long as its connection. So all methods are
-served as if their callers sent streams, of which the first message is read here.
+For methods with one request message, grpc receives it before it calls the handler, however long that takes: a call
+    whose caller sends only the headers would count as a concurrent call as long as its connection exists. So all
+    methods are served as if their callers sent streams, of which the first message is read here.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ class Receiver:
         self._reading: set[asyncio.Future[Any]] = set()  # the loop holds only weak references
 
     async def message(self, context: Context, limit_s: float, evicted: asyncio.Future[None] | None = None) -> bytes:
-        """The bytes of a call's first message.
+        """Receives the bytes of a call's first message.
 
         Args:
-            context: the call's, which has no deserializer.
+            context: context of the call, which has no deserializer.
             limit_s: longest wait, seconds.
-            evicted: done when the call has to end for another one.
+            evicted: a future that is done when the call has to end in favour of another one.
 
         Raises:
-            DeadlineExceeded: no message came in time.
+            DeadlineExceeded: no message arrived in time.
             Overloaded: the call was evicted.
-            InvalidArgument: the caller sent none, or a too large one (which grpc itself reports to the caller).
+            InvalidArgument: the caller sent no message, or a too large one (which grpc itself reports to the caller).
         """
         reading = asyncio.ensure_future(context.read())
         self._reading.add(reading)
@@ -67,7 +67,7 @@ class Receiver:
 
 
 class OpenMethods:
-    """Serves methods without authentication in limited number, so that they cannot take up all calls of the server."""
+    """Serves methods without authentication, limited in number, so that they cannot use up all concurrent calls."""
 
     def __init__(self, receiver: Receiver) -> None:
         self._receiver = receiver
@@ -75,7 +75,7 @@ class OpenMethods:
         self._streams = 0
 
     def guarded(self, handler: Any) -> Any:
-        """The method's handler, limited in number and in the time for its message."""
+        """Wraps a method's handler, with a limit on concurrent calls and on the time for the message."""
         if not handler.response_streaming:
             return grpc.stream_unary_rpc_method_handler(self._unary(handler), None, handler.response_serializer)
         if handler.request_streaming:
@@ -117,7 +117,7 @@ class OpenMethods:
         self._streams += 1
 
     async def _request(self, handler: Any, context: Context) -> Any:
-        """The call's message, parsed; aborts the call if there is none."""
+        """Receives and parses the call's message; aborts the call if there is none."""
         if len(self._waiting) >= MAX_OPEN_WAITING:
             oldest = next(iter(self._waiting))
             del self._waiting[oldest]
@@ -138,9 +138,9 @@ class OpenMethods:
 
 
 class _Latest:
-    """The context of a health watch, whose `write` never waits: of unread messages only the latest is kept.
+    """The context of a health watch, whose `write` never waits: only the latest unread message is kept.
 
-    The servicer writes while it holds the lock that changing the health takes, as a server does that stops.
+    The servicer writes while it has the lock for changes of the health, which a stopping server needs.
     """
 
     def __init__(self, context: Context) -> None:
@@ -156,7 +156,7 @@ class _Latest:
             self._writing.add_done_callback(retrieve)
 
     async def _write(self) -> None:
-        """Never cancelled, for the same reason as reading."""
+        """Sends the messages; never cancelled, for the same reason as reading."""
         while self._message is not None:
             message, self._message = self._message, None
             await self._context.write(message)
@@ -165,7 +165,7 @@ class _Latest:
 def has_ended(failure: BaseException | None) -> bool:
     """Whether a status could not be sent because the call has ended: grpc rejected its message, or the caller left.
 
-    The handler that lets such an error pass to grpc has its stack trace in the log.
+    If such an error reached grpc, it would log its stack trace.
     """
     return isinstance(failure, grpc.aio.BaseError) and not isinstance(failure, grpc.aio.AbortError)
 
@@ -173,7 +173,7 @@ def has_ended(failure: BaseException | None) -> bool:
 def quiet_ended_calls() -> None:
     """Keeps stack traces of calls that ended before their status was sent out of the log; grpc writes them itself.
 
-    They come from methods whose messages grpc reads, such as reflection, after a message that is too large.
+    They come from methods whose messages grpc reads itself, such as reflection, after a message that is too large.
     """
     logging.getLogger("grpc._cython.cygrpc").addFilter(_is_no_ended_call)
 

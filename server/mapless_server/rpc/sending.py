@@ -31,21 +31,21 @@ _STATUS_LIMIT_S = 1.0
 
 
 class Sender:
-    """Writes messages and statuses; runs on the event loop."""
+    """Sends messages and statuses; runs on the event loop."""
 
     def __init__(self) -> None:
         self._sending: set[asyncio.Task[None]] = set()  # the loop holds only weak references
 
     async def headers(self, context: Context) -> None:
-        """Begins a stream; raises what `message` does.
+        """Sends the headers of a stream; raises the same exceptions as `message`.
 
-        The first message would carry the headers, but while that message waits, no status could be sent: it would carry
-        them, too, and grpc rejects headers that it already has.
+        Otherwise the headers would be sent with the first message, and no status could be sent while that message
+            waits: it would contain the headers, too, and grpc rejects headers that it already has.
         """
         await self._in_time(context.send_initial_metadata(()), SEND_LIMIT_S)
 
     async def message(self, context: Context, data: bytes, limit_s: float) -> None:
-        """Returns when grpc has let a message through.
+        """Sends a message; returns when grpc has accepted it.
 
         Raises:
             DeadlineExceeded: the caller does not read in time.
@@ -54,9 +54,9 @@ class Sender:
         await self._in_time(context.write(data), limit_s)
 
     async def error(self, context: Context, call: Call, error: RequestError) -> None:
-        """Ends a call; always raises, and the handler must let that exception pass to grpc.
+        """Ends a call with an error: always raises, and the handler must not catch that exception.
 
-        Does not wait for a caller that does not read: it gets the status when it has read the earlier messages.
+        It does not wait for a caller that does not read, which gets the status after the earlier messages.
         """
         status = rpc_status.to_status(to_status(error, call.request_id))
         metadata = (*status.trailing_metadata, (REQUEST_ID_KEY, call.request_id))
@@ -78,7 +78,7 @@ class Sender:
         task.result()
 
     def _begin(self, sending: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Never cancelled, because grpc still reads from its buffer. It ends with the call at the latest."""
+        """Sends in a task that is never cancelled, because grpc still reads its buffer; it ends with the call."""
         task = asyncio.ensure_future(sending)
         self._sending.add(task)
         task.add_done_callback(self._forget)

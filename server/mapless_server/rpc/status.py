@@ -1,4 +1,4 @@
-"""Errors as callers receive them: google.rpc.Status with details for programs."""
+"""Errors in the form that callers receive: google.rpc.Status with details for programs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _MAX_MESSAGE_CHARACTERS = 1000  # trailers hold about 8 KB, and they hold the te
 
 
 def to_status(error: RequestError, request_id: str = "") -> status_pb2.Status:
-    """The error as google.rpc.Status: one ErrorInfo, the details of its kind, and the request id if there is one."""
+    """Converts an error to google.rpc.Status: one ErrorInfo, the details of its kind, and the request id if given."""
     message = str(error)[:_MAX_MESSAGE_CHARACTERS]
     field = {} if error.field is None else {"field": error.field}
     details: list[Message] = [error_details_pb2.ErrorInfo(reason=error.reason, domain=_DOMAIN, metadata=field)]

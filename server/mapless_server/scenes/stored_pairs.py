@@ -95,7 +95,7 @@ class PairFinder:
         return found
 
     def find_one(self, name: str, first: PosedView, second: PosedView) -> Matches | None:
-        """The matches of a pair, given `in_order`, for the background; None if there are none. Errors as PairStore."""
+        """The matches of a pair, given `in_order`, for the background; None if not stored. Errors as in PairStore."""
         return self._read(name, [(first, second)])[0][0]
 
     def _read(self, name: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> tuple[list[Matches | None], int]:

@@ -1,6 +1,6 @@
 """The work queue: which job is computed when, and by which thread. Imports the standard library only.
 
-In the order in which a job meets them:
+Terms, in the order of a job's way through the queue:
 
 job         A call's work (`jobs`). It goes through stages, such as "prepare", "coarse" and "refine"; its current `Step`
             names the stage and carries the input. What a stage returns (`StageResult`) ends the job or gives the next

@@ -19,7 +19,7 @@ MEMORY = 10
 
 
 class CostModel:
-    """Predicts the computing time of a job in a stage: an average over jobs of its kind that favours recent ones."""
+    """Predicts the computing time of a job in a stage: an average over its kind, with more weight for recent jobs."""
 
     def __init__(self) -> None:
         self._kinds: OrderedDict[tuple[str, str], tuple[int, float]] = OrderedDict()
@@ -29,12 +29,12 @@ class CostModel:
         self._kinds.clear()
 
     def predict(self, stage: str, kind: str) -> float:
-        """Seconds. For an unknown kind, the average over all kinds in the stage."""
+        """Predicted seconds; for an unknown kind, the average over all kinds in the stage."""
         known = self._kinds.get((stage, kind)) or self._kinds.get((stage, ""))
         return FIRST_GUESS_S if known is None else known[1]
 
     def observe(self, stage: str, kind: str, seconds: float) -> None:
-        """A job took so long; its share, if it was computed with others."""
+        """Records the computing time of a job; its share, if it was computed with others."""
         for key in ((stage, kind), (stage, "")):
             count, mean_s = self._kinds.pop(key, (0, 0.0))
             count = min(count + 1, MEMORY)
@@ -47,7 +47,7 @@ class Ledger:
     """Predicted computing time, by lane, and memory of the admitted jobs: in total and per caller.
 
     Attributes:
-        jobs: those that are admitted and have not ended.
+        jobs: jobs that are admitted and have not ended.
     """
 
     def __init__(self) -> None:
@@ -83,7 +83,7 @@ class Ledger:
         self._forget_if_empty(job.flow)
 
     def hold(self, flow: Flow, size_bytes: int) -> None:
-        """Books memory that a call of several jobs holds beside them."""
+        """Books memory that a call of several jobs needs besides these jobs."""
         for holdings in (self._flows.setdefault(flow, _Holdings()), self._all):
             holdings.size_bytes += size_bytes
 
@@ -102,9 +102,9 @@ class Ledger:
         return self._of(flow).booked_s[lane]
 
     def ahead_s(self, flow: Flow, lane: str, own_s: float) -> float:
-        """Computing time before a new job of cost `own_s` is done, if all callers get equal shares.
+        """Computing time until a new job of cost `own_s` is done, if all callers get equal shares.
 
-        The caller's other jobs come first, and from every other caller as much as from this one.
+        The caller's other jobs come first, and other callers get as much computing time as this one.
         """
         until_done_s = self.booked_s(lane, flow) + own_s
         of_others = (it.booked_s[lane] for other, it in self._flows.items() if other != flow)
@@ -182,7 +182,7 @@ class Admission:
                 raise Refused(Refusal.QUEUE_FULL, message, max(MIN_RETRY_S, excess_s / self._threads[lane]))
 
     def check_memory(self, flow: Flow, size_bytes: int) -> None:
-        """Raises Refused if a caller cannot hold so much more; the first caller may hold all there is."""
+        """Raises Refused if a caller cannot have this much more memory; a single caller may have all of it."""
         self._check_size(size_bytes)
         all_bytes, held_bytes = self._ledger.size_bytes(), self._ledger.size_bytes(flow)
         is_first = not (all_bytes or self._ledger.jobs)
@@ -199,7 +199,7 @@ class Admission:
     def fits(self, job: Job, cost_s: Counter[str]) -> bool:
         """Whether an admitted job may continue although it now needs more than it was admitted with.
 
-        The only one may: no other job waits. It is booked `within_bounds`, so that others are still admitted.
+        The only job may, since no other job waits. It is booked `within_bounds`, so that others are still admitted.
         """
         if len(self._ledger.jobs) == 1:
             return True
@@ -207,7 +207,7 @@ class Admission:
         return all(it <= 0 or self._excess_s(job.flow, lane, it) <= 0 for lane, it in added_s.items())
 
     def within_bounds(self, job: Job, cost_s: Counter[str]) -> Counter[str]:
-        """Of what an admitted job now needs, as much as its caller may hold, but no less than it was admitted with."""
+        """The part of an admitted job's cost that its caller may have, but no less than it was admitted with."""
         bounded_s: Counter[str] = Counter()
         for lane, own_s in cost_s.items():
             room_s = max(0.0, -self._excess_s(job.flow, lane, 0.0))
@@ -215,11 +215,11 @@ class Admission:
         return bounded_s
 
     def _excess_s(self, flow: Flow, lane: str, added_s: float) -> float:
-        """Computing time by which a caller would exceed its bound with so much more."""
+        """Computing time by which a caller would exceed its bound with this much more."""
         bound_s = self._options.max_queued_s * self._threads[lane]
         held_s = self._ledger.booked_s(lane, flow)
         return held_s + added_s - self._share(bound_s, self._ledger.booked_s(lane), held_s)
 
     def _share(self, bound: float, held: float, held_by_flow: float) -> float:
-        """What one caller may hold of a bound, given what it and all callers hold."""
+        """The part of a bound that one caller may have, given what it and all callers have."""
         return self._options.flow_share * (bound - (held - held_by_flow))

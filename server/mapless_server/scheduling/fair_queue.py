@@ -25,13 +25,13 @@ class FairQueue(Generic[J]):
     """Waiting jobs in the order in which they are to be computed.
 
     Deficit round robin (Shreedhar and Varghese, 1996) with overdrawing: each caller in turn is credited a quantum of
-    time and served while it has credit. What its last job costs beyond that it pays back in later rounds, as long as it
-    has jobs waiting. So while two callers both wait, their shares differ by at most a quantum and two jobs, whatever
+    time and served while it has credit. If its last job costs more, it pays the rest back in later rounds, as long as
+    it has jobs waiting. So while two callers both wait, their shares differ by at most a quantum and two jobs, whatever
     they send.
     """
 
     def __init__(self, quantum_s: float) -> None:
-        """A tenant's only caller is credited `quantum_s` per round, which should be at least a typical job's cost."""
+        """A tenant's only caller gets `quantum_s` per round, which should be at least the cost of a typical job."""
         self._quantum_s = quantum_s
         # Callers with waiting jobs only, in the order of their turns.
         self._accounts: OrderedDict[Flow, _Account[J]] = OrderedDict()
@@ -50,7 +50,7 @@ class FairQueue(Generic[J]):
 
     @property
     def cost_s(self) -> float:
-        """Sum over all waiting jobs."""
+        """Sum of the costs of all waiting jobs."""
         return self._cost_s if self._flow_of else 0.0  # without rounding errors
 
     def push(self, job: J, flow: Flow, cost_s: float) -> None:
@@ -77,7 +77,7 @@ class FairQueue(Generic[J]):
         return cost_s
 
     def pop(self) -> J:
-        """Removes the next job and charges its caller. Raises IndexError if nothing waits."""
+        """Removes the next job and charges its caller; raises IndexError if none waits."""
         if not self._flow_of:
             raise IndexError("nothing waits")
         for flow in list(self._accounts):
@@ -91,7 +91,7 @@ class FairQueue(Generic[J]):
         return self.pop()
 
     def pop_alike(self, is_alike: Callable[[J], bool], at_most: int) -> list[J]:
-        """Removes further jobs to be computed with the last one, from each caller in turn, and charges for them."""
+        """Removes further jobs to compute with the last one, from each caller in turn, and charges for them."""
         if at_most < 1:
             return []
         alike = [list(filter(is_alike, account.jobs)) for account in self._accounts.values()]
@@ -103,7 +103,7 @@ class FairQueue(Generic[J]):
         self._accounts.move_to_end(flow)
 
     def _share_s(self, flow: Flow) -> float:
-        """What a caller is credited per round."""
+        """The credit of a caller per round, seconds."""
         return self._quantum_s / self._callers_of_tenant[flow.tenant]
 
     def _charge(self, job: J) -> J:

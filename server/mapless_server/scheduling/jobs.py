@@ -13,14 +13,14 @@ from typing import Any, NamedTuple
 
 
 class Flow(NamedTuple):
-    """Whose a job is. Tenants get equal shares, and so do the clients of a tenant."""
+    """The owner of a job: tenants get equal shares, and so do the clients of a tenant."""
 
     tenant: str
     client: str
 
 
 class Refusal(str, Enum):
-    """Why a job is not admitted."""
+    """Reasons why a job is not admitted."""
 
     QUEUE_FULL = "queue_full"
     TOO_MUCH_MEMORY = "too_much_memory"
@@ -54,8 +54,8 @@ class Refused(Exception):
     """A job is not admitted.
 
     Attributes:
-        reason: why.
-        retry_after_s: when another attempt may succeed, seconds; None if the same job never will.
+        reason: why it is not admitted.
+        retry_after_s: seconds after which another attempt may succeed; None if the same job is never admitted.
     """
 
     def __init__(self, reason: Refusal, message: str, retry_after_s: float | None = None) -> None:
@@ -73,9 +73,9 @@ class Stage:
     """One kind of computation.
 
     Attributes:
-        name: unique.
+        name: its unique name.
         lane: the threads that compute it.
-        then: the stage that usually follows; None for the last.
+        then: name of the stage that usually follows; None for the last.
         max_batch: largest number of jobs that are computed together.
     """
 
@@ -87,11 +87,11 @@ class Stage:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """What a job needs next.
+    """The next computation of a job.
 
     Attributes:
         stage: name of the stage that computes it.
-        kind: jobs of one kind take about the same time there.
+        kind: jobs of one kind take about the same time in the stage.
         bucket: jobs of one bucket can be computed together.
         payload: the stage's input.
         later_kind: the kind in the stages that usually follow; empty if it is the same.
@@ -114,7 +114,7 @@ class Done:
 
 @dataclass(frozen=True, eq=False)
 class Fallback:
-    """Makes the result that is given if there is no better one at `at_s`, by the queue's clock."""
+    """Makes the result that is given at `at_s`, by the queue's clock, if there is no better one."""
 
     make: Callable[[], Done]
     at_s: float
@@ -125,7 +125,7 @@ class Next:
     """The job needs another step. From now on it ends with the fallback, if there is one, instead of expiring.
 
     Attributes:
-        step: what it needs.
+        step: the next step.
         fallback: also given at once if the step would end too late or cost too much.
         alternative: a cheaper step, which is then tried before the fallback is given.
     """
@@ -161,13 +161,13 @@ class StageRecord:
 
     @property
     def waited_s(self) -> float:
-        """How long the job waited before it was computed or stopped waiting."""
+        """Time that the job waited until it was computed or stopped waiting."""
         return self.start_s - self.queued_s
 
 
 @dataclass(eq=False)
 class _Life:
-    """What `Job.check` needs, apart from the job: payloads hold it, and would be freed late if it held them.
+    """The part of a job that `Job.check` needs; payloads refer to it instead of the job, which is then freed early.
 
     Attributes:
         over: set at the job's end.
@@ -185,13 +185,13 @@ class _Life:
 
 @dataclass(eq=False)
 class Job:
-    """A call's work, from admission to its one and only ending.
+    """A call's work, from admission to its end.
 
     Attributes:
-        flow: whose it is.
-        step: what it needs now.
+        flow: its owner.
+        step: its current step.
         deadline_s: when its result becomes useless, by the queue's clock.
-        size_bytes: memory that it holds.
+        size_bytes: memory that it needs.
         on_end: called once, with how it ended and its result or exception.
         records: the stages that it has been through.
         continues: whether it completes what other jobs of its call have computed; then it is always admitted, also
@@ -201,9 +201,9 @@ class Job:
         waits_since_s: when it began to wait for the step, by the queue's clock.
         booked_s: computing time still predicted for it, by lane.
         charged_s: computing time charged to its tenant at admission.
-        unusual_s: part of the current batch's computing time that says nothing about later jobs; set by its stage.
+        unusual_s: part of the current batch's computing time that is not used for predictions; set by its stage.
         is_computed: whether it is in a batch now.
-        timer_s: the `due_s` that the scheduler has set a timer for.
+        timer_s: the `due_s` of the timer that the scheduler has set.
     """
 
     flow: Flow
@@ -230,12 +230,12 @@ class Job:
 
     @property
     def checked_s(self) -> float:
-        """When a stage last called `check`, `time.monotonic`: a sign of life of the computing thread."""
+        """Time of a stage's last call of `check`, by `time.monotonic`: shows that the computing thread is alive."""
         return self._life.checked_s
 
     @property
     def due_s(self) -> float:
-        """When it ends at the latest, by the queue's clock."""
+        """Latest time of its end, by the queue's clock."""
         return self.deadline_s if self.fallback is None else min(self.fallback.at_s, self.deadline_s)
 
     @property
@@ -255,10 +255,10 @@ class Batch:
     """Jobs of one stage and bucket that are computed together.
 
     Attributes:
-        stage: of all.
-        jobs: at least one.
-        start_s: when it began, by the queue's clock.
-        number: counts the batches from 1.
+        stage: stage of all jobs.
+        jobs: the jobs, at least one.
+        start_s: time of its beginning, by the queue's clock.
+        number: its number, counted from 1.
     """
 
     stage: Stage

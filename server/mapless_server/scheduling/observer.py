@@ -18,13 +18,13 @@ class Observer:
         """A job was refused."""
 
     def queued(self, stage: str, jobs: int, cost_s: float) -> None:
-        """Number of jobs that now wait for a stage, and the computing time predicted for them from there on."""
+        """Reports the number of jobs that wait for a stage, and their predicted computing time from there on."""
 
     def running(self, stage: str, jobs: int) -> None:
-        """Number of jobs that are now computed in a stage."""
+        """Reports the number of jobs that are being computed in a stage."""
 
     def waited(self, stage: str, seconds: float) -> None:
-        """A job enters a stage after waiting for it."""
+        """A job was taken from a stage's waiting jobs after this time."""
 
     def computed(self, stage: str, bucket: str, jobs: int, seconds: float) -> None:
         """A batch of this many jobs of a bucket was computed."""

@@ -10,18 +10,18 @@ class WorkQueueOptions:
     """Bounds of admission, order of computing, and supervision of the threads.
 
     Attributes:
-        max_queued_s: predicted computing time of the admitted jobs, seconds per thread of a lane. A job admitted beyond
-            it would get a late result, and a longer queue does not drain sooner.
-        max_bytes: memory that admitted jobs, and calls that consist of several jobs, may hold together.
-        flow_share: share of what other callers leave of either bound that one caller may fill, so that there is always
-            room for the next caller; 0 to 1.
+        max_queued_s: largest predicted computing time of the admitted jobs, seconds per thread of a lane. The result of
+            a job admitted beyond it would be late, and a longer queue has no higher throughput.
+        max_bytes: largest memory of admitted jobs, and of calls that consist of several jobs, together.
+        flow_share: share, 0 to 1, that one caller may use of what other callers leave of either bound, so that there is
+            always room for the next caller.
         time_margin: a job is admitted if at least this many times its predicted time remains until its deadline; 1 or
             more. Predictions are averages, and a result that comes too late is wasted for everyone.
-        first_stage_interval: of so many batches of a lane in which several stages wait, one is of the first stage; 2 or
+        first_stage_interval: one of this many batches of a lane is of the first stage, if several stages wait; 2 or
             more.
         quantum_s: computing time credited to a caller in each round of the fair queue; about what one job of a stage
             takes.
-        stall_limit_s: a batch without a sign of life (its end, or a job's `check`) for longer is considered hung: its
+        stall_limit_s: a batch without any progress (its end, or a job's `check`) for longer is considered hung: its
             thread is lost, and the queue ends.
         heartbeat_s: interval of supervision.
     """

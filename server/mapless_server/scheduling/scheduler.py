@@ -1,4 +1,4 @@
-"""The scheduler: admits jobs, selects what each thread computes next, and ends jobs whose time is over.
+"""The scheduler: admits jobs, selects what each thread computes next, and ends jobs whose deadline has passed.
 
 A state machine without threads, waiting or a clock: times are passed in, so that it is tested on a virtual clock.
 """
@@ -49,11 +49,11 @@ class Quota(Protocol):
     """Limits the computing rate of tenants."""
 
     def charge(self, tenant: str, cost_s: float, now_s: float) -> float:
-        """Books predicted computing time; returns how long to wait, seconds, if there is no room: 0 means booked."""
+        """Books predicted computing time and returns 0; if the limit is reached, returns the seconds to wait."""
         ...
 
     def settle(self, tenant: str, predicted_s: float, actual_s: float, now_s: float) -> None:
-        """Replaces booked computing time by what was used."""
+        """Replaces booked computing time by the time used."""
         ...
 
 
@@ -62,8 +62,8 @@ class _Lane:
     """A group of threads.
 
     Attributes:
-        threads: how many.
-        stages: that they compute, in the order in which jobs go through them.
+        threads: number of threads.
+        stages: the stages that they compute, in the order in which jobs go through them.
         free: number of idle threads.
         passed_over: batches since the first stage that has waiting jobs was served.
         busy_s: sum of the threads' computing times so far.
@@ -77,7 +77,7 @@ class _Lane:
 
 
 class Scheduler:
-    """Keeps jobs from admission to their end. Not thread-safe."""
+    """Manages jobs from admission to their end; not thread-safe."""
 
     def __init__(
         self,
@@ -88,15 +88,15 @@ class Scheduler:
         ending_of: Callable[[Exception], Ending] = lambda _: Ending.FAILED,
         quota: Quota | None = None,
     ) -> None:
-        """An idle scheduler.
+        """Makes an idle scheduler.
 
         Args:
-            stages: in the order in which jobs go through them.
+            stages: the stages, in the order in which jobs go through them.
             lanes: number of threads of each lane.
-            options: see there.
+            options: options of the queue.
             observer: receives the events.
-            ending_of: how a job ends whose stage returned this exception.
-            quota: of tenants, if they are limited.
+            ending_of: function that returns how a job ends whose stage returned this exception.
+            quota: quota of the tenants; None if they are not limited.
         """
         self.costs = CostModel()
         self._options = options
@@ -121,12 +121,12 @@ class Scheduler:
 
     @property
     def jobs(self) -> frozenset[Job]:
-        """Those that are admitted and have not ended."""
+        """The jobs that are admitted and have not ended."""
         return frozenset(self._ledger.jobs)
 
     @property
     def backlog_s(self) -> float:
-        """Computing time predicted for the jobs, per thread, of the lane with the most of it."""
+        """Predicted computing time of the jobs, per thread, of the lane with the most of it."""
         return max(self._ledger.booked_s(name) / lane.threads for name, lane in self._lanes.items())
 
     @property
@@ -136,7 +136,7 @@ class Scheduler:
 
     @property
     def next_due_s(self) -> float | None:
-        """When `expire` must be called next; None if there is no job."""
+        """Time of the next necessary call of `expire`; None if there is no job."""
         while self._due:
             due_s, _, reference = self._due[0]
             job = reference()
@@ -146,7 +146,7 @@ class Scheduler:
         return None
 
     def admit(self, job: Job, now_s: float) -> None:
-        """Admits a job, which from then on ends exactly once. Raises Refused, with nothing changed."""
+        """Admits a job, which then ends exactly once; raises Refused without any change."""
         cost_s = self._predict(job.step)
         with self._refusals_reported():
             self._admission.check(job, cost_s, now_s)
@@ -161,7 +161,7 @@ class Scheduler:
         self._enqueue(job, now_s)
 
     def hold(self, flow: Flow, size_bytes: int) -> None:
-        """Books memory that a call holds beside its jobs until `release`. Raises Refused if there is no room."""
+        """Books memory that a call needs besides its jobs, until `release`; raises Refused if there is no room."""
         with self._refusals_reported():
             self._admission.check_memory(flow, size_bytes)
         self._ledger.hold(flow, size_bytes)
@@ -171,12 +171,12 @@ class Scheduler:
         self._ledger.release(flow, size_bytes)
 
     def check_room(self, step: Step) -> None:
-        """Raises Refused if not even a caller without other jobs would be admitted with this first step."""
+        """Raises Refused if a job with this first step would not be admitted even for a caller without other jobs."""
         with self._refusals_reported():
             self._admission.check_queue(_NEW_CALLER, self._predict(step))
 
     def take(self, lane_name: str, now_s: float) -> Batch | None:
-        """Selects what a thread of a lane computes now; None if all are busy or nothing waits."""
+        """Selects what a thread of a lane computes now; None if all threads are busy or no job waits."""
         self.expire(now_s)
         lane = self._lanes[lane_name]
         waiting = [stage for stage in lane.stages if self._queues[stage.name]]
@@ -196,7 +196,7 @@ class Scheduler:
         return Batch(stage, jobs, now_s, next(self._batch_number))
 
     def finish(self, batch: Batch, results: Sequence[StageResult], now_s: float) -> None:
-        """A batch was computed: each of its jobs ends or continues, unless it has ended meanwhile."""
+        """Handles the results of a batch: each of its jobs ends or continues, unless it has ended meanwhile."""
         stage, seconds = batch.stage, now_s - batch.start_s
         lane = self._lanes[stage.lane]
         lane.free += 1
@@ -227,12 +227,12 @@ class Scheduler:
         self._report_load(stage)
 
     def cancel(self, job: Job, now_s: float) -> None:
-        """The caller does not wait for a job any more."""
+        """Ends a job whose caller does not wait for it any more."""
         if not job.is_over:
             self._end(job, Ending.CANCELLED, None, now_s)
 
     def expire(self, now_s: float) -> None:
-        """Ends the jobs that are due, waiting or computed."""
+        """Ends the jobs that are due, waiting or being computed."""
         while (due_s := self.next_due_s) is not None and due_s <= now_s:
             job = heapq.heappop(self._due)[2]()
             assert job is not None
@@ -243,7 +243,7 @@ class Scheduler:
                 self._give_fallback(job, job.fallback, now_s)
 
     def limit_batch(self, stage: str, bucket: str, size: int) -> None:
-        """Computes at most so many jobs of a bucket together from now on, because more did not fit in memory."""
+        """Limits the number of jobs of a bucket that are computed together, because more did not fit in memory."""
         self._max_batch[stage, bucket] = max(1, min(size, self._max_batch.get((stage, bucket), size)))
 
     def drain(self) -> None:
@@ -251,7 +251,7 @@ class Scheduler:
         self._admission.close()
 
     def fail_all(self, error: Exception, now_s: float) -> None:
-        """Ends every job, because nothing will be computed any more."""
+        """Ends all jobs, because nothing will be computed any more."""
         self._admission.close()
         try:
             for job in self.jobs:
@@ -270,7 +270,7 @@ class Scheduler:
             raise
 
     def _predict(self, step: Step) -> Counter[str]:
-        """Computing time of a step and of those that usually follow, by lane."""
+        """Predicted computing time, by lane, of a step and of those that usually follow."""
         cost_s: Counter[str] = Counter()
         stage: Stage | None = self._stages[step.stage]
         kind = step.kind
@@ -281,9 +281,9 @@ class Scheduler:
         return cost_s
 
     def _continue(self, job: Job, result: Next, now_s: float) -> None:
-        """Queues a job for its next step, or if that would end too late or cost too much, for the alternative.
+        """Queues a job for its next step, or, if that would end too late or cost too much, for the alternative.
 
-        Gives the fallback if neither is worthwhile.
+        Ends the job with its fallback if neither is worthwhile.
         """
         job.step, job.fallback = result.step, result.fallback
         cost_s = self._predict(job.step)
@@ -300,7 +300,7 @@ class Scheduler:
         self._enqueue(job, now_s)
 
     def _is_worthwhile(self, job: Job, cost_s: Counter[str], now_s: float) -> bool:
-        """Whether a job's next step fits within the bounds, and its result will be there before the job is due."""
+        """Whether a job's next step fits within the bounds and ends before the job is due."""
         lane = self._lanes[self._stages[job.step.stage].lane]
         coming_first = lane.stages[lane.stages.index(self._stages[job.step.stage]) :]
         wait_s = sum(
@@ -311,7 +311,7 @@ class Scheduler:
         return self._admission.fits(job, cost_s) and now_s + wait_s / lane.threads + cost_s.total() <= job.due_s
 
     def _is_tried_anyway(self, step: Step) -> bool:
-        """True for one in so many: only computing corrects a prediction, and the fallback is given in time anyway."""
+        """Whether to try a step against its prediction: once in a while, since only computing corrects a prediction."""
         self._declined[step.stage, step.kind] += 1
         return self._declined[step.stage, step.kind] % _TRY_ONE_IN == 0
 
@@ -327,7 +327,7 @@ class Scheduler:
         self._report_load(stage)
 
     def _sweep_timers(self) -> None:
-        """Keeps the list of timers about as long as that of the jobs."""
+        """Removes outdated timers, so that their number stays close to that of the jobs."""
         if len(self._due) > 2 * len(self._ledger.jobs) + _ENDED_TIMERS:
             alive = {id(job) for job in self._ledger.jobs}
             self._due = [entry for entry in self._due if id(entry[2]()) in alive]

@@ -32,7 +32,7 @@ ComputeItem = Callable[[ItemT, Callable[[], None]], ResultT]
 
 
 class Failure(Enum):
-    """What an exception of a stage means; its value is how the job ends."""
+    """Kinds of a stage's exceptions; the value is how the job ends."""
 
     BAD_INPUT = Ending.REFUSED_INPUT
     """The caller's error."""
@@ -51,11 +51,11 @@ class WorkQueue:
     """Computes jobs. Methods must be called on one event loop, unless stated otherwise.
 
     The threads take batches from the scheduler themselves: passing every step through the event loop would cost as much
-    as a small step takes, and leave threads idle whenever the loop is busy.
+        as a small step, and leave threads idle whenever the loop is busy.
 
     Attributes:
         on_fatal: called on the event loop when the queue cannot continue.
-        heartbeat_s: when the queue last checked itself, `time.monotonic`.
+        heartbeat_s: time of the queue's last check of itself, by `time.monotonic`.
     """
 
     def __init__(
@@ -67,15 +67,15 @@ class WorkQueue:
         failure_of: Callable[[Exception], Failure] = lambda _: Failure.JOB_FAILED,
         quota: Quota | None = None,
     ) -> None:
-        """An idle queue.
+        """Makes an idle queue.
 
         Args:
-            stages: in the order in which jobs go through them.
+            stages: the stages, in the order in which jobs go through them.
             lanes: number of threads of each lane.
-            options: see there.
+            options: options of the queue.
             observer: receives the events.
-            failure_of: classifies exceptions of stages.
-            quota: of tenants, if they are limited.
+            failure_of: function that classifies exceptions of stages.
+            quota: quota of the tenants; None if they are not limited.
         """
         self._options = options
         self._observer = observer
@@ -108,7 +108,7 @@ class WorkQueue:
 
     @property
     def backlog_s(self) -> float:
-        """Computing time predicted for the admitted jobs, per thread, of the lane with the most of it."""
+        """Predicted computing time of the admitted jobs, per thread, of the lane with the most of it."""
         with self._lock:
             return self._scheduler.backlog_s
 
@@ -140,11 +140,11 @@ class WorkQueue:
         """Submits a job and waits for its result; cancelling the wait cancels the job.
 
         Raises:
-            ValueError: it has been run and has ended.
+            ValueError: the job has been run already.
             Refused: there is no room for it.
             Expired: its deadline passed.
             Fatal: the queue has ended.
-            Exception: its stage failed with it.
+            Exception: the exception with which its stage failed.
         """
         if job.is_over:
             raise ValueError("a job that has ended cannot be run again")
@@ -170,7 +170,7 @@ class WorkQueue:
 
     @contextmanager
     def hold(self, flow: Flow, size_bytes: int) -> Iterator[None]:
-        """Books memory that a call of several jobs holds during the block; their own sizes then exclude it.
+        """Books memory that a call of several jobs needs during the block; their own sizes then exclude it.
 
         Raises:
             Refused: there is no room for it.
@@ -189,17 +189,17 @@ class WorkQueue:
             self._scheduler.check_room(step)
 
     def forget_costs(self) -> None:
-        """Forgets how long jobs took, because later ones will differ."""
+        """Forgets the observed computing times, because those of later jobs will differ."""
         with self._lock:
             self._scheduler.costs.forget()
 
     def drain(self) -> None:
-        """Refuses every job from now on; those admitted are computed."""
+        """Refuses all new jobs; admitted ones are still computed."""
         with self._lock:
             self._scheduler.drain()
 
     async def close(self, limit_s: float = 30.0) -> None:
-        """Ends every job and waits until the threads have finished their current step.
+        """Ends all jobs and waits until the threads have finished their current step.
 
         A thread that takes longer than `limit_s` is abandoned: it ends with the process.
         """
@@ -225,7 +225,7 @@ class WorkQueue:
                     condition.notify_all()
 
     async def _run_timer(self) -> None:
-        """Ends jobs that are due and detects threads that hang, until the queue is closed."""
+        """Ends due jobs and detects hanging threads, until the queue is closed."""
         try:
             while True:
                 self._wakes_timer.clear()
@@ -242,7 +242,7 @@ class WorkQueue:
             self._fail(error)
 
     def _notify(self) -> None:
-        """Wakes threads and timer after the scheduler has changed; with the lock held."""
+        """Wakes threads and timer after a change of the scheduler; the caller has the lock."""
         for condition in self._wakes_threads.values():
             condition.notify()
         due_s = self._scheduler.next_due_s
@@ -257,7 +257,7 @@ class WorkQueue:
                 raise Fatal(f"the stage {batch.stage.name} has computed for {silent_s:.0f} s in one step: it hangs")
 
     def _fail(self, error: BaseException) -> None:
-        """Ends the queue: every job fails, and the owner is notified once."""
+        """Ends the queue: all jobs fail, and the owner is notified once."""
         if self._is_closed:
             return
         fatal = error if isinstance(error, Fatal) else Fatal(f"the work queue failed: {error!r}")
@@ -296,7 +296,7 @@ class WorkQueue:
         return None
 
     def _compute_batch(self, stage: Stage, jobs: Sequence[Job]) -> list[StageResult]:
-        """The stage's result for each job; if the stage raises, by computing halves."""
+        """Computes the stage's result for each job; if the stage raises, computes halves of the batch."""
         try:
             results = list(self._compute[stage.name](jobs))
             if len(results) != len(jobs):
@@ -320,7 +320,7 @@ class WorkQueue:
         return self._compute_batch(stage, jobs[:half]) + self._compute_batch(stage, jobs[half:])
 
     def _classify(self, error: Exception) -> Failure:
-        """What the exception means. Raises Fatal if the device is lost."""
+        """Classifies an exception; raises Fatal if the device is lost."""
         failure = self._failure_of(error)
         if failure is Failure.OUT_OF_MEMORY:
             self._observer.ran_out_of_memory()
@@ -355,7 +355,7 @@ class ItemList(Generic[ItemT, ResultT]):
         self.results: list[ResultT] = [None] * len(items)  # type: ignore[list-item]  # each is set before it is read
 
     def compute_next(self, job: Job) -> StageResult:
-        """Computes one item; done when none is left."""
+        """Computes one item; the job is done when none is left."""
         try:
             index, item = self._remaining.popleft()
         except IndexError:

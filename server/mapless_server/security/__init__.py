@@ -1,7 +1,7 @@
-"""Who may do what: tokens, TLS, tenancy, the address that may be listened on, and each tenant's computing time.
+"""Access control: tokens, TLS, tenancy, the address to listen on, and each tenant's computing time.
 
 Imports only errors and settings. Begin with `protection.Protection`, which is made from the settings, and
-`METHOD_ROLES` in `access`, the role that each method takes. `tenancy` has the keys of scenes, which all rooms below the
+`METHOD_ROLES` in `access`, the role that each method needs. `tenancy` has the keys of scenes, which all rooms below the
 services use. `protection` and `tls` are imported by name: a store needs keys of scenes, and no TLS.
 """
 

@@ -1,4 +1,4 @@
-"""Authentication and authorization: one table has the role that each method takes; other methods are rejected."""
+"""Authentication and authorization: one table has the role that each method needs; other methods are rejected."""
 
 from __future__ import annotations
 
@@ -65,17 +65,17 @@ class Authenticator:
         tokens: Callable[[], Tokens] | None,
         now: Callable[[], datetime] = lambda: datetime.now(timezone.utc),
     ) -> None:
-        """`tokens` gives the current tokens; None if callers need none."""
+        """The function `tokens` returns the current tokens; None if callers need no token."""
         self._tokens = tokens
         self._now = now
 
     def authenticate(
         self, metadata: Metadata, method: str, auth_context: Mapping[str, Iterable[bytes]] | None = None
     ) -> Principal:
-        """The caller of a method, who may call it.
+        """Authenticates the caller of a method, and checks that it may call the method.
 
         Args:
-            metadata: of the call.
+            metadata: metadata of the call.
             method: "/package.Service/Method", one of METHOD_ROLES.
             auth_context: the connection's facts about the caller, `context.auth_context()`.
 
@@ -104,7 +104,7 @@ class Authenticator:
 
 
 def certificate_name(auth_context: Mapping[str, Iterable[bytes]]) -> str:
-    """The name in the client's certificate, fit for the log; empty without a certificate."""
+    """The name in the client's certificate, in a form for the log; empty without a certificate."""
     for key in ("x509_common_name", "x509_subject_alternative_name", "x509_subject"):
         for value in auth_context.get(key, ()):
             text = value.decode(errors="replace")

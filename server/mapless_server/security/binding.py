@@ -13,7 +13,7 @@ Resolve = Callable[[str], list[str]]
 
 
 def resolve_host(host: str) -> list[str]:
-    """The addresses of a name or an address; none if it cannot be resolved."""
+    """The addresses of a host's name or address; empty if it cannot be resolved."""
     try:
         found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError):
@@ -28,7 +28,7 @@ def is_loopback(host: str, resolve: Resolve = resolve_host) -> bool:
 
 
 def assess_binding(settings: Settings, resolve: Resolve = resolve_host) -> tuple[int, str]:
-    """The danger of listening on the settings' host with the settings' protection.
+    """Rates the danger of listening on the settings' host with the settings' protection.
 
     Returns:
         A level of `logging`, of which CRITICAL means that the server must not start, and a sentence for the operator,

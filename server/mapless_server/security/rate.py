@@ -1,6 +1,6 @@
 """Limits each tenant's computing time by a token bucket of seconds.
 
-Time is passed in. There is no lock here: the work queue calls from many threads while it holds its own.
+Times are arguments. There is no lock here: the work queue calls from many threads with its own lock.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _SWEEP_AT_LEAST = 64
 
 @dataclass
 class _Bucket:
-    """Seconds of computing that were left (below 0: debt) at a time."""
+    """The remaining seconds of computing (negative: debt) at a time."""
 
     level_s: float
     at_s: float
@@ -29,7 +29,7 @@ class RateLimiter:
     def __init__(
         self, rate: float, burst_s: float, rate_of: Callable[[str], float | None] = lambda tenant: None
     ) -> None:
-        """A tenant may use `rate` seconds of computing a second and save up `burst_s`.
+        """A tenant may use `rate` seconds of computing per second, and save up `burst_s`.
 
         Args:
             rate: 0 for no limit.
@@ -37,7 +37,7 @@ class RateLimiter:
             rate_of: a tenant's own rate, or None; it may change at any time.
 
         Raises:
-            ValueError: a number out of its range.
+            ValueError: a number is out of its range.
         """
         if not rate >= 0:
             raise ValueError(f"rate must be at least 0, is {rate}")
@@ -51,12 +51,12 @@ class RateLimiter:
         self._sweep_at = _SWEEP_AT_LEAST
 
     def charge(self, tenant: str, cost_s: float, now_s: float) -> float:
-        """Admits a job and charges for it, or gives the time until it would be admitted, seconds; 0: admitted.
+        """Admits a job, charges for it and returns 0; otherwise returns the seconds until it would be admitted.
 
         A job that costs more than the burst is admitted when the bucket is full, and leaves a debt.
 
         Args:
-            tenant: whose job.
+            tenant: owner of the job.
             cost_s: predicted computing time, seconds.
             now_s: the time, by any monotonic clock.
         """
@@ -95,7 +95,7 @@ class RateLimiter:
             self._forget_full(now_s)
 
     def _forget_full(self, now_s: float) -> None:
-        """Runs again at twice the number that remains, so that its cost per job is constant."""
+        """Removes full buckets; runs again at twice the remaining number, so that its cost per job is constant."""
         self._buckets = {
             tenant: bucket
             for tenant, bucket in self._buckets.items()

@@ -26,22 +26,22 @@ class Refreshable(Protocol):
     """A value that is read from files."""
 
     def refresh(self) -> bool:
-        """Reads the files if they changed; whether they did. It blocks."""
+        """Reads the files if they have changed, and returns whether they have; it blocks."""
 
 
 class Reloading(Generic[T]):
-    """A value made from files; `value` may be read from any thread and never waits."""
+    """A value that is read from files; `value` may be read from any thread and never waits."""
 
     def __init__(self, paths: Sequence[Path], read: Callable[[], T], what: str) -> None:
         """Reads the files.
 
         Args:
             paths: all files that `read` reads.
-            read: makes the value; raises SecurityError if it cannot.
-            what: its name in the log, "tokens".
+            read: function that makes the value; raises SecurityError if it cannot.
+            what: name of the value in the log, "tokens".
 
         Raises:
-            SecurityError: a file is missing, or wrong.
+            SecurityError: a file is missing or wrong.
         """
         self._paths = tuple(paths)
         self._read = read
@@ -55,7 +55,7 @@ class Reloading(Generic[T]):
         return self._value
 
     def refresh(self) -> bool:
-        """Reads the files if they changed; whether the value is a new one.
+        """Reads the files if they have changed, and returns whether the value is new.
 
         An error is logged once, and the files are read again by every call: files that are replaced one after the other
         do not fit together until the last one is. One thread at a time.
@@ -86,7 +86,7 @@ class Reloading(Generic[T]):
 
 
 async def keep_fresh(sources: Sequence[Refreshable], interval_s: float = CHECK_INTERVAL_S) -> None:
-    """Refreshes until it is cancelled, in a thread, so that the event loop never waits for the disk."""
+    """Refreshes the values in a thread, until it is cancelled, so that the event loop never waits for the disk."""
     while True:
         await asyncio.sleep(interval_s)
         for source in sources:

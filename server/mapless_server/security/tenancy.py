@@ -1,7 +1,7 @@
-"""Callers, and keys of scenes, which hold a scene's tenant below the services. Only this module makes and reads keys.
+"""Callers, and keys of scenes, which contain the scene's tenant. Only this module makes and reads keys.
 
-The store and its caches use keys only, so that a scene of another tenant does not exist for a caller. Callers use ids,
-and never see keys.
+The store and its caches use only keys, so that scenes of another tenant do not exist for a caller. Callers use ids, and
+never see keys.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ class Principal:
     """A caller.
 
     Attributes:
-        tenant: whose scenes it can access.
+        tenant: tenant whose scenes it can access.
         role: its rights on them.
-        name: of its token or certificate, for the log; empty without either.
+        name: name of its token or certificate, for the log; empty without either.
     """
 
     tenant: str = DEFAULT_TENANT
@@ -53,12 +53,12 @@ _NEXT_CHARACTER = "0"
 
 
 def check_tenant(tenant: str) -> str:
-    """The tenant's name, unchanged; ValueError if it breaks the rules, which are those of ids."""
+    """Returns the tenant's name; raises ValueError if it breaks the rules, which are those of ids."""
     return check_id(tenant)
 
 
 def key_of(tenant: str, scene_id: str) -> SceneKey:
-    """The key of a tenant's scene; both names are checked already."""
+    """The key of a tenant's scene; both names must have been checked."""
     return SceneKey(scene_id if tenant == DEFAULT_TENANT else f"{tenant}{KEY_SEPARATOR}{scene_id}")
 
 
@@ -77,6 +77,6 @@ def scene_id_of(key: SceneKey) -> str:
 def end_of_keys(tenant: str) -> str:
     """The first text, by code point, after all keys of a tenant that is not the default one.
 
-    Between "tenant/" and "tenant0" lie the tenant's keys and nothing else.
+    Between "tenant/" and "tenant0" there are only the tenant's keys.
     """
     return f"{tenant}{_NEXT_CHARACTER}"

@@ -25,7 +25,7 @@ class TlsFiles:
 
     Attributes:
         certificate: the server's chain, its own certificate first.
-        key: of that certificate.
+        key: key of that certificate.
         client_ca: the authorities of clients' certificates.
     """
 
@@ -41,7 +41,7 @@ class TlsFiles:
 
 @dataclass(frozen=True)
 class TlsMaterial:
-    """The contents of the files, PEM, and when the server's certificate expires."""
+    """The PEM contents of the files, and the time when the server's certificate expires."""
 
     certificate: bytes
     key: bytes
@@ -49,12 +49,12 @@ class TlsMaterial:
     expires: datetime
 
     def __repr__(self) -> str:
-        """Without the key."""
+        """Omits the key."""
         return f"TlsMaterial(expires={self.expires})"
 
 
 def read_material(files: TlsFiles) -> TlsMaterial:
-    """The contents of the files.
+    """Reads the contents of the files.
 
     Raises:
         SecurityError: a file is missing or not PEM, the key is not the certificate's, or the certificate is not valid
@@ -72,7 +72,7 @@ def read_material(files: TlsFiles) -> TlsMaterial:
 
 
 class Tls:
-    """The server's TLS; `refresh` follows changes of the files."""
+    """The server's TLS; `refresh` reads changed files."""
 
     def __init__(self, files: TlsFiles) -> None:
         """Raises SecurityError if the files cannot be used."""
@@ -81,7 +81,7 @@ class Tls:
 
     @property
     def expiry_s(self) -> float:
-        """When the certificate in use expires, seconds since 1970."""
+        """Time when the certificate in use expires, seconds since 1970."""
         return self._material.value.expires.timestamp()
 
     def refresh(self) -> bool:
@@ -89,11 +89,11 @@ class Tls:
         return self._material.refresh()
 
     def server_credentials(self) -> grpc.ServerCredentials:
-        """For `add_secure_port`; they follow the files."""
+        """Credentials for `add_secure_port`; they follow changes of the files."""
         lock, in_use = threading.Lock(), self._material.value
 
         def fetch() -> grpc.ServerCertificateConfiguration | None:
-            """Called by grpc for every connection, in its own threads; None: no change."""
+            """The current certificate, None if unchanged; grpc calls this for every connection, in its own threads."""
             nonlocal in_use
             with lock:
                 if self._material.value is in_use:
@@ -130,7 +130,7 @@ def _check_time(certificate: x509.Certificate, path: Path) -> None:
 
 
 def _certified_key(certificate: x509.Certificate, path: Path) -> bytes:
-    """The public key of a certificate, DER."""
+    """The certificate's public key, DER."""
     try:
         return certificate.public_key().public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
     except (ValueError, UnsupportedAlgorithm) as error:
@@ -138,7 +138,7 @@ def _certified_key(certificate: x509.Certificate, path: Path) -> bytes:
 
 
 def _public_key_of(data: bytes, path: Path) -> bytes:
-    """The public key of a private one, DER."""
+    """The public key that belongs to a private key, DER."""
     try:
         key = load_pem_private_key(data, password=None)
     except TypeError as error:

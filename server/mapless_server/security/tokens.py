@@ -42,11 +42,11 @@ class Token(BaseModel):
     """An entry of the file.
 
     Attributes:
-        name: of the holder; unique, and the caller's name in the log.
-        tenant: whose scenes the holder can access.
+        name: unique name of its holder, and the caller's name in the log.
+        tenant: tenant whose scenes the holder can access.
         role: the holder's rights.
-        sha256: of the token, hexadecimal.
-        expires: when it expires; None: never.
+        sha256: hash of the token, hexadecimal.
+        expires: when it expires; None for never.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -90,12 +90,12 @@ class Tokens(BaseModel):
     def find(self, token: str) -> Token | None:
         """The entry of a token; None if it is unknown.
 
-        The look-up is by hash, so its duration depends on the caller's own token and reveals nothing of the others.
+        The look-up is by hash, so its duration depends only on the caller's own token.
         """
         return self._by_hash.get(sha256_of(token))
 
     def rate_ms(self, tenant: str) -> float | None:
-        """Computing time that a tenant may use, milliseconds a second; None if the file does not set it."""
+        """Computing time that a tenant may use, milliseconds per second; None if the file does not set it."""
         limits = self.tenants.get(tenant)
         return limits.rate_ms if limits else None
 
@@ -110,7 +110,7 @@ def sha256_of(token: str) -> str:
 
 
 def read_tokens(path: Path) -> Tokens:
-    """The file of tokens; SecurityError if it cannot be read or is malformed."""
+    """Reads the file of tokens; SecurityError if it cannot be read or is malformed."""
     try:
         return Tokens.model_validate_json(read_file(path))
     except ValidationError as error:
@@ -118,7 +118,7 @@ def read_tokens(path: Path) -> Tokens:
 
 
 def create_token(path: Path, name: str, tenant: str, role: str, expires: datetime | None) -> str:
-    """A new token, whose hash is added to the file, or to a new file.
+    """Creates a token and adds its hash to the file, which is created if missing; returns the token.
 
     Raises:
         SecurityError: the name is taken, a value is wrong, or the file cannot be read or written.
@@ -152,7 +152,7 @@ def revoke_token(path: Path, name: str) -> None:
 
 
 def _describe(error: ValidationError) -> str:
-    """The first fault, without the value, which may be a token in the place of its hash."""
+    """Describes the first fault without its value, which may be a token in the place of its hash."""
     fault = error.errors()[0]
     where = ascii(".".join(map(str, fault["loc"])))[1:-1]  # names in the file may be anything
     what = fault["msg"].removeprefix("Value error, ")
@@ -161,7 +161,7 @@ def _describe(error: ValidationError) -> str:
 
 @contextmanager
 def _changing(path: Path) -> Iterator[Path]:
-    """The file, with links resolved, locked against other commands; SecurityError if that fails."""
+    """Locks the file, with links resolved, against other commands; SecurityError if that fails."""
     file = path.resolve()
     try:
         folder = os.open(file.parent, os.O_RDONLY)

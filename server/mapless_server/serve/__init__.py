@@ -1,4 +1,4 @@
-"""The process: from settings to a server that listens, and its end.
+"""The process: from settings to a running server, and its end.
 
 May import every room of the package. Begin with `run.serve`, which runs until a signal, then `running.running_server`,
 which opens in order what must be closed in reverse; `assembly` makes engine and store from the settings, and `command`

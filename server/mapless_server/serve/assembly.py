@@ -1,4 +1,4 @@
-"""Makes the engine and its store from the settings, and replaces what `auto` would use and is not installed.
+"""Makes the engine and its store from the settings; replaces parts that `auto` would use but are not installed.
 
 Nothing here imports torch unless the settings name a network.
 """
@@ -77,14 +77,14 @@ class StartupError(Exception):
 
 
 def image_limits(settings: Settings) -> ImageLimits:
-    """The limits of images in the settings."""
+    """Limits of images from the settings."""
     return ImageLimits(
         max_bytes=settings.max_image_mib * 2**20, max_pixels=round(settings.max_image_megapixels * 1_000_000)
     )
 
 
 def engine_options(settings: Settings) -> EngineOptions:
-    """The engine's options in the settings."""
+    """Options of the engine from the settings."""
     return EngineOptions(
         workers=settings.workers,
         max_batch=settings.max_batch,
@@ -100,7 +100,7 @@ def engine_options(settings: Settings) -> EngineOptions:
 
 
 def open_store(settings: Settings) -> Store:
-    """The store of the settings' database or data folder; StartupError if it cannot be opened."""
+    """Opens the store of the settings' database or data folder; StartupError if it cannot be opened."""
     cache_bytes = settings.reference_cache_mib * 2**20
     try:
         if settings.database_url is not None:
@@ -114,7 +114,7 @@ MakeEngine = Callable[[Settings, Store, Metrics, "RateLimiter | None"], QueueEng
 
 
 def make_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
-    """The engine of the settings; StartupError if they name a device or weights that are missing."""
+    """Makes the engine of the settings; StartupError if they name a device or weights that are missing."""
     try:
         tiers = make_tiers(settings)
         descriptor = make_descriptor(settings, tiers[0].extractor)
@@ -185,7 +185,7 @@ def _background_matching(
     made: SceneDepths | None,
     depths: DepthFinder | None,
 ) -> BackgroundMatching:
-    """Matching for the queries of each tier, the first one first; from now on, queries look for its results."""
+    """Makes the matching for the queries of each tier, in order; queries look for its results from then on."""
     pairs, matchings, strong = PairStore(store.database), dict[Matching, PairFinder](), dict[Matching, PairFinder]()
     for tier in engine.tiers:
         matcher = tier.pipeline.matcher
@@ -220,9 +220,9 @@ def _tiers(features: str, device: str) -> tuple[tuple[str, ...], ...]:
 
 
 def make_tiers(settings: Settings) -> tuple[Tier, ...]:
-    """The tiers of the settings, the cheapest first.
+    """Makes the tiers of the settings, the cheapest first.
 
-    `auto` leaves out features without weights or packages, and logs it; at the worst SIFT is used alone.
+    `auto` leaves out features without weights or packages, and logs it; in the worst case only SIFT is used.
 
     Raises:
         ValueError: there is no such device.
@@ -265,7 +265,7 @@ def make_depth_network(settings: Settings, tiers: Sequence[Tier]) -> Reconstruct
 
 
 def make_descriptor(settings: Settings, extractor: FeatureExtractor) -> GlobalDescriptor:
-    """The descriptor by which references are chosen; `extractor` is the first tier's. Errors as `make_tiers`.
+    """Makes the descriptor for choosing references; `extractor` is the first tier's. Errors as in `make_tiers`.
 
     `auto` is MegaLoc if networks run on a CUDA device and its weights are present: on a CPU it takes seconds.
     """
@@ -282,7 +282,7 @@ def make_descriptor(settings: Settings, extractor: FeatureExtractor) -> GlobalDe
 
 
 def make_first_features(settings: Settings) -> tuple[str, FeatureExtractor]:
-    """The first tier's features, and their extractor; errors as `make_tiers`."""
+    """Name of the first tier's features, and their extractor; errors as in `make_tiers`."""
     missing = _Missing()
     extractors = _make_extractors(settings, device_for(settings), missing)
     _log_missing(extractors, missing)
@@ -290,14 +290,14 @@ def make_first_features(settings: Settings) -> tuple[str, FeatureExtractor]:
 
 
 def what_is_missing(error: ImportError | WeightsMissing) -> str:
-    """The missing package or weights, and how to get them, for the operator."""
+    """Says which package or weights are missing, and how to get them, for the operator."""
     return install_hint(error) if isinstance(error, ImportError) else str(error)
 
 
 def device_for(settings: Settings) -> str:
-    """The device of networks; errors as `choose_device`.
+    """The device of networks; errors as in `choose_device`.
 
-    Without networks it is the CPU: looking for others would import torch, a third of the server's memory.
+    Without networks it is the CPU: searching for others would import torch, a third of the server's memory.
     """
     needs_none = settings.backend == "geometric" and settings.reference_depth in (OFF, STORED)
     if settings.device == "auto" and needs_none and not _wants_networks(settings):
@@ -306,7 +306,7 @@ def device_for(settings: Settings) -> str:
 
 
 def _wants_networks(settings: Settings) -> bool:
-    """Whether the features are a network's; with `auto`, whether there are weights of one."""
+    """Whether the features are a network's; with `auto`, whether weights of a network are present."""
     if settings.features != AUTO:
         return settings.features != WITHOUT_WEIGHTS
     return any(name != WITHOUT_WEIGHTS for tiers in (CPU_TIERS, GPU_TIERS) for name in _present(tiers, settings))
@@ -322,7 +322,7 @@ def _present(tiers: Iterable[Sequence[str]], settings: Settings) -> Iterator[str
 
 
 def choose_device(device: str) -> str:
-    """The device of networks; `auto` is a CUDA device if torch is installed and finds one, else the CPU.
+    """Chooses the device of networks; `auto` is a CUDA device if torch is installed and finds one, else the CPU.
 
     Raises:
         ValueError: there is no such device.
@@ -366,7 +366,7 @@ def _find_device(device: str) -> str:
 
 
 def _make_extractors(settings: Settings, device: str, missing: _Missing) -> dict[str, FeatureExtractor]:
-    """The features of each tier; adds to `missing` what `auto` leaves out."""
+    """Makes the extractor of each tier; adds to `missing` what `auto` leaves out."""
     extractors: dict[str, FeatureExtractor] = {}
     for alternatives in _tiers(settings.features, device):
         for name in alternatives:
@@ -392,7 +392,7 @@ def _log_missing(present: Iterable[str], missing: _Missing) -> None:
 
 
 def _remedy(missing: _Missing) -> str:
-    """What brings the missing features: a package first, then all weights at once."""
+    """Says how to get the missing features: a package first, then all weights at once."""
     for error in missing.values():
         if isinstance(error, ImportError):
             return install_hint(error)
@@ -406,7 +406,7 @@ def _make_extractor(name: str, settings: Settings, device: str) -> FeatureExtrac
 
 
 def _make_matcher(name: str, settings: Settings, device: str) -> Matcher:
-    """Nearest neighbours, or LightGlue on a GPU if its weights are present."""
+    """Makes a matcher: nearest neighbours, or LightGlue on a GPU if its weights are present."""
     network = _light_glue_of(name)
     if device != "cpu" and network is not None:
         try:
@@ -417,15 +417,15 @@ def _make_matcher(name: str, settings: Settings, device: str) -> Matcher:
 
 
 def _make_strong_matcher(name: str, settings: Settings, missing: _Missing) -> Matcher:
-    """For a tier that answers where a cheaper one is doubtful, on a CPU: with LightGlue, half a second a pair.
+    """Makes the matcher of a stronger tier, on a CPU: with LightGlue, half a second per pair.
 
-    Adds its weights to `missing` if they are.
+    Adds its weights to `missing` if they are missing.
     """
     return make_matcher(name, available_cores(), _find_light_glue(name, settings, missing))
 
 
 def _find_light_glue(features: str, settings: Settings, missing: _Missing) -> Path | None:
-    """The weights of the LightGlue of some features, if there is one; added to `missing` if they are."""
+    """Finds the weights of the features' LightGlue, if there is one; adds them to `missing` if they are missing."""
     network = _light_glue_of(features)
     try:
         return None if network is None else find_weights(network, settings.weights_dir)
@@ -435,6 +435,6 @@ def _find_light_glue(features: str, settings: Settings, missing: _Missing) -> Pa
 
 
 def _light_glue_of(features: str) -> str | None:
-    """Its name in the catalogue; None if there is none."""
+    """Name of the features' LightGlue in the catalogue; None if there is none."""
     network = f"{features}-lightglue"
     return network if network in WITH_WEIGHTS else None

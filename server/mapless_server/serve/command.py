@@ -25,7 +25,7 @@ Config = Annotated[Path | None, typer.Option(help="TOML file of settings; also M
 
 
 def _with_setting_flags(command: Callable[..., None]) -> Callable[..., None]:
-    """Adds an option for each setting, None where it is not given, to a command that takes any keyword.
+    """Adds an option for each setting to a command that takes any keyword; an option that is not given is None.
 
     Secrets get no flag, because every user of the machine can read a command line.
     """
@@ -74,6 +74,6 @@ def serve_command(config: Config = None, **flags: Any) -> None:
 
 
 def fail(message: str, code: int = 2) -> NoReturn:
-    """Ends a command with one line on standard error and an exit code, 2 for wrong usage."""
+    """Ends a command with one line on standard error and an exit code (2 for wrong usage)."""
     print(f"mapless-server: {message}", file=sys.stderr)
     raise typer.Exit(code)

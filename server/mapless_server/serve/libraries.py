@@ -1,4 +1,4 @@
-"""What libraries must know before they are imported and before there are threads; commands set it first."""
+"""What libraries must have before they are imported and before threads are started; commands set it first."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _MALLOC_OPTIONS = {-8: 1, -3: 32 * 2**20, -1: 128 * 2**20}
 
 
 def configure_libraries(settings: Settings) -> None:
-    """Sets environment variables that libraries read, and how memory is allocated; the operator's own values stay."""
+    """Sets environment variables of libraries, and the allocation of memory; the operator's own values remain."""
     environment = {
         # Calls run in parallel, and matching has threads of its own. The matrices are small, and threads of BLAS wait
         # for one another in a busy loop: with two, on two cores of which one was busy, a call took 1.9 s instead of
@@ -33,12 +33,12 @@ def configure_libraries(settings: Settings) -> None:
 
 
 def _share_one_heap() -> None:
-    """Lets all threads allocate from the same heap, where the C library is glibc.
+    """Makes all threads allocate from the same heap, if the C library is glibc.
 
-    It gives threads heaps of their own, each of which keeps the tens of megabytes that the features of one photograph
-    need for a moment: a server without references had 415 MiB instead of 225. Threads hold Python's lock for most
-    allocations, so that they do not wait for the heap. It keeps up to 128 MiB free for the next query, because
-    requesting them from the system took a query 16 ms.
+    By default glibc gives each thread its own heap, which keeps the tens of megabytes that the features of one
+        photograph need for a short time: a server without references had 415 MiB instead of 225. Threads have Python's
+        lock for most allocations, so they do not wait for the heap. The heap keeps up to 128 MiB free for the next
+        query, because requesting them from the system took 16 ms per query.
     """
     if sys.platform == "linux" and (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
         for option, value in _MALLOC_OPTIONS.items():

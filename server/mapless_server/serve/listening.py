@@ -22,7 +22,7 @@ class AddressTaken(Exception):
 
 
 class GrpcServer:
-    """Listens for the services' calls.
+    """Receives the calls of the services.
 
     Attributes:
         address: "host:port".
@@ -34,7 +34,7 @@ class GrpcServer:
         """Binds its port.
 
         Raises:
-            AddressTaken: another server has it, or it is not an address of ours.
+            AddressTaken: another server uses the address, or it is not an address of this machine.
         """
         self._server = grpc.aio.server(options=_options(settings), maximum_concurrent_rpcs=MAX_CONCURRENT_RPCS)
         services.add_to(self._server)
@@ -54,11 +54,11 @@ class GrpcServer:
         await self._server.start()
 
     async def stop(self) -> None:
-        """Accepts no more calls; answers in transit get a moment."""
+        """Stops accepting calls; answers that are being sent get a moment."""
         await self._server.stop(_LAST_BYTES_S)
 
     async def close(self) -> None:
-        """Ends at once."""
+        """Ends immediately."""
         await self._server.stop(0)
 
 

@@ -1,4 +1,4 @@
-"""Runs the server until a signal stops it, or a failure inside it."""
+"""Runs the server until a signal or an internal failure stops it."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ async def serve(settings: Settings, make: MakeEngine = make_engine) -> None:
 
 
 async def exit_failed() -> NoReturn:
-    """Ends the process when callers have been notified, for its supervisor to restart it."""
+    """Ends the process after callers have been notified, so that its supervisor restarts it."""
     await asyncio.sleep(NOTIFY_S)
     logging.shutdown()
     os._exit(FATAL_EXIT_CODE)  # not waiting for threads, which may hang

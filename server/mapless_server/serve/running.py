@@ -1,4 +1,4 @@
-"""A running server: opens its parts in order, and closes them in reverse when its block is left."""
+"""A running server: opens its parts in order, and closes them in reverse order at the end of its block."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ class Listener(Protocol):
         """Accepts calls."""
 
     async def stop(self) -> None:
-        """Accepts no more calls; all are answered, but the last bytes may be in transit."""
+        """Stops accepting calls; all calls are answered, but the last bytes may still be in transit."""
 
     async def close(self) -> None:
-        """Ends at once; may follow `stop`."""
+        """Ends immediately; may be called after `stop`."""
 
 
 Listen = Callable[[Settings, Services, "grpc.ServerCredentials | None"], Listener]
@@ -64,13 +64,13 @@ Listen = Callable[[Settings, Services, "grpc.ServerCredentials | None"], Listene
 
 @dataclass(frozen=True)
 class Running:
-    """A server that serves.
+    """A server that answers calls.
 
     Attributes:
         address: "host:port".
-        metrics_address: the same of the metrics; empty if there are none.
-        engine: of the services.
-        failed: done after an unrecoverable failure: nothing will be computed any more.
+        metrics_address: "host:port" of the metrics; empty if they are not served.
+        engine: engine of the services.
+        failed: a future that is done after an unrecoverable failure, when nothing will be computed any more.
     """
 
     address: str
@@ -83,16 +83,17 @@ class Running:
 async def running_server(
     settings: Settings, make: MakeEngine = make_engine, store: Store | None = None, listen: Listen = GrpcServer
 ) -> AsyncIterator[Running]:
-    """A running server, for use within a program; it is drained when the block is left.
+    """Runs a server within a program; it is drained at the end of the block.
 
-    It listens at once, and serves when its engine is warm.
+    It listens at once, and answers calls after the warm-up.
 
     Args:
-        settings: port 0 takes any free one.
-        make: makes the engine, in a thread, because networks take long to load. The engine is closed at the end.
-        store: of the references; opened from the settings if None. Closed at the end, unless the settings' protection
-            is rejected.
-        listen: makes the listener.
+        settings: its settings; port 0 for any free one.
+        make: function that makes the engine, called in a thread, because networks take long to load. The engine is
+            closed at the end.
+        store: store of the references; opened from the settings if None. Closed at the end, unless the settings'
+            protection is rejected.
+        listen: function that makes the listener.
 
     Raises:
         StartupError: weights or a device are missing, the data folder or a file cannot be used, a port is taken, or
@@ -147,7 +148,7 @@ async def _start(
 
 
 async def _stop_serving(services: Services, failed: asyncio.Future[Fatal]) -> None:
-    """Reports NOT_SERVING when the server has failed."""
+    """Reports NOT_SERVING after the server has failed."""
     await asyncio.wait({failed})
     await services.set_serving(False)
 
@@ -168,7 +169,7 @@ def _make_tracer(settings: Settings) -> Tracer:
 def _serve_metrics(
     settings: Settings, metrics: Metrics, store: Store, protection: Protection, stack: AsyncExitStack
 ) -> str:
-    """Serves the metrics; gives "host:port", empty if the settings switch them off."""
+    """Serves the metrics; returns "host:port", empty if the settings disable them."""
     metrics.scraped.reference_cache = lambda: store.reference_cache
     if protection.tls is not None:
         tls = protection.tls
@@ -219,7 +220,7 @@ def _on_fatal(fatal: Fatal, failed: asyncio.Future[Fatal], metrics: Metrics) -> 
 
 
 def _run_task(stack: AsyncExitStack, work: Coroutine[Any, Any, None]) -> None:
-    """Runs a task until the stack is left; logs its failure at once."""
+    """Runs a task until the stack is closed; logs its failure at once."""
     task = asyncio.ensure_future(work)
 
     def log_failure(_: asyncio.Task[None]) -> None:

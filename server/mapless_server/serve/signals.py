@@ -11,7 +11,7 @@ from typing import Any
 
 @contextmanager
 def terminable() -> Iterator[None]:
-    """SIGTERM raises SystemExit within the block, so that child servers and temporary folders are removed."""
+    """Converts SIGTERM within the block to SystemExit, so that child servers and temporary folders are removed."""
 
     def leave(*_: Any) -> None:
         sys.exit(128 + signal.SIGTERM)

@@ -1,7 +1,7 @@
 """Health of the ReferenceService: NOT_SERVING while the store cannot be changed.
 
-Queries still read what is in memory and on the disk, so a disk that is full or read-only does not end the service of
-the whole server. A database that servers share is not watched: while it is down, no other server is better.
+Queries still read memory and disk, so a disk that is full or read-only does not make the whole server unhealthy. A
+database that servers share is not watched: if it fails, it fails for all of them.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ CHECK_INTERVAL_S = 5.0
 async def watch_store(
     store: Store, notify: Callable[[bool], Awaitable[None]], interval_s: float = CHECK_INTERVAL_S
 ) -> None:
-    """Notifies of each change of whether the store can be written, until it is cancelled.
+    """Reports each change of whether the store can be written, until it is cancelled.
 
     Args:
         store: written to once at the beginning.
-        notify: called with the new value; the first one is compared with True.
+        notify: called with the new value; the initial value is True.
         interval_s: time between checks.
     """
     if store.database.is_shared:

@@ -1,4 +1,4 @@
-"""Localizes a photograph before the first call: finds failures at the start, and does what is slow only once.
+"""Localizes a photograph before the first call: detects failures at the start, and does what is slow the first time.
 
 The photographs are rendered: two walls with random patterns, one before the other, from four camera centres.
 """
@@ -51,7 +51,7 @@ class WarmUpFailed(Exception):
 
 
 async def warm_up(engine: QueueEngine) -> None:
-    """Localizes until the queue can predict the time of a query; WarmUpFailed if the answer is wrong."""
+    """Localizes until the queue can predict the time of a query; raises WarmUpFailed if the answer is wrong."""
     # Outside the queue, because describing references is no part of a usual query.
     references = await asyncio.to_thread(_RenderedReferences, [tier.extractor for tier in engine.tiers])
     query_pose = _pose(_QUERY_X_M)
@@ -82,14 +82,14 @@ async def warm_up(engine: QueueEngine) -> None:
 
 
 def _time_pair(matcher: Matcher, first: PosedView, second: PosedView) -> None:
-    """The time of one pair, by which queries know how many there is time for."""
+    """Measures the time of one pair, by which queries compute how many they have time for."""
     for _ in range(ROUNDS):
         matcher.pair_s = None
         matcher.rematch(first.view, second)
 
 
 class _RenderedReferences:
-    """The source of references in place of the store."""
+    """Rendered references in place of the store's."""
 
     def __init__(self, extractors: Sequence[FeatureExtractor]) -> None:
         self._views = {
@@ -109,7 +109,7 @@ class _RenderedReferences:
         return 1, self._views[extractor.name]
 
     def pair(self, extractor: FeatureExtractor) -> tuple[PosedView, PosedView]:
-        """The two that are farthest apart."""
+        """The two references that are farthest apart."""
         first, *_, last = self._views[extractor.name]
         return first, last
 
@@ -139,7 +139,7 @@ def _posed_view(name: str, world_from_camera: RigidTransform, extractor: Feature
 
 
 def _pose(x_m: float) -> RigidTransform:
-    """world_from_camera of a camera on a line along the walls, turned a little towards their middle."""
+    """Pose world_from_camera of a camera on a line along the walls, turned a little towards their middle."""
     rotation, _ = cv2.Rodrigues(np.array([0.0, -0.15 * x_m, 0.0]))
     return RigidTransform(np.asarray(rotation, np.float64), np.array([x_m, 0.1 * x_m, 0.0]))
 

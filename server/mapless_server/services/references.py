@@ -110,7 +110,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
     def _contradictions(
         self, scene: SceneRecord, count: int, call: Call, added: Sequence[RigidTransform] = ()
     ) -> list[str]:
-        """What contradicts the scene's attributes in its first references and in added ones; noted in the log."""
+        """Returns and logs contradictions of the scene's attributes and poses of its first and of added references."""
         try:
             references = self._store.list_references(scene.scene_key, count, "")
         except DataLoss as error:

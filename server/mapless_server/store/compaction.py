@@ -1,4 +1,4 @@
-"""Rewrites stored features that 0.2.0 wrote as float32 in 8 bits, a quarter of the bytes, while the server serves."""
+"""Rewrites stored features that 0.2.0 wrote as float32 in 8 bits, a quarter of the bytes, while the server runs."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ class Database(Protocol):
         ...
 
     def free_space(self) -> None:
-        """Frees what the database takes of the disk beside its data, as far as that is quick; outside transactions."""
+        """Frees disk space that the database does not need for data, as far as that is quick; outside transactions."""
         ...
 
     def close(self) -> None:

@@ -52,7 +52,7 @@ def delete_unused(database: Database, check: Callable[[], None]) -> None:
 
 
 def _delete_portion(connection: Connection, name: str, limit_us: int) -> bool:
-    """Deletes the pairs of some references; whether there may be more. Stops if a server uses the matching again."""
+    """Deletes the pairs of some references; whether more may be left. Stops if a server uses the matching again."""
     is_it = (matching_use.c.matching == name) & (matching_use.c.used_time_us < limit_us)
     if connection.scalar(select(matching_use.c.matching).where(is_it).with_for_update()) is None:
         return False

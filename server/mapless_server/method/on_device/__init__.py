@@ -163,7 +163,7 @@ def _structure(points: Points, prepared: HostInputs, options: StructureOptions) 
 
 
 def _matches(points: Points, keypoint_count: int, radius_px: float) -> PointMatches:
-    """The matches in the order of match_points: by votes, then by the guided search, each in the order of points."""
+    """The matches in the order of match_points: by votes, then by guided search, each in the order of points."""
     keep = points.seen.any(axis=1)
     keypoint, guided = points.keypoint[keep].astype(np.intp), points.guided[keep].astype(bool)
     order = np.argsort(guided, kind="stable")
