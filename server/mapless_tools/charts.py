@@ -1,4 +1,4 @@
-"""What all charts share: axes without pyplot's global state, curves, and the figure as SVG for a page or as a file."""
+"""The common parts of all charts: axes without pyplot's global state, curves, and figures as SVG or files."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def new_axes(title: str, x_label: str, y_label: str) -> Axes:
 
 
 def prepared(axes: Axes, title: str, x_label: str, y_label: str) -> Axes:
-    """Axes with titles, a grid, and curves that differ without colour, too."""
+    """Prepares axes: titles, a grid, and curves that are distinguishable without colour, too."""
     with rc_context(_STYLE):
         axes.set_title(title, fontweight="bold", loc="left", fontsize=10)
         axes.set_xlabel(x_label)
@@ -60,7 +60,7 @@ def use_logarithms(*axes: Axis) -> None:
 
 
 def _minor_label(axis: Axis, x: float, _: object) -> str:
-    """2 and 5 in each decade; in less than a decade all."""
+    """Labels 2 and 5 in each decade; in less than a decade, all ticks."""
     low, high = axis.get_view_interval()
     return f"{x:g}" if high < 10 * low or f"{x:e}"[0] in "25" else ""
 
@@ -68,7 +68,7 @@ def _minor_label(axis: Axis, x: float, _: object) -> str:
 def plot(
     axes: Axes, label: str, x: Sequence[float], y: Sequence[float], marker: str = "", dotted: bool = False
 ) -> None:
-    """A curve. Infinite values are failures: they interrupt it, and are crosses at the upper edge of the axes."""
+    """Draws a curve; infinite values are failures, which interrupt it and are crosses at the upper edge."""
     at, values = np.asarray(x, float), np.asarray(y, float)
     failed = np.isinf(values)
     (line,) = axes.plot(at, np.where(failed, np.nan, values), label=label, marker=marker, markersize=4)

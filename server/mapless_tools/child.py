@@ -35,8 +35,8 @@ class Memory:
     """Memory of a process.
 
     Attributes:
-        resident_mib: now.
-        peak_mib: the most it ever was (VmHWM).
+        resident_mib: present size.
+        peak_mib: largest size so far (VmHWM).
     """
 
     resident_mib: float
@@ -51,7 +51,7 @@ class ChildServer:
     process_id: int
 
     def memory(self) -> Memory | None:
-        """What the process holds; None where there is no /proc to read."""
+        """Memory of the process; None without /proc."""
         try:
             status = Path(f"/proc/{self.process_id}/status").read_text()
         except OSError:
@@ -69,18 +69,18 @@ def child_server(
     environment: Mapping[str, str] | None = None,
     log: Path | None = None,
 ) -> Iterator[ChildServer]:
-    """A server on a free port of the loopback interface until the block is left, by whatever way.
+    """Runs a server on a free port of the loopback interface until the end of the block.
 
-    Settings of the environment hold for it, except where it listens and stores, and those of `more_flags`.
+    It uses the settings of the environment, except its address, its store, and those of `more_flags`.
 
     Args:
         store: a data folder, or the URL of a database that servers share.
-        more_flags: of the command `serve`, with their values.
-        environment: variables that are added to our own.
-        log: file that its log is added to; None for our own standard error.
+        more_flags: flags of the command `serve`, with their values.
+        environment: variables that are added to those of this process.
+        log: file that its log is appended to; None for this process's standard error.
 
     Raises:
-        ServerFailed: it ended, or did not listen within `START_TIMEOUT_S`.
+        ServerFailed: the server ended, or did not listen within `START_TIMEOUT_S`.
     """
     flags = {
         "--host": "127.0.0.1",
@@ -114,13 +114,13 @@ def temporary_server() -> Iterator[Client]:
 def child_module(
     module: str, *arguments: str, environment: Mapping[str, str] | None = None, log: Path | None = None
 ) -> Iterator[ChildServer]:
-    """A module that runs as a server and prints its address as `mapless-server serve` does; see `child_server`.
+    """Runs a module as a server that prints its address as `mapless-server serve` does; see `child_server`.
 
     Args:
-        module: its name.
-        arguments: of its command line.
-        environment: variables that are added to our own, or replace them.
-        log: file that its standard error is added to; None for our own.
+        module: name of the module.
+        arguments: arguments of its command line.
+        environment: variables that are added to those of this process, or replace them.
+        log: file that its standard error is appended to; None for that of this process.
     """
     with nullcontext() if log is None else log.open("ab") as errors:
         process = subprocess.Popen(

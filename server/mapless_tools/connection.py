@@ -1,4 +1,4 @@
-"""The server that a command talks to: one that runs, or one of its own on the store of the settings.
+"""The server of a command: a running one, or one of its own on the store of the settings.
 
 Imports the client only when it connects, so that --help answers at once.
 """
@@ -41,7 +41,7 @@ class Connection:
     client_id: Annotated[str, typer.Option(help="Which of the token's users this is.")] = ""
 
     def options(self) -> ConnectOptions:
-        """As the client takes them; ValueError if they do not fit together or a file cannot be read."""
+        """The options in the client's form; ValueError if they do not fit together or a file cannot be read."""
         from mapless import ConnectOptions
 
         token = _read(self.token_file).decode("utf-8") if self.token_file else os.environ.get(CLIENT_TOKEN_VARIABLE)
@@ -58,7 +58,7 @@ class Connection:
 
 
 def with_connection_flags(command: Callable[..., None]) -> Callable[..., None]:
-    """Gives a command the flags of a Connection in the place of its keyword parameter `connection`."""
+    """Gives a command the flags of a Connection in place of its keyword parameter `connection`."""
     own = inspect.signature(command, eval_str=True).parameters.values()
     hints = get_type_hints(Connection, include_extras=True)
     flags = [
@@ -77,11 +77,11 @@ def with_connection_flags(command: Callable[..., None]) -> Callable[..., None]:
 
 @contextmanager
 def connected(connection: Connection, settings: Settings) -> Iterator[Client]:
-    """A client until the block is left; without an address, of a server that is started on the settings' store.
+    """A client until the end of the block; without an address, of a server that is started on the settings' store.
 
     Raises:
-        ValueError: the connection's options do not fit together, or the settings' server would not take us.
-        ServerFailed: our own server did not start.
+        ValueError: the connection's options do not fit together, or the settings' server would reject the client.
+        ServerFailed: the server did not start.
     """
     from mapless import Client
     from mapless.cli.suggesting import suggesting
@@ -94,9 +94,9 @@ def connected(connection: Connection, settings: Settings) -> Iterator[Client]:
 def reachable(
     connection: Connection, settings: Settings, environment: Mapping[str, str] | None = None
 ) -> Iterator[tuple[str, ConnectOptions]]:
-    """The address of a server until the block is left, and how to connect to it; see `connected`.
+    """The address of a server until the end of the block, and how to connect to it; see `connected`.
 
-    `environment` has settings for a server that is started, besides those of our own environment.
+    `environment` has settings for a started server, besides those of this process's environment.
     """
     from mapless import ConnectOptions
 

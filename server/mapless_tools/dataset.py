@@ -38,10 +38,10 @@ class Frame:
     """A photograph whose pose is known.
 
     Attributes:
-        name: unique in its dataset, and a legal reference id.
+        name: its name, unique in the dataset, and a legal reference id.
         image_path: the file; its EXIF orientation is not to be applied.
-        camera: with the distortion of the file's pixels.
-        world_from_camera: metres, or the dataset's unit when it is not metric.
+        camera: its camera, with the distortion of the file's pixels.
+        world_from_camera: its pose; metres, or the dataset's unit if it is not metric.
         split: "train" for those a benchmark builds its references from, "test" for its queries, empty if unknown.
     """
 
@@ -58,10 +58,10 @@ class Frame:
 
 @dataclass(frozen=True)
 class Refusal:
-    """A frame that a dataset names and that cannot be used.
+    """A frame of a dataset that cannot be used.
 
     Attributes:
-        frame: what its file calls it.
+        frame: its name in the file.
         reason: one clause that names file and field.
     """
 
@@ -78,16 +78,16 @@ class Dataset:
     """Frames of one place, in one world frame.
 
     Attributes:
-        name: of the folder.
-        frames: in the order of the file.
+        name: name of the folder.
+        frames: the frames, in the order of the file.
         metric: whether lengths are metres.
         source: where the photographs come from; empty if the file does not say.
         ground_truth: how the poses were found ("SfM (COLMAP)", "KinectFusion"); empty if the file does not say.
         format: name of the layout it was read from.
         refused: frames that are not among `frames`, and why.
-        notes: how it was read, for the user: a choice that was made, a unit that is not metres.
-        datum: where the world is on the Earth; None if the file does not say.
-        down_in_world: unit vector of gravity, likewise.
+        notes: notes for the user on how it was read, such as a choice that was made or a unit other than metres.
+        datum: position of the world on the Earth; None if the file does not say.
+        down_in_world: unit vector of gravity; None if the file does not say.
     """
 
     name: str
@@ -103,17 +103,17 @@ class Dataset:
 
 
 def printable(text: str) -> str:
-    """Text from a file as a terminal can show it: cut, and without characters that move the cursor."""
+    """Text of a file in a form for terminals: cut, and without characters that move the cursor."""
     text = text if len(text) <= _MAX_QUOTED else f"{text[:_MAX_QUOTED]}..."
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def read_folder(path: Path, skips_unusable: bool = False) -> Dataset:
-    """Read the frames of a folder; images are not opened.
+    """Reads the frames of a folder; images are not opened.
 
     Args:
         path: the folder.
-        skips_unusable: whether frames that are malformed are only listed in `refused`, as long as another one is not.
+        skips_unusable: whether malformed frames are only listed in `refused`, if at least one frame is usable.
 
     Raises:
         ValueError: no `cameras.json`, or something in it is missing or malformed; the message names frame and field.
@@ -160,12 +160,12 @@ def read_folder(path: Path, skips_unusable: bool = False) -> Dataset:
 
 
 def read_place(file: Path, content: Mapping[str, Any]) -> tuple[Datum | None, Vector | None]:
-    """Datum and direction of gravity of a file's content, each None if it is not there; ValueError names the field."""
+    """Reads datum and direction of gravity, each None if it is missing; ValueError names the field."""
     return _parsed(file, content, "datum", Datum.from_json), _parsed(file, content, "down_in_world", _direction)
 
 
 def read_json(file: Path) -> Any:
-    """The content of a JSON file; ValueError, naming it, if it cannot be read or is none."""
+    """Reads a JSON file; ValueError, naming it, if it cannot be read or is not JSON."""
     try:
         return json.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
@@ -227,7 +227,7 @@ def image_file(folder: Path, image: str) -> Path:
 
 
 def read_frame(folder: Path, entry: object, taken: Container[str]) -> Frame:
-    """The frame of an entry of `frames`, with an id that is not `taken`; ValueError names the field that is wrong."""
+    """Reads an entry of `frames`, with an id that is not `taken`; ValueError names the wrong field."""
     if not isinstance(entry, dict):
         raise ValueError("must be an object")
     image = entry.get("image")
@@ -257,7 +257,7 @@ def _numbers(entry: Mapping[str, Any], field: str, shape: tuple[int, ...] | None
 
 
 def finite_numbers(value: object, what: str, shape: tuple[int, ...] | None = None) -> Array:
-    """Numbers, or their texts, as an array; ValueError, naming `what` they are, for others or another shape."""
+    """Converts numbers, or their texts, to an array; ValueError, naming `what` they are, for other values or shapes."""
     try:
         values = np.array(value, dtype=float)
     except (TypeError, ValueError, OverflowError) as error:  # JSON's integers have any number of digits

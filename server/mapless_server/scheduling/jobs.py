@@ -240,7 +240,7 @@ class Job:
 
     @property
     def check(self) -> Callable[[], None]:
-        """Raises Abandoned if the job has ended. Stages call it between their steps, from any thread."""
+        """Makes a function that raises Abandoned if the job has ended; stages call it between steps, on any thread."""
         return self._life.check
 
     def end(self, ending: Ending, value: Any) -> None:

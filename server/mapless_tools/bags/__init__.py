@@ -1,7 +1,7 @@
-"""Recordings of robots (rosbag2, MCAP): their messages, their images with camera, and poses by time.
+"""Recordings of robots (rosbag2, MCAP): messages, images with their camera, and poses by time.
 
-`ingest.formats.rosbag` makes a dataset of one, `replay.bags` localizes one. Imports the client and the package
-`rosbags`. Begin with `source`.
+`ingest.formats.rosbag` converts a recording to a dataset, `replay.bags` localizes its images. Imports the client and
+the package `rosbags`. Begin with `source`.
 """
 
 from pathlib import Path
@@ -18,5 +18,5 @@ def is_recording(path: Path) -> bool:
 
 
 def storages(folder: Path) -> list[Path]:
-    """The files of a folder that hold messages."""
+    """Files of a folder that contain messages."""
     return sorted(it for it in folder.iterdir() if it.suffix in SUFFIXES)

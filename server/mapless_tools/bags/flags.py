@@ -33,7 +33,7 @@ def bag_options(
     body_from_camera: str,
     max_pose_gap: float,
 ) -> BagOptions:
-    """Options of these flags; ValueError if one is none."""
+    """Makes options from these flags; ValueError if a flag is invalid."""
     from mapless.cameras import read_pose
 
     from .options import BagOptions

@@ -1,4 +1,4 @@
-"""Where a recording holds what."""
+"""Which topics and frames of a recording are used."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ from mapless.geometry import RigidTransform
 
 @dataclass(frozen=True)
 class BagOptions:
-    """Where a recording holds what; empty for what is unambiguous.
+    """Which topics and frames of a recording are used; empty for unambiguous ones.
 
     Attributes:
-        image_topic: of images.
-        camera_topic: of the images' CameraInfo.
-        pose_topic: of Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped, or /tf.
+        image_topic: topic of images.
+        camera_topic: topic of the images' CameraInfo.
+        pose_topic: topic of Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped, or /tf.
         world_frame: frame of the poses, for /tf: by default the root of its tree.
-        body_frame: whose poses a topic without child_frame_id has: by default the root of the camera's static frames.
-        body_from_camera: pose of the camera's optical frame on that body; None for what /tf_static says.
-        max_pose_gap_s: how far before and after an image poses may be. At 10 Hz there is one every 0.1 s; between two
-            of them a robot that accelerates by 2 m/s2 is off a straight line by 2.5 mm.
+        body_frame: frame whose poses a topic without child_frame_id has: by default the root of the camera's static
+            frames.
+        body_from_camera: pose of the camera's optical frame on that body; None for that of /tf_static.
+        max_pose_gap_s: largest time between an image and the poses before and after it. At 10 Hz there is one every 0.1
+            s; between two of them a robot that accelerates by 2 m/s2 is off a straight line by 2.5 mm.
     """
 
     image_topic: str = ""

@@ -1,7 +1,7 @@
-"""Messages of a recording: a folder of rosbag2, or one file of its (.mcap, .db3).
+"""Messages of a recording: a folder of rosbag2, or one of its files (.mcap, .db3).
 
-Standard messages are the same in every version of ROS 2, so they are read by the definitions of one version, whatever
-those in the recording are: many recordings have none, or some that cannot be read of messages that are not needed.
+Standard messages are the same in every version of ROS 2, so they are read by the definitions of one version, not by
+    those in the recording: many recordings have no definitions, or unreadable ones of messages that are not needed.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ _HINTS = (
 
 
 class Recording:
-    """A recording, open until its block is left.
+    """A recording, open until the end of its block.
 
     Attributes:
-        path: of the folder or file.
-        types: of the messages of each topic that has any, "sensor_msgs/msg/Image".
-        counts: how many those are.
-        typestore: of the classes of its messages.
+        path: path of the folder or file.
+        types: type of the messages of each topic that has messages, "sensor_msgs/msg/Image".
+        counts: number of messages of each topic.
+        typestore: the classes of its messages.
     """
 
     def __init__(self, path: Path) -> None:
-        """ValueError if it cannot be opened; names the file."""
+        """Opens a recording; raises ValueError, with the file's name, if it cannot be opened."""
         self.path = path
         self.typestore = get_typestore(Stores.ROS2_HUMBLE)
         self._stack = ExitStack()
@@ -62,7 +62,7 @@ class Recording:
         return sorted(name for name, kind in self.types.items() if kind in types)
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
-        """Topic, time of recording in nanoseconds, and message, of these topics in the order of recording.
+        """Yields topic, time of recording (nanoseconds) and message of these topics, in the order of recording.
 
         Raises:
             ValueError: the recording is damaged; names the topic, the message and the time.
@@ -93,7 +93,7 @@ class Recording:
 
     @contextmanager
     def _named(self, where: str = "") -> Iterator[None]:
-        """Errors of the library, which are of any kind where bytes are damaged, as one that names the file."""
+        """Converts the library's errors, of any kind if bytes are damaged, to one that names the file."""
         try:
             yield
         except Exception as error:
@@ -104,10 +104,10 @@ class Recording:
 
 
 def stamp_of(message: Any, previous_ns: int | None, what: str) -> int:
-    """The stamp of a message's header, nanoseconds; `previous_ns` is the latest one before it.
+    """Stamp of a message's header, nanoseconds; `previous_ns` is the latest stamp before it.
 
     Raises:
-        ValueError: there is none, or time jumps back; names `what` it is.
+        ValueError: there is no stamp, or time jumps back; the message names `what` it is.
     """
     stamp_ns = int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)
     if not stamp_ns:
@@ -122,12 +122,12 @@ def stamp_of(message: Any, previous_ns: int | None, what: str) -> int:
 
 
 def seconds(time_ns: int) -> str:
-    """A time as tools for recordings print it."""
+    """A time in the form that tools for recordings print."""
     return f"{time_ns // 1_000_000_000}.{time_ns % 1_000_000_000:09d} s"
 
 
 def _openable(path: Path) -> Path:
-    """The folder, or its only file where the recorder did not come to write metadata.yaml."""
+    """The folder, or its only file if the recorder was stopped before it wrote metadata.yaml."""
     files = [path] if path.is_file() else storages(path)
     for file in files:
         _check_whole(file)
@@ -139,7 +139,7 @@ def _openable(path: Path) -> Path:
 
 
 def _check_whole(file: Path) -> None:
-    """ValueError of an SQLite file that is shorter than it says: the missing pages would be read as zeros."""
+    """Raises ValueError if an SQLite file is shorter than its header says; missing pages would be read as zeros."""
     with file.open("rb") as stream:
         head = stream.read(100)
     if head.startswith(b"SQLite format 3\0"):

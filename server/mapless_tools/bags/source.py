@@ -1,4 +1,4 @@
-"""What a recording holds of one camera: its intrinsics, its images, and the frames that lead from them to the world."""
+"""The data of one camera in a recording: intrinsics, images, and frames from the camera to the world."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ class Images:
     """The images of one camera of a recording.
 
     Attributes:
-        recording: where they are.
-        topic: theirs.
-        frame: of the camera; what its messages say.
+        recording: the recording.
+        topic: topic of the images.
+        frame: frame of the camera, as in its messages.
         camera: its intrinsics; None if the recording has none.
         begin_ns: the time from which times in seconds are counted.
     """
@@ -46,7 +46,7 @@ class Images:
     begin_ns: int
 
     def __iter__(self) -> Iterator[tuple[int, int, Any]]:
-        """Stamp, time of recording, both in nanoseconds, and message; ValueError where time jumps back."""
+        """Yields stamp and time of recording, both in nanoseconds, and message; ValueError if time jumps back."""
         previous_ns: int | None = None
         for number, (_, time_ns, message) in enumerate(self.recording.messages([self.topic]), 1):
             what = f"{self.recording.path}: message {number} of {self.topic}, recorded at {seconds(time_ns)}"
@@ -55,7 +55,7 @@ class Images:
             yield stamp_ns, time_ns, message
 
     def time_s(self, stamp_ns: int) -> float:
-        """A stamp as the trajectories count; exact to nanoseconds, which a double of the epoch is not."""
+        """Converts a stamp to the trajectories' seconds, exact to nanoseconds, unlike a float of the epoch."""
         return (stamp_ns - self.begin_ns) / 1e9
 
 
@@ -64,8 +64,8 @@ class Poses:
     """The frames of a recording.
 
     Attributes:
-        tree: of all frames.
-        topic: where the poses are from.
+        tree: tree of all frames.
+        topic: topic of the poses.
         world, body: frames of these poses.
     """
 
@@ -76,7 +76,7 @@ class Poses:
 
 
 def open_images(recording: Recording, options: BagOptions) -> Images:
-    """The images of the options' topic, or of the only one there is; ValueError says what is missing or ambiguous."""
+    """Opens the images of the options' topic, or of the only one; ValueError names what is missing or ambiguous."""
     topic = _image_topic(recording, options.image_topic)
     first = next(recording.messages([topic]))[2]
     camera_topic = _camera_topic(recording, topic, options.camera_topic)
@@ -86,10 +86,10 @@ def open_images(recording: Recording, options: BagOptions) -> Images:
 
 
 def open_poses(images: Images, options: BagOptions) -> Poses:
-    """Poses of the options' topic, or of the only one there is, and the frames that lead from the camera to them.
+    """Opens the poses of the options' topic, or of the only one, with the frames from the camera to them.
 
     Raises:
-        ValueError: there is none, there are several, or nothing leads there; says which flag helps.
+        ValueError: there is no such topic, there are several, or no frames connect them; names the flag that helps.
     """
     recording = images.recording
     topic = _pose_topic(recording, options)
@@ -115,7 +115,7 @@ def static_tree(images: Images, options: BagOptions) -> FrameTree:
 
 
 def _unnamed_body(images: Images, topic: str, static: dict[str, Edge], options: BagOptions) -> str:
-    """The frame of poses that do not name theirs: what carries the camera."""
+    """The frame of poses that do not name it: the body that carries the camera."""
     if options.body_from_camera is not None:
         return "(body)"
     if images.frame in static:
@@ -165,7 +165,7 @@ def _image_topic(recording: Recording, given: str) -> str:
 
 
 def _shows_photographs(recording: Recording, topic: str) -> bool:
-    """Whether a topic shows no depths, by its first message."""
+    """Whether a topic shows photographs rather than depths, by its first message."""
     message = next(recording.messages([topic]))[2]
     return message.encoding in ENCODINGS if hasattr(message, "encoding") else "compressedDepth" not in message.format
 
@@ -220,24 +220,24 @@ def _pose_topic(recording: Recording, options: BagOptions) -> str:
 
 @dataclass
 class _Rows:
-    """Poses of a child frame as they are read: eight doubles each, whatever number there is."""
+    """Poses of a child frame while they are read, each stored as eight doubles."""
 
     parent: str
     table: array[float] = field(default_factory=lambda: array("d"))
     previous_ns: int | None = None
 
     def add(self, time_s: float, pose: RigidTransform) -> None:
-        """A pose."""
+        """Adds a pose."""
         q = pose.quaternion()
         self.table.extend([time_s, *pose.translation.tolist(), q.x, q.y, q.z, q.w])
 
     def trajectory(self, max_gap_s: float) -> Trajectory:
-        """Of all; ValueError of fewer than two."""
+        """Makes the trajectory of all poses; ValueError for fewer than two."""
         return Trajectory(np.frombuffer(self.table).reshape(-1, 8), max_gap_s)
 
 
 def _transforms(images: Images, topics: list[str], options: BagOptions) -> dict[str, Edge]:
-    """Edges by child frame of all TFMessages; a frame that is known at one time only stands still."""
+    """Edges of all TFMessages by child frame; a frame that is known at one time only is static."""
     rows: dict[str, _Rows] = {}
     is_static = topics == [STATIC_TF_TOPIC]
     for topic, time_ns, message in images.recording.messages([it for it in topics if it in images.recording.types]):
@@ -257,7 +257,7 @@ def _transforms(images: Images, topics: list[str], options: BagOptions) -> dict[
 
 
 def _static(rows: _Rows) -> RigidTransform:
-    """The last one counts, as in ROS."""
+    """The static pose: the last one counts, as in ROS."""
     return _pose_of(rows, -1)
 
 

@@ -16,9 +16,9 @@ class Trajectory:
     """Poses at times, and interpolated between them: positions linearly, rotations along the shortest arc."""
 
     def __init__(self, table: ArrayLike, max_gap_s: float) -> None:
-        """Rows of time in seconds, position and quaternion x y z w, in any order; of equal times the first counts.
+        """Reads rows of time (seconds), position and quaternion x y z w, in any order; of equal times the first counts.
 
-        `max_gap_s` is how far the poses before and after a time may be. ValueError of fewer than two poses.
+        `max_gap_s` is the largest time to the poses before and after. Raises ValueError for fewer than two poses.
         """
         rows = np.asarray(table, float).reshape(-1, 8)
         _, order = np.unique(rows[:, 0], return_index=True)
@@ -31,7 +31,7 @@ class Trajectory:
         self._slerp = Slerp(self._time_s, Rotation.from_quat(rows[:, 4:]))
 
     def at(self, time_s: float) -> RigidTransform:
-        """The pose at a time; ValueError if none is near."""
+        """The pose at a time; ValueError if no pose is near."""
         after = int(np.searchsorted(self._time_s, time_s))
         before = after if after < len(self._time_s) and self._time_s[after] == time_s else after - 1
         if before < 0 or after >= len(self._time_s):
@@ -48,13 +48,13 @@ class Trajectory:
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """A frame's parent, and its pose in it: one for all times, or one by time."""
+    """A frame's parent, and its pose in the parent: constant, or by time."""
 
     parent: str
     pose: RigidTransform | Trajectory
 
     def at(self, time_s: float) -> RigidTransform:
-        """parent_from_child; ValueError as `Trajectory.at`."""
+        """The pose parent_from_child; ValueError as in `Trajectory.at`."""
         return self.pose if isinstance(self.pose, RigidTransform) else self.pose.at(time_s)
 
 

@@ -24,10 +24,10 @@ COLD_STARTS = 5
 
 
 def bench(data: Path, quick: bool) -> None:
-    """Measures all scenes in a folder, prints Markdown and writes `OUTPUT`. Absent scenes are named and passed over.
+    """Measures all scenes in a folder, prints Markdown and writes `OUTPUT`; absent scenes are named and skipped.
 
     Raises:
-        UsageError: none of the scenes is there, one is damaged, or a setting is wrong.
+        UsageError: no scene is present, one is damaged, or a setting is wrong.
         ServerFailed: the server did not start.
         MaplessError: a call failed.
     """
@@ -62,5 +62,5 @@ def bench(data: Path, quick: bool) -> None:
 
 
 def _labelled(progress: Progress, label: str) -> Progress:
-    """The same progress, each step under a label."""
+    """Returns a progress whose steps have this label."""
     return lambda step, done, total: progress(f"{label}: {step}", done, total)

@@ -1,4 +1,4 @@
-"""What a call costs: time and memory of a server that does nothing else."""
+"""The cost of a call: time and memory of a server that does nothing else."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ REFERENCE_COUNT = 30
 
 @dataclass(frozen=True)
 class Latency:
-    """What calls cost, milliseconds.
+    """The cost of calls, milliseconds.
 
     Attributes:
-        cold_ms: the first call of each of several fresh servers on a filled store, on another photograph each.
-        first_pass: calls of one server that meets every query for the first time, the cold one left out.
+        cold_ms: the first call of each of several fresh servers on a filled store, with a different photograph each.
+        first_pass: the first call of every query on one server, without the cold one.
         warm: the same calls again.
-        memory: of that server after them; None where there is no /proc to read.
+        memory: memory of that server after these calls; None without /proc.
     """
 
     cold_ms: tuple[float, ...]
@@ -38,9 +38,9 @@ class Latency:
 def measure_latency(
     dataset: Dataset, settings: Settings, query_count: int | None, cold_count: int, progress: Progress
 ) -> Latency:
-    """Localizes on 30 stored references with K = 10, one call after the other; the first call of `cold_count` servers.
+    """Localizes on 30 stored references with K = 10, one call after the other; first calls on `cold_count` servers.
 
-    The servers that are measured did not store the references: what storing needs is not in their memory.
+    The measured servers did not store the references themselves, so their memory does not include what storing needs.
     """
     options = EvaluationOptions(reference_count=REFERENCE_COUNT, query_count=query_count)
     plan = plan_for(dataset, options, settings, progress)

@@ -1,4 +1,4 @@
-"""A benchmark for people (Markdown, fit for BENCHMARKS.md) and for programs (JSON)."""
+"""The report of a benchmark for people (Markdown, as in BENCHMARKS.md) and for programs (JSON)."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ class BenchResult:
 
     Attributes:
         machine: processor and cores.
-        scenes: those with a target.
-        others: those without.
+        scenes: scenes with a target.
+        others: scenes without a target.
         latency: None if its scene is absent.
-        absent: folders that are not there.
+        absent: missing folders.
         quick: whether queries were left out, so that targets do not apply.
     """
 

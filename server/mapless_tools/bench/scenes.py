@@ -1,4 +1,4 @@
-"""The scenes, what is aimed at on each, and what a map reaches."""
+"""The scenes of the benchmark, with the target on each and the accuracy that a map reaches."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mapless_tools.evaluate.metrics import Summary
 
 @dataclass(frozen=True)
 class Figures:
-    """Median errors and how many queries were localized; None for all."""
+    """Median errors, and the number of localized queries; None for all."""
 
     translation_cm: float
     rotation_deg: float
@@ -18,10 +18,10 @@ class Figures:
 
 @dataclass(frozen=True)
 class BenchScene:
-    """A measurement: what is aimed at, and what COLMAP 4.2 reaches with a map built of all references beforehand.
+    """A measurement with its target, and the accuracy of COLMAP 4.2 with a map built from all references beforehand.
 
     Attributes:
-        references: how many; None leaves one out.
+        references: number of references; None for leave-one-out.
     """
 
     folder: str
@@ -45,7 +45,7 @@ OTHER_FOLDERS = ("fox-portrait", "reichstag-internet", "rendered-room")
 
 
 def met(target: Figures, summary: Summary) -> bool:
-    """Whether a scene reaches its target."""
+    """Whether a scene meets its target."""
     wanted = summary.query_count if target.localized is None else target.localized
     return (
         100 * summary.median_translation <= target.translation_cm

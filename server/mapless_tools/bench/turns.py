@@ -1,4 +1,4 @@
-"""Two commits in one run, by turns: `python -m mapless_tools.bench.turns BEFORE [AFTER] --data FOLDER`.
+"""Two commits compared in one run, by turns: `python -m mapless_tools.bench.turns BEFORE [AFTER] --data FOLDER`.
 
 Times of two runs differ by more than a change of the code does, so a server of each commit is measured at the same
 time: both have the same references, and localize each photograph one after the other, in the order A B B A. What is
@@ -34,12 +34,12 @@ RESAMPLES = 2000
 
 @dataclass(frozen=True)
 class Measured:
-    """What one photograph cost.
+    """The cost of one photograph.
 
     Attributes:
-        processor_s: (2, T) of the server process of each commit, its calls in order.
-        wall_s: (2, T) as the client sees it.
-        apart_m: distance of the two commits' positions; None if one of them has none.
+        processor_s: (2, T) processor time of each commit's server, for its calls in order.
+        wall_s: (2, T) time that the client measures.
+        apart_m: distance between the two commits' positions; None if one has no position.
     """
 
     processor_s: Array
@@ -66,7 +66,7 @@ def main(
 
 @contextmanager
 def _server(commit: str) -> Iterator[ChildServer]:
-    """A server of a commit; of the working tree where it is empty. Nothing is computed in the background."""
+    """Runs a server of a commit, or of the working tree if it is empty, without work in the background."""
     environment = {"MAPLESS_BACKGROUND_MATCHING": "false"}
     with tempfile.TemporaryDirectory(prefix="mapless-turns-") as folder, ExitStack() as stack:
         tree = Path.cwd()
@@ -82,7 +82,7 @@ def _server(commit: str) -> Iterator[ChildServer]:
 def measure(
     servers: Sequence[ChildServer], dataset: Dataset, options: EvaluationOptions, rounds: int
 ) -> list[Measured]:
-    """Localizes photographs on two servers by turns, after each once on both; the servers choose the references."""
+    """Localizes photographs on two servers by turns, after once each on both; the servers choose the references."""
     split = split_frames(len(dataset.frames), options)
     with ExitStack() as stack:
         clients = [stack.enter_context(Client(server.address, CONNECT)) for server in servers]
@@ -112,12 +112,12 @@ def _call(client: Client, server: ChildServer, frame: Frame) -> tuple[float, flo
 
 
 def _processor_s(process_id: int) -> float:
-    """Processor time of another process, to the nanosecond: its clock, as clock_getcpuclockid names it on Linux."""
+    """Processor time of another process, to the nanosecond, by the clock that clock_getcpuclockid defines on Linux."""
     return time.clock_gettime((~process_id << 3) | 2)
 
 
 def report(measured: Sequence[Measured], names: tuple[str, str]) -> list[str]:
-    """Lines in Markdown."""
+    """Lines of the report, in Markdown."""
     lines = [f"{len(measured)} photographs, {names[0]} and {names[1]} by turns (A B B A), medians in ms.", ""]
     lines += ["| | before | after | ratio | 95 % |", "|---|---|---|---|---|"]
     for what, times in {
@@ -133,7 +133,7 @@ def report(measured: Sequence[Measured], names: tuple[str, str]) -> list[str]:
 
 
 def ratio_with_interval(times: Array) -> tuple[float, float, float]:
-    """Geometric mean of after / before of times (N, 2), and its 95 % interval by bootstrap over the rows."""
+    """Geometric mean of after / before of times (N, 2), with its 95 % interval by bootstrap over the rows."""
     logs = np.log(times[:, 1] / times[:, 0])
     drawn = np.random.default_rng(0).integers(len(logs), size=(RESAMPLES, len(logs)))
     low, high = np.quantile(logs[drawn].mean(axis=1), [0.025, 0.975])

@@ -1,7 +1,7 @@
-"""`mapless-server bench-network`: the networks' times, beside the least time that their arithmetic takes.
+"""`mapless-server bench-network`: the networks' times, with the least time that their arithmetic needs.
 
 Weights are random: time does not depend on them. `python -m mapless_tools.bench_network` is the same command without
-the dependencies of the others; all of it but whole queries needs torch and NumPy alone.
+the dependencies of the others; all parts except whole queries need only torch and NumPy.
 
     operations.py    counts operations and bytes, and predicts times from them
     subject.py       the networks, their weights and their inputs

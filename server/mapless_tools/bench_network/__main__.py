@@ -1,4 +1,4 @@
-"""The same command with torch and NumPy alone, for a machine with a GPU and none of the server's other packages."""
+"""The same command with only torch and NumPy, for a machine with a GPU and no other packages of the server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""All parts in order. A part that fails is reported in the table, and the rest goes on: device time is scarce."""
+"""Runs all parts in order. A failed part is reported in the table and the rest goes on, since device time is scarce."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ REPEATS, QUICK_REPEATS = 20, 3
 
 
 def bench_network(quick: bool = False, only: Sequence[str] | None = None, output: Path = OUTPUT) -> list[Figure]:
-    """Measures, and prints a table; writes `network.json` and `network.md`, again after each part.
+    """Measures and prints a table; writes `network.json` and `network.md` after each part.
 
     Args:
-        quick: few repetitions and nothing compiled: to see that it runs.
-        only: of `PARTS`; None for all that this machine can run.
+        quick: whether to use few repetitions and to compile nothing, to check that it runs.
+        only: names of `PARTS`; None for all that this machine can run.
         output: folder, made if needed.
 
     Returns:
@@ -67,7 +67,7 @@ def bench_network(quick: bool = False, only: Sequence[str] | None = None, output
 
 
 class _Bench:
-    """The parts, and their figures so far."""
+    """The parts of the benchmark, and their figures so far."""
 
     def __init__(self, device: torch.device, quick: bool) -> None:
         self.device = device
@@ -91,7 +91,7 @@ class _Bench:
         return rates
 
     def run(self, part: str) -> None:
-        """Adds the figures of a part."""
+        """Runs a part and adds its figures."""
         start_s = time.perf_counter()
         print(f"{part}: ", end="", flush=True)
         figures = [*self._tried(self._part(part), part)]
@@ -124,7 +124,7 @@ class _Bench:
         yield from parts[kind]()
 
     def _runner(self, name: str, weights_on: torch.device | str) -> NetworkRunner:
-        """The network as the server runs it, with the shapes of a query of ten references compiled."""
+        """The network as the server runs it, compiled for a query with ten references."""
         options = RunnerOptions(compile_backend=self._backend)
         runner = NetworkRunner(make_network(name, device=weights_on), name, "random weights", self.device, options)
         runner.warm_up([CompiledShape(GRID, REFERENCES + 1)])
@@ -142,7 +142,7 @@ class _Bench:
         runner.close()
 
     def _tried(self, figures: Iterator[Figure], part: str) -> Iterator[Figure]:
-        """The figures until one fails."""
+        """Yields the figures until one fails."""
         try:
             yield from figures
         except Exception as error:  # what comes after can still be measured
@@ -157,7 +157,7 @@ class _Bench:
         return None if self.quick else "inductor"
 
     def write(self, output: Path) -> None:
-        """Writes what there is so far."""
+        """Writes the figures so far."""
         content = as_json(self.title, self.figures, self._details)
         (output / "network.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
         (output / "network.md").write_text("\n".join(markdown(self.title, self.figures)) + "\n", encoding="utf-8")

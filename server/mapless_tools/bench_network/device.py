@@ -1,4 +1,4 @@
-"""What a device reaches at most, and the memory of a network that serves on it."""
+"""The limits of a device, and the memory of a network that serves on it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LIMIT_GB = 8.0
 
 
 def median_s(work: Callable[[], object], device: torch.device, repeats: int, warm_up: int = 3) -> tuple[float, float]:
-    """The median time of `work`, seconds, taken twice: versions that differ by less than these two are equal."""
+    """The median time of `work`, seconds, measured twice: a difference smaller than that of the two is none."""
     for _ in range(warm_up):
         work()
     first, second = (_median_s(work, device, repeats) for _ in range(2))
@@ -49,7 +49,7 @@ def _median_s(work: Callable[[], object], device: torch.device, repeats: int) ->
 
 
 def measure_rates(device: torch.device, repeats: int = 20) -> Rates:
-    """The ceilings of a CUDA device, on random numbers: zeros are faster."""
+    """Measures the limits of a CUDA device on random numbers, since zeros are faster."""
     a, b = (torch.randn(PRODUCT_SIDE, PRODUCT_SIDE, device=device, dtype=torch.bfloat16) for _ in range(2))
     product_s = min(median_s(lambda: a @ b, device, repeats))
     source = torch.randint(0, 255, (COPY_BYTES,), dtype=torch.uint8, device=device)
@@ -60,7 +60,7 @@ def measure_rates(device: torch.device, repeats: int = 20) -> Rates:
 
 
 def _launch_s(device: torch.device, count: int = 2000) -> float:
-    """The host's time for an operation on a tiny tensor, whose kernel is shorter."""
+    """The host's time for an operation on a tiny tensor, whose kernel takes less time."""
     x = torch.ones(1, device=device)
     torch.cuda.synchronize(device)
     start_s = time.perf_counter()
@@ -72,9 +72,9 @@ def _launch_s(device: torch.device, count: int = 2000) -> float:
 
 
 def measure_memory(make_runner: Callable[[], NetworkRunner], device: torch.device) -> Iterator[Figure]:
-    """The peak while the network is loaded, warmed up and used, with the tokens of a hundred references on the device.
+    """Peak memory while the network is loaded, warmed up and used, with a hundred references' tokens on the device.
 
-    The figures are of the whole process: nothing else may be on the device before.
+    The figures are those of the whole process, so nothing else may be on the device before.
     """
     torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats(device)

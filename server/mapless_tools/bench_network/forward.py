@@ -1,4 +1,4 @@
-"""The network's forward pass on a CUDA device: its steps beside floor and prediction, its kernels, its variants."""
+"""A network's forward pass on a CUDA device: its steps with their least and predicted times, kernels, variants."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ HEADS, HEAD_WIDTH = 16, 64
 
 @dataclass(frozen=True)
 class Step:
-    """One way to compute a query."""
+    """A way to compute a query."""
 
     name: str
     work: Work
@@ -64,7 +64,7 @@ STEPS = (
 
 
 class Forward:
-    """A network in bfloat16, with one kind of attention and no other, and one scene."""
+    """A network in bfloat16 with exactly one kind of attention, and a scene."""
 
     def __init__(
         self,
@@ -83,7 +83,7 @@ class Forward:
 
     @contextmanager
     def kernels(self) -> Iterator[None]:
-        """The wanted attention alone: where it cannot run, that is an error. Flash is what the network takes itself."""
+        """Enables only the wanted attention; if it cannot run, that is an error. The network itself uses flash."""
         with torch.no_grad():
             if self.backend is SDPBackend.FLASH_ATTENTION:
                 yield
@@ -92,7 +92,7 @@ class Forward:
                 yield
 
     def run(self, work: Work, compiled: bool = False) -> NetworkOutput:
-        """Encodes the last views, the query's the last of all, takes the tokens of the others, and reconstructs."""
+        """Encodes the last views, the query last of all, uses kept tokens for the others, and reconstructs."""
         encode, reconstruct = self._compiled if compiled else (self.network.encode, self.network.reconstruct)
         scene, kept = self.scene, work.views - work.encoded
         with self.kernels():
@@ -109,7 +109,7 @@ def _any_attention(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
 
 
 def _compiled(network: Network) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """As the runner compiles; nothing happens before the first call."""
+    """Compiles as the runner does; nothing happens before the first call."""
     options: dict[str, str | int | bool | Callable[..., Any]] = {"triton.cudagraphs": True}
     encode = torch.compile(network.encode, backend="inductor", fullgraph=True, dynamic=False, options=options)
     reconstruct = torch.compile(network.reconstruct, backend="inductor", fullgraph=True, dynamic=False, options=options)
@@ -117,7 +117,7 @@ def _compiled(network: Network) -> tuple[Callable[..., Any], Callable[..., Any]]
 
 
 def measure_forward(name: str, rates: Rates, device: torch.device, repeats: int, compiles: bool) -> Iterator[Figure]:
-    """A figure for each step, as it comes."""
+    """Measures each step and yields its figure."""
     part = f"{name} forward, {VIEWS} views of {GRID[1] * 14}x{GRID[0] * 14}"
     forward = Forward(make_network(name, device=device))
     for step in STEPS:
@@ -139,10 +139,10 @@ def measure_forward(name: str, rates: Rates, device: torch.device, repeats: int,
 
 
 def _check(forward: Forward, step: Step) -> float:
-    """Runs a step; its largest difference from the eager pass.
+    """Runs a step; returns its largest difference from the eager pass.
 
     Raises:
-        ArithmeticError: the output is not finite, or another one.
+        ArithmeticError: the output is not finite, or differs too much.
     """
     output = forward.run(step.work, step.compiled)
     if not all(bool(tensor.isfinite().all()) for tensor in vars(output).values()):
@@ -161,12 +161,12 @@ def max_difference(output: NetworkOutput, reference: NetworkOutput) -> float:
 
 
 def reason_of(error: Exception) -> str:
-    """What failed, in one line that fits a table."""
+    """What failed, in one line for the table."""
     return f"{type(error).__name__}: {error}".splitlines()[0][:160].replace("|", "/")
 
 
 def measure_kernels(name: str, device: torch.device) -> tuple[list[Figure], dict[str, Any]]:
-    """Which kernels an eager forward pass launches; and how often it is flash attention, and the host waits."""
+    """Which kernels an eager forward pass launches, how often flash attention, and how often the host waits."""
     forward = Forward(make_network(name, device=device))
     work = Work(1, REFERENCES)
     forward.run(work)
@@ -191,7 +191,7 @@ def measure_kernels(name: str, device: torch.device) -> tuple[list[Figure], dict
 
 
 def _waits(forward: Forward, work: Work) -> int:
-    """How often the host waits for the device, as far as torch notices."""
+    """How often the host waits for the device, as far as torch detects it."""
     torch.cuda.set_sync_debug_mode("warn")
     try:
         with warnings.catch_warnings(record=True) as caught:
@@ -212,7 +212,7 @@ def _kind(kernel: str) -> str:
 
 
 def measure_attention(rates: Rates, device: torch.device, repeats: int) -> Iterator[Figure]:
-    """Attention alone, over the scene and within its views, by each kernel."""
+    """Measures attention alone, over the scene and within its views, with each kernel."""
     tokens = 5 + GRID[0] * GRID[1]
     for batch, count in ((1, VIEWS * tokens), (VIEWS, tokens)):
         q, k, v = torch.randn(3, batch, HEADS, count, HEAD_WIDTH, device=device, dtype=torch.bfloat16)
@@ -232,7 +232,7 @@ def measure_attention(rates: Rates, device: torch.device, repeats: int) -> Itera
 
 
 def measure_variants(name: str, device: torch.device, repeats: int) -> Iterator[Figure]:
-    """Eager forward passes with the references' tokens kept, one thing changed at a time."""
+    """Measures eager forward passes with kept references' tokens, with one change at a time."""
     part = f"{name} forward, eager, tokens kept, otherwise"
     network = make_network(name, device=device)
     for label, backend in BACKENDS.items():
@@ -245,7 +245,7 @@ def measure_variants(name: str, device: torch.device, repeats: int) -> Iterator[
 
 
 def _rounding(part: str, network: Network) -> Figure:
-    """What bfloat16 changes at full size; casts the network to it."""
+    """The effect of bfloat16 at full size; casts the network to it."""
     scene = Scene(network, VIEWS, GRID)
     with torch.no_grad():
         exact = scene.reconstruct(network, scene.encode(network, slice(None))[None], REFERENCES)
@@ -264,7 +264,7 @@ def _figure(part: str, label: str, network: Network, backend: SDPBackend, device
 
 
 def with_low_precision_stream(network: PiNetwork) -> None:
-    """Lets the main decoder carry bfloat16, which the official code does not."""
+    """Makes the main decoder's residual stream bfloat16, unlike the official code."""
     network.set_compute_type(torch.bfloat16)
     network.decoder.to(torch.bfloat16)
     network.register_token.data = network.register_token.to(torch.bfloat16)

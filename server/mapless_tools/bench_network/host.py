@@ -1,4 +1,4 @@
-"""What can be measured without a CUDA device: operations, time of a block, what rounding and keeping tokens change."""
+"""Measurements without a CUDA device: operations, time of a block, effects of rounding and of kept tokens."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ MEDIUM = Sizes(384, 6, encoder_depth=8, decoder_depth=12, head_depth=3, camera_w
 
 
 def count_all(rates: Rates, quick: bool) -> Iterator[Figure]:
-    """Operations of forward passes and of the layers for each pixel, and bytes on the device."""
+    """Counts operations of forward passes and of the layers for each pixel, and bytes on the device."""
     yield from count_forward(rates, quick)
     yield from count_memory()
     yield from count_pixel_heads()
 
 
 def count_forward(rates: Rates = H200, quick: bool = False) -> Iterator[Figure]:
-    """Operations of forward passes of the official networks, and the floor and the prediction that follow from them."""
+    """Counts operations of forward passes of the official networks; yields the least and the predicted times."""
     for name in NETWORKS:
         for size, grid in GRIDS.items():
             if quick and grid is not GRID:
@@ -72,7 +72,7 @@ def _counted(part: str, label: str, operations: Operations, rates: Rates) -> Fig
 
 
 def count_memory() -> Iterator[Figure]:
-    """Bytes that lie on the device between queries."""
+    """Counts bytes that remain on the device between queries."""
     for name in NETWORKS:
         network = meta_network(name)
         weights = sum(it.nbytes for it in network.parameters())
@@ -82,7 +82,7 @@ def count_memory() -> Iterator[Figure]:
 
 
 def count_pixel_heads() -> Iterator[Figure]:
-    """The share of what follows the last tokens: computing points only at keypoints could save no more than that."""
+    """The share of the layers after the last tokens: computing points only at keypoints could save no more."""
     for name in ("pi3", "pi3x"):
         network = meta_network(name)
         heads = [network.get_submodule(head) for head in ("point_head", "conf_head")]
@@ -94,7 +94,7 @@ def count_pixel_heads() -> Iterator[Figure]:
 
 
 def measure_blocks(repeats: int) -> Iterator[Figure]:
-    """One block of each kind at full width, three views of 266x196, on one thread."""
+    """Measures one block of each kind at full width, with three views of 266x196, on one thread."""
     views, grid, device = 3, (14, 19), torch.device("cpu")
     sizes = Sizes(encoder_depth=1, decoder_depth=2, head_depth=1)
     for dtype in (torch.float32, torch.bfloat16):
@@ -121,7 +121,7 @@ def measure_blocks(repeats: int) -> Iterator[Figure]:
 
 
 def compare_kept_tokens() -> Iterator[Figure]:
-    """Outputs with kept tokens against those without: encoded one by one the same bits, encoded together nearly."""
+    """Compares outputs with and without kept tokens: equal if encoded one by one, nearly equal if together."""
     for name, label, sizes in (*((name, "small", SMALL[name]) for name in NETWORKS), ("pi3", "medium", MEDIUM)):
         for dtype in (torch.float32, torch.bfloat16):
             network = make_network(name, sizes)
@@ -150,7 +150,7 @@ def _encoded(network: Network, scene: Scene, views: slice, dtype: torch.dtype) -
 
 
 def compare_rounding() -> Iterator[Figure]:
-    """What bfloat16 changes, and how much of that is the rounding of tokens where they are kept."""
+    """The effect of bfloat16, and the part of it that is due to the rounding of kept tokens."""
     outputs: dict[tuple[torch.dtype, torch.dtype], NetworkOutput] = {}
     for compute in (torch.float32, torch.bfloat16):
         network = make_network("pi3", MEDIUM)
@@ -173,7 +173,7 @@ def compare_rounding() -> Iterator[Figure]:
 
 
 def count_compilations() -> Iterator[Figure]:
-    """Graphs that are compiled after the warm-up, by shapes that are warm and one that is not."""
+    """Counts graphs that are compiled after the warm-up, for warm shapes and another one."""
     for name in NETWORKS:
         network = make_network(name, SMALL[name])
         runner = NetworkRunner(network, name, "random", "cpu", RunnerOptions(compile_backend="eager"))

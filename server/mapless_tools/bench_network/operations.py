@@ -33,14 +33,14 @@ PRODUCTS: frozenset[Any] = frozenset(
 
 @dataclass(frozen=True)
 class Rates:
-    """What a device reaches.
+    """The limits of a device.
 
     Attributes:
         device: its name.
         matrix_flops: operations per second of a large bfloat16 matrix product.
         copy_bytes: bytes read plus bytes written per second of a large copy.
         launch_s: the host's time to launch a kernel.
-        measured: whether these are of the device at hand.
+        measured: whether they were measured on this device.
     """
 
     device: str
@@ -56,17 +56,17 @@ H200 = Rates("NVIDIA H200", 790e12, 4.3e12)
 
 @dataclass(frozen=True)
 class Operations:
-    """What some work executes.
+    """What a computation executes.
 
     Attributes:
-        flop: of matrix products and convolutions, a multiply-add counted as two.
-        attention_flop: those among them that are attention's own, q k^T and the weighted sum of v.
-        tf32_flop: those among them of convolutions in float32.
-        float32_flop: those among them of linear layers in float32.
-        kernels: launched when every operation is one.
-        eager_bytes: read and written by what lies between the products when every operation is a kernel.
-        fused_bytes: the same when everything between two products is one kernel, which reads what one has written and
-            writes what the next one reads; and the residual stream is read and written at each addition.
+        flop: operations of matrix products and convolutions; a multiply-add counts as two.
+        attention_flop: those of attention itself, q k^T and the weighted sum of v.
+        tf32_flop: those of convolutions in float32.
+        float32_flop: those of linear layers in float32.
+        kernels: number of kernels, if every operation is one.
+        eager_bytes: bytes read and written by operations between the products, if every operation is a kernel.
+        fused_bytes: the same if all operations between two products are one kernel, which reads the output of one
+            product and writes the input of the next; the residual stream is read and written at each addition.
     """
 
     flop: int = 0
@@ -81,11 +81,11 @@ class Operations:
         return Operations(*(a + b for a, b in zip(vars(self).values(), vars(other).values(), strict=True)))
 
     def floor_s(self, rates: Rates) -> float:
-        """No program is faster."""
+        """The least time; no program is faster."""
         return self.flop / rates.matrix_flops
 
     def predicted_s(self, rates: Rates, compiled: bool) -> float:
-        """Products, attention and what lies between, one after the other; launches behind that if they are faster."""
+        """Time of products, attention and other operations in sequence; of kernel launches, if these take longer."""
         slower = self.tf32_flop * (1 / TF32_RATE - 1) + self.float32_flop * (1 / FLOAT32_RATE - 1)
         products = (self.flop - self.attention_flop + slower) / (MATRIX_EFFICIENCY * rates.matrix_flops)
         attention = self.attention_flop / (ATTENTION_EFFICIENCY * rates.matrix_flops)
@@ -95,7 +95,7 @@ class Operations:
 
 
 def count_operations(work: Callable[[], object]) -> Operations:
-    """What `work` executes; on the meta device it need not be executed for that."""
+    """Counts what `work` executes; on the meta device nothing is computed."""
     # The plain attention consists of matrix products that are counted; of the other kernels not every one is.
     with torch.no_grad(), sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as flops, _Traffic() as traffic:
         work()
@@ -105,7 +105,7 @@ def count_operations(work: Callable[[], object]) -> Operations:
 
 
 class _Traffic(TorchFunctionMode):
-    """Watches torch's functions, and counts all but `Operations.flop`."""
+    """Observes torch's functions, and counts all but `Operations.flop`."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -125,7 +125,7 @@ class _Traffic(TorchFunctionMode):
 
 
 def _counted(func: Any, inputs: Sequence[Tensor], made: Sequence[Tensor]) -> Operations:
-    """What one function that makes tensors executes."""
+    """Counts what one function that makes tensors executes."""
     written = sum(tensor.nbytes for tensor in made)
     if func not in PRODUCTS:
         adds = func in (Tensor.add, Tensor.__add__, torch.add)
@@ -146,12 +146,12 @@ def _counted(func: Any, inputs: Sequence[Tensor], made: Sequence[Tensor]) -> Ope
 
 
 def _is_new(tensor: Tensor, inputs: Sequence[Tensor]) -> bool:
-    """Whether it has memory of its own."""
+    """Whether a tensor has memory of its own."""
     return not tensor._is_view() and all(tensor is not it for it in inputs)
 
 
 def compiled_graphs() -> int:
-    """How many graphs torch has compiled in this process."""
+    """Number of graphs that torch has compiled in this process."""
     from torch._dynamo.utils import counters  # takes a second to import
 
     return int(counters["stats"]["unique_graphs"])

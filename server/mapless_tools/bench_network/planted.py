@@ -1,4 +1,4 @@
-"""A network's backend whose answer is replaced by the truth, so that the stages after it have real work.
+"""A network's backend whose output is replaced by the truth, so that the later stages have realistic work.
 
 The output of random weights has no relation to a scene, and the time of the stages after them depends on it. Here the
 network computes as it would, and its output is replaced by the rendered room's true depths and poses, up to a scale.
@@ -27,7 +27,7 @@ UNITS_PER_METRE = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """A photograph's camera and pose, and its depths in metres (h, w), of the camera resized to that."""
+    """A photograph's camera and pose, and its depths (h, w) in metres, for the camera resized to that size."""
 
     camera: Camera
     world_from_camera: RigidTransform
@@ -35,29 +35,29 @@ class Truth:
 
 
 class PlantedReconstructor:
-    """A `Reconstructor` that waits for the network and answers the truth.
+    """A `Reconstructor` that waits for the network and returns the truth.
 
     Attributes:
-        network: what computes.
+        network: the network that computes.
     """
 
     uses_correspondences = False
     is_batched = True
 
     def __init__(self, network: NetworkReconstructor, truths: Mapping[str, Truth], device: torch.device) -> None:
-        """`truths` are the views' by the SHA-256 of their images; they lie on the device beforehand."""
+        """The `truths` are by the SHA-256 of the views' images; they are copied to the device beforehand."""
         self.network = network
         self._truths = truths
         self._maps = {sha256: torch.from_numpy(true_points(truth)).to(device) for sha256, truth in truths.items()}
 
     @property
     def name(self) -> str:
-        """Of the network."""
+        """Name of the network."""
         return self.network.name
 
     @property
     def weights_sha256(self) -> str:
-        """Of the network."""
+        """SHA-256 of the network's weights."""
         return self.network.weights_sha256
 
     def close(self) -> None:
@@ -65,7 +65,7 @@ class PlantedReconstructor:
         self.network.close()
 
     def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
-        """Of the network."""
+        """See the network's `bucket`."""
         return self.network.bucket(query, references)
 
     def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
@@ -97,7 +97,7 @@ class PlantedReconstructor:
         return replace(outcome, point_maps=maps, confidence=confidence, local_from_camera=on_device)
 
     def _local_pose(self, key: str, anchor: str) -> Array:
-        """(4, 4) in the planted frame, which is the first reference's camera."""
+        """Pose (4, 4) in the planted frame, which is the first reference's camera."""
         local_from_world = self._truths[anchor].world_from_camera.inverse()
         pose = local_from_world.compose(self._truths[key].world_from_camera).matrix()
         pose[:3, 3] *= UNITS_PER_METRE
@@ -105,7 +105,7 @@ class PlantedReconstructor:
 
 
 def true_points(truth: Truth) -> NDArray[np.float32]:
-    """(H, W, 3) what the pixels of the network's picture see, in the camera's frame, planted units."""
+    """Points (H, W, 3) that the pixels of the network's picture show, in the camera's frame, planted units."""
     options = GridOptions()
     camera = lay_out(truth.camera, common_grid([truth.camera], options), options).camera
     rows, columns = np.indices((camera.height_px, camera.width_px))

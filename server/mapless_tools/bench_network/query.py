@@ -1,7 +1,7 @@
 """Whole queries on photographs of the rendered room: K = 10 stored references, everything in this process.
 
-A query is what the server does from the encoded photograph to the answer: it decodes, finds features, matches, runs the
-network, finds the scale, refines. What a call adds to that, protocol and store, is not in it.
+A query is everything from the encoded photograph to the answer: decoding, features, matching, network, scale,
+    refinement. Protocol and store, which a call adds, are not included.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ THREADS = 8
 
 @dataclass(frozen=True)
 class QueryOptions:
-    """What to measure.
+    """Options of the measurement.
 
     Attributes:
-        features: local features, by name; `sift` serves if their weights are not there.
-        query_count: different photographs.
-        rounds: how often each is localized in one measurement.
+        features: name of the local features; `sift` is used if their weights are missing.
+        query_count: number of different photographs.
+        rounds: how often each one is localized in one measurement.
     """
 
     features: str = "aliked"
@@ -67,7 +67,7 @@ class Room:
 
 
 def photographs(query_count: int) -> Room:
-    """All references, and some queries."""
+    """Returns all references, and some queries."""
     place = room()
     references, queries = (
         {hashlib.sha256(it.data).hexdigest(): it for it in some} for some in (place.references, place.queries)
@@ -76,7 +76,7 @@ def photographs(query_count: int) -> Room:
 
 
 def make_tier(features: str, device: torch.device) -> tuple[Tier, str]:
-    """Features and their matcher, and what to say about them."""
+    """Makes features with their matcher, and a note about them."""
 
     def made(name: str) -> Tier:
         flags = {"features": name, "backend": "geometric", "device": str(device)}
@@ -89,7 +89,7 @@ def make_tier(features: str, device: torch.device) -> tuple[Tier, str]:
 
 
 class Bench:
-    """Everything that a query needs, in place."""
+    """Everything that a query needs, in memory."""
 
     def __init__(self, room: Room, tier: Tier) -> None:
         self.room = room
@@ -104,7 +104,7 @@ class Bench:
         return PosedView(key, photo.name, view, photo.world_from_camera)
 
     def nearest(self, photo: Picture) -> list[PosedView]:
-        """The ten references whose cameras stand the nearest."""
+        """The ten references whose cameras are nearest."""
         centre = photo.world_from_camera.translation
 
         def distance(view: PosedView) -> float:
@@ -113,7 +113,7 @@ class Bench:
         return sorted(self._stored.values(), key=distance)[:REFERENCES]
 
     def localize(self, key: str, pipeline: Pipeline) -> tuple[Answer, dict[str, float]]:
-        """One query; its answer, and the seconds of each stage and of all ("total")."""
+        """Localizes one photograph; returns the answer, and the seconds of each stage and of all ("total")."""
         photo, stages = self.room.queries[key], {}
         start_s = time.perf_counter()
         pixels = decode_image(photo.data, ImageLimits())
@@ -128,7 +128,7 @@ class Bench:
 def measure_queries(
     runner: NetworkRunner, bench: Bench, options: QueryOptions, note: str, keep_on_device: bool
 ) -> Iterator[Figure]:
-    """Latency, its stages, and throughput, on a planted reconstruction; and what the random network's own leads to."""
+    """Measures latency, stages and throughput on a planted reconstruction, and with the random network's own output."""
     where = "device" if keep_on_device else "host"
     features = bench.tier.extractor.name.split("-")[0]
     part = f"{runner.name} query, {features}, K = {REFERENCES}, stages after the network on the {where}"
@@ -155,7 +155,7 @@ Runs = Sequence[tuple[Answer, dict[str, float]]]
 
 
 def _runs(bench: Bench, pipeline: Pipeline, rounds: int) -> Runs:
-    """Every query as often as asked, one after the other."""
+    """Localizes every query `rounds` times, one after the other."""
     return [bench.localize(key, pipeline) for _ in range(rounds) for key in bench.room.queries]
 
 

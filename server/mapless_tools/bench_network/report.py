@@ -1,4 +1,4 @@
-"""What was measured: a table for people, JSON for programs, Markdown for BENCHMARKS.md."""
+"""The figures: a table for people, JSON for programs, Markdown for BENCHMARKS.md."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Figure:
-    """One measured or counted number; less is better but where `target_is_least` says otherwise.
+    """One measured or counted number; less is better unless `target_is_least`.
 
     Attributes:
-        part: what it belongs to.
-        name: what it is.
+        part: the part it belongs to.
+        name: its name.
         value: the number; None if it was not measured.
-        unit: of the number, `again` and `target`.
+        unit: unit of the number, of `again` and of `target`.
         again: the same measured a second time.
-        floor_ms: what no program is faster than.
-        predicted_ms: before it was measured.
+        floor_ms: the least possible time.
+        predicted_ms: the time predicted before the measurement.
         target: the value to reach.
-        target_is_least: whether more is better.
-        note: anything else, the reason if it was not measured.
+        target_is_least: whether the target is a lower bound, so that more is better.
+        note: a remark; the reason, if it was not measured.
     """
 
     part: str
@@ -38,7 +38,7 @@ class Figure:
 
     @property
     def is_met(self) -> bool | None:
-        """Whether the target is reached; None without one, or without a number."""
+        """Whether the target is reached; None without a target or a number."""
         if self.target is None or self.value is None:
             return None
         return self.value >= self.target if self.target_is_least else self.value <= self.target
@@ -62,7 +62,7 @@ def markdown(title: str, figures: Sequence[Figure]) -> list[str]:
 
 
 def table(figures: Sequence[Figure]) -> list[str]:
-    """The same in columns of equal width, a heading for each part; of the notes only why something is not measured."""
+    """The same in columns of equal width, with a heading for each part; only notes on why something is not measured."""
     rows = [HEADINGS, *(_cells(figure) for figure in figures)]
     widths = [max(len(row[i]) for row in rows) for i in range(len(HEADINGS))]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
@@ -97,7 +97,7 @@ def _cells(figure: Figure) -> tuple[str, ...]:
 
 
 def _short(value: float | None) -> str:
-    """Three digits that count."""
+    """A number with three significant digits."""
     if value is None:
         return ""
     return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"

@@ -27,7 +27,7 @@ AnySizes = Sizes | MapAnythingSizes
 
 
 def network_without_weights(name: str, sizes: AnySizes | None = None) -> Network:
-    """A Pi3, Pi3X or MapAnything, on the meta device, of its own kind of sizes; None are the official ones."""
+    """A Pi3, Pi3X or MapAnything on the meta device, with sizes of its own kind; None for the official ones."""
     with torch.device("meta"):
         if name == "mapanything":
             if isinstance(sizes, Sizes):
@@ -41,9 +41,9 @@ def network_without_weights(name: str, sizes: AnySizes | None = None) -> Network
 def make_network(
     name: str, sizes: AnySizes | None = None, device: torch.device | str = "cpu", seed: int = 0
 ) -> Network:
-    """A network, float32, with seeded random weights that keep all activations finite and of a trained one's order.
+    """A float32 network with seeded random weights, whose activations are finite and of a trained network's order.
 
-    Zeros would be computed faster, and would show no error.
+    Zeros would be faster to compute, and would hide errors.
     """
     network = network_without_weights(name, sizes)
     random = torch.Generator(device).manual_seed(seed)
@@ -59,7 +59,7 @@ def make_network(
 
 
 def _marker(buffer: Tensor) -> Tensor:
-    """MapAnything's mark of the first view: 0 on even channels, 1 on odd ones."""
+    """MapAnything's marker of the first view: 0 on even channels, 1 on odd ones."""
     return (torch.arange(buffer.shape[-1]) % 2).float().expand(buffer.shape).clone()
 
 
@@ -84,11 +84,11 @@ class Work:
     """One forward pass of a scene.
 
     Attributes:
-        encoded: how many views are encoded; the tokens of the others are at hand.
-        mapped: of how many views points and confidence are computed.
-        views: of the scene.
+        encoded: number of views that are encoded; the tokens of the others are given.
+        mapped: number of views whose points and confidence are computed.
+        views: number of views of the scene.
         grid: rows and columns of patches.
-        query_only: whether the last view's pose is all that is computed; only of MapAnything.
+        query_only: whether only the last view's pose is computed, which only MapAnything can.
     """
 
     encoded: int
@@ -99,7 +99,7 @@ class Work:
 
 
 class Scene:
-    """Random views of one scene, and what is known of them, on the network's device."""
+    """Random views of one scene, and what is known about them, on the network's device."""
 
     def __init__(self, network: Network, views: int, grid: tuple[int, int], seed: int = 0) -> None:
         device = next(network.parameters()).device
@@ -120,16 +120,16 @@ class Scene:
             self.conditions = tuple(it.to(device) for it in given)
 
     def encode(self, network: Network, views: slice) -> Tensor:
-        """Tokens (V, T, C) of some views."""
+        """Encodes some views to tokens (V, T, C)."""
         intrinsics = None if self.intrinsics is None else self.intrinsics[views]
         return network.encode(self.images[views], self.layout, intrinsics)
 
     def reconstruct(self, network: Network, tokens: Tensor, mapped: int) -> NetworkOutput:
-        """The scene of tokens (1, N, T, C)."""
+        """Reconstructs the scene from tokens (1, N, T, C)."""
         return network.reconstruct(tokens, self.layout, mapped, *self.conditions)
 
     def query_pose(self, network: Network, tokens: Tensor) -> Tensor:
-        """The pose of the last view alone, which only MapAnything computes alone."""
+        """The pose of the last view alone, which only MapAnything can compute alone."""
         assert isinstance(network, MapAnything)
         return network.query_pose(tokens, self.layout, *self.conditions)
 
@@ -137,7 +137,7 @@ class Scene:
 def operations_of(
     name: str, work: Work, sizes: AnySizes | None = None, dtype: torch.dtype = torch.bfloat16
 ) -> Operations:
-    """What a forward pass executes."""
+    """Counts what a forward pass executes."""
     network = meta_network(name, sizes, dtype)
     scene = Scene(network, work.views, work.grid)
     shape = (1, work.views, network.token_count(work.grid), network.width)
@@ -149,7 +149,7 @@ def operations_of(
 
 
 def meta_network(name: str, sizes: AnySizes | None = None, dtype: torch.dtype = torch.bfloat16) -> Network:
-    """A network without memory, to count on."""
+    """A network without memory, for counting."""
     network = network_without_weights(name, sizes)
     network.requires_grad_(False).set_compute_type(dtype)
     return network.to("meta")

@@ -1,6 +1,6 @@
-"""How often answers keep the radii that they claim, measured on photographs with known poses, and factors that help.
+"""Measures how often the truth is within the claimed radii, on photographs with known poses, and finds factors.
 
-A folder's photographs are localized (`queries`); each error beside the radii that were claimed is a `Claim`; from these
-come the factors (`claims`), which a scene keeps and the server multiplies every answer by, and what the report says
+A folder's photographs are localized (`queries`); a `Claim` is an error with the radii that were claimed for it. Claims
+give the factors (`claims`), which the server stores with a scene and multiplies its radii by, and the report
 (`findings`, `report`). Begin reading with `run`.
 """

@@ -1,10 +1,10 @@
-"""Claimed radii beside the truth, and the factors that make them right, from few photographs.
+"""Claimed radii compared with the truth, and the factors that correct them, from few photographs.
 
-The ratio of an error to the radius that was claimed for probability p should be below 1 with probability p. What it is
-below in truth is estimated from the ratios of n answers, and is the factor. With few answers a sample quantile says
-little, least of all for 95 %; so the claims themselves count as m = `PRIOR_QUERIES` further answers, whose ratios are
-distributed as claimed: their p-quantile is 1. That is the predictive distribution of a Dirichlet process whose base is
-the claim (Ferguson 1973),
+The ratio of an error to the radius that was claimed for probability p should be below 1 with probability p. The factor
+is the value below which it is with probability p, estimated from the ratios of n answers. With few answers a sample
+quantile says little, least of all for 95 %; so the claims themselves count as m = `PRIOR_QUERIES` further answers,
+whose ratios are distributed as claimed: their p-quantile is 1. That is the predictive distribution of a Dirichlet
+process whose base is the claim (Ferguson 1973),
 
     P(ratio <= f) = (n F_n(f) + m F_0(f)) / (n + m),
 
@@ -13,10 +13,10 @@ k-th smallest ratio, so that the next answer is within the factor as often as st
 answers; what remains beyond the largest ratio is spread up to twice the largest.
 
 A mixture, and not a factor drawn towards 1: where claims are far too small, most ratios lie where the prior has nothing
-more to say, and the factor follows them; where they are too large the prior holds it back. It errs to the safe side.
-Simulated with normal and with heavy-tailed errors and claims of a third, once and three times the truth, the calibrated
-radii of answers not seen held 94 to 100 % (95 % radius) and 57 to 86 % (68 %) after 10 answers, 95 to 100 % and 64 to
-76 % after 26, 95 or 96 % and 67 to 69 % after 150, where the claims' own 68 % radius held 6 to 100 %.
+more to say, and the factor follows them; where they are too large the prior holds it back. Its errors are on the safe
+side. Simulated with normal and with heavy-tailed errors and claims of a third, once and three times the truth, the
+calibrated radii of answers not seen held 94 to 100 % (95 % radius) and 57 to 86 % (68 %) after 10 answers, 95 to 100 %
+and 64 to 76 % after 26, 95 or 96 % and 67 to 69 % after 150, where the claims' own 68 % radius held 6 to 100 %.
 """
 
 from __future__ import annotations
@@ -46,12 +46,12 @@ _TRIED = np.exp(np.linspace(np.log(MIN_FACTOR), np.log(MAX_FACTOR), 2305))
 
 @dataclass(frozen=True, eq=False)
 class Claim:
-    """An error and what was claimed of it, in one unit.
+    """An error and the radii claimed for it, in one unit.
 
     Attributes:
         error: distance to the truth.
-        radius_68, radius_95: claimed not to be exceeded with this probability.
-        radii: (L,) the same for `LEVELS`, never falling.
+        radius_68, radius_95: radii claimed not to be exceeded with this probability.
+        radii: (L,) the same for `LEVELS`, not decreasing.
     """
 
     error: float
@@ -61,7 +61,7 @@ class Claim:
 
     @classmethod
     def of(cls, error: float, radius_68: float, radius_95: float, covariance: Array) -> Claim:
-        """From what an answer says.
+        """Makes the claim of an answer.
 
         An answer states two radii and a covariance. The radius for another probability p is the covariance's
         (`error_radii`) times what the stated ones are of the covariance's own: exactly at 68 and 95 %, linear in p
@@ -69,9 +69,9 @@ class Claim:
 
         Args:
             error: distance to the truth.
-            radius_68: the stated one, the unit of `error`.
-            radius_95: likewise.
-            covariance: (3, 3), the unit of `error`, squared.
+            radius_68: the stated radius, unit of `error`.
+            radius_95: the stated radius, unit of `error`.
+            covariance: (3, 3), square of the unit of `error`.
         """
         at = (0.68, 0.95)
         own = error_radii(covariance, LEVELS)
@@ -79,7 +79,7 @@ class Claim:
         return cls(error, radius_68, radius_95, np.maximum.accumulate(own * np.interp(LEVELS, at, stated)))
 
     def held(self, probability: float) -> bool:
-        """Whether the truth lies within the radius for a probability, one of `LEVELS`' range."""
+        """Whether the truth is within the radius for a probability in the range of `LEVELS`."""
         return bool(self.error <= np.interp(probability, LEVELS, self.radii))
 
     def probability(self, length: Array) -> Array:
@@ -88,7 +88,7 @@ class Claim:
         return np.asarray(np.interp(length, radii, levels, right=1.0), float)
 
     def times(self, factor_68: float, factor_95: float) -> Claim:
-        """The claim with its radii multiplied, as an answer's are (`scaled_accuracy`); between, linear in p."""
+        """The claim with its radii multiplied, as in `scaled_accuracy`; linear in the probability in between."""
         factors = np.interp(LEVELS, (0.68, 0.95), (factor_68, factor_95))
         radius_68 = factor_68 * self.radius_68
         return Claim(
@@ -105,7 +105,7 @@ class TooFewQueries(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """What answers claimed of position (metres) and rotation (degrees), in the same order."""
+    """Claims of position (metres) and rotation (degrees), in the same order."""
 
     position: tuple[Claim, ...]
     rotation: tuple[Claim, ...]
@@ -118,7 +118,7 @@ class Sample:
         return len(self.position)
 
     def times(self, factors: Factors) -> Sample:
-        """With the radii multiplied."""
+        """The sample with its radii multiplied."""
         return Sample(
             tuple(it.times(factors.position_68, factors.position_95) for it in self.position),
             tuple(it.times(factors.rotation_68, factors.rotation_95) for it in self.rotation),
@@ -126,7 +126,7 @@ class Sample:
 
 
 def fit_factors(sample: Sample) -> Factors:
-    """The factors of a sample; TooFewQueries if it is too small."""
+    """Fits the factors of a sample; TooFewQueries if it is too small."""
     if len(sample) < MIN_QUERIES:
         raise TooFewQueries(
             f"{len(sample)} answers are too few to calibrate from, {MIN_QUERIES} are needed: with fewer, chance decides"
@@ -135,18 +135,18 @@ def fit_factors(sample: Sample) -> Factors:
 
 
 def left_one_out(sample: Sample) -> Sample:
-    """Each claim with the factors that all others give: what a calibration is worth to a photograph it has not seen."""
+    """Multiplies each claim by the factors from all others, as for a photograph that was not used to calibrate."""
     return Sample(_left_one_out(sample.position), _left_one_out(sample.rotation))
 
 
 def factor_for(claims: Sequence[Claim], probability: float) -> float:
-    """What the radius for a probability, 0.68 or 0.95, has to be multiplied by; 1 without claims."""
+    """The factor for the radius of a probability, 0.68 or 0.95; 1 without claims."""
     ratios, claimed = _table(claims, probability)
     return _factor(ratios, claimed.mean(axis=0), probability) if claims else 1.0
 
 
 def _pair(claims: Sequence[Claim]) -> tuple[float, float]:
-    """Factors for 68 and 95 %; the latter so large that no answer's radius for 95 % becomes the smaller one."""
+    """Factors for 68 and 95 %; the latter is so large that no answer's 95 % radius becomes the smaller one."""
     factor_68, factor_95 = (factor_for(claims, p) for p in (0.68, 0.95))
     narrowest = max(claim.radius_68 / max(claim.radius_95, np.finfo(float).tiny) for claim in claims)
     return factor_68, min(max(factor_95, factor_68 * narrowest), MAX_FACTOR)
@@ -164,7 +164,7 @@ def _left_one_out(claims: Sequence[Claim]) -> tuple[Claim, ...]:
 
 
 def _table(claims: Sequence[Claim], probability: float) -> tuple[Array, Array]:
-    """Ratios (n,) of errors to radii, and for each claim the probability (n, G) that it gives to the ratios tried."""
+    """Ratios (n,) of errors to radii, and the probability (n, G) that each claim gives to the tried ratios."""
     radii = np.array([claim.radius_68 if probability == 0.68 else claim.radius_95 for claim in claims])
     radii = np.maximum(radii, np.finfo(float).tiny)
     claimed = [claim.probability(_TRIED * radius) for claim, radius in zip(claims, radii, strict=True)]
@@ -172,7 +172,7 @@ def _table(claims: Sequence[Claim], probability: float) -> tuple[Array, Array]:
 
 
 def _factor(ratios: Array, claimed: Array, probability: float) -> float:
-    """Where the predictive distribution reaches a probability; ratios (n,), the claims' mean distribution (G,)."""
+    """The ratio at which the predictive distribution reaches a probability; ratios (n,), mean claims (G,)."""
     count = len(ratios)
     predictive = (count * _empirical(np.sort(ratios)) + PRIOR_QUERIES * claimed) / (count + PRIOR_QUERIES)
     reached = np.flatnonzero(predictive >= probability)
@@ -180,6 +180,6 @@ def _factor(ratios: Array, claimed: Array, probability: float) -> float:
 
 
 def _empirical(ratios: Array) -> Array:
-    """The conformal distribution (G,) of sorted ratios (n,): k / (n + 1) at the k-th, linear between."""
+    """The conformal distribution (G,) of sorted ratios (n,): k / (n + 1) at the k-th, linear in between."""
     knots = np.concatenate([[0.0], ratios, [2 * ratios[-1]]])
     return np.interp(_TRIED, knots, np.arange(len(knots)) / (len(ratios) + 1))

@@ -1,4 +1,4 @@
-"""What a calibration found: how often claims hold, before and after; what trust is worth; what was rejected."""
+"""Results of a calibration: how often claims hold before and after, the value of trust, and rejections."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DIAGRAM = tuple(p / 100 for p in range(5, 100))
 
 @dataclass(frozen=True)
 class RightRule:
-    """What counts as a right answer: both errors are at most this."""
+    """Defines a right answer: both errors are at most these."""
 
     position_m: float = 0.10
     rotation_deg: float = 5.0
@@ -33,13 +33,13 @@ class RightRule:
             raise ValueError(f"right_deg must be above 0 and at most 180, is {self.rotation_deg:g}")
 
     def __call__(self, outcome: Outcome) -> bool:
-        """Whether an answer is right; one that is none is not."""
+        """Whether an answer is right; False without a pose."""
         return outcome.error_m <= self.position_m and outcome.error_deg <= self.rotation_deg
 
 
 @dataclass(frozen=True)
 class Share:
-    """How many of some, and between which shares the true one lies with 95 % confidence (Clopper and Pearson 1934)."""
+    """A share of a number, with the 95 % confidence interval of the true share (Clopper and Pearson 1934)."""
 
     part: int
     whole: int
@@ -48,12 +48,12 @@ class Share:
 
     @property
     def value(self) -> float:
-        """The share; NaN of none."""
+        """The share; NaN if the number is 0."""
         return self.part / self.whole if self.whole else math.nan
 
     @classmethod
     def of(cls, part: int, whole: int, confidence: float = 0.95) -> Share:
-        """With the interval: shares under which a count as extreme is not rarer than half of 1 - confidence."""
+        """Makes a share with its interval, from both one-sided tests at (1 - confidence) / 2."""
         tail = (1 - confidence) / 2
         low = float(betaincinv(part, whole - part + 1, tail)) if part else 0.0
         high = float(betaincinv(part + 1, whole - part, 1 - tail)) if part < whole else 1.0
@@ -62,14 +62,14 @@ class Share:
 
 @dataclass(frozen=True)
 class Held:
-    """How often the truth lies within a claimed radius.
+    """How often the truth is within a claimed radius.
 
     Attributes:
         claim: "position" or "rotation".
-        probability: claimed.
-        before: as the server claims it, without any factor.
-        factor: what makes it right; None where there are too few answers.
-        after: with the factor that all other answers give; None likewise.
+        probability: the claimed probability.
+        before: the share without any factor.
+        factor: the factor that corrects it; None if there are too few answers.
+        after: the share with the factor from all other answers; None if there are too few.
     """
 
     claim: str
@@ -81,14 +81,14 @@ class Held:
 
 @dataclass(frozen=True)
 class Operating:
-    """What accepting every answer with at least a score comes to.
+    """The result of accepting every answer with at least a given score.
 
     Attributes:
         score: the smallest accepted.
         coverage: share of the right answers that are accepted.
         risk: share of wrong ones among the accepted.
-        accepted: how many are.
-        wrong: how many of these are wrong.
+        accepted: number of accepted answers.
+        wrong: number of wrong ones among these.
     """
 
     score: float
@@ -100,18 +100,18 @@ class Operating:
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """All that a calibration found.
+    """All results of a calibration.
 
     Attributes:
         outcomes: of all photographs, in their order.
-        conditions: what computed the answers that are calibrated: most of all.
-        sample: of those.
-        others: how many answers something else computed; they are left out.
-        factors: of the sample; None if it is too small, and `refusal` says so.
-        after: the sample with the factors that all others give; None likewise.
+        conditions: what computed the calibrated answers, which are the majority.
+        sample: claims of those answers.
+        others: number of answers that were computed under other conditions, and are left out.
+        factors: factors of the sample; None if it is too small, which `refusal` says.
+        after: the sample, each claim with the factors from all others; None if it is too small.
         held: a row for each kind and probability.
-        rejections: how many by reason.
-        right: how many answers are.
+        rejections: number of rejections by reason.
+        right: number of right answers.
         trusted: risk against coverage, by trust; empty if answers have none.
         auroc: probability that a right answer has more trust than a wrong one; NaN if there is none of either.
     """
@@ -131,7 +131,7 @@ class Findings:
 
 
 def find(outcomes: Sequence[Outcome], right: RightRule) -> Findings:
-    """Everything, from the answers to all photographs."""
+    """Computes all results from the answers to all photographs."""
     answered = [it for it in outcomes if it.pose is not None]
     counts = Counter(it.conditions for it in answered if it.position is not None)
     conditions = counts.most_common(1)[0][0] if counts else None
@@ -165,14 +165,14 @@ def find(outcomes: Sequence[Outcome], right: RightRule) -> Findings:
 
 
 def reliability(claims: Sequence[Claim]) -> list[tuple[float, float]]:
-    """The reliability diagram: claimed probability against the share of claims (at least one) that hold at it."""
+    """The reliability diagram: claimed probability, and the share of claims (at least one) that hold at it."""
     return [(p, float(np.mean([claim.held(p) for claim in claims]))) for p in DIAGRAM]
 
 
 def auroc(scores: Sequence[float], right: Sequence[bool]) -> float:
     """Probability that a right answer has a higher score than a wrong one; equal scores count half.
 
-    The area under the receiver's curve, as the Mann-Whitney statistic. NaN where all are right or none is.
+    This is the area under the ROC curve, computed as the Mann-Whitney statistic. NaN if all are right or none is.
     """
     is_right = np.asarray(right, bool)
     rights, wrongs = int(is_right.sum()), int((~is_right).sum())

@@ -1,4 +1,4 @@
-"""Localizing a folder's photographs through a server: each answer beside the truth, and whether the worlds agree.
+"""Localizes a folder's photographs through a server, compares answers with the truth, and checks that the worlds agree.
 
 If a folder's poses are in another world than the scene, every answer is wrong, and all are wrong in the same way.
 """
@@ -37,12 +37,12 @@ EXPLAINED = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """A photograph and the references that it is compared with.
+    """A photograph, and the references that it is compared with.
 
     Attributes:
-        frame: with its true pose, in the scene's world.
-        references: names; none: the server chooses among all.
-        reranked: whether it chooses `count` among `references`.
+        frame: the photograph with its true pose in the scene's world.
+        references: names of the references; empty if the server chooses among all.
+        reranked: whether the server chooses `count` among `references`.
     """
 
     frame: Frame
@@ -52,18 +52,18 @@ class Query:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """The answer to a photograph beside the truth.
+    """The answer to a photograph, compared with the truth.
 
     Attributes:
-        name: of the frame.
-        error_m, error_deg: of the answered pose; infinite if there is none.
-        position, rotation: what was claimed, in metres and degrees; None if nothing was.
-        trust: of the answer; None if it has none.
-        inlier_count, match_count: of the answer.
+        name: name of the frame.
+        error_m, error_deg: errors of the answered pose; infinite if there is none.
+        position, rotation: the claims, in metres and degrees; None without radii.
+        trust: trust of the answer; None if it has none.
+        inlier_count, match_count: counts of the answer.
         rejection, message: why there is no pose; empty if there is one.
         conditions: what computed it; None if the server refused the photograph.
-        true_pose: world from camera.
-        pose: the answered one.
+        true_pose: true world_from_camera.
+        pose: the answered pose.
     """
 
     name: str
@@ -82,12 +82,12 @@ class Outcome:
 
 
 def planned_queries(queries: Sequence[PlannedQuery]) -> list[Query]:
-    """The queries of an evaluation's plan."""
+    """Makes the queries of an evaluation's plan."""
     return [Query(query.frame, tuple(reference.name for reference in query.references)) for query in queries]
 
 
 def scene_queries(client: Client, scene: str, frames: Sequence[Frame], progress: Progress) -> list[Query]:
-    """Queries in a stored scene: no photograph is compared with itself, nor with a copy of itself.
+    """Makes queries for a stored scene: no photograph is compared with itself or a copy of itself.
 
     Raises:
         UsageError: the scene has too few references, or a photograph's poses in the folder and in the scene differ.
@@ -114,10 +114,10 @@ def localize(client: Client, scene: str, query: Query, *, count: int, variant: s
     """Localizes one photograph, as if the scene had no calibration.
 
     Args:
-        client: of the server.
+        client: client of the server.
         scene: id of the scene.
         query: the photograph.
-        count: references that the server chooses, where it does.
+        count: number of references that the server chooses, if it does.
         variant: form of the method.
 
     Raises:
@@ -147,11 +147,11 @@ def localize(client: Client, scene: str, query: Query, *, count: int, variant: s
 
 @dataclass(frozen=True)
 class OtherWorld:
-    """How a folder's world lies in the scene's, as the answers show.
+    """The position of a folder's world in the scene's, by the answers.
 
     Attributes:
-        moved_m, turned_deg: of the folder's frame.
-        left_m: median error once that is undone.
+        moved_m, turned_deg: motion of the folder's frame.
+        left_m: median error after undoing this motion.
     """
 
     moved_m: float
@@ -166,7 +166,7 @@ class OtherWorld:
 
 
 def other_world(outcomes: Sequence[Outcome]) -> OtherWorld | None:
-    """The motion between the folder's world and the scene's; None where answers do not show one.
+    """The motion between the folder's world and the scene's; None if the answers do not show one.
 
     Each answer's scene_from_folder = answered pose times inverse true pose is a candidate; the one that leaves the
     smallest median error is taken.
@@ -230,7 +230,7 @@ def _refuse_another_pose(frame: Frame, own: Sequence[Reference], scene: str) -> 
 
 
 def _without(client: Client, scene: str, frame: Frame, known: Sequence[Reference], own: Sequence[Reference]) -> Query:
-    """The query whose references are all but the photograph itself."""
+    """The query whose references are all except the photograph itself."""
     if not own:
         return Query(frame)
     left_out = {reference.reference_id for reference in own}

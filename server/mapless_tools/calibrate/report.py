@@ -1,4 +1,4 @@
-"""A calibration for people (a table, and one HTML file with charts) and for programs (JSON)."""
+"""The report of a calibration for people (a table, and one HTML file with charts) and for programs (JSON)."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ RULES = (
 
 @dataclass(frozen=True, eq=False)
 class CalibrationReport:
-    """What was measured, and on what.
+    """The figures of a calibration, and what they were measured on.
 
     Attributes:
         dataset: the folder.
-        scene: the scene that was asked; empty if the folder was its own.
-        references: how many the scene has.
-        count: references that a query was given.
-        stored: what was done with the factors, a sentence.
+        scene: the scene that was calibrated; empty for the folder alone.
+        references: number of references of the scene.
+        count: number of references of a query.
+        stored: one sentence on what was done with the factors.
         found: all figures.
     """
 
@@ -63,7 +63,7 @@ class CalibrationReport:
 
     @property
     def unit(self) -> str:
-        """Of lengths; that of a scene which was asked is the metre."""
+        """Unit of lengths; the metre for a stored scene."""
         return "m" if self.dataset.metric or self.scene else "units"
 
     @property
@@ -72,7 +72,7 @@ class CalibrationReport:
         return f"scene {self.scene}, on {self.dataset.name}" if self.scene else self.dataset.name
 
     def facts(self) -> dict[str, str]:
-        """What figures are of, name by name."""
+        """What the figures were measured on, by name."""
         found, conditions = self.found, self.found.conditions
         answered = sum(it.pose is not None for it in found.outcomes)
         return {
@@ -93,7 +93,7 @@ class CalibrationReport:
 
 
 def share_text(share: Share) -> str:
-    """For people: per cent, the count, and the interval."""
+    """Text of a share: per cent, count, and interval."""
     if not share.whole:
         return "-"
     return (
@@ -102,7 +102,7 @@ def share_text(share: Share) -> str:
 
 
 def trust_text(found: Findings) -> str:
-    """What trust is worth, for people."""
+    """Text on how well trust separates right from wrong answers."""
     if not found.right.whole:
         return "nothing was answered"
     if not found.trusted:
@@ -127,13 +127,13 @@ COLUMNS = ("radius", "held, as claimed", "factor", "with the factors of all othe
 
 
 def worst(report: CalibrationReport, count: int = 10) -> list[Outcome]:
-    """The answers that exceed a radius of 95 % that they claim, by most first."""
+    """The answers that exceed a claimed 95 % radius, by most first."""
     answered = [it for it in report.found.outcomes if it.position is not None and it.rotation is not None]
     return sorted((it for it in answered if _excess(it) > 1), key=lambda it: -_excess(it))[:count]
 
 
 def print_report(report: CalibrationReport, console: Console) -> None:
-    """The figures."""
+    """Prints the figures."""
     table = Table("", "", title=report.title, show_header=False, title_justify="left")
     for name, value in report.facts().items():
         table.add_row(name, value)
@@ -145,7 +145,7 @@ def print_report(report: CalibrationReport, console: Console) -> None:
 
 
 def to_json(report: CalibrationReport) -> dict[str, Any]:
-    """Everything as JSON values; what is infinite or unknown is null."""
+    """Everything as JSON values; infinite and unknown ones are null."""
     found = report.found
     return {
         "folder": report.dataset.name,
@@ -217,7 +217,7 @@ SMALLEST_CM, SMALLEST_DEG = 0.01, 0.001
 
 
 def page(report: CalibrationReport) -> str:
-    """The report."""
+    """The HTML page of the report."""
     return render(
         "calibration.html",
         title=f"Calibration of mapless: {report.title}",
@@ -248,7 +248,7 @@ def _length(value: float, unit: str) -> str:
 
 
 def charts_of(found: Findings, unit: str) -> list[Figure]:
-    """All charts of what was found; a length is in centimetres where `unit` is "m", else in the folder's unit."""
+    """All charts of the findings; lengths are in centimetres if `unit` is "m", else in the folder's unit."""
     length_unit, per_unit = ("cm", 100.0) if unit == "m" else (unit, 1.0)
     figures = []
     for kind, kind_unit, factor, smallest in (

@@ -1,4 +1,4 @@
-"""A calibration from end to end: read, localize, find, store, report."""
+"""A calibration from beginning to end: reads, localizes, computes, stores, and reports."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class CalibrateOptions:
 
     Attributes:
         scene: the scene to calibrate; empty for the folder by itself.
-        layout: of the folder.
+        layout: layout of the folder.
         evaluation: how the folder is split and its photographs are localized.
         right: what counts as a right answer.
         dry_run: whether to store nothing.
@@ -78,13 +78,13 @@ def clear_calibration(folder: Path | None, scene: str, connection: Connection) -
 
 
 def calibrate(folder: Path, options: CalibrateOptions, connection: Connection, output: Path) -> bool:
-    """Measures, prints, writes the report, and stores the factors where there is a scene.
+    """Measures, prints, writes the report, and stores the factors if there is a scene.
 
     Args:
-        folder: with photographs and their poses.
-        options: see there.
-        connection: of the scene's server.
-        output: folder for the report; made if it is not there.
+        folder: the folder with photographs and their poses.
+        options: options of the calibration.
+        connection: connection to the scene's server.
+        output: folder of the report, created if missing.
 
     Returns:
         Whether factors were found.
@@ -112,7 +112,7 @@ def calibrate(folder: Path, options: CalibrateOptions, connection: Connection, o
 def _measure_folder(
     dataset: Dataset, options: CalibrateOptions, _: Connection, settings: Settings, progress: Progress
 ) -> CalibrationReport:
-    """The folder by itself, as `evaluate` splits it, on a server of its own."""
+    """Measures the folder alone, split as by `evaluate`, on a server of its own."""
     plan = plan_for(dataset, options.evaluation, settings, progress)
     with temporary_server() as client:
         store_references(client, OWN_SCENE, plan.references, progress)
@@ -126,7 +126,7 @@ def _measure_folder(
 def _measure_scene(
     dataset: Dataset, options: CalibrateOptions, connection: Connection, settings: Settings, progress: Progress
 ) -> CalibrationReport:
-    """A stored scene; its calibration is replaced by the factors that were found, except in a dry run."""
+    """Measures a stored scene; its calibration is replaced by the found factors, except in a dry run."""
     frames = evenly_spread(dataset.frames, options.evaluation.query_count)
     check_images(frames, image_limits(settings))
     with _connected(connection, settings) as client:
@@ -144,7 +144,7 @@ def _measure_scene(
 
 
 def _store(client: Client, options: CalibrateOptions, found: Findings, before: Calibration | None) -> str:
-    """What was done with the factors; `before` is the calibration that the scene had."""
+    """Stores the factors and says what was done; `before` is the calibration that the scene had."""
     if found.factors is None or found.conditions is None:
         return f"not stored: {found.refusal}"
     if options.dry_run:
@@ -156,7 +156,7 @@ def _store(client: Client, options: CalibrateOptions, found: Findings, before: C
 
 
 def calibration_of(found: Findings) -> Calibration:
-    """What a scene keeps of findings that have factors."""
+    """Makes the calibration to store from findings that have factors."""
     assert found.factors is not None
     assert found.conditions is not None
     return Calibration(
@@ -189,7 +189,7 @@ def _localize_all(
 
 @contextmanager
 def _connected(connection: Connection, settings: Settings) -> Iterator[Client]:
-    """As `connected`; what is wrong with the connection's options is a UsageError."""
+    """Connects as `connected`; errors in the connection's options become UsageError."""
     with ExitStack() as stack:
         with usage_errors():
             client = stack.enter_context(connected(connection, settings))

@@ -53,7 +53,7 @@ def _options(
 def _add_tool(
     name: str, command: Callable[..., None], extra: str = "tools", cls: type[TyperCommand] | None = None
 ) -> None:
-    """Adds a command that first checks that the packages of its extra are installed."""
+    """Adds a command that first checks whether the packages of its extra are installed."""
 
     @functools.wraps(command)
     def checked(**arguments: Any) -> None:

@@ -99,10 +99,10 @@ class Examined:
 
     Attributes:
         scene: its id.
-        audits: of the references so far, in the server's order.
+        audits: audits of the references so far, in the server's order.
         total: number of references of the scene; None before it is known.
         stopped: why it ended early; empty if it did not.
-        warnings: what the scene's datum, down and unit contradict in the poses of its references.
+        warnings: contradictions of the scene's datum, down and unit and the poses of its references.
     """
 
     scene: str
@@ -113,7 +113,7 @@ class Examined:
 
 
 def warnings_of(client: Client, known: KnownScene) -> list[str]:
-    """What a scene's datum, down and unit contradict in the poses of its first references by id."""
+    """Contradictions of a scene's datum, down and unit and the poses of its first references by id."""
     from mapless import DataLoss
     from mapless_server.scenes.plausibility import contradictions
     from mapless_server.store import SceneAttributes
@@ -155,7 +155,7 @@ def _report(examined: Examined, everything: bool, report: Path | None, html: Pat
 
 
 def worst_first(audits: Iterable[ReferenceAudit]) -> list[ReferenceAudit]:
-    """Sorted by finding, then by offset, then by name."""
+    """Sorts audits by finding, then by offset, then by name."""
     return sorted(audits, key=lambda a: (_rank(a.verdict), -a.position_offset_m, -a.rotation_offset_deg, a.name))
 
 

@@ -1,4 +1,4 @@
-"""The rule of what commands print: text on a terminal, JSON where standard output is none; flags decide otherwise."""
+"""What commands print: text on a terminal, else JSON; flags decide otherwise."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ AsJson = Annotated[bool | None, typer.Option("--json/--text", help="What is prin
 
 
 def printed_as_json(given: bool | None, value: Any) -> bool:
-    """Prints a value as JSON if that is to be, by the flag or the rule; returns whether it was."""
+    """Prints a value as JSON if the flag or the rule says so; returns whether it did."""
     is_json = given if given is not None else not sys.stdout.isatty()
     if is_json:
         print(json.dumps(value, indent=2, default=str))

@@ -91,7 +91,7 @@ def restore_command(
 
 
 def _open(config: Path | None, data_dir: Path | None) -> Database:
-    """The settings' store, brought up to date; created if missing."""
+    """Opens the settings' store, migrated to this program's schema; created if missing."""
     from mapless_server.store.postgresql import PostgresqlDatabase
     from mapless_server.store.sqlite import SqliteDatabase
 
@@ -100,7 +100,7 @@ def _open(config: Path | None, data_dir: Path | None) -> Database:
 
 
 def _look(config: Path | None, data_dir: Path | None) -> Database:
-    """The settings' store, read-only, while others may use it."""
+    """Opens the settings' store read-only, while others may use it."""
     from mapless_server.store.postgresql import PostgresqlDatabase
     from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
 
@@ -119,7 +119,7 @@ def _settings(config: Path | None, data_dir: Path | None) -> tuple[str | None, P
 
 @contextmanager
 def _store_errors() -> Iterator[None]:
-    """An error of the store or the settings ends the command with one line."""
+    """Ends the command with one line for an error of the store or the settings."""
     from mapless_server.errors import RequestError
     from mapless_server.settings import ConfigError
     from mapless_server.store import StoreError

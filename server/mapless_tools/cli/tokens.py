@@ -86,7 +86,7 @@ def _tokens_file(given: Path | None) -> Iterator[Path]:
 
 
 def _read_time(text: str) -> datetime:
-    """A time in the future; ends the command if it is none."""
+    """Reads a time in the future; ends the command if the text is not one."""
     from pydantic import AwareDatetime, TypeAdapter, ValidationError
 
     try:

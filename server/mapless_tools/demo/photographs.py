@@ -1,4 +1,4 @@
-"""What the demo runs on: the project's own photographs of a room, or a folder of real ones."""
+"""The demo's photographs: the project's own ones of a room, or a folder of real ones."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class Outline:
     """Edges of a room and its larger furniture, world, metres.
 
     Attributes:
-        edges: (E, 2, 3) all.
-        visible_edges: (S, 2, 3) by the names of the queries: the parts that nothing hides from them.
+        edges: (E, 2, 3) all edges.
+        visible_edges: (S, 2, 3) by the names of the queries: the parts that are not hidden in them.
     """
 
     edges: Array
@@ -50,7 +50,7 @@ class Place:
 
     Attributes:
         title: shown to the user.
-        references, queries: apart from one another.
+        references, queries: the photographs; none is in both.
         metric: whether lengths are metres.
         outline: None if it is not known.
     """

@@ -1,7 +1,7 @@
-"""A picture that shows at a glance whether a pose is right.
+"""A picture that shows whether a pose is right.
 
-Left the photograph with known structure drawn where the found pose puts it, right the nearest reference with the same
-structure, below the numbers and a plan of the place.
+Left: the photograph with known structure projected by the found pose. Right: the nearest reference with the same
+    structure. Below: the numbers and a plan of the place.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ class Scenery:
     """What is known of the place, for drawing.
 
     Attributes:
-        points: triangulated from references.
+        points: points triangulated from references.
         outline: (E, 2, 3) edges, world; none for a real place.
-        visible_outline: (S, 2, 3) the parts of edges that nothing hides from the photograph.
+        visible_outline: (S, 2, 3) the parts of edges that are not hidden in the photograph.
     """
 
     points: SparsePoints
@@ -58,13 +58,13 @@ def draw(
     scenery: Scenery,
     caption: Sequence[str],
 ) -> Canvas:
-    """The picture of one answer, (H, W, 3) uint8 RGB.
+    """Draws the picture (H, W, 3) uint8 RGB of one answer.
 
     Args:
         query: the photograph with its true pose.
-        world_from_query: the found pose; None when the photograph was rejected: then nothing is drawn on it.
+        world_from_query: the found pose; None if the photograph was rejected, then nothing is drawn on it.
         nearest: the reference that the answer rests on most.
-        references: all, for the plan.
+        references: all references, for the plan.
         scenery: what to draw.
         caption: lines; the first one is the heading.
     """
@@ -105,7 +105,7 @@ def png(picture: Canvas) -> bytes:
 
 
 def _show(axes: Axes, image: Canvas, title: str) -> None:
-    """The image in its own pixels, which further drawing does not widen."""
+    """Shows the image in its own pixels, with limits that further drawing does not change."""
     axes.imshow(image, interpolation="antialiased")
     axes.autoscale(False)
     axes.set_axis_off()
@@ -114,12 +114,12 @@ def _show(axes: Axes, image: Canvas, title: str) -> None:
 
 
 def _add_lines(axes: Axes, ends: Array, **style: Any) -> None:
-    """Segments (S, 2, 2), without those that have an end behind the camera."""
+    """Draws segments (S, 2, 2), without those that have an end behind the camera."""
     axes.add_collection(LineCollection(list(ends[np.isfinite(ends).all(axis=(1, 2))]), **style))
 
 
 def _add_points(axes: Axes, shot: Shot, points: SparsePoints) -> str:
-    """The points where the shot's pose puts them, near red, far blue; and in words how well that fits."""
+    """Draws the points projected by the shot's pose, near red, far blue; returns a text on how well they fit."""
     pixels = shot.project(points.x_in_world)
     last_px = [shot.camera.width_px - 1, shot.camera.height_px - 1]
     inside = ((pixels >= 0) & (pixels <= last_px)).all(axis=-1)
@@ -143,7 +143,7 @@ def _add_points(axes: Axes, shot: Shot, points: SparsePoints) -> str:
 def _draw_plan(
     axes: Axes, true: RigidTransform, found: RigidTransform | None, references: Sequence[Shot], scenery: Scenery
 ) -> None:
-    """The place seen from above: structure, references, the true position and the found one."""
+    """Draws the place from above: structure, references, the true position and the found one."""
     poses = [reference.world_from_camera for reference in references]
     ground = _ground_axes(poses)
     points = scenery.points.x_in_world @ ground.T
@@ -172,7 +172,7 @@ def _draw_plan(
 
 
 def _ground_axes(poses: Sequence[RigidTransform]) -> Array:
-    """Two level directions (2, 3), taking the cameras' mean down direction for down."""
+    """Two horizontal directions (2, 3); the mean of the cameras' y axes is taken as down."""
     down = np.mean([pose.rotation[:, 1] for pose in poses], axis=0)
     down /= np.linalg.norm(down)
     start = np.eye(3)[int(np.argmin(np.abs(down)))]

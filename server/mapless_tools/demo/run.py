@@ -1,4 +1,4 @@
-"""The demo: starts a server, adds references, localizes photographs it has never seen, judges and draws the answers."""
+"""The demo: starts a server, adds references, localizes photographs it has not seen, judges and draws the answers."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Outcome:
 
 
 def run_demo(data: Path | None, output: Path, console: Console | None = None) -> bool:
-    """Run the whole demo.
+    """Runs the whole demo.
 
     Args:
         data: a folder with `images/` and `cameras.json`; None for the rendered room.
@@ -50,8 +50,8 @@ def run_demo(data: Path | None, output: Path, console: Console | None = None) ->
         console: where to write; None for the standard output.
 
     Returns:
-        whether it succeeded: the rendered room's queries are all localized with small median errors; of a real folder's
-        more than half are localized.
+        Whether it succeeded: all queries of the rendered room are localized with small median errors, or more than half
+            of those of a real folder are localized.
 
     Raises:
         ValueError: the folder is malformed.
@@ -90,7 +90,7 @@ def run_demo(data: Path | None, output: Path, console: Console | None = None) ->
 
 
 def judge(query: Photograph, answer: LocalizationResult | Rejected) -> Outcome:
-    """An answer against the truth."""
+    """Compares an answer with the truth."""
     if isinstance(answer, Rejected):
         return Outcome(query, answer, math.inf, math.inf)
     error = query.world_from_camera.inverse().compose(answer.world_from_camera)
@@ -98,7 +98,7 @@ def judge(query: Photograph, answer: LocalizationResult | Rejected) -> Outcome:
 
 
 def table_of(outcomes: Sequence[Outcome], metric: bool) -> Table:
-    """One row a query; the radius is the server's own, not exceeded in 68 % of cases."""
+    """A table with one row for each query; the radius is the server's own, not exceeded in 68 % of cases."""
     unit = "cm" if metric else "/100"
     headings = ("query", "outcome", f"{unit} off", "deg off", f"radius {unit}", "inliers", "refs", "s")
     table = Table(*headings, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))  # within the 80 columns of a plain terminal
@@ -123,7 +123,7 @@ def table_of(outcomes: Sequence[Outcome], metric: bool) -> Table:
 
 
 def summarize(console: Console, place: Place, outcomes: Sequence[Outcome]) -> bool:
-    """Print the medians and the verdict; whether the demo succeeded."""
+    """Prints the medians and the verdict; returns whether the demo succeeded."""
     localized = [outcome for outcome in outcomes if isinstance(outcome.answer, LocalizationResult)]
     translation = float(np.median([outcome.translation_error for outcome in outcomes]))
     rotation_deg = float(np.median([outcome.rotation_error_deg for outcome in outcomes]))
@@ -146,7 +146,7 @@ def summarize(console: Console, place: Place, outcomes: Sequence[Outcome]) -> bo
 
 
 def write_pictures(place: Place, outcomes: Sequence[Outcome], output: Path) -> list[Path]:
-    """One picture a query, and first a sheet of all."""
+    """Writes one picture for each query, and first a sheet of all."""
     output.mkdir(parents=True, exist_ok=True)
     shots = {photo.name: Shot.of(photo, DRAWN_PX) for photo in place.references}
     pictures = [_picture(place, outcome, shots) for outcome in outcomes]

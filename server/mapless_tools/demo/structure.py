@@ -1,7 +1,7 @@
-"""Points to draw: matched between photographs with known poses and triangulated, apart from the server's own work.
+"""Points to draw: matched between photographs with known poses and triangulated, independent of the server.
 
-An answer has a pose and no points. Known structure that falls where the photograph shows it makes a pose credible, so
-the demo computes a little structure itself, from the references alone.
+An answer has a pose, but no points. Known structure that is projected to where the photograph shows it makes a pose
+credible, so the demo triangulates some points itself, from the references alone.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ class Shot:
     """A decoded photograph with its pose.
 
     Attributes:
-        name: of the reference or query.
+        name: name of the reference or query.
         image: (H, W, 3) uint8 RGB.
-        camera: in the pixels of `image`.
+        camera: its camera, in the pixels of `image`.
         world_from_camera: its known pose.
     """
 
@@ -47,7 +47,7 @@ class Shot:
 
     @staticmethod
     def of(photograph: Photograph, max_side_px: int) -> Shot:
-        """Not larger than needed; like the server, blind to EXIF orientation. ValueError if it cannot be read."""
+        """Decodes a photograph, reduced if it is large, without EXIF orientation; ValueError if it cannot be read."""
         flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
         image = cv2.imdecode(np.frombuffer(photograph.data, np.uint8), flags)
         if image is None:
@@ -59,7 +59,7 @@ class Shot:
 
     @cached_property
     def features(self) -> tuple[Array, NDArray[np.float32]]:
-        """SIFT keypoints (N, 2) in pixels of the image, distorted as it is, and descriptors (N, 128)."""
+        """SIFT keypoints (N, 2) in pixels of the distorted image, and descriptors (N, 128)."""
         keypoints, descriptors = cv2.SIFT.create(MAX_FEATURES).detectAndCompute(self.image, None)
         if len(keypoints) == 0:
             return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
@@ -72,7 +72,7 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class SparsePoints:
-    """Triangulated points: (N, 3) world, and their SIFT descriptors (N, 128) float32."""
+    """Triangulated points (N, 3) in the world, and their SIFT descriptors (N, 128) float32."""
 
     x_in_world: Array
     descriptors: NDArray[np.float32]
@@ -93,7 +93,7 @@ def match(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.int64]:
 
 
 def points_to_draw(references: Sequence[Shot]) -> SparsePoints:
-    """Triangulate what any two of a few references see that look at the same place."""
+    """Triangulates points from all pairs of a few references that show the same place."""
     points, descriptors = [np.zeros((0, 3))], [np.zeros((0, 128), np.float32)]
     for a, b in itertools.combinations(references, 2):
         (pixels_a, of_a), (pixels_b, of_b) = a.features, b.features
@@ -108,7 +108,7 @@ def points_to_draw(references: Sequence[Shot]) -> SparsePoints:
 
 
 def triangulate(a: Shot, b: Shot, pixels_a: Array, pixels_b: Array) -> tuple[Array, Array]:
-    """Points (N, 3), world, and the angles (N,) at which their rays meet, degrees."""
+    """Triangulates points (N, 3), world; also returns the angles (N,) between their rays, degrees."""
     if len(pixels_a) == 0:
         return np.zeros((0, 3)), np.zeros(0)
     poses = [shot.world_from_camera.inverse().matrix()[:3] for shot in (a, b)]
@@ -125,11 +125,11 @@ def triangulate(a: Shot, b: Shot, pixels_a: Array, pixels_b: Array) -> tuple[Arr
 
 
 def find_in(points: SparsePoints, shot: Shot, max_offset_px: float) -> tuple[NDArray[np.int64], Array]:
-    """Which of the points a photograph shows, recognized by their descriptors alone.
+    """Finds which of the points a photograph shows, by their descriptors alone.
 
     Returns:
-        indices (M,) of points and the pixels (M, 2) that show them, at most `max_offset_px` from where the shot's pose
-        puts them.
+        Indices (M,) of points and the pixels (M, 2) that show them, at most `max_offset_px` from their projections by
+        the shot's pose.
     """
     pixels, descriptors = shot.features
     pairs = match(points.descriptors, descriptors)

@@ -20,12 +20,12 @@ class Average:
     """Figures of one method in one setting over scenes.
 
     Attributes:
-        scenes: which.
-        complete: whether they are all that the paper averages over; always, where there is no paper.
+        scenes: the scenes.
+        complete: whether these are all scenes that the paper averages over; True without figures of the paper.
         median_translation_m, median_rotation_deg: mean of the scenes' medians; infinite if one is.
         recall: mean of the scenes' shares within `RECALL_BARS`.
-        localized, queries: of all scenes together.
-        latency_p50_ms, latency_p95_ms: mean of the scenes'.
+        localized, queries: numbers over all scenes.
+        latency_p50_ms, latency_p95_ms: means of the scenes' values.
     """
 
     scenes: tuple[str, ...]
@@ -45,10 +45,10 @@ class Group:
 
     Attributes:
         benchmark: None for folders with cameras.json.
-        scenes: those that were to be measured, in order.
-        settings, methods: the same.
-        runs: by scene, setting and method; what could not be measured is not there.
-        summaries: the same.
+        scenes: scenes to measure, in order.
+        settings, methods: settings and methods to measure, in order.
+        runs: runs by scene, setting and method, without those that could not be measured.
+        summaries: their summaries by scene, setting and method.
     """
 
     layout: str
@@ -64,11 +64,11 @@ class Group:
 
     @property
     def title(self) -> str:
-        """Name of the benchmark, or what it is else."""
+        """Name of the benchmark, or else a description."""
         return self.benchmark.title if self.benchmark else "Own photographs"
 
     def results(self, scene: str, setting: int, method: Method) -> tuple[QueryResult, ...]:
-        """Of one run; empty if it could not be measured."""
+        """Results of one run; empty if it could not be measured."""
         run = self.runs.get((scene, setting, method))
         return () if run is None else run.results
 
@@ -94,7 +94,7 @@ class Group:
 
 
 def groups_of(suite: Suite) -> tuple[Group, ...]:
-    """The runs of each benchmark together."""
+    """Groups the runs by benchmark."""
     groups = []
     for layout in dict.fromkeys(scene.place.layout for scene in suite.scenes):
         scenes = [scene for scene in suite.scenes if scene.place.layout == layout]

@@ -1,4 +1,4 @@
-"""The paper's benchmarks: their scenes, the numbers of references it tries, and where scenes lie in a folder."""
+"""The paper's benchmarks: their scenes, the numbers of references it uses, and where scenes are in a folder."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ class Benchmark:
     """A benchmark of the paper.
 
     Attributes:
-        layout: name of its layout on the disk, as `formats` has it.
-        title: as printed.
-        scenes: by name of the folder and in the paper's order, what the paper's tables call each.
+        layout: name of its layout on the disk, as in `formats`.
+        title: its name in reports.
+        scenes: names in the paper's tables by name of the folder, in the paper's order.
         sparse: numbers of references that the paper keeps, the densest first.
-        ground_truth: what the paper's figures are against.
-        paper: its figures.
+        ground_truth: ground truth of the paper's figures.
+        paper: figures of the paper.
     """
 
     layout: str
@@ -96,9 +96,9 @@ class ScenePlace:
     """A scene on the disk.
 
     Attributes:
-        name: unique among those found; the paper's folder name where it has one, in whatever case it is written.
+        name: its name, unique among the found ones; the paper's folder name, if it has one, in any case.
         path: its folder.
-        layout: how it lies there.
+        layout: its layout.
     """
 
     name: str
@@ -112,7 +112,7 @@ class ScenePlace:
 
 
 def find_scenes(folder: Path, layout: str = "auto") -> tuple[ScenePlace, ...]:
-    """The scene that a folder is, or those in it, in the paper's order, others after them by name.
+    """Finds the scene that a folder is, or those in it, in the paper's order, others after them by name.
 
     Raises:
         UsageError: there is no such folder, or no scene of this layout in it.
@@ -132,7 +132,7 @@ def find_scenes(folder: Path, layout: str = "auto") -> tuple[ScenePlace, ...]:
 
 
 def _search(folder: Path, wanted: tuple[str, ...], depth: int) -> tuple[list[tuple[Path, str]], str]:
-    """Scenes with their layouts, and a layout that was seen and is not wanted."""
+    """Finds scenes with their layouts; also returns a layout that was found but is not wanted."""
     layout = _layout(folder, wanted)
     if layout in wanted:
         return [(folder, layout)], ""
@@ -148,7 +148,7 @@ def _search(folder: Path, wanted: tuple[str, ...], depth: int) -> tuple[list[tup
 
 
 def _layout(folder: Path, wanted: tuple[str, ...]) -> str:
-    """The layout that a folder has, of the wanted ones if it has several; empty if it has none."""
+    """The layout of a folder; of several, one of the wanted ones; empty if it has none."""
     found = [layout for layout in _MARKS if fits(folder, layout)]
     return next((layout for layout in found if layout in wanted), next(iter(found), ""))
 

@@ -31,7 +31,7 @@ NO_POSE = ("pose:", "ground truth:")
 
 
 def evaluate_folder(folder: Path, json_file: Path | None, **options: Any) -> None:
-    """Measures the server on a folder with cameras.json, prints the table and writes the JSON file, if one is named.
+    """Measures the server on a folder with cameras.json, prints the table, and writes the JSON file, if named.
 
     `options` are those of EvaluationOptions.
 
@@ -66,13 +66,13 @@ def evaluate_benchmarks(
     """Measures the server on a scene, or on all scenes of a folder, and writes the report.
 
     Args:
-        folder: a scene, or what holds scenes.
-        output: folder of the report; made if need be. What it holds of the same evaluation is not measured again.
+        folder: a scene, or a folder of scenes.
+        output: folder of the report, created if missing. Its results of the same evaluation are not measured again.
         pairs: references of each query, a file or a folder with one for each scene; None: see the options' `choice`.
         ground_truth: poses instead of the layout's own, see `ReadOptions`.
         partial: whether images that are missing or damaged may be left out; the report names them.
         worst: how many queries of each scene are shown as pictures.
-        options: those of SuiteOptions.
+        options: fields of SuiteOptions.
 
     Returns:
         Whether everything was measured.
@@ -109,7 +109,7 @@ def evaluate_benchmarks(
 
 
 def _journal_folder(output: Path) -> Path:
-    """The folder of the journals in it; raises UsageError if it cannot be written."""
+    """The folder of journals in the output; raises UsageError if it cannot be written."""
     journals = output / RUNS_FOLDER
     try:
         journals.mkdir(parents=True, exist_ok=True)
@@ -128,7 +128,7 @@ def _read_scene(
     ground_truth: Path | None,
     partial: bool,
 ) -> SceneWork:
-    """A scene read, split and checked; UsageError if that is not possible, or images cannot be used."""
+    """Reads, splits and checks a scene; UsageError if that is not possible, or images cannot be used."""
     with usage_errors():
         dataset = read_dataset(place.path, place.layout, ReadOptions(ground_truth=ground_truth))
     if not dataset.metric:

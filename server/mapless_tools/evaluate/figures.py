@@ -1,4 +1,4 @@
-"""What was measured, for programs: evaluation.json, evaluation.csv (a line a run) and queries.csv (a line a query)."""
+"""The figures for programs: evaluation.json, evaluation.csv (a line for each run), queries.csv (one for each query)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ RULES = (
 
 
 def write_figures(suite: Suite, folder: Path) -> None:
-    """Writes the three files, each whole or not at all."""
+    """Writes the three files, each completely or not at all."""
     groups = groups_of(suite)
     with whole_file(folder / JSON_FILE) as partial:
         write_json(partial, as_json(suite, groups))
@@ -36,7 +36,7 @@ def write_figures(suite: Suite, folder: Path) -> None:
 
 
 def as_json(suite: Suite, groups: Sequence[Group]) -> dict[str, Any]:
-    """Everything but the single queries, whose files are named; what is infinite is null."""
+    """Everything except single queries, whose files are named; infinite values are null."""
     return {
         "provenance": asdict(suite.provenance),
         "options": asdict(suite.options) | {"pairs": None if suite.pairs is None else str(suite.pairs)},
@@ -62,7 +62,7 @@ def as_json(suite: Suite, groups: Sequence[Group]) -> dict[str, Any]:
 
 
 def run_figures(run: Run) -> dict[str, Any]:
-    """One run's figures, flat: the columns of evaluation.csv."""
+    """One run's figures: the columns of evaluation.csv."""
     summary = summarize(run.results)
     return {
         "layout": run.scene.place.layout,

@@ -1,4 +1,4 @@
-"""Errors, recall and latency of an evaluation. A query that was not localized counts as infinitely wrong."""
+"""Errors, recall and latency of an evaluation. A query that was not localized has infinite errors."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ class QueryResult:
     """The result of one query; a rejected one has infinite errors.
 
     Attributes:
-        name: of the frame.
+        name: name of the frame.
         references: names of the references it was given, in order.
         translation_error: distance between true and answered camera centre, the dataset's unit.
         rotation_error_deg: angle between true and answered orientation.
         reference_distance: median distance from the true camera centre to those of its references, the dataset's unit.
         position_68: the claimed radius, a position error not exceeded in 68 % of cases; None without one.
-        inlier_count, match_count: of the answer; 0 for a rejection.
+        inlier_count, match_count: counts of the answer; 0 for a rejection.
         rejection: reason; empty if localized.
         message: the rejection's sentence.
-        latency_ms: of the call, as the client sees it.
-        stage_ms: inside the server, by stage.
-        backend, features: that computed it.
+        latency_ms: time of the call that the client measures.
+        stage_ms: time inside the server, by stage.
+        backend, features: what computed it.
         best_reference: name of the one with the most inliers; empty for a rejection.
-        pose: the answered one, world from camera: x y z and the quaternion x y z w; None for a rejection.
+        pose: the answered world_from_camera: x y z and the quaternion x y z w; None for a rejection.
     """
 
     name: str
@@ -61,20 +61,20 @@ class QueryResult:
 
 @dataclass(frozen=True)
 class Summary:
-    """All queries together. Medians, p90 and recall are over all queries, infinite where too many were rejected.
+    """All queries together. Medians, p90 and recall are over all queries, infinite if too many were rejected.
 
     Attributes:
-        query_count, localized_count: how many.
+        query_count, localized_count: numbers of queries and of localized ones.
         median_translation, p90_translation: the dataset's unit.
         median_rotation_deg: degrees.
         median_relative: translation error over the distance to the query's references, no unit.
         recall: share of queries within each of `RECALL_BARS`; meaningless if the dataset is not metric.
         claim_held: share of claimed 68 % radii that held; None if nothing was claimed.
-        latency_p50_ms, latency_p95_ms: of calls, the first left out if there are more.
-        latency_first_ms: of the first, which finds every cache empty.
-        stage_share: share of each stage in the time of all.
-        rejections: how many by reason.
-        features: how many answers by the features that they are of; several where stronger ones are tried.
+        latency_p50_ms, latency_p95_ms: latency of calls, without the first if there are more.
+        latency_first_ms: latency of the first call, with empty caches.
+        stage_share: share of each stage in the total time.
+        rejections: number of rejections by reason.
+        features: number of answers by the features that gave them; several if stronger ones are tried.
     """
 
     query_count: int
@@ -130,7 +130,7 @@ def summarize(results: Sequence[QueryResult]) -> Summary:
 
 
 def quantile(values: Sequence[float], share: float) -> float:
-    """Quantile by linear interpolation; infinite where it touches an infinite value (NumPy's is NaN there)."""
+    """Quantile by linear interpolation; infinite if an infinite value contributes (NumPy's is NaN then)."""
     ordered = sorted(values)
     position = share * (len(ordered) - 1)
     lower, upper = ordered[math.floor(position)], ordered[math.ceil(position)]

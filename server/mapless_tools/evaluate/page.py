@@ -1,4 +1,4 @@
-"""The report as one HTML file with its charts, and what its figures are of, for the terminal too."""
+"""The report as one HTML file with charts; also the facts about its figures, for the terminal, too."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def _group(group: Group, worst: Sequence[WorstQuery]) -> dict[str, object]:
 
 
 def print_suite(suite: Suite) -> None:
-    """The tables, and what the figures come from, for the terminal."""
+    """Prints the tables, and the origin of the figures."""
     for group in groups_of(suite):
         for table in (table for table in tables_of(group) if not table.wide):
             print(f"\n{group.title}. {table.title}")
@@ -61,7 +61,7 @@ def print_suite(suite: Suite) -> None:
 
 
 def facts(suite: Suite) -> dict[str, str]:
-    """What the figures come from and what was left out, name by name."""
+    """The origin of the figures and what was left out, by name."""
     made, options = suite.provenance, suite.options
     choice = f"the pairs of {suite.pairs}" if suite.pairs is not None else options.choice
     return {
@@ -79,7 +79,7 @@ def facts(suite: Suite) -> dict[str, str]:
 
 
 def problems(suite: Suite) -> list[str]:
-    """What is missing or was decided for the reader, a sentence each."""
+    """What is missing, and choices that were made, a sentence each."""
     lines = [f"{failure.scene} is not complete: {failure.message}" for failure in suite.failures]
     for scene in suite.scenes:
         refused = scene.dataset.refused
@@ -93,7 +93,7 @@ def problems(suite: Suite) -> list[str]:
 
 
 def _ground_truths(scenes: Iterable[SceneWork]) -> list[str]:
-    """Each ground truth once, with its scenes, beside the one of the paper's figures."""
+    """Each ground truth once, with its scenes, compared with that of the paper's figures."""
     by_truth: dict[tuple[str, str], list[str]] = {}
     for scene in scenes:
         benchmark = scene.place.benchmark
@@ -124,14 +124,14 @@ MAX_POINTS = 400
 
 @dataclass(frozen=True)
 class Measure:
-    """An error that is drawn.
+    """An error that is shown in charts.
 
     Attributes:
         name: "translation error" or "rotation error".
-        unit: of the values.
+        unit: unit of the values.
         of_query, of_average: the error of one query, and the mean over scenes of the median error.
-        smallest: smaller values are drawn as this one: no ground truth is that good.
-        paper_index: of the value in the paper's medians.
+        smallest: smaller values are drawn as this one, since no ground truth is so accurate.
+        paper_index: index of the value in the paper's medians.
     """
 
     name: str
@@ -143,7 +143,7 @@ class Measure:
 
     @property
     def label(self) -> str:
-        """Of an axis."""
+        """Label of an axis."""
         return f"{self.name}, {self.unit}"
 
 
@@ -210,7 +210,7 @@ def ablation(group: Group) -> list[Figure]:
 
 
 def along_sequence(group: Group, scene: str) -> list[Figure]:
-    """Errors of the first method, query after query, for the densest and the sparsest setting."""
+    """Errors of the first method along the sequence of queries, for the densest and the sparsest setting."""
     method = group.methods[0]
     settings = dict.fromkeys((group.settings[0], group.settings[-1]))
     runs = {s: results for s in settings if (results := group.results(scene, s, method))}
@@ -231,7 +231,7 @@ def along_sequence(group: Group, scene: str) -> list[Figure]:
 
 
 def _against_settings(group: Group, measure: Measure, title: str, methods: dict[str, Method]) -> Axes:
-    """A curve for each method, by its label: the mean of the medians, over the settings."""
+    """Draws a curve for each method, by its label: the mean of the medians, over the settings."""
     axes = new_axes(title, "references of the scene", measure.label)
     use_logarithms(axes.yaxis)
     names = ["all" if setting == DENSE else str(setting) for setting in group.settings]

@@ -1,4 +1,4 @@
-"""The figures of the paper's tables, of its own method and of its rivals, as printed there.
+"""The figures of the paper's tables, for its own method and the others, as printed there.
 
 Yu Zhang et al., "L3: Scene-agnostic Visual Localization in the Wild". Its ground truth indoors is SfM pseudo ground
 truth (Brachmann et al., ICCV 2021), outdoors the benchmark's own; figures against another are not comparable.
@@ -28,7 +28,7 @@ class PaperMethod:
     """A line of the paper's tables.
 
     Attributes:
-        name: as printed.
+        name: name as printed.
         kind: the paper's group: FM, APR, SCR, NVS or "ours".
         scenes: dense medians by scene.
         average: mean of the medians over all scenes by number of references (DENSE for all); None for a failure in at
@@ -44,17 +44,17 @@ class PaperMethod:
 
     @property
     def variant(self) -> str:
-        """The variant here that it corresponds to; empty for rivals."""
+        """The corresponding variant here; empty for other methods."""
         return VARIANT_OF.get(self.name, "")
 
 
 @dataclass(frozen=True)
 class PaperTables:
-    """What the paper has on a benchmark.
+    """The paper's tables of a benchmark.
 
     Attributes:
         dense_table, sparse_table: the tables' titles.
-        methods: in the paper's order.
+        methods: the methods, in the paper's order.
     """
 
     dense_table: str

@@ -1,7 +1,7 @@
-"""The worst queries as pictures: the photograph beside the reference that served it best, and their matches.
+"""Pictures of the worst queries: the photograph beside its best reference, with their matches.
 
-A match is drawn green where it fits the true poses, red where it does not. Red alone: the wrong things were matched.
-Green and a wrong pose: the fault lies after matching. Neither: the two photographs do not overlap.
+A match is green if it fits the true poses, else red. Only red ones: the matches are wrong. Green ones and a wrong pose:
+the error is after matching. None: the two photographs do not overlap.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class WorstQuery:
 
     Attributes:
         data_uri: the picture, a JPEG file.
-        reference: name of the one beside it; empty if it had none.
-        matches, fitting: how many there are, and how many of them fit the true poses.
+        reference: name of the reference beside it; empty if there is none.
+        matches, fitting: number of matches, and of those that fit the true poses.
     """
 
     run: Run
@@ -74,7 +74,7 @@ class WorstQuery:
 
 
 def worst_queries(suite: Suite, count: int, matcher: Matcher, progress: Progress) -> list[WorstQuery]:
-    """So many of each scene, by its first method in the densest and in the sparsest setting."""
+    """The worst queries of each scene, by its first method in the densest and in the sparsest setting."""
     method = suite.options.methods()[0]
     runs: list[Run] = []
     for scene in suite.scenes:
@@ -88,7 +88,7 @@ def worst_queries(suite: Suite, count: int, matcher: Matcher, progress: Progress
 
 
 def worst_of(run: Run, count: int, matcher: Matcher) -> list[WorstQuery]:
-    """The queries with the largest translation errors, the rejected first, each with its picture."""
+    """The queries with the largest translation errors, rejected ones first, each with its picture."""
     order = sorted(run.results, key=lambda it: (-it.translation_error, -it.rotation_error_deg, it.name))
     frames = {frame.name: frame for frame in (*run.split.references, *run.split.queries)}
     worst = []
@@ -109,7 +109,7 @@ def worst_of(run: Run, count: int, matcher: Matcher) -> list[WorstQuery]:
 def fit_true_poses(
     query: Frame, reference: Frame, query_view: View, reference_view: View, matches: NDArray[np.int32]
 ) -> NDArray[np.bool_]:
-    """Which matches (M, 2), query and reference keypoint, lie within `EPIPOLAR_PX` of the true epipolar line, (M,)."""
+    """Which matches (M, 2) of query and reference keypoints are within `EPIPOLAR_PX` of the true epipolar line."""
     query_from_reference = query.world_from_camera.inverse().compose(reference.world_from_camera)
     essential = cross_matrix(query_from_reference.translation) @ query_from_reference.rotation
     x_query = query_view.camera.rays(query_view.features.keypoints[matches[:, 0]])
@@ -120,7 +120,7 @@ def fit_true_poses(
 
 
 def data_uri(picture: Picture) -> str:
-    """The picture (H, W, 3) RGB as a JPEG file inside an address."""
+    """The picture (H, W, 3) RGB as a JPEG in a data URI."""
     quality = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
     encoded = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), quality)[1]
     return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
@@ -128,7 +128,7 @@ def data_uri(picture: Picture) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """A photograph, reduced for the page, and its features.
+    """A photograph, reduced for the page, with its features.
 
     Attributes:
         keypoints: (N, 2) pixels of `image`, with the lens distortion that it has.
@@ -164,7 +164,7 @@ def _side_by_side(query: _Shown, reference: _Shown, matches: NDArray[np.int32], 
 
 
 def _some(count: int) -> Sequence[int]:
-    """Evenly spread indices, so that no part of the matches is preferred."""
+    """Evenly spread indices."""
     return [int(i) for i in np.unique(np.linspace(0, count - 1, min(count, MAX_DRAWN)).round())] if count else []
 
 

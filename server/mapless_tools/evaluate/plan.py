@@ -1,8 +1,8 @@
-"""What is measured: which frames are references and which are queries, in which settings, and by which methods.
+"""The plan of an evaluation: which frames are references and queries, in which settings, and by which methods.
 
-A benchmark's references are the frames of its training split and its queries those of its test split. Dense, all of the
-former are references; sparse, N of them, evenly spread. A folder without a split leaves one out, or has N references
-evenly spread and queries between them.
+A benchmark's references are the frames of its training split and its queries those of its test split. In the dense
+setting all training frames are references; in a sparse one N of them, evenly spread. A folder without a split is
+evaluated by leaving one out, or with N evenly spread references and queries between them.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ class EvaluationOptions:
     Attributes:
         reference_count: frames that are references, evenly spread; None leaves one out: every frame is localized from
             all others.
-        query_count: frames that are localized, evenly spread; None means 40 beside chosen references, and all frames
-            when one is left out.
-        k: references that a query is given.
+        query_count: number of frames to localize, evenly spread; None for 40 with `reference_count`, and for all frames
+            without.
+        k: number of references of a query.
         variant: form of the method.
-        scale_strategy: how it finds the metric scale.
+        scale_strategy: how the metric scale is estimated.
     """
 
     reference_count: int | None = None
@@ -70,16 +70,16 @@ class SuiteOptions:
     """Options of an evaluation as in the paper.
 
     Attributes:
-        layout: how the scenes lie on the disk; "auto" looks.
+        layout: layout of the scenes on the disk; "auto" to recognize it.
         protocols: dense, sparse or both.
-        sparse: numbers of references; empty for the paper's of each benchmark.
+        sparse: numbers of references; empty for those of the paper.
         variants: forms of the method, each with the first of `scales`.
-        scales: ways to find the metric scale; those after the first are run with `ablated` only.
-        k: references that a query is given; the paper's.
-        stride: dense, every so many-th training frame is a reference; 1, as in the paper, takes all.
-        max_queries: queries of a scene, evenly spread; None, as in the paper, takes all.
-        choice: of a query's references: by the server's own "retrieval", as for a request that names none; by feature
-            "matches" counted here; or all are "given", in the order they were taken, without a ranking.
+        scales: strategies of the metric scale; those after the first are run only with the variant `ablated`.
+        k: number of references of a query, as in the paper.
+        stride: in the dense setting every n-th training frame is a reference; 1, as in the paper, for all.
+        max_queries: largest number of queries of a scene, evenly spread; None, as in the paper, for all.
+        choice: how a query's references are chosen: by the server's "retrieval", as for a request that names none; by
+            feature "matches" counted here; or all are "given", in the order they were taken, without a ranking.
     """
 
     layout: str = "auto"
@@ -108,19 +108,19 @@ class SuiteOptions:
 
     @property
     def ablated(self) -> str:
-        """The variant whose scale is varied: the paper's own where it is among the variants."""
+        """The variant whose scale is varied: the paper's own if it is among the variants."""
         return "full" if "full" in self.variants else self.variants[0]
 
     def methods(self) -> tuple[Method, ...]:
-        """What is run in every setting: each variant, then the ablation of the scale."""
+        """The methods of every setting: each variant, then the ablation of the scale."""
         first, *others = self.scales
         return (*(Method(v, first) for v in self.variants), *(Method(self.ablated, scale) for scale in others))
 
     def settings(self, place: ScenePlace) -> tuple[int, ...]:
-        """Numbers of references of a scene, DENSE first, then the densest.
+        """Numbers of references of a scene: DENSE first, then in decreasing order.
 
         Raises:
-            UsageError: sparse is wanted of a scene of no benchmark, without numbers.
+            UsageError: a sparse setting is requested, without numbers, for a scene of no benchmark.
         """
         sparse: tuple[int, ...] = ()
         if "sparse" in self.protocols:
@@ -141,13 +141,13 @@ class Method:
 
     @property
     def label(self) -> str:
-        """For people; the paper's scale strategy is left out."""
+        """Label of the method; the paper's scale strategy is omitted."""
         return self.variant if self.scale == "two_stage" else f"{self.variant}, {self.scale}"
 
 
 @dataclass(frozen=True)
 class Split:
-    """Indices of the frames that are references and of those that are queries, each in order and once."""
+    """Indices of references and of queries, each ascending and without repetition."""
 
     references: tuple[int, ...]
     queries: tuple[int, ...]
@@ -158,9 +158,9 @@ class SceneSplit:
     """References and queries of a scene in one setting.
 
     Attributes:
-        setting: number of references that was asked for; DENSE for all.
-        references, queries: frames.
-        test_count: queries that the benchmark has, of which `queries` may be a part.
+        setting: requested number of references; DENSE for all.
+        references, queries: the frames.
+        test_count: number of queries of the benchmark, of which `queries` may be a part.
     """
 
     setting: int
@@ -170,12 +170,12 @@ class SceneSplit:
 
 
 def setting_name(setting: int) -> str:
-    """For people: "dense" or "N=10"."""
+    """Name of a setting: "dense" or "N=10"."""
     return "dense" if setting == DENSE else f"N={setting}"
 
 
 def split_frames(frame_count: int, options: EvaluationOptions) -> Split:
-    """References and queries among F frames.
+    """Splits F frames into references and queries.
 
     With N references: those at round(linspace(0, F - 1, N)), and those of round(linspace(3, F - 4, M)) that are not
     references as queries; fewer than 8 frames have no room for that margin, there it is round(linspace(0, F - 1, M)).
@@ -204,7 +204,7 @@ def split_frames(frame_count: int, options: EvaluationOptions) -> Split:
 
 
 def split_scene(dataset: Dataset, setting: int, options: SuiteOptions) -> SceneSplit:
-    """References and queries of a scene in a setting.
+    """Splits a scene into references and queries in a setting.
 
     A folder with cameras.json may have no split; sparse, it is then split as `split_frames` does.
 
@@ -243,7 +243,7 @@ def split_scene(dataset: Dataset, setting: int, options: SuiteOptions) -> SceneS
 
 
 def evenly_spread(items: Sequence[T], count: int | None) -> list[T]:
-    """`count` of the items, evenly spread from the first to the last; all if there are no more, or for None."""
+    """Selects `count` items, evenly spread from the first to the last; all if there are fewer, or for None."""
     if count is None or count >= len(items):
         return list(items)
     return [items[i] for i in _spread(0, len(items) - 1, count)]

@@ -1,4 +1,4 @@
-"""What figures come from: code, weights, settings, machine, day; without them they cannot be reproduced."""
+"""The origin of figures (code, weights, settings, machine, day), without which they cannot be reproduced."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from mapless_server.settings import Settings, available_cores
 
 @dataclass(frozen=True)
 class Provenance:
-    """What figures come from.
+    """The origin of figures.
 
     Attributes:
-        version: of mapless.
+        version: version of mapless.
         commit: `git describe` of a checkout, with a digest of what is not committed; empty for an installed package.
-        weights: SHA-256 of each network's file that these settings use; "not recorded" for one put there by hand.
-        settings: those that figures depend on.
-        machine: processor, cores, and the GPU where networks run on one.
+        weights: SHA-256 of each network's file that these settings use; "not recorded" for a file copied by hand.
+        settings: settings that figures depend on.
+        machine: processor, cores, and the GPU if networks use one.
         date: when it began, UTC.
     """
 

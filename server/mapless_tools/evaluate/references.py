@@ -1,4 +1,4 @@
-"""Which references each query is given: by feature matches, or as a file says."""
+"""The references of each query: by feature matches, or as a file says."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Pairs = Mapping[str, tuple[Frame, ...]]
 
 @dataclass(frozen=True, eq=False)
 class PlannedQuery:
-    """A frame to localize and the references it is given, most similar first; none: the server chooses."""
+    """A frame to localize and its references, most similar first; empty if the server chooses."""
 
     frame: Frame
     references: tuple[Frame, ...]
@@ -36,12 +36,12 @@ class PlannedQuery:
 
 @dataclass(frozen=True, eq=False)
 class Matcher:
-    """The features that queries and references are compared by.
+    """The features by which queries and references are compared.
 
     Attributes:
-        extractor: finds them.
-        ratio: of a match with the query.
-        limits: of photographs.
+        extractor: finds the features.
+        ratio: ratio of a match with the query.
+        limits: limits of photographs.
     """
 
     extractor: FeatureExtractor
@@ -50,10 +50,10 @@ class Matcher:
 
     @classmethod
     def of(cls, settings: Settings) -> Matcher:
-        """With the first features that a server of these settings has.
+        """Makes the matcher with the first features that a server with these settings has.
 
         Raises:
-            UsageError: the settings ask for features that are not there.
+            UsageError: the settings name features that are not available.
         """
         try:
             features, extractor = make_first_features(settings)
@@ -87,7 +87,7 @@ def choose_references(
     count: int,
     ratio: float = CorrespondOptions.query_ratio,
 ) -> list[int]:
-    """Indices of at most `count` candidates, in the order of choice, the most similar first; `ratio`: the features'."""
+    """Indices of at most `count` candidates, most similar first; `ratio` is that of the features."""
     matches = [len(mutual_matches(query.features, c.view.features, ratio)) for c in candidates]
     return spread_choice(matches, [c.world_from_camera.translation for c in candidates], count)
 
@@ -95,10 +95,10 @@ def choose_references(
 def rank_by_matches(
     queries: Sequence[Frame], references: Sequence[Frame], k: int, matcher: Matcher, progress: Progress
 ) -> tuple[PlannedQuery, ...]:
-    """The queries, each with those k references, itself excepted, that share the most feature matches with it.
+    """Chooses for each query the k references, except itself, that share the most feature matches with it.
 
-    The true poses are not looked at. The ranking is the server's own, done here because a query that is
-    left out must not be offered itself.
+    The true poses are not used. The ranking is the server's own, computed here so that a query that is left out is not
+    compared with itself.
 
     Raises:
         UsageError: an image is damaged.
@@ -123,7 +123,7 @@ def rank_by_matches(
 
 
 def pairs_file(path: Path, scene: str, scene_count: int) -> Path:
-    """The file of a scene's pairs: the one given, or in a folder the one of the scene's name.
+    """The file of a scene's pairs: the given file, or the one of the scene's name in the given folder.
 
     Raises:
         UsageError: there is no such file, or one file is given for several scenes.
@@ -138,7 +138,7 @@ def pairs_file(path: Path, scene: str, scene_count: int) -> Path:
 
 
 def read_pairs(file: Path, dataset: Dataset, folder: Path) -> Pairs:
-    """References of each query as hloc writes them: lines "query reference", most similar first.
+    """Reads the references of each query in hloc's form: lines "query reference", most similar first.
 
     An image is named by its path from the scene's folder, or by its frame's name.
 
@@ -173,10 +173,10 @@ def read_pairs(file: Path, dataset: Dataset, folder: Path) -> Pairs:
 
 
 def paired(pairs: Pairs, query: Frame, references: Set[str], k: int) -> PlannedQuery:
-    """A query with the first k of its pairs that are among the named references of the setting.
+    """Makes a query with the first k of its pairs that are references of the setting.
 
     Raises:
-        UsageError: there are none.
+        UsageError: there are no such pairs.
     """
     chosen = tuple(frame for frame in pairs.get(query.name, ()) if frame.name in references)[:k]
     if not chosen:

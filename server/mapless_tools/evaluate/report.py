@@ -1,4 +1,4 @@
-"""An evaluation for people (tables) and for programs (JSON)."""
+"""The report of an evaluation for people (tables) and for programs (JSON)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SCALE_FREE = (
 
 
 def to_json(evaluation: Evaluation) -> dict[str, Any]:
-    """Everything as JSON values; what is infinite or unknown is null."""
+    """Everything as JSON values; infinite and unknown ones are null."""
     dataset, options = evaluation.dataset, evaluation.options
     summary = summarize(evaluation.results)
     metric = dataset.metric
@@ -67,7 +67,7 @@ def to_json(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def print_report(evaluation: Evaluation, console: Console) -> None:
-    """The table, what was rejected, and the rules that the figures follow."""
+    """Prints the table, what was rejected, and the rules of the figures."""
     dataset, options = evaluation.dataset, evaluation.options
     summary = summarize(evaluation.results)
     split = "leave one out" if options.reference_count is None else f"{evaluation.reference_count} references"
@@ -92,24 +92,24 @@ def print_report(evaluation: Evaluation, console: Console) -> None:
 
 
 def format_length(value: float, metric: bool) -> str:
-    """Centimetres, or the folder's own unit."""
+    """A length in centimetres, or in the folder's own unit."""
     if math.isinf(value):
         return "infinite"
     return f"{100 * value:.2f} cm" if metric else f"{value:.4g} units"
 
 
 def format_rotation(degrees: float) -> str:
-    """Degrees, three decimals."""
+    """An angle in degrees, with three decimals."""
     return "infinite" if math.isinf(degrees) else f"{degrees:.3f}°"
 
 
 def format_share(share: float) -> str:
-    """Per cent, three decimals."""
+    """A share in per cent, with three decimals."""
     return "infinite" if math.isinf(share) else f"{100 * share:.3f} %"
 
 
 def format_stages(shares: Mapping[str, float]) -> str:
-    """Shares of the time, per cent; the stages of each stronger tier, "aliked-2048-1024px/coarse", in one sum."""
+    """Shares of the time, per cent; the stages of each stronger tier, "aliked-2048-1024px/coarse", are summed."""
     sums: dict[str, float] = {}
     for stage, share in shares.items():
         features, slash, _ = stage.partition("/")
@@ -119,7 +119,7 @@ def format_stages(shares: Mapping[str, float]) -> str:
 
 
 def _format_features(counts: Mapping[str, int]) -> str:
-    """The features, and how many answers are of them unless all are."""
+    """The features; with the number of their answers if there are several."""
     if len(counts) == 1:
         return next(iter(counts))
     return ", ".join(f"{name} {count}" for name, count in counts.items())
@@ -145,7 +145,7 @@ def _accuracy_rows(evaluation: Evaluation, summary: Summary) -> dict[str, str]:
 
 
 def _relative(evaluation: Evaluation, summary: Summary) -> dict[str, Any]:
-    """Lengths for which the unit does not matter, and the unit's own where it is not the metre."""
+    """Lengths that do not depend on the unit, and those in the folder's unit if it is not the metre."""
     radius = evaluation.trajectory_radius
     relative: dict[str, Any] = {
         "median_translation_of_reference_radius": finite(summary.median_translation / radius) if radius else None,

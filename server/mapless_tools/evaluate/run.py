@@ -1,4 +1,4 @@
-"""An evaluation of a folder from end to end: client, gRPC, decoding, engine, pipeline; nothing is bypassed."""
+"""An evaluation of a folder from beginning to end, through client, gRPC, decoding, engine and method."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SCENE = "evaluation"
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """All that is to be done: upload the references, localize the queries."""
+    """References to upload and queries to localize."""
 
     dataset: Dataset
     references: tuple[Frame, ...]
@@ -34,12 +34,12 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Results and what they are results of.
+    """The results of an evaluation, with its dataset and options.
 
     Attributes:
-        dataset, options: that were given.
-        reference_count: references of the scene; when one is left out, the query among them.
-        trajectory_radius: of the references, the dataset's unit.
+        dataset, options: the inputs of the evaluation.
+        reference_count: number of references of the scene, including the query if one is left out.
+        trajectory_radius: trajectory radius of the references, in the dataset's unit.
         results: one for each query.
     """
 
@@ -51,10 +51,10 @@ class Evaluation:
 
 
 def evaluate(dataset: Dataset, options: EvaluationOptions, settings: Settings, progress: Progress) -> Evaluation:
-    """Measures the server on a folder; starts one and ends it.
+    """Measures the server on a folder; starts a server and ends it.
 
     Raises:
-        UsageError: the folder does not hold what the options ask for.
+        UsageError: the folder does not suffice for the options.
         ServerFailed: the server does not start.
         MaplessError: a call failed.
     """
@@ -112,11 +112,11 @@ def localize_query(
     """Localizes one query.
 
     Args:
-        client: of the server.
+        client: client of the server.
         scene: id of the scene.
-        query: with its references; none: the server chooses k.
+        query: the query with its references; without any, the server chooses k.
         options: variant, scale strategy and k.
-        references: those of the scene, by name.
+        references: references of the scene, by name.
 
     Raises:
         MaplessError: the call failed.

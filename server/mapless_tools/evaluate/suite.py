@@ -1,4 +1,4 @@
-"""An evaluation as in the paper, from end to end: every scene, setting and method, each query through a real server.
+"""An evaluation as in the paper: every scene, setting and method, each query through a real server.
 
 A scene has a server of its own, which holds a set of references for each setting. Each result is written to a journal
 at once, so that an evaluation of days can be interrupted, and a scene that fails does not stop the others.
@@ -31,7 +31,7 @@ from .run import localize_query, store_references
 
 @dataclass(frozen=True, eq=False)
 class SceneWork:
-    """A scene that is ready to be measured.
+    """A scene that is ready for measurement.
 
     Attributes:
         place, dataset: the scene.
@@ -75,8 +75,8 @@ class Suite:
     """Everything that was measured, and its circumstances.
 
     Attributes:
-        options, provenance, scenes: that it is of.
-        runs: complete ones, in the order of scenes, settings and methods.
+        options, provenance, scenes: what was measured.
+        runs: complete runs, in the order of scenes, settings and methods.
         failures: what is missing, and why.
         pairs: file or folder of given pairs; None without.
     """
@@ -94,10 +94,10 @@ class RunSetup:
     """What all runs have in common.
 
     Attributes:
-        options, provenance: of the suite.
-        matcher: ranks references, where matches do.
-        journals: folder of the journals; exists.
-        progress: of the command.
+        options, provenance: those of the suite.
+        matcher: ranks references, if they are chosen by matches.
+        journals: existing folder of the journals.
+        progress: progress of the command.
     """
 
     options: SuiteOptions
@@ -110,12 +110,12 @@ class RunSetup:
 def measure(
     scenes: Sequence[SceneWork], setup: RunSetup, pairs: Path | None, on_scene: Callable[[Suite], None]
 ) -> Suite:
-    """Measures all scenes; what a journal has already is not measured again.
+    """Measures all scenes; results that a journal already has are not measured again.
 
     Args:
-        scenes: what to measure.
+        scenes: scenes to measure.
         setup: what all runs have in common.
-        pairs: for the report.
+        pairs: file or folder of given pairs, for the report.
         on_scene: called with everything so far after each scene.
     """
     runs: list[Run] = []
@@ -138,18 +138,18 @@ def measure(
 
 
 class Journal:
-    """The results of one run as they come: a file with a line for each query.
+    """The results of one run while they are computed: a file with a line for each query.
 
-    The first line says what the run is of; the file's name ends in a digest of it. A run that is started again with the
-    same data, options, code and weights goes on where its file ends; with anything else it gets another file.
+    The first line identifies the run; the file's name ends in a digest of it. A run that is started again with the same
+    data, options, code and weights continues at the end of its file; any other run has another file.
     """
 
     def __init__(self, folder: Path, name: str, identity: Mapping[str, Any]) -> None:
-        """Reads what is there already.
+        """Reads the existing file, if any.
 
         Args:
-            folder: exists.
-            name: of the run.
+            folder: an existing folder.
+            name: name of the run.
             identity: what the run's results depend on, as JSON values.
         """
         self._head = json.dumps(identity, sort_keys=True)
@@ -159,7 +159,7 @@ class Journal:
             self._read()
 
     def _read(self) -> None:
-        """Takes whole lines; one that a crash tore, and what follows it, is cut off."""
+        """Reads complete lines; an incomplete line, and what follows it, is cut off."""
         content = self.path.read_bytes()
         head, *lines = content.split(b"\n")
         if head.decode() != self._head:
@@ -177,7 +177,7 @@ class Journal:
             os.truncate(self.path, whole)
 
     def add(self, result: QueryResult) -> None:
-        """Writes a result; it survives the program once this returns."""
+        """Writes a result; once this returns, it survives the end of the program."""
         begins = not self.path.is_file() or not self.path.stat().st_size
         # Only rejections have infinities: they are written as null.
         line = {
@@ -236,7 +236,7 @@ def _pending_runs(scene: SceneWork, setup: RunSetup) -> list[_PendingRun]:
 
 
 def _identity(scene: SceneWork, setup: RunSetup) -> dict[str, Any]:
-    """What results depend on beside the data; not how many queries there are: more go on where fewer ended."""
+    """What results depend on besides the data, without the number of queries, so that more can be added."""
     made, options = setup.provenance, setup.options
     pairs = None
     if scene.pairs is not None:
@@ -293,7 +293,7 @@ def _measure_setting(client: Client, split: SceneSplit, runs: Sequence[_PendingR
 def _with_references(
     scene: SceneWork, split: SceneSplit, setup: RunSetup, progress: Progress
 ) -> tuple[PlannedQuery, ...]:
-    """The queries with their references; without where the server is to choose."""
+    """The queries with their references; empty if the server chooses."""
     options = setup.options
     if scene.pairs is not None:
         known = {frame.name for frame in split.references}

@@ -1,4 +1,4 @@
-"""The paper's tables, with our figures beside its own; the same tables for the terminal and for the page."""
+"""The paper's tables with our figures beside its own, for the terminal and for the page."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ METRIC_ALREADY = (
 
 @dataclass(frozen=True)
 class Row:
-    """A line of a table, and where its figures come from: `OURS`, `PAPERS` or `RIVAL`."""
+    """A line of a table, and the origin of its figures: `OURS`, `PAPERS` or `RIVAL`."""
 
     cells: tuple[str, ...]
     source: str
@@ -37,8 +37,8 @@ class Table:
     """A table for people.
 
     Attributes:
-        head: of the columns; the first names the lines.
-        notes: what has to be known to read it.
+        head: headings of the columns; the first column names the lines.
+        notes: notes for the reader.
         wide: whether it is too wide for a terminal.
     """
 
@@ -50,7 +50,7 @@ class Table:
 
 
 def tables_of(group: Group) -> tuple[Table, ...]:
-    """All tables of a benchmark that have something in them."""
+    """All tables of a benchmark that are not empty."""
     tables = [_dense(group)] if DENSE in group.settings else []
     tables += [_by_setting(group), _recall(group), _by_scene(group)]
     if len({method.scale for method in group.methods}) > 1:
@@ -59,7 +59,7 @@ def tables_of(group: Group) -> tuple[Table, ...]:
 
 
 def text_lines(table: Table) -> list[str]:
-    """The table as lines of plain text, whole whatever the terminal's width."""
+    """The table as lines of plain text, independent of the terminal's width."""
     lines = (table.head, *(row.cells for row in table.rows))
     widths = [max(len(line[i]) for line in lines) for i in range(len(table.head))]
     return [
@@ -72,7 +72,7 @@ def text_lines(table: Table) -> list[str]:
 
 
 def format_median(translation_cm: float, rotation_deg: float) -> str:
-    """As the paper prints it, with a digit more: "0.62/0.214"."""
+    """A median in the paper's form with one more digit: "0.62/0.214"."""
     if math.isinf(translation_cm) or math.isinf(rotation_deg):
         return FAILED
     return (
@@ -142,7 +142,7 @@ def _by_scene(group: Group) -> Table:
 
 
 def _scales(group: Group) -> Table:
-    """The ablation: one variant, every strategy."""
+    """The table of the ablation: one variant with every strategy."""
     last = group.methods[-1].variant
     backends = {result.backend for run in group.runs.values() for result in run.results}
     methods = [method for method in group.methods if method.variant == last]
@@ -194,7 +194,7 @@ def _average_row(group: Group, name: str, method: Method) -> Row:
 
 
 def _paper_methods(group: Group) -> Sequence[PaperMethod]:
-    """The paper's own first, then the rivals from the best down."""
+    """The paper's own methods first, then the others, the best first."""
     return group.benchmark.paper.methods[::-1] if group.benchmark else ()
 
 

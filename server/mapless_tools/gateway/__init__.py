@@ -5,6 +5,6 @@
                   > rpc      (gRPC-Web and Connect, for browsers)
             > guard  (origins, size and number of requests)
 
-It is a client like any other: a process of its own, which speaks gRPC to the server and stores nothing. `failures` has
-the one form of its errors, `openapi` the description of what it serves. Begin reading with `app`.
+It is a client like any other: a separate process, which calls the server by gRPC and stores nothing. `failures` has the
+    form of its errors, `openapi` the description of its interface. Begin with `app`.
 """

@@ -1,4 +1,4 @@
-"""The gateway's HTTP interface: what is served under which path."""
+"""The gateway's HTTP interface: the paths and their handlers."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ class GatewayOptions:
     """What is served, and to whom.
 
     Attributes:
-        scene: of requests that name none; "" for none.
+        scene: scene of requests that name none; "" for none.
         pages: folder that is served at "/"; None for none.
-        guard: limits of what is taken.
+        guard: limits of accepted requests.
     """
 
     scene: str = ""
@@ -63,12 +63,12 @@ class GatewayOptions:
 
 
 def gateway(connect: Callable[[], Client], options: GatewayOptions, rpc: ASGIApp | None = None) -> ASGIApp:
-    """The application.
+    """Makes the application.
 
     Args:
-        connect: makes the client, when the event loop runs.
+        connect: function that makes the client, called when the event loop runs.
         options: what is served.
-        rpc: what serves browsers' calls, at the paths of gRPC; None for nothing.
+        rpc: application for browsers' calls, at the paths of gRPC; None for none.
     """
     handlers = _Handlers(connect, options)
     routes: list[BaseRoute] = [
@@ -97,7 +97,7 @@ def gateway(connect: Callable[[], Client], options: GatewayOptions, rpc: ASGIApp
 
 
 def _handler(handle: Callable[[_Handlers, Request], Awaitable[Response]]) -> Callable[[_Handlers, Request], Any]:
-    """Answers errors with their JSON; here, so that pages of other origins can read it."""
+    """Answers errors with their JSON; here, so that pages of other origins can read them."""
 
     @wraps(handle)
     async def handled(self: _Handlers, request: Request) -> Response:
@@ -122,7 +122,7 @@ class _Handlers:
     _client: Client | None = None
 
     def _client_for(self, request: Request) -> Client:
-        """With the caller's token, where the request has one."""
+        """A client with the caller's token, if the request has one."""
         if self._client is None:
             self._client = self.connect()
         given, identity = request.headers.get("authorization"), request.headers.get("x-client-id", "")
@@ -152,14 +152,14 @@ class _Handlers:
 
     @_handler
     async def status(self, request: Request) -> Response:
-        """Whether the server behind serves, as clients of the protocol ask."""
+        """Answers whether the server behind the gateway serves, for clients of the protocol."""
         if not await self._client_for(request).is_serving():
             raise of_server(Unavailable("UNAVAILABLE", "the server does not serve", retry_after_s=1.0))
         return JSONResponse({"status": "running"})
 
     @_handler
     async def geopose(self, request: Request) -> Response:
-        """A request of the GeoPose Protocol."""
+        """Answers a request of the GeoPose Protocol."""
         geopose.check_version(request.headers.get("accept", ""))
         client, scene = self._client_for(request), self._scene_of(request)
         body = b"".join([part async for part in request.stream()])  # `request.body()` would keep it
@@ -192,23 +192,23 @@ class _Handlers:
 
     @_handler
     async def localize(self, request: Request) -> Response:
-        """A photograph as a form."""
+        """Answers a photograph that is sent as a form."""
         client = self._client_for(request)
         asked = await plain.read_form(request.headers, request.stream(), self.options.scene)
         response = await _while_connected(request, client.run(_localized(asked)))
         return JSONResponse(await asyncio.to_thread(plain.to_json, response))
 
     async def description(self, request: Request) -> Response:
-        """What is served, for programs."""
+        """Answers with the description of the interface, for programs."""
         return JSONResponse(openapi.description())
 
     async def page(self, request: Request) -> Response:
-        """What is served, for people."""
+        """Answers with the description of the interface, for people."""
         return HTMLResponse(openapi.page())
 
 
 async def _while_connected(request: Request, work: Coroutine[Any, Any, T]) -> T:
-    """The result of a call, which is cancelled when its caller leaves, with `ClientDisconnect`."""
+    """The result of a call, which is cancelled if its caller leaves, with `ClientDisconnect`."""
     task = asyncio.ensure_future(work)
 
     async def watch() -> None:
@@ -229,7 +229,7 @@ async def _while_connected(request: Request, work: Coroutine[Any, Any, T]) -> T:
 
 
 def _localized(request: pb.LocalizeRequest) -> Exchange[pb.LocalizeResponse]:
-    """The answer as the server sends it."""
+    """Makes the call, and returns the server's message unchanged."""
     response: pb.LocalizeResponse = yield Call(LOCALIZE, request, pb.LocalizeResponse)
     return response
 

@@ -1,4 +1,4 @@
-"""Errors of the gateway: an HTTP status, and JSON that says what is wrong and where."""
+"""Errors of the gateway: an HTTP status, and JSON that says what is wrong, in which field."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class Failure(Exception):
     """A request that is not answered.
 
     Attributes:
-        status: of HTTP.
+        status: HTTP status.
         content: the members of `error` in the JSON; those without a value are left out. The message begins with the
             field.
-        retry_after_s: when to try again; None if that changes nothing.
+        retry_after_s: seconds until another attempt; None if that would not help.
     """
 
     def __init__(
@@ -49,14 +49,14 @@ class Failure(Exception):
         self.retry_after_s = retry_after_s
 
     def response(self) -> JSONResponse:
-        """What is sent."""
+        """The HTTP response."""
         after = {} if self.retry_after_s is None else {"retry-after": str(math.ceil(self.retry_after_s))}
         content = {name: value for name, value in self.content.items() if value is not None}
         return JSONResponse({"error": content}, self.status, after)
 
 
 def of_server(error: MaplessError, field: str | None = None) -> Failure:
-    """The failure of a call; `field` replaces its own."""
+    """Makes the failure of a call; `field` replaces the error's own."""
     return Failure(
         error.message,
         _STATUS.get(error.code, 502),

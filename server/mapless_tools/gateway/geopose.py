@@ -1,6 +1,6 @@
-"""The GeoPose Protocol: a request to a photograph with priors, an answer to a response.
+"""The GeoPose Protocol: converts a request to a photograph with priors, and an answer to a response.
 
-What clients leave out or fill with zeros is taken as unknown.
+Values that clients omit or set to zero are taken as unknown.
 """
 
 from __future__ import annotations
@@ -55,16 +55,16 @@ _EXIF_FOCAL_SIGMA = 0.03
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """What a request asks.
+    """The contents of a request.
 
     Attributes:
-        request_id, timestamp_ms: of the response: those of the request and of the photograph.
+        request_id, timestamp_ms: for the response: the request's id and the photograph's time.
         image: the file's bytes.
-        camera: that took it.
-        uncertainty: of the camera; None for a calibrated one's.
+        camera: the camera that took it.
+        uncertainty: uncertainty of the camera; None for that of a calibrated one.
         priors: what is known of the pose.
-        prior_fields: where the request has each prior, by the field of the call.
-        is_confidential: whether the photograph serves the answer alone.
+        prior_fields: path of each prior in the request, by the field of the call.
+        is_confidential: whether the photograph is used for the answer only.
     """
 
     request_id: str
@@ -78,7 +78,7 @@ class Photograph:
 
 
 def check_version(accept: str) -> None:
-    """Refuses a client that accepts another version of the protocol alone."""
+    """Rejects a client that accepts only another version of the protocol."""
     for part in accept.replace(" ", "").lower().split(","):
         kind, _, parameters = part.partition(";")
         if kind == "application/vnd.oscp+json":
@@ -93,12 +93,12 @@ def check_version(accept: str) -> None:
 
 
 def read(body: bytes, datum: Datum) -> Photograph:
-    """The photograph of a body for a scene with this datum; Failure names what is wrong, and where."""
+    """Reads the photograph of a body, for a scene with this datum; Failure names what is wrong, and where."""
     return photograph_of(read_request(body), datum)
 
 
 def read_request(body: bytes) -> Request:
-    """The request of a body; Failure names what is wrong, and where."""
+    """Reads the request of a body; Failure names what is wrong, and where."""
     check_json(body)
     try:
         return Request.model_validate_json(body)
@@ -111,7 +111,7 @@ def read_request(body: bytes) -> Request:
 
 
 def photograph_of(request: Request, datum: Datum, now_s: float | None = None) -> Photograph:
-    """The photograph of a request for a scene with this datum; Failure names what is wrong, and where."""
+    """Converts a request for a scene with this datum; Failure names what is wrong, and where."""
     readings, now_ms = request.sensorReadings, 1000 * (time.time() if now_s is None else now_s)
     _check_past(request.timestamp, now_ms, "timestamp")
     cameras = [(i, it) for i, it in enumerate(readings.cameraReadings) if it.imageFormat.upper() != "DEPTH"]
@@ -144,7 +144,7 @@ def photograph_of(request: Request, datum: Datum, now_s: float | None = None) ->
 
 
 def response_to(photograph: Photograph, answer: LocalizationResult) -> dict[str, Any]:
-    """The protocol's response; Failure for an answer without a place on the Earth."""
+    """Makes the protocol's response; Failure for an answer without a position on the Earth."""
     if answer.geo_pose is None or answer.accuracy is None:
         raise Failure("the answer has no place on the Earth", 502, reason="MALFORMED_ANSWER")
     return {
@@ -184,7 +184,7 @@ def _image_of(reading: CameraReading, where: str) -> tuple[bytes, tuple[int, int
 
 
 def _encoded(pixels: bytes, width_px: int, height_px: int, channels: int) -> bytes:
-    """A PNG of pixels; what is too small for one is left as it is."""
+    """Encodes pixels as a PNG; a too small image is returned unchanged."""
     if not pixels:
         return pixels
     raster = np.frombuffer(pixels, np.uint8).reshape(height_px, width_px, channels)
@@ -196,7 +196,7 @@ def _encoded(pixels: bytes, width_px: int, height_px: int, channels: int) -> byt
 def _camera_of(
     given: CameraParameters | None, image: bytes, width_px: int, height_px: int, where: str
 ) -> tuple[Camera, IntrinsicsUncertainty | None]:
-    """The camera of the parameters; without them, of the focal length that the file's EXIF has."""
+    """Makes the camera of the parameters; without them, of the focal length in the file's EXIF."""
     model = given.model.upper() if given is not None else _UNKNOWN_MODEL
     if given is None or (model.startswith(_UNKNOWN_MODEL) and not given.modelParams):
         film_mm = _film_focal_mm(image)
@@ -225,7 +225,7 @@ def _camera_of(
 
 
 def _film_focal_mm(image: bytes) -> float | None:
-    """The focal length in 35 mm film, if the file's EXIF has one that lenses have."""
+    """The focal length in 35 mm film, if the file's EXIF has a plausible one."""
     try:
         with Image.open(io.BytesIO(image)) as opened:
             value = float(opened.getexif().get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLengthIn35mmFilm, 0))
@@ -237,7 +237,7 @@ def _film_focal_mm(image: bytes) -> float | None:
 def _position_prior(
     readings: Sequence[GeolocationReading], taken_ms: float, now_ms: float
 ) -> tuple[GeoPositionPrior | None, str]:
-    """The prior of the reading that is nearest to the photograph in time, and its field; without an age it has none."""
+    """The prior of the reading nearest to the photograph in time, with its field; a reading without age is skipped."""
     found: list[tuple[float, int]] = []
     for i, reading in enumerate(readings):
         _check_past(reading.timestamp, now_ms, f"sensorReadings.geolocationReadings[{i}].timestamp")
@@ -264,7 +264,7 @@ def _position_prior(
 def _pose_prior(
     earlier: Sequence[Response], taken_ms: float, now_ms: float, datum: Datum
 ) -> tuple[PosePrior | None, str]:
-    """The prior of the newest earlier response, and its field: less certain for each second since."""
+    """The prior of the newest earlier response, and its field; less certain for each second that has passed."""
     for i, it in enumerate(earlier):
         _check_past(it.timestamp, now_ms, f"priorPoses[{i}].timestamp")
     if not earlier:
@@ -294,5 +294,5 @@ def _check_past(timestamp_ms: float, now_ms: float, field: str) -> None:
 
 
 def _path(parts: Sequence[int | str]) -> str:
-    """("a", 0, "b") is "a[0].b"."""
+    """Joins a path: ("a", 0, "b") is "a[0].b"."""
     return "".join(f"[{it}]" if isinstance(it, int) else f".{it}" for it in parts).lstrip(".")

@@ -1,4 +1,4 @@
-"""What reaches the gateway at all: pages of allowed origins, a bounded number of requests, each of bounded size."""
+"""Limits which requests reach the gateway: pages of allowed origins, and number and size of requests."""
 
 from __future__ import annotations
 
@@ -19,17 +19,18 @@ _LOOPBACK_NAMES = ("127.0.0.1", "localhost", "[::1]")
 
 @dataclass(frozen=True)
 class GuardOptions:
-    """Limits of what is taken.
+    """Limits of accepted requests.
 
     Attributes:
-        origins: of pages that may call besides the gateway's own, "https://app.example"; ("*",) for all.
-        is_loopback: whether it listens on this machine alone. Other names that lead here are then refused, but for
-            those of `origins`: a page whose own name was pointed at this machine would count as the gateway's.
-        max_body_bytes: of a request. A photograph of 16 MiB, the most that servers take, is 22.4 MB in base64.
-        max_requests: at a time; further ones are refused.
-        max_held_bytes: of all requests at a time; further ones are refused. It bounds the memory, which is four times
-            as much: the text, the photograph, the call, and its bytes on the way.
-        body_s: in which a request has to arrive.
+        origins: origins of pages that may call, besides the gateway's own, "https://app.example"; ("*",) for all.
+        is_loopback: whether it listens on this machine only. Then host names other than its own and those of `origins`
+            are rejected: a page whose name resolves to this machine would count as the gateway's own.
+        max_body_bytes: largest body of a request. A photograph of 16 MiB, the largest that servers accept, has 22.4 MB
+            in base64.
+        max_requests: largest number of concurrent requests; further ones are rejected.
+        max_held_bytes: largest size of all concurrent requests; further ones are rejected. It limits the memory, which
+            is four times as much: text, photograph, call, and the bytes being sent.
+        body_s: time in which a request has to arrive.
     """
 
     origins: Sequence[str] = ()
@@ -51,7 +52,7 @@ class GuardOptions:
 
 @dataclass
 class Guard:
-    """Refuses what must not reach the application `app`."""
+    """Rejects what must not reach the application `app`."""
 
     app: ASGIApp
     options: GuardOptions = field(default_factory=GuardOptions)
@@ -59,7 +60,7 @@ class Guard:
     _held_bytes: int = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handles a request; anything else passes."""
+        """Handles a request; anything else is passed on."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
@@ -106,13 +107,13 @@ class Guard:
             raise _busy("too many requests at a time")
 
     def check_size(self, size: int) -> None:
-        """Refuses a body of this size."""
+        """Rejects a body of this size if it is too large."""
         if size > self.options.max_body_bytes:
             large = f"the request is larger than {self.options.max_body_bytes} bytes"
             raise Failure(large, 413, reason="REQUEST_TOO_LARGE")
 
     def hold(self, size: int) -> None:
-        """Counts bytes that have arrived."""
+        """Counts bytes that have arrived; rejects them if there are too many."""
         self._held_bytes += size
         if self._held_bytes > self.options.max_held_bytes:
             raise _busy("too large requests at a time")
@@ -129,10 +130,10 @@ def _busy(message: str) -> Failure:
 
 
 class _Body:
-    """The body of a request, as long as it is small enough and arrives in time.
+    """The body of a request, with limits on its size and time.
 
     Attributes:
-        size: of what has arrived, bytes.
+        size: bytes that have arrived.
     """
 
     def __init__(self, guard: Guard, receive: Receive) -> None:
@@ -143,7 +144,7 @@ class _Body:
         self.size = 0
 
     async def receive(self) -> Message:
-        """The next part; after the last one, the end of the connection."""
+        """The next part; after the last one, waits for the end of the connection."""
         if self._is_complete:
             return await self._receive()
         try:

@@ -1,6 +1,6 @@
 """Messages of Open AR Cloud's GeoPose Protocol, version 2, as far as they are used.
 
-The protocol has no description for machines; its authority is github.com/OpenArCloud/oscp-geopose-protocol (README.md
+The protocol has no formal description; it is defined by github.com/OpenArCloud/oscp-geopose-protocol (README.md
 and the Python library) and the schemas of gpp-access.
 """
 # ruff: noqa: N815  members carry the names of the protocol
@@ -17,13 +17,13 @@ Ignored = Any
 
 
 class _Message(BaseModel):
-    """Members that are not named are ignored: clients send some of their own."""
+    """A message; unknown members are ignored, since clients send some of their own."""
 
     model_config = ConfigDict(extra="ignore")
 
 
 class Position(_Message):
-    """Of a GeoPose: WGS84, degrees and metres above the ellipsoid."""
+    """Position of a GeoPose: WGS84, degrees, and metres above the ellipsoid."""
 
     lat: Annotated[Number, Field(ge=-90, le=90)]
     lon: Annotated[Number, Field(ge=-180, le=180)]
@@ -31,7 +31,7 @@ class Position(_Message):
 
 
 class Quaternion(_Message):
-    """Of a GeoPose: turns x forward, y left, z up to east, north, up."""
+    """Rotation of a GeoPose, from x forward, y left, z up to east, north, up."""
 
     x: Number
     y: Number
@@ -54,7 +54,7 @@ class Accuracy(_Message):
 
 
 class Response(_Message):
-    """An answer, and one that a request gives back as a prior."""
+    """An answer, also one that a later request contains as a prior."""
 
     id: Text
     timestamp: Number
@@ -71,7 +71,7 @@ class CameraParameters(_Message):
 
 
 class Orientation(_Message):
-    """How the device was held; the pose is that of the raster as it is sent."""
+    """How the device was held; not used, since the pose refers to the raster as it is sent."""
 
     mirrored: bool = False
 
@@ -102,7 +102,7 @@ class GeolocationReading(_Message):
 
 
 class SensorReadings(_Message):
-    """The photograph and the position are used; readings of other sensors are taken and ignored."""
+    """The photograph and the position are used; readings of other sensors are accepted and ignored."""
 
     cameraReadings: Annotated[list[CameraReading], Field(max_length=100, fail_fast=True)] = []
     geolocationReadings: Annotated[list[GeolocationReading], Field(max_length=1000, fail_fast=True)] = []
@@ -114,7 +114,7 @@ class SensorReadings(_Message):
 
 
 class Request(_Message):
-    """One photograph, and what is known of where it was taken."""
+    """One photograph, and what is known about where it was taken."""
 
     id: Text
     timestamp: Number

@@ -1,4 +1,4 @@
-"""What the gateway serves: as OpenAPI 3.1 for programs, and as a page that loads nothing from elsewhere for people."""
+"""The description of the gateway: as OpenAPI 3.1 for programs, and as a self-contained page for people."""
 
 from __future__ import annotations
 
@@ -159,7 +159,7 @@ def _error_schema() -> dict[str, Any]:
 
 
 def _add_message(message: Any, schemas: dict[str, Any]) -> None:
-    """The JSON form of a message and of those in it."""
+    """Adds the JSON schema of a message and of those in it."""
     if message.full_name in schemas:
         return
     properties: dict[str, Any] = {}

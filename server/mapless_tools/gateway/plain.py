@@ -1,4 +1,4 @@
-"""One photograph as a form, for people with curl: a photograph and its intrinsics to a request of Localize."""
+"""One photograph as a form, for curl: converts a photograph and its intrinsics to a request of Localize."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _MAX_PART_BYTES = 2**20
 
 
 async def read_form(headers: Headers, body: AsyncGenerator[bytes, None], default_scene: str) -> pb.LocalizeRequest:
-    """The request that a form describes; Failure names the field that is wrong.
+    """Reads the request that a form describes; Failure names the wrong field.
 
     Args:
-        headers: of the HTTP request.
+        headers: headers of the HTTP request.
         body: its body.
-        default_scene: used where the form names none; may be empty.
+        default_scene: scene if the form names none; may be empty.
     """
     if not headers.get("content-type", "").startswith("multipart/form-data"):
         example = "curl -F image=@photo.jpg -F intrinsics=@camera.json"
@@ -47,7 +47,7 @@ async def read_form(headers: Headers, body: AsyncGenerator[bytes, None], default
 
 
 async def _parts(headers: Headers, body: AsyncGenerator[bytes, None]) -> dict[str, bytes]:
-    """The bytes of each field. Photographs stay in memory: nothing of them is written to a disk."""
+    """The bytes of each field. Photographs stay in memory and are never written to a disk."""
     parser = MultiPartParser(
         headers, body, max_files=len(FIELDS), max_fields=len(FIELDS), max_part_size=_MAX_PART_BYTES
     )
@@ -75,7 +75,7 @@ def _parse(text: bytes, message: Any, field: str) -> None:
 
 
 def to_json(response: pb.LocalizeResponse) -> dict[str, Any]:
-    """An answer with the names of the interface; numbers that are zero are there, too."""
+    """An answer with the interface's names, including numbers that are zero."""
     content: dict[str, Any] = MessageToDict(
         response, preserving_proto_field_name=True, always_print_fields_with_no_presence=True
     )

@@ -1,7 +1,7 @@
-"""Calls of browsers: gRPC-Web and Connect, by the library connectrpc, become gRPC calls of the server.
+"""Converts browsers' calls (gRPC-Web and Connect, by the library connectrpc) to gRPC calls of the server.
 
-Messages pass as they are, also fields that this version does not know; so do deadlines, cancellation, tokens, and
-errors with their details. Each call carries its caller's own token, never the gateway's.
+Messages are passed on unchanged, with fields that this version does not know; so are deadlines, cancellation, tokens,
+and errors with their details. Each call has its caller's own token, never the gateway's.
 """
 
 from __future__ import annotations
@@ -62,11 +62,11 @@ class _JsonCodec:
 
 
 def rpc_application(connect: Connect, max_message_bytes: int) -> ASGIApp:
-    """The application that serves the interface's methods at gRPC's paths.
+    """Makes the application that serves the interface's methods at gRPC's paths.
 
     Args:
-        connect: makes the channel to the server, when the event loop runs.
-        max_message_bytes: of a request.
+        connect: function that makes the channel to the server, called when the event loop runs.
+        max_message_bytes: largest size of a request.
     """
     channel: list[grpc.aio.Channel] = []
 

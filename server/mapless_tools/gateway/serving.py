@@ -23,7 +23,7 @@ class Binding:
     """Where to listen.
 
     Attributes:
-        host, port: port 0 takes any free one.
+        host, port: the address; port 0 for any free one.
         certificate, key: files, PEM; None for no TLS.
         insecure: whether to listen beyond this machine without TLS, or to a server without tokens.
     """
@@ -62,7 +62,7 @@ def run(server: str, connect: ConnectOptions, options: GatewayOptions, binding: 
         binding: where to listen.
 
     Raises:
-        ValueError: the server gives everybody all rights, and must not.
+        ValueError: the server needs no token, and `insecure` is not set.
         MaplessError: the server cannot be reached to find that out.
         OSError: the port is taken.
     """

@@ -1,4 +1,4 @@
-"""`mapless-server import` and `export`: flags in, a report out. Imports what it needs when it runs: --help is quick."""
+"""The flags of `mapless-server import` and `export`. Imports modules when it runs, so that --help is quick."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ DISTANCE_SEPARATOR = "\0"
 
 
 class ImportCommand(TyperCommand):
-    """Takes three values for --distance each time it is given, which typer can but once."""
+    """Accepts three values for each --distance; typer accepts several values only once."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Reads arguments, the three values of a distance as one."""
+        """Reads arguments, and the three values of a distance as one."""
         joined: list[str] = []
         rest = iter(args)
         for argument in rest:

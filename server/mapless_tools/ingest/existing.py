@@ -1,4 +1,4 @@
-"""What a scene holds already, and whether a frame is among it."""
+"""The references that a scene has already, and whether a frame is one of them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Stored:
 
 
 class KnownReferences:
-    """References of a scene by id and by image, and those that this import is about to add; for several threads."""
+    """References of a scene by id and by image, and those that this import is adding; thread-safe."""
 
     def __init__(self, references: Iterable[Reference]) -> None:
         self._lock = threading.Lock()
@@ -40,7 +40,7 @@ class KnownReferences:
             self._remember(stored_of(reference))
 
     def claim(self, new: Stored) -> Stored | None:
-        """What there is already under this id, or else with this image; if there is nothing, the new one is there now.
+        """Returns the reference that already has this id or this image; if there is none, enters the new one.
 
         An image is enough to be the same photograph: a second id for it would be the same reference twice.
         """
@@ -51,7 +51,7 @@ class KnownReferences:
             return known
 
     def forget(self, stored: Stored) -> None:
-        """It was not added after all."""
+        """Removes an entry that was not added after all."""
         with self._lock:
             for index, key in ((self._by_id, stored.reference_id), (self._by_image, stored.image_sha256)):
                 if index.get(key) is stored:
@@ -63,12 +63,12 @@ class KnownReferences:
 
 
 def stored_of(reference: Reference) -> Stored:
-    """Of what the server answers."""
+    """What identifies a reference of the server."""
     return Stored(reference.reference_id, reference.image_sha256, reference.camera, reference.world_from_camera)
 
 
 def difference(there: Stored, new: Stored) -> str:
-    """In what two differ, their ids aside; empty if they are the same."""
+    """Says in what two references differ besides their ids; empty if they are the same."""
     if there.image_sha256 != new.image_sha256:
         return "its image differs"
     return _camera_difference(there.camera, new.camera) or _pose_difference(

@@ -1,6 +1,6 @@
-"""An export from end to end: references are fetched, their images written as stored, then what describes them.
+"""An export: fetches references, writes their images unchanged, then the file that describes them.
 
-It is also how a store is rescued of which a disk has damaged something: the references that are whole are written.
+It can also rescue a damaged store: undamaged references are written.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ FORMATS = (*LAYOUTS, "gltf")
 
 
 def check_target(folder: Path, layout: str) -> None:
-    """Raises ValueError unless the folder is empty or not there, and the layout is one that is written."""
+    """Raises ValueError unless the folder is empty or missing, and the layout can be written."""
     if layout not in FORMATS:
         raise ValueError(f"format must be one of {', '.join(FORMATS)}, not {layout!r}")
     if folder.exists() and not folder.is_dir():
@@ -27,16 +27,16 @@ def check_target(folder: Path, layout: str) -> None:
 
 
 def export_scene(client: Client, scene: str, folder: Path, layout: str, progress: Progress) -> Export:
-    """Writes a scene's references into a folder, but for those that are damaged.
+    """Writes a scene's references into a folder, except damaged ones.
 
-    The layouts `cameras` and `kapture` have the scene's datum, down and unit, too. A calibration is of these references
-    on a server of this version, and is measured anew elsewhere; a backup keeps it.
+    The layouts `cameras` and `kapture` also have the scene's datum, down and unit. A calibration is not exported, since
+    it holds for this server version only; a backup keeps it.
 
-    The description is written last, so that a folder without it is an interrupted export. Where every reference is
-    damaged, nothing is left in the folder.
+    The description is written last, so a folder without it is an interrupted export. If every reference is damaged,
+    nothing is left in the folder.
 
     Raises:
-        ValueError: as `check_target`, or the scene is empty.
+        ValueError: as in `check_target`, or the scene is empty.
         OSError: a file cannot be written.
         MaplessError: a call failed.
     """

@@ -1,4 +1,4 @@
-"""The references of a scene, fetched side by side; those that are damaged are named."""
+"""Fetches the references of a scene concurrently; damaged ones are named."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Export:
-    """What became of a scene's references.
+    """The result of an export.
 
     Attributes:
-        written: how many lie in the folder.
+        written: number of written references.
         damaged: the server's messages about the others, by their ids, in their order.
     """
 
@@ -31,7 +31,7 @@ class Export:
 
     @property
     def total(self) -> int:
-        """How many the scene has."""
+        """Number of references of the scene."""
         return self.written + len(self.damaged)
 
 
@@ -42,14 +42,14 @@ def fetch_all(
     progress: Progress,
     pictures: int | None = None,
 ) -> tuple[list[T], dict[str, str]]:
-    """What `take`, in threads, makes of each reference, in order; and the server's messages about the damaged ones.
+    """Calls `take`, in threads, for each reference; returns its results in order, and messages about damaged ones.
 
     Args:
         client: a client of the server.
         scene: id of the scene.
-        take: called with a reference.
-        progress: reports how many are done.
-        pictures: how many, evenly spread, have their photographs; None for all.
+        take: function that is called with each reference.
+        progress: reports how many references are done.
+        pictures: number of evenly spread references that have their photographs; None for all.
 
     Raises:
         ValueError: the scene has no references.
@@ -86,7 +86,7 @@ def fetch_all(
 
 
 def _reference_ids(client: Client, scene: str) -> list[str]:
-    """Of all references, damaged ones too."""
+    """Ids of all references, including damaged ones."""
     with suppress(DataLoss):
         return [reference.reference_id for reference in client.list_references(scene, page_size=1000)]
     # A list ends at a reference whose pose is damaged; an audit names it and continues, but examines each reference.

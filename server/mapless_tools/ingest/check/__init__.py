@@ -1,4 +1,4 @@
-"""Whether photographs fit their poses, before they are stored: matched points of neighbours must satisfy the poses.
+"""Checks whether photographs fit their poses: matched points of neighbours must satisfy the epipolar constraint.
 
 Imports the method of `mapless_server`, and nothing of the import itself. Begin with `comparing`.
 """

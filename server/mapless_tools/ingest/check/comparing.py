@@ -1,6 +1,6 @@
-"""The epipolar check of a dataset: photographs are read and described, pairs matched and judged.
+"""The epipolar check of a dataset: reads and describes photographs, matches and judges pairs.
 
-It comes before anything is uploaded. Wrong poses may not show which photographs are near each other, so when they do
+It is made before anything is uploaded. Wrong poses may not show which photographs are near each other, so if they do
 not fit, photographs that are near in the folder's order are compared as well.
 """
 
@@ -31,13 +31,13 @@ LIMITS = ImageLimits(max_bytes=2**28, max_pixels=200_000_000)
 
 
 def check_frames(frames: Sequence[Frame], progress: Progress, extractor: FeatureExtractor | None = None) -> Verdict:
-    """The verdict on frames; pairs and suspects are indices among them.
+    """Judges frames; pairs and suspects are indices of frames.
 
     Photographs that cannot be read are left out: the upload reports them.
 
     Args:
-        frames: with the poses to check.
-        progress: called with how far it is.
+        frames: frames with the poses to check.
+        progress: reports the progress.
         extractor: SIFT if none.
     """
     poses = [frame.world_from_camera for frame in frames]
@@ -57,7 +57,7 @@ def check_frames(frames: Sequence[Frame], progress: Progress, extractor: Feature
 
 @dataclass
 class _Comparison:
-    """Pairs compared so far, and the views that it took."""
+    """Pairs compared so far, and their views."""
 
     frames: Sequence[Frame]
     extractor: FeatureExtractor
@@ -67,7 +67,7 @@ class _Comparison:
     pairs: list[Pair] = field(default_factory=list)
 
     def compare(self, pairs: Sequence[Pair]) -> None:
-        """Describes and matches pairs that were not compared yet."""
+        """Describes and matches pairs that were not compared before."""
         new = [pair for pair in pairs if pair not in self.pairs]
         missing = sorted({i for pair in new for i in pair} - self.views.keys())
         with ThreadPoolExecutor(available_cores()) as threads:
@@ -79,7 +79,7 @@ class _Comparison:
         self.matched += [item for item in found if item is not None and len(item.matches)]
 
     def verdict(self) -> Verdict:
-        """On all pairs so far."""
+        """The verdict on all pairs so far."""
         views = {i: view for i, view in self.views.items() if view is not None}
         readable = sum(views.keys() >= set(pair) for pair in self.pairs)
         return judge(views, self.matched, readable - len(self.matched))

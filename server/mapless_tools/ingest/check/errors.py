@@ -39,7 +39,7 @@ Pair = tuple[int, int]
 
 
 def pairs_by_pose(poses: Sequence[RigidTransform], count: int = PAIR_COUNT) -> list[Pair]:
-    """Pairs of neighbours that look the same way, about a good baseline apart; fewer if there are not so many.
+    """Pairs of neighbours that look the same way, with a good baseline; fewer if there are not enough.
 
     With few photographs each of them is in several pairs.
     """
@@ -68,7 +68,7 @@ def pairs_by_order(frame_count: int, count: int = PAIR_COUNT) -> list[Pair]:
 
 
 class _Neighbours:
-    """Which photographs are near each other and look the same way."""
+    """Defines which photographs are near each other and look the same way."""
 
     def __init__(self, poses: Sequence[RigidTransform]) -> None:
         self._centre: Array = np.array([pose.translation for pose in poses])
@@ -79,14 +79,14 @@ class _Neighbours:
         self._baseline = max(float(np.median(nearest)) if nearest else 0.0, BASELINE_SHARE * extent)
 
     def ranked(self, reference: int) -> list[int]:
-        """Those that look the same way, the best baseline first."""
+        """Photographs that look the same way, the best baseline first."""
         others, distances = self._distances(reference)
         aligned = self._ahead[others] @ self._ahead[reference] > np.cos(np.radians(MAX_TURN_DEG))
         others, distances = others[aligned], distances[aligned]
         return [int(i) for i in others[np.argsort(np.abs(np.log(distances / self._baseline)), kind="stable")]]
 
     def _distances(self, reference: int) -> tuple[NDArray[np.intp], Array]:
-        """Those elsewhere, and how far."""
+        """Photographs at other places, and their distances."""
         distances = np.linalg.norm(self._centre - self._centre[reference], axis=1)
         elsewhere = np.flatnonzero(distances > 1e-6)
         return elsewhere, distances[elsewhere]
@@ -113,7 +113,7 @@ MIN_MATCHES = 24
 
 
 def consistent_matches(first: View, second: View) -> Matches:
-    """Inlier matches of one fundamental matrix, without use of poses; none if they are too few."""
+    """Inlier matches of one fundamental matrix, without use of poses; none if there are too few."""
     matches = mutual_matches(first.features, second.features, RATIO)
     if len(matches) < MIN_MATCHES:
         return matches[:0]
@@ -152,7 +152,7 @@ shutter); a phone's tracking up to two. Wrong conventions give tens."""
 
 @dataclass(frozen=True, eq=False)
 class MatchedPair:
-    """Two photographs and the matches that a fundamental matrix of their own explains."""
+    """Two photographs with the matches that fit a fundamental matrix estimated from them."""
 
     pair: Pair
     matches: Matches
@@ -169,7 +169,7 @@ class PairError:
 
     @property
     def is_bad(self) -> bool:
-        """Whether it does not satisfy the poses."""
+        """Whether the pair does not satisfy the poses."""
         return not self.error_px <= self.threshold_px
 
 
@@ -178,7 +178,7 @@ Views = Mapping[int, PosedView]
 
 
 def errors_of(views: Views, matched: Sequence[MatchedPair]) -> list[PairError]:
-    """The pairs' errors, without those of photographs at one place."""
+    """Errors of the pairs, without those of photographs at one place."""
     errors = []
     for item in matched:
         first, second = (views[i] for i in item.pair)
@@ -190,7 +190,7 @@ def errors_of(views: Views, matched: Sequence[MatchedPair]) -> list[PairError]:
 
 
 def summary(errors: Sequence[PairError]) -> tuple[float, float]:
-    """Median error, and share of the bad."""
+    """Median error, and share of bad pairs."""
     if not errors:
         return math.inf, 1.0
     return float(np.median([error.error_px for error in errors])), float(np.mean([error.is_bad for error in errors]))
@@ -199,6 +199,6 @@ def summary(errors: Sequence[PairError]) -> tuple[float, float]:
 def summary_with(
     views: Views, matched: Sequence[MatchedPair], change: Callable[[PosedView], PosedView]
 ) -> tuple[float, float]:
-    """The same if every view were changed."""
+    """Median error, and share of bad pairs, if every view were changed."""
     used = {i for item in matched for i in item.pair}
     return summary(errors_of({i: change(views[i]) for i in used}, matched))

@@ -1,7 +1,7 @@
-"""Which usual mistake in poses or intrinsics, corrected, makes poses fit that do not.
+"""Finds which common mistake in poses or intrinsics, if corrected, makes them fit.
 
-A correction turns a pose as it was given into what was meant. A pose with mirrored axes stays a rotation when both the
-world and the camera are mirrored, so those of left-handed engines pass all other checks.
+A correction converts a pose as it was given to the intended one. If both world and camera are mirrored, a rotation is
+still a rotation, so poses of left-handed engines pass all other checks.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def _mirrored(pose: RigidTransform) -> RigidTransform:
 
 
 def _reordered(order: tuple[int, int, int, int]) -> Correction:
-    """The quaternion (x, y, z, w) of what was read, its parts taken in another order."""
+    """The correction for a quaternion (x, y, z, w) whose parts were read in a wrong order."""
 
     def correct(pose: RigidTransform) -> RigidTransform:
         q = pose.quaternion()
@@ -53,7 +53,7 @@ def _reordered(order: tuple[int, int, int, int]) -> Correction:
 
 
 def _within_inverse(correction: Correction) -> Correction:
-    """The correction of camera_from_world."""
+    """Applies a correction to the inverse of a pose, camera_from_world."""
     return lambda pose: correction(pose.inverse()).inverse()
 
 
@@ -84,8 +84,8 @@ class Explanation:
 
     Attributes:
         text: for the report; empty if there is none.
-        error_px: median error of the pairs if it were corrected.
-        photographs: those that it concerns, where it does not concern all.
+        error_px: median error of the pairs after the correction.
+        photographs: the photographs it concerns, if not all.
     """
 
     text: str = ""
@@ -94,12 +94,12 @@ class Explanation:
 
 
 def explain(views: Views, matched: Sequence[MatchedPair], given_px: float) -> Explanation:
-    """The mistake that, corrected, makes the poses fit best.
+    """Finds the mistake whose correction makes the poses fit best.
 
     Args:
-        views: as given.
-        matched: pairs of them.
-        given_px: their median error as given.
+        views: the views as given.
+        matched: matched pairs of them.
+        given_px: their median error without correction.
     """
     matched = [MatchedPair(item.pair, item.matches[:: 1 + len(item.matches) // _ENOUGH_MATCHES]) for item in matched]
     candidates = []
@@ -122,7 +122,7 @@ def explain(views: Views, matched: Sequence[MatchedPair], given_px: float) -> Ex
 
 
 def best_focal_scale(views: Views, matched: Sequence[MatchedPair]) -> tuple[float, float, float]:
-    """The factor on all focal lengths with the least median error, that error, and the share of bad pairs then."""
+    """The factor on all focal lengths with the least median error; that error, and the share of bad pairs with it."""
 
     def summary_at(scale: float) -> tuple[float, float]:
         return summary_with(views, matched, lambda view: _focal_scaled(view, scale))
@@ -137,7 +137,7 @@ def best_focal_scale(views: Views, matched: Sequence[MatchedPair]) -> tuple[floa
 
 
 def _mixed(views: Views, matched: Sequence[MatchedPair], text: str, correction: Correction) -> Explanation:
-    """With every pair free to have either, both or none of its photographs corrected; empty if that does not fit."""
+    """Explains pairs by correcting either, both or none of their photographs; empty if that does not fit."""
     turned = {i: _corrected(view, correction) for i, view in views.items()}
     best: list[PairError] = []
     votes: Counter[int] = Counter()

@@ -1,6 +1,6 @@
-"""The verdict on a scene's poses by the epipolar errors of pairs: right, wrong as a whole and how, or single ones.
+"""The verdict on a scene's poses by epipolar errors: right, wrong as a whole and why, or single wrong ones.
 
-A wrong unit changes no angle: its trace is how far away the photographed points are.
+A wrong unit changes no angle, but the depth of the photographed points.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ kilometres as small."""
 
 
 def median_depth(views: Views, matched: Sequence[MatchedPair]) -> float | None:
-    """Median depth of points that two photographs show, in the unit of the poses; None where they are too few."""
+    """Median depth of points that pairs of photographs show, in the unit of the poses; None if there are too few."""
     depths = []
     for item in matched:
         centre, ray = [], []
@@ -45,7 +45,7 @@ def median_depth(views: Views, matched: Sequence[MatchedPair]) -> float | None:
 
 
 def implausible_depth(depth: float | None) -> str:
-    """One sentence about a median depth that no place has if it is in metres; empty if it may be."""
+    """One sentence about a median depth that is not plausible in metres; empty if it is plausible."""
     if depth is None or MIN_DEPTH_M <= depth <= MAX_DEPTH_M:
         return ""
     likely = "millimetres" if depth > MAX_DEPTH_M else "kilometres"
@@ -62,19 +62,20 @@ _SUSPECT_PAIRS = 2
 
 @dataclass(frozen=True)
 class Verdict:
-    """Of all pairs.
+    """The verdict on all pairs.
 
     Attributes:
-        pairs: those that had matches.
-        unmatched_count: pairs that had too few.
-        median_px: of the pairs' errors; NaN without pairs.
-        bad_share: of the pairs; NaN without pairs.
+        pairs: pairs with matches.
+        unmatched_count: number of pairs with too few matches.
+        median_px: median of the pairs' errors; NaN without pairs.
+        bad_share: share of bad pairs; NaN without pairs.
         threshold_px: median of the pairs' thresholds.
-        suspects: photographs that do not fit their neighbours while the scene as a whole does, or that the explanation
-            is about if it is not about all.
+        suspects: photographs that do not fit their neighbours although the scene as a whole does, or those that the
+            explanation concerns, if not all.
         explanation: the likely mistake if the scene as a whole is wrong; empty if none was found.
-        explained_px: the median if that mistake were corrected.
-        median_depth: of the photographed points, in the unit of the poses; None if unknown, or the scene is wrong.
+        explained_px: the median error after correcting that mistake.
+        median_depth: median depth of the photographed points, in the unit of the poses; None if unknown, or the scene
+            is wrong.
     """
 
     pairs: tuple[PairError, ...]
@@ -89,22 +90,22 @@ class Verdict:
 
     @property
     def is_known(self) -> bool:
-        """Whether there was anything to judge by."""
+        """Whether there were any pairs to judge by."""
         return bool(self.pairs)
 
     @property
     def is_wrong(self) -> bool:
-        """Whether the scene as a whole does not fit: too many pairs are bad for single photographs to be the reason."""
+        """Whether the scene as a whole does not fit: more pairs are bad than single photographs can explain."""
         return self.is_known and self.bad_share > _WRONG_SHARE
 
 
 def judge(views: Views, matched: Sequence[MatchedPair], unmatched_count: int = 0) -> Verdict:
-    """The verdict on pairs.
+    """Judges the matched pairs.
 
     Args:
-        views: by the index that pairs use.
+        views: views by the index that pairs use.
         matched: pairs that have matches.
-        unmatched_count: those that were tried and have too few.
+        unmatched_count: number of pairs with too few matches.
     """
     errors = errors_of(views, matched)
     if not errors:
@@ -121,7 +122,7 @@ def judge(views: Views, matched: Sequence[MatchedPair], unmatched_count: int = 0
 
 
 def suspects_of(errors: Sequence[PairError]) -> tuple[int, ...]:
-    """Photographs almost all of whose pairs are bad; the worst first, whose pairs then count against no other."""
+    """Photographs almost all of whose pairs are bad, the worst first; its pairs then do not count against others."""
     left = list(errors)
     suspects: list[int] = []
     while True:

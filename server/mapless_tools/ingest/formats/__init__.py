@@ -1,4 +1,4 @@
-"""Layouts in which photographs with poses lie on disks, read into `dataset.Dataset`, and those that are written.
+"""Layouts of photographs with poses on disks, read into `dataset.Dataset`, and those that can be written.
 
 Each layout is a module with `fits(path) -> bool` and `read(path, options) -> Dataset`; its docstring describes the
 files. Conventions of a layout end there: the cameras and poses that it returns follow ours. A new one is a new module,
@@ -21,10 +21,10 @@ __all__ = ["Intrinsics", "KeyframeOptions", "ReadOptions", "fits", "read_dataset
 
 
 def recognize(path: Path) -> str:
-    """Name of the layout that a folder has.
+    """Recognizes the layout of a folder.
 
     Raises:
-        ValueError: it has none that is known, or several; the message names them.
+        ValueError: the folder has no known layout, or several; the message names them.
     """
     _check_there(path)
     found = [name for name in FORMATS if fits(path, name)]
@@ -41,16 +41,16 @@ def fits(path: Path, format: str) -> bool:
 
 
 def read_dataset(path: Path, format: str = "auto", options: ReadOptions | None = None) -> Dataset:
-    """Read the posed photographs of a folder.
+    """Reads the posed photographs of a folder.
 
     Args:
-        path: the folder (`7scenes`: a scene; `12scenes`: a room; `colmap`: a model, or what holds one), or a file of
+        path: the folder (`7scenes`: a scene; `12scenes`: a room; `colmap`: a model or a folder of one), or a file of
             `rosbag`.
         format: one of FORMATS, or "auto" to recognize it; `Dataset.format` is then its name.
         options: see ReadOptions.
 
     Returns:
-        The dataset. Frames that cannot be used are in `refused`, with the reason; at least one can be.
+        The dataset, with at least one frame. Frames that cannot be used are in `refused`, with the reason.
 
     Raises:
         ValueError: the folder as a whole cannot be read; the message, which can be printed, names file and field.

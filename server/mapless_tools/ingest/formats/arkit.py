@@ -36,7 +36,7 @@ def fits(path: Path) -> bool:
 
 
 def read(path: Path, options: ReadOptions) -> Dataset:
-    """Reads it; see `read_dataset`."""
+    """Reads the folder; see `read_dataset`."""
     collector = Collector(path)
     folders = _polycam(path)
     if folders is not None:

@@ -29,7 +29,7 @@ def fits(path: Path) -> bool:
 
 
 def read(path: Path, options: ReadOptions) -> Dataset:
-    """Reads it; see `read_dataset`."""
+    """Reads the folder; see `read_dataset`."""
     collector = Collector(path)
     lenses = _lenses(path / RECONSTRUCTION) if options.intrinsics is None else {}
     lines = [(words[0], words[1:], split) for split, file in SPLIT_FILES.items() for words in _pose_lines(path / file)]
@@ -55,7 +55,7 @@ def read(path: Path, options: ReadOptions) -> Dataset:
 
 @dataclass(frozen=True)
 class Lens:
-    """What VisualSFM found for an image.
+    """VisualSFM's lens of an image.
 
     Attributes:
         focal_px: focal length.
@@ -67,7 +67,7 @@ class Lens:
     k: float
 
     def camera(self, size: tuple[int, int]) -> Camera:
-        """As one of ours, whose distortion goes from the ideal camera to the lens's.
+        """Converts the lens to a camera, whose distortion goes from the ideal camera to the lens.
 
         That is the inverse of VisualSFM's: u = d + k d^3 solved for d = u - k u^3 + 3 k^2 u^5 - 12 k^3 u^7 + ...
         """
@@ -77,7 +77,7 @@ class Lens:
 
 
 def _stem(image: str) -> str:
-    """Path without ending, by which both files' paths are the same."""
+    """A path without its ending, which is the same in both files."""
     return str(PurePosixPath(image.replace("\\", "/")).with_suffix(""))
 
 

@@ -1,7 +1,7 @@
-"""What all readers share: a frame that is wrong is refused with the reason, and the others are read.
+"""Common to all readers: a wrong frame is refused with the reason, and the others are read.
 
-Only what concerns a layout as a whole ends its reading. Checks that every layout needs are made here: the image lies in
-the folder, exists and is named once; the pose is possible.
+Only errors of a layout as a whole end its reading. Checks that every layout needs are made here: the image is in the
+folder, exists and is named once; the pose is possible.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Collector:
     """Frames of a layout as they are read, and those that were refused."""
 
     def __init__(self, folder: Path) -> None:
-        """`folder` is what image paths are relative to."""
+        """Paths of images are relative to `folder`."""
         self.folder = folder
         self.frames: list[Frame] = []
         self.refused: list[Refusal] = []
@@ -43,14 +43,14 @@ class Collector:
 
     @contextmanager
     def attempt(self, frame: str) -> Iterator[None]:
-        """A ValueError within the block refuses the frame."""
+        """Refuses the frame if the block raises ValueError."""
         try:
             yield
         except ValueError as error:
             self.refused.append(Refusal(frame, str(error)))
 
     def image(self, image: str) -> Path:
-        """The file of an image, which no frame before had; ValueError as `image_file`, or if one had."""
+        """The file of an image; ValueError as in `image_file`, or if an earlier frame has the same file."""
         file = image_file(self.folder, image)
         if file in self._images:
             raise ValueError(f"image: {image!r} is named twice")
@@ -59,17 +59,17 @@ class Collector:
     def add(
         self, image: str, camera: Camera, world_from_camera: RigidTransform, split: str = "", name: str = ""
     ) -> None:
-        """Takes a frame.
+        """Adds a frame.
 
         Args:
             image: path from the folder, with slashes.
-            camera: of the file's pixels.
+            camera: its camera, in the file's pixels.
             world_from_camera: its pose.
             split: see Frame.
-            name: what to make the frame's id of; the image's path without its ending if empty.
+            name: text from which the frame's id is made; if empty, the image's path without its ending.
 
         Raises:
-            ValueError: something is wrong with one of them; names it.
+            ValueError: one of them is wrong; the message names it.
         """
         file = self.image(image)
         check_camera(camera)
@@ -83,7 +83,7 @@ class Collector:
         self._images.add(file)
 
     def dataset(self, name: str, layout: str, *, metric: bool, source: str = "", ground_truth: str = "") -> Dataset:
-        """The dataset of all that was taken; ValueError if that is nothing."""
+        """Makes the dataset of all added frames; ValueError if there is none."""
         if not self.frames:
             first = f"; the first, {self.refused[0].frame}: {self.refused[0].reason}" if self.refused else ""
             raise ValueError(f"{self.folder}: none of {len(self.refused)} frames can be used{first}")
@@ -93,7 +93,7 @@ class Collector:
 
 
 def check_camera(camera: Camera) -> None:
-    """Raises ValueError if a camera's size or intrinsics cannot be any camera's."""
+    """Raises ValueError if no camera can have this size and these intrinsics."""
     if not (1 <= camera.width_px <= MAX_SIDE_PX and 1 <= camera.height_px <= MAX_SIDE_PX):
         raise ValueError(f"camera: {camera.width_px}x{camera.height_px} is no size")
     numbers = [camera.focal_x_px, camera.focal_y_px, camera.principal_x_px, camera.principal_y_px]
@@ -106,20 +106,20 @@ def check_camera(camera: Camera) -> None:
 
 
 def from_corner(camera: Camera) -> Camera:
-    """The camera whose principal point was counted from the corner of the top-left pixel, not from its centre.
+    """Converts a camera whose principal point is counted from the corner of the top-left pixel instead of its centre.
 
-    So do COLMAP and what is made of its models, nerfstudio and ARKit.
+    COLMAP, layouts that are made from its models, nerfstudio and ARKit count so.
     """
     return replace(camera, principal_x_px=camera.principal_x_px - 0.5, principal_y_px=camera.principal_y_px - 0.5)
 
 
 def from_opengl(world_from_camera: RigidTransform) -> RigidTransform:
-    """The pose of a camera that was given with OpenGL's axes: x right, y up, z back."""
+    """Converts a camera's pose from OpenGL's axes: x right, y up, z back."""
     return RigidTransform(world_from_camera.rotation @ OPENCV_FROM_OPENGL, world_from_camera.translation)
 
 
 def size_of(file: Path) -> tuple[int, int]:
-    """Width and height of an image file, of which little is read; ValueError if it is none."""
+    """Width and height of an image file, from its header; ValueError if it is not an image."""
     try:
         with file.open("rb") as stream:
             head = stream.read(_HEAD_BYTES)
@@ -136,7 +136,7 @@ def size_of(file: Path) -> tuple[int, int]:
 
 
 def read_text(file: Path) -> str:
-    """A text file; ValueError, naming it, if it cannot be read."""
+    """Reads a text file; ValueError, naming it, if it cannot be read."""
     try:
         return file.read_text(encoding="utf-8")
     except OSError as error:
@@ -146,7 +146,7 @@ def read_text(file: Path) -> str:
 
 
 def rotation_of(quaternion: Array, what: str) -> Array:
-    """The rotation of a unit quaternion (w, x, y, z); ValueError, naming `what` it is of, if it is none."""
+    """The rotation of a unit quaternion (w, x, y, z); ValueError, naming `what` it belongs to, if it is not one."""
     w, x, y, z = quaternion.tolist()
     try:
         return Quaternion(x, y, z, w).matrix()
@@ -155,7 +155,7 @@ def rotation_of(quaternion: Array, what: str) -> Array:
 
 
 def natural_order(name: str) -> list[tuple[int, int, str]]:
-    """Sorts "frame-9" before "frame-10"."""
+    """Sort key that puts "frame-9" before "frame-10"."""
     key: list[tuple[int, int, str]] = []
     for part in filter(None, re.split(r"(\d+)", name)):
         digits = part.lstrip("0")  # not as a number: Python reads none of thousands of digits

@@ -41,7 +41,7 @@ def fits(path: Path) -> bool:
 
 
 def read(path: Path, options: ReadOptions) -> Dataset:
-    """Reads it; see `read_dataset`."""
+    """Reads the folder; see `read_dataset`."""
     is_capture = not (path / "sensors" / "sensors.txt").is_file()
     if is_capture and not fits(path):
         raise ValueError(
@@ -70,7 +70,7 @@ def read(path: Path, options: ReadOptions) -> Dataset:
 
 
 def _properties(file: Path) -> dict[str, Any]:
-    """What our own exports say of the scene; ValueError for another version of the format."""
+    """Properties of the scene in our own exports; ValueError for another version of the format."""
     lines = read_text(file).splitlines()
     version = re.match(r"#\s*kapture format:\s*(\S+)", lines[0]) if lines else None
     if version is not None and not version[1].startswith("1."):
@@ -84,7 +84,7 @@ def _properties(file: Path) -> dict[str, Any]:
 
 
 def _cameras(file: Path) -> dict[str, ColmapCamera]:
-    """The cameras by id; those of unknown models are refused where an image is theirs."""
+    """Reads the cameras by id; a camera of an unknown model is refused only with its images."""
     cameras = {}
     for place, (sensor, _, kind, *parameters) in _rows(file, 3):
         if kind != "camera":
@@ -103,14 +103,14 @@ def _cameras(file: Path) -> dict[str, ColmapCamera]:
 
 @dataclass(frozen=True)
 class _Row:
-    """A pose as a file has it, read when it is needed: one that is damaged concerns its images alone."""
+    """A pose in a file's form, read when it is needed, so that a damaged pose affects only its own images."""
 
     place: str
     words: list[str]
     is_inverse: bool
 
     def pose(self) -> RigidTransform:
-        """Of the device in the world, or of the sensor in the rig."""
+        """Pose of the device in the world, or of the sensor in the rig."""
         if "" in self.words:
             raise ValueError(f"{self.place}: the pose is not complete")
         numbers = finite_numbers(self.words, f"{self.place}: the pose", (7,))
@@ -119,7 +119,7 @@ class _Row:
 
 
 class _Poses:
-    """Poses of devices, by their own trajectories and those of the rigs that they are mounted on."""
+    """Poses of devices, from their own trajectories and those of the rigs they are mounted on."""
 
     def __init__(self, trajectories: Path, rigs: Path, is_capture: bool) -> None:
         self._file = trajectories
@@ -132,7 +132,7 @@ class _Poses:
                 self._mounts.setdefault(device, []).append((rig, _Row(place, words[:7], not is_capture)))
 
     def world_from_device(self, timestamp: str, device: str) -> RigidTransform:
-        """The pose of a device at a time; ValueError if neither it nor a rig that it is mounted on has one."""
+        """The pose of a device at a time; ValueError if neither it nor a rig it is mounted on has one."""
         pose = self._found(_whole(timestamp, "timestamp"), device, _MAX_NESTED)
         if pose is None:
             mounted = (
@@ -162,7 +162,7 @@ def _whole(text: str, what: str) -> int:
 
 
 def _rows(file: Path, least: int) -> Iterator[tuple[str, list[str]]]:
-    """Rows of a table, each with its place; ValueError if it cannot be read or a row is too short."""
+    """Yields rows of a table with their position; ValueError if it cannot be read or a row is too short."""
     for number, line in enumerate(read_text(file).splitlines(), 1):
         if line.strip() and not line.startswith("#"):
             words = [word.strip() for word in line.split(",")]

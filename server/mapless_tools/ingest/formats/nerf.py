@@ -34,7 +34,7 @@ def fits(path: Path) -> bool:
 
 
 def read(path: Path, options: ReadOptions) -> Dataset:
-    """Reads it; see `read_dataset`."""
+    """Reads the folder; see `read_dataset`."""
     collector = Collector(path)
     names = [FILE_NAME] if (path / FILE_NAME).is_file() else [n for n in SPLIT_FILES if (path / n).is_file()]
     if not names:

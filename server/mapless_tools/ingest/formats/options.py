@@ -13,7 +13,7 @@ from mapless_tools.bags.options import BagOptions
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A pinhole that a person gives because the layout has none; (0, 0) is the centre of the top-left pixel."""
+    """A pinhole camera given by the user because the layout has none; (0, 0) is the centre of the top-left pixel."""
 
     focal_x_px: float
     focal_y_px: float
@@ -31,11 +31,11 @@ class Intrinsics:
 
 @dataclass(frozen=True)
 class KeyframeOptions:
-    """Which images of a recording are taken: the sharpest of some, each time the camera has moved or turned.
+    """Options of choosing keyframes: the sharpest of a few images, each time the camera has moved or turned.
 
     Attributes:
-        distance_m: from the last one. A tenth of the depth of a room: neighbours share most of what they show.
-        angle_deg: likewise; a third of a narrow lens's field of view.
+        distance_m: distance from the last keyframe. A tenth of the depth of a room, so that neighbours overlap.
+        angle_deg: angle from the last keyframe; a third of a narrow lens's field of view.
     """
 
     distance_m: float = 0.3
@@ -59,12 +59,12 @@ class ReadOptions:
     """Options of reading.
 
     Attributes:
-        images: folder of the images where that of the layout is not the usual one; only for `colmap`.
-        ground_truth: poses to take instead of the layout's own: a file or folder of SfM pseudo ground truth, for
-            `7scenes` and `12scenes`.
+        images: folder of the images, if it is not the layout's usual one; only for `colmap`.
+        ground_truth: poses that replace the layout's own: a file or folder of SfM pseudo ground truth, for `7scenes`
+            and `12scenes`.
         intrinsics: for layouts without them (`7scenes`, `tum`, recordings); None for the layout's usual ones.
-        bag: where a recording holds what; only for `rosbag`.
-        keyframes: which images of a recording are taken; only for `rosbag`.
+        bag: which topics and frames of a recording are used; only for `rosbag`.
+        keyframes: which images of a recording are used; only for `rosbag`.
     """
 
     images: Path | None = None

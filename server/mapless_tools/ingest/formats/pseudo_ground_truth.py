@@ -1,4 +1,4 @@
-"""SfM pseudo ground truth of 7-Scenes and 12-Scenes (Brachmann et al. 2021), in both forms in which it is distributed.
+"""SfM pseudo ground truth of 7-Scenes and 12-Scenes (Brachmann et al. 2021), in both published forms.
 
 Text files, one a split (`redkitchen_train.txt`, `apt1_kitchen_test.txt`): lines of the image's path, qw qx qy qz tx ty
 tz of camera_from_world, and the focal length. The principal point is the image's centre, as COLMAP's models of these
@@ -40,7 +40,7 @@ class PosesBySplit:
     def camera_and_pose(
         self, image: str, size: tuple[int, int], intrinsics: Intrinsics | None
     ) -> tuple[Camera, RigidTransform]:
-        """Of an image of this size; intrinsics if given stand for those found. ValueError if the image has no pose."""
+        """Camera and pose of an image of this size; given intrinsics replace the file's. ValueError without a pose."""
         if self.model is not None:
             camera, pose = self.model.camera_and_pose(image)
             check_camera(camera)  # before it is divided by its size
@@ -61,15 +61,15 @@ class PosesBySplit:
 
 
 def find_ground_truth(path: Path, scene: str) -> PosesBySplit:
-    """The poses of a scene.
+    """Finds the poses of a scene.
 
     Args:
-        path: a text file; a folder with the scene's text files, at any of the depths of the original repository; a
-            COLMAP model; or a folder with one of the scene.
+        path: a text file; a folder with the scene's text files, at any depth of the original repository; a COLMAP
+            model; or a folder with a model of the scene.
         scene: "redkitchen", or "apt1_kitchen".
 
     Raises:
-        ValueError: there are none, or a file is malformed.
+        ValueError: there are no poses, or a file is malformed.
     """
     if path.is_file():
         return PosesBySplit(path, _read_lines([path]), None)

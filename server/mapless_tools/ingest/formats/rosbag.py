@@ -40,7 +40,7 @@ def fits(path: Path) -> bool:
 
 
 def read(path: Path, options: ReadOptions) -> Dataset:
-    """Reads it; see `read_dataset`."""
+    """Reads the recording; see `read_dataset`."""
     from mapless_tools.bags.recording import Recording
     from mapless_tools.bags.source import open_images, open_poses
 

@@ -27,7 +27,7 @@ def fits(path: Path) -> bool:
 
 
 def read(path: Path, options: ReadOptions) -> Dataset:
-    """Reads it; see `read_dataset`."""
+    """Reads the folder; see `read_dataset`."""
     folders = find_models(path)
     if not folders:
         raise ValueError(f"{path} holds no COLMAP model: cameras and images, .bin or .txt, here or in sparse/")
@@ -52,7 +52,7 @@ def read(path: Path, options: ReadOptions) -> Dataset:
 
 
 def _images_folder(path: Path, model_folder: Path, model: Model, given: Path | None) -> Path:
-    """Where the images are: of the usual places the one that has most of them."""
+    """The folder of the images: of the usual places, the one that has most of them."""
     if given is not None:
         if not given.is_dir():
             raise ValueError(f"images: there is no folder {given}")

@@ -1,4 +1,4 @@
-"""COLMAP's camera models and which of them are cameras of ours."""
+"""COLMAP's camera models, and which of them mapless has."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ _PERSPECTIVE = frozenset({"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL"
 
 @dataclass(frozen=True)
 class ColmapCamera:
-    """A camera as a model has it.
+    """A camera in a model's form.
 
     Attributes:
-        camera_id: COLMAP's, or the layout's that has COLMAP's cameras.
-        model: one of MODEL_NAMES, or another that is no camera of ours.
+        camera_id: its id in COLMAP, or in a layout that uses COLMAP's cameras.
+        model: one of MODEL_NAMES, or a model that mapless does not have.
         width_px, height_px: size of its images.
-        parameters: as many as the model has.
+        parameters: the parameters of the model.
     """
 
     camera_id: int | str
@@ -55,7 +55,7 @@ class ColmapCamera:
     parameters: Sequence[float]
 
     def camera(self) -> Camera:
-        """As one of ours; ValueError if it is none."""
+        """Converts it to a mapless camera; ValueError if there is no such model."""
         if self.model not in _FISHEYE | _PERSPECTIVE:
             raise ValueError(
                 f"camera {self.camera_id}: its model {self.model} has no counterpart here; undistort the images first "
@@ -82,7 +82,7 @@ def _distortion(model: str, value: dict[str, float]) -> Distortion | None:
 
 
 def from_camera(camera_id: int | str, camera: Camera) -> ColmapCamera:
-    """A camera of ours as COLMAP's."""
+    """Converts a mapless camera to COLMAP's form."""
     lens = camera.distortion
     model = "PINHOLE"
     coefficients: tuple[float, ...] = ()

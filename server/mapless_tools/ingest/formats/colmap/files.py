@@ -1,6 +1,6 @@
-"""COLMAP's files of cameras and images, binary and text, record by record; observations are passed over.
+"""COLMAP's files of cameras and images, binary and text, record by record; observations are skipped.
 
-Read here and not by pycolmap, which takes truncated files for whole ones (docs/decisions.md). Binary files are little
+They are not read by pycolmap, which accepts truncated files (docs/decisions.md). Binary files are little
 endian and have no checksum, so every step is compared with the file's size. Observations make files of gigabytes:
 binary ones are mapped, text is read by the line.
 """
@@ -24,9 +24,9 @@ class ImageRecord:
     """An image.
 
     Attributes:
-        image_id: COLMAP's.
+        image_id: its id in COLMAP.
         pose: qw qx qy qz tx ty tz of camera_from_world.
-        camera_id: of its camera.
+        camera_id: id of its camera.
         name: its path from the images' folder.
     """
 
@@ -37,12 +37,12 @@ class ImageRecord:
 
 
 def read_cameras(file: Path) -> Iterator[ColmapCamera]:
-    """The cameras of a cameras.bin or cameras.txt; ValueError, naming file and record, where it is malformed."""
+    """Reads the cameras of a cameras.bin or cameras.txt; ValueError, naming file and record, if malformed."""
     return _cameras_bin(file) if file.suffix == ".bin" else _cameras_txt(file)
 
 
 def read_images(file: Path) -> Iterator[ImageRecord]:
-    """The images of an images.bin or images.txt; ValueError, naming file and record, where it is malformed."""
+    """Reads the images of an images.bin or images.txt; ValueError, naming file and record, if malformed."""
     return _images_bin(file) if file.suffix == ".bin" else _images_txt(file)
 
 
@@ -70,7 +70,7 @@ def _images_bin(file: Path) -> Iterator[ImageRecord]:
 
 
 class _Cursor:
-    """Reads a binary file from front to back; whatever ends too early is a ValueError with the place."""
+    """Reads a binary file from beginning to end; raises ValueError with the position if it ends too early."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
@@ -85,7 +85,7 @@ class _Cursor:
             raise ValueError(f"{file} cannot be read: {error.strerror}") from error
 
     def take(self, layout: str) -> tuple[int | float, ...]:
-        """The next values."""
+        """Reads the next values."""
         size = struct.calcsize("<" + layout)
         if self.position + size > len(self._data):
             raise self.fault(f"the file ends after {len(self._data)} bytes")
@@ -94,7 +94,7 @@ class _Cursor:
         return values
 
     def count(self, smallest_record: int, what: str) -> int:
-        """The next value, a number of records that there must be room for."""
+        """Reads a number of records, for which there must be room in the file."""
         number = int(self.take("Q")[0])
         left = len(self._data) - self.position
         if number * smallest_record > left:
@@ -102,7 +102,7 @@ class _Cursor:
         return number
 
     def text(self) -> str:
-        """The next text, which ends with a zero byte."""
+        """Reads the next text, which ends with a zero byte."""
         end = self._data.find(b"\0", self.position, self.position + _MAX_NAME_BYTES)
         if end < 0:
             raise self.fault("the name does not end")
@@ -114,13 +114,13 @@ class _Cursor:
         return name
 
     def end(self) -> None:
-        """There must be nothing more."""
+        """Raises ValueError unless the file ends here."""
         if self.position != len(self._data):
             self.record = "end"
             raise self.fault(f"{len(self._data) - self.position} bytes are left over")
 
     def fault(self, what: str) -> ValueError:
-        """What is wrong, and where."""
+        """The error that says what is wrong, and where."""
         return ValueError(f"{self.file}: {self.record}, byte {self.position}: {what}; the file is cut off or damaged")
 
 
@@ -140,7 +140,7 @@ def _cameras_txt(file: Path) -> Iterator[ColmapCamera]:
 
 
 def _images_txt(file: Path) -> Iterator[ImageRecord]:
-    """A line for an image, then one for its observations, which may be empty."""
+    """Reads images.txt: a line for an image, then one for its observations, which may be empty."""
     for place, line in _lines(file, skipped_after=1):
         words = line.split(maxsplit=9)  # a name may have spaces
         if len(words) != 10:
@@ -154,7 +154,7 @@ def _images_txt(file: Path) -> Iterator[ImageRecord]:
 
 
 def _lines(file: Path, skipped_after: int = 0) -> Iterator[tuple[str, str]]:
-    """Lines that are neither empty nor comments, each with its place, and without the so many that follow it."""
+    """Yields lines that are neither empty nor comments, with their position; skips this many lines after each."""
     try:
         with file.open(encoding="utf-8") as stream:
             numbered = enumerate(stream, 1)

@@ -1,4 +1,4 @@
-"""A COLMAP model in memory, and where on the disk one is."""
+"""A COLMAP model in memory, and where models are on the disk."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Model:
     """Cameras and images.
 
     Attributes:
-        file: of the images, for messages.
-        cameras: by COLMAP's id.
-        images: by name.
+        file: file of the images, for messages.
+        cameras: cameras by COLMAP's id.
+        images: images by name.
         refused: names that occur twice, each with the reason.
     """
 
@@ -31,7 +31,7 @@ class Model:
     refused: Sequence[tuple[str, str]]
 
     def camera_and_pose(self, name: str) -> tuple[Camera, RigidTransform]:
-        """Camera and world_from_camera of an image; ValueError if it has none that can be used."""
+        """Camera and world_from_camera of an image; ValueError if they cannot be used."""
         if name not in self.images:
             raise ValueError(f"{self.file} has no image {name}")
         image = self.images[name]
@@ -41,7 +41,7 @@ class Model:
 
 
 def find_models(path: Path) -> list[Path]:
-    """Folders with models: the folder itself, or those where COLMAP and others put them."""
+    """Finds folders with models: the folder itself, or the usual places in it."""
     for places in ([path], [path / "sparse"], _numbered(path / "sparse"), _numbered(path / "colmap" / "sparse")):
         found = [place for place in places if find_model(place) is not None]
         if found:
@@ -50,7 +50,7 @@ def find_models(path: Path) -> list[Path]:
 
 
 def find_model(folder: Path) -> str | None:
-    """The ending of the model's files in a folder, None if there is none; of two COLMAP itself takes the binary one."""
+    """The ending of the model's files in a folder, None without a model; binary if both exist, as in COLMAP."""
     for ending in (".bin", ".txt"):
         if all((folder / f"{name}{ending}").is_file() for name in ("cameras", "images")):
             return ending
