@@ -176,10 +176,13 @@ class NearestNeighbours:
 
     def match(self, query: View, references: Sequence[PosedView], check: Callable[[], None]) -> Sequence[Matches]:
         """See QueryMatching.match."""
+        ours = query.features
+        if ours.descriptors.dtype == np.uint8:  # once for all references
+            ours = replace(ours, descriptors=ours.unit_descriptors())
 
         def with_one(reference: PosedView) -> Matches:
             check()
-            return mutual_matches(query.features, reference.view.features, self.ratio)
+            return mutual_matches(ours, reference.view.features, self.ratio)
 
         return tuple(self._pool.map(with_one, references))
 
