@@ -101,7 +101,7 @@ def child_server(
 
 @contextmanager
 def temporary_server() -> Iterator[Client]:
-    """A client of a server with an empty store; both are gone when the block is left. Errors as `child_server`."""
+    """A client of a server with an empty store, both removed at the end of the block. Errors as in `child_server`."""
     with (
         tempfile.TemporaryDirectory(prefix="mapless-") as data_dir,
         child_server(Path(data_dir)) as server,

@@ -1,6 +1,6 @@
-"""How a command ends that cannot do its work: one line on standard error, and an exit code that says whose fault it is.
+"""How a command ends that cannot do its work: one line on standard error, and an exit code by the cause.
 
-Imports nothing that takes time.
+Imports nothing that is slow.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ class UsageError(ValueError):
 
 @contextmanager
 def usage_errors() -> Iterator[None]:
-    """Turns ValueError and ConfigError into UsageError; for a block that checks arguments and computes nothing."""
+    """Converts ValueError and ConfigError to UsageError, in a block that only checks arguments."""
     from mapless_server.settings import ConfigError
 
     try:

@@ -73,7 +73,7 @@ class Group:
         return () if run is None else run.results
 
     def average(self, setting: int, method: Method) -> Average | None:
-        """Over those measured scenes that the paper averages over, else over all; None if nothing was measured."""
+        """Average over the measured scenes that the paper averages over, else over all; None without any."""
         measured = tuple(scene for scene in self.scenes if (scene, setting, method) in self.summaries)
         papers = tuple(self.benchmark.scenes) if self.benchmark else ()
         scenes = tuple(scene for scene in measured if scene in papers) or measured

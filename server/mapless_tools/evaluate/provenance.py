@@ -35,7 +35,7 @@ class Provenance:
 
 
 def provenance_of(settings: Settings) -> Provenance:
-    """Of a server with these settings, here and now; errors as `device_for` and `feature_names`."""
+    """The origin of figures of a server with these settings; errors as in `device_for` and `feature_names`."""
     device = device_for(settings)
     features = feature_names(settings, device)
     used = {settings.backend, *features, *(f"{name}-lightglue" for name in features if device != "cpu")}

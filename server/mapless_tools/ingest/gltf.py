@@ -1,8 +1,8 @@
-"""A scene as one binary glTF file: its cameras as frusta with small photographs, and points that they share.
+"""A scene as one binary glTF file: cameras as frusta with small photographs, and points that they share.
 
-Any viewer opens it. The root node turns the scene's world to glTF's axes (y up); below it, positions count from the
-middle of the scene, so that single precision is enough. Each reference is a node with glTF's axes of cameras (x right,
-y up, z back); `extras` have the reference's id, camera and pose, and the scene's datum, down and unit.
+Any viewer can show it. The root node rotates the scene's world to glTF's axes (y up); below it, positions are relative
+to the middle of the scene, so that single precision is enough. Each reference is a node with glTF's axes of cameras (x
+right, y up, z back); `extras` have the reference's id, camera and pose, and the scene's datum, down and unit.
 """
 
 from __future__ import annotations
@@ -102,9 +102,9 @@ def _thumbnail(image: NDArray[np.uint8]) -> bytes:
 def _points(
     client: Client, scene: str, reference: Reference, image: NDArray[np.uint8]
 ) -> tuple[Array, NDArray[np.uint8]] | tuple[None, None]:
-    """Points in the world that a reference's photograph shares with others, and their colours; None without.
+    """Points in the world that a reference's photograph shares with others, and their colours; None without any.
 
-    A scene without points is a scene, too: nothing of this ends the export.
+    No failure here ends the export, since points are optional.
     """
     try:
         answer = client.localize(reference.image or b"", reference.camera, scene, include_debug=True)
@@ -132,7 +132,7 @@ def to_gltf(scene: KnownScene, views: Sequence[View]) -> bytes:
 
 
 class _File:
-    """A glTF file as it grows; offsets are filled in at its end."""
+    """A glTF file that is being built; offsets are filled in at its end."""
 
     def __init__(self, scene: KnownScene, scenery: Scenery) -> None:
         self._scenery = scenery
@@ -155,7 +155,7 @@ class _File:
         )
 
     def add_camera(self, view: View) -> None:
-        """A node with a camera, its frustum, and its photograph if there is one."""
+        """Adds a node with a camera, its frustum, and its photograph if there is one."""
         reference = view.reference
         pose = self._scenery.placed(reference.world_from_camera)
         turned = RigidTransform(pose.rotation @ OPENCV_FROM_OPENGL, pose.translation)
@@ -179,7 +179,7 @@ class _File:
         self._in_world.append(self._node(node))
 
     def add_points(self, points: Array, colours: NDArray[np.uint8]) -> None:
-        """One node with all points."""
+        """Adds one node with all points."""
         positions = self._array((points - self._scenery.origin).astype(np.float32), FLOAT, "VEC3")
         linear = np.rint(255 * (colours / 255) ** _GAMMA).astype(np.uint8)
         rgba = np.concatenate([linear, np.full((len(colours), 1), 255, np.uint8)], axis=1)  # four bytes: aligned
@@ -188,13 +188,13 @@ class _File:
         self._in_world.append(self._node(Node(name="points", mesh=mesh)))
 
     def content(self) -> bytes:
-        """The file, complete."""
+        """Returns the complete file."""
         self._gltf.buffers = [Buffer(byteLength=len(self._blob))]
         self._gltf.set_binary_blob(bytes(self._blob))
         return b"".join(self._gltf.save_to_bytes())
 
     def _frustum(self, reference: Reference) -> tuple[int, int]:
-        """The camera and the mesh of lines of a reference's intrinsics, which many references share."""
+        """The camera and the mesh of lines for a reference's intrinsics, which many references share."""
         camera = reference.camera
         if camera not in self._frustums:
             perspective = Perspective(
@@ -212,14 +212,14 @@ class _File:
         return self._frustums[camera]
 
     def _corners(self, reference: Reference) -> Array:
-        """(4, 3) corners of the photograph at the frustum's end, glTF's axes, from the top left on clockwise."""
+        """Corners (4, 3) of the photograph at the frustum's end, in glTF's axes, clockwise from the top left."""
         camera = reference.camera.pinhole()
         right, bottom = camera.width_px - 0.5, camera.height_px - 0.5
         rays = camera.rays(np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]]))
         return rays / rays[:, 2:] * self._scenery.size_m @ OPENCV_FROM_OPENGL
 
     def _picture(self, reference: Reference, thumbnail: bytes) -> int:
-        """A mesh of two triangles with the photograph."""
+        """Adds a mesh of two triangles with the photograph."""
         gltf = self._gltf
         gltf.images.append(EmbeddedImage(bufferView=self._view(thumbnail), mimeType="image/jpeg"))
         gltf.textures.append(Texture(source=len(gltf.images) - 1))
@@ -262,7 +262,7 @@ class _File:
 
 
 def _upright(down: Array) -> list[float]:
-    """x, y, z, w of the rotation from the world to glTF's axes, in which y points up."""
+    """Quaternion x, y, z, w of the rotation from the world to glTF's axes, in which y points up."""
     up = -np.asarray(down, float)
     side = np.eye(3)[np.argmin(np.abs(up))]
     back = np.cross(side, up)
@@ -272,7 +272,7 @@ def _upright(down: Array) -> list[float]:
 
 
 def _material(name: str, **colour: Any) -> Material:
-    """One that is seen without lights, from both sides."""
+    """A material that is visible without lights, from both sides."""
     metallic = PbrMetallicRoughness(metallicFactor=0.0, **colour)
     return Material(
         name=name, pbrMetallicRoughness=metallic, doubleSided=True, extensions={_UNLIT: {}}, alphaCutoff=None

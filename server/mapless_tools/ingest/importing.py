@@ -1,4 +1,4 @@
-"""An import from end to end: read, choose, check, compare with what is there, store, report."""
+"""An import: reads, selects, checks, compares with the scene, stores, and reports."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ class ImportOptions:
     Attributes:
         format: name of the folder's layout, or "auto".
         read: options of its reader.
-        metres: where metres come from if the folder's unit is another.
-        split: take only frames of this split, "train" or "test"; empty for all.
-        stride: take only the first of every so many frames.
-        max_count: take so many at most, spread evenly; None for all.
-        id_prefix: before every reference's id, for several folders in one scene.
+        metres: how lengths become metres, if the folder's unit is another.
+        split: the split whose frames are used, "train" or "test"; empty for all.
+        stride: every n-th frame is used.
+        max_count: largest number of frames, evenly spread; None for all.
+        id_prefix: prefix of every reference's id, for several folders in one scene.
         check: whether to compare photographs with the poses first.
         upload: how references are sent.
     """
@@ -76,10 +76,10 @@ def run_import(
     connection: Connection | None,
     report_file: Path | None,
 ) -> bool:
-    """An import, without a connection a dry one; prints what it does and finds.
+    """Runs an import, a dry one without a connection; prints what it does and finds.
 
     Returns:
-        whether everything was imported; of a dry run, whether everything could be.
+        Whether everything was imported; for a dry run, whether everything could be.
 
     Raises:
         ValueError: the folder, the scene's id or the connection cannot be used.
@@ -113,7 +113,7 @@ def run_import(
 
 
 def read_frames(folder: Path, options: ImportOptions) -> tuple[Dataset, tuple[Frame, ...]]:
-    """The dataset, and those of its frames that are to be imported.
+    """Reads the dataset, and selects the frames to import.
 
     Raises:
         ValueError: the folder cannot be read, its metres or its datum contradict it, or nothing is left to import.
@@ -134,7 +134,7 @@ def read_frames(folder: Path, options: ImportOptions) -> tuple[Dataset, tuple[Fr
 
 
 def refuse_wrong_images(report: ImportReport) -> None:
-    """Refuses the report's chosen frames whose image a server would refuse by its header; for a dry run."""
+    """Refuses the chosen frames whose image a server would reject by its header; for a dry run."""
     for frame in report.chosen:
         try:
             size = image_size(frame.image_path.read_bytes(), ImageLimits())
@@ -148,7 +148,7 @@ def refuse_wrong_images(report: ImportReport) -> None:
 
 
 def _store(report: ImportReport, options: UploadOptions, settings: Settings, connection: Connection) -> None:
-    """Stores the chosen frames in the scene, which is made with the dataset's datum and down if there is none."""
+    """Stores the chosen frames in the scene, which is created with the dataset's datum and down if missing."""
     try:
         with connected(connection, settings) as client, progress_bars() as progress:
             existing = open_scene(client, report.scene, report.dataset, report.chosen)
@@ -165,7 +165,7 @@ def _store(report: ImportReport, options: UploadOptions, settings: Settings, con
 
 
 def _attributes(dataset: Dataset) -> SceneAttributes:
-    """Of the scene that the dataset makes; ValueError if they contradict each other."""
+    """Attributes of the scene that the dataset makes; ValueError if they contradict each other."""
     try:
         return SceneAttributes(dataset.datum, dataset.down_in_world, arbitrary_unit=not dataset.metric)
     except DatumWithoutMetres:
@@ -182,7 +182,7 @@ def _warn(report: ImportReport, texts: Sequence[str]) -> None:
 
 @contextmanager
 def _reported(report: ImportReport, file: Path | None) -> Iterator[None]:
-    """The report is printed and written however the block is left."""
+    """Prints and writes the report at the end of the block, also after an exception."""
     try:
         yield
     except (KeyboardInterrupt, SystemExit):

@@ -4,7 +4,7 @@ Three ways: the factor itself; distances between camera centres that were measur
 centres, to which the similarity is fitted that minimizes their squared distances (Umeyama, "Least-squares estimation of
 transformation parameters between two point patterns", PAMI 1991). The rotation is SciPy's.
 
-What contradicts itself is refused with each residual, for a wrong scale cannot be noticed once it is stored.
+Contradictory values are rejected with their residuals, since a wrong scale cannot be detected once it is stored.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ class KnownDistance:
 
 @dataclass(frozen=True)
 class MetreOptions:
-    """Where metres come from; at most one of the three.
+    """How lengths become metres; at most one of the three.
 
     Attributes:
         scale: metres per unit of the folder; None if not given.
-        distances: between camera centres.
+        distances: measured distances between camera centres.
         positions: CSV file of camera centres with known coordinates; None if not given.
     """
 
@@ -77,10 +77,10 @@ class MetreOptions:
 
 
 def in_metres(dataset: Dataset, options: MetreOptions, id_prefix: str = "") -> Dataset:
-    """The dataset in metres, with notes of what was done; unchanged if the options say nothing.
+    """Converts the dataset to metres, with notes on what was done; unchanged without options.
 
-    A position file has a frame of its own: the dataset is turned and moved into it, its direction of gravity with it.
-    Its datum, which places another frame on the Earth, is dropped.
+    A position file has its own frame: the dataset and its direction of gravity are transformed to it. The dataset's
+        datum, which belongs to its former frame, is dropped.
 
     Raises:
         ValueError: a reference is unknown, the known values contradict each other or do not suffice, or a pose would
@@ -113,7 +113,7 @@ def in_metres(dataset: Dataset, options: MetreOptions, id_prefix: str = "") -> D
 
 
 def scale_of_distances(distances: Sequence[KnownDistance], find: Finder) -> tuple[float, list[str]]:
-    """Metres per unit, and a line for each distance; ValueError if they contradict each other.
+    """Metres per unit, with a line of text for each distance; ValueError if they contradict each other.
 
     The scale minimizes the squared differences, each in units of its bound.
     """
@@ -145,9 +145,9 @@ def scale_of_distances(distances: Sequence[KnownDistance], find: Finder) -> tupl
 
 
 def umeyama(source: Array, target: Array) -> Similarity:
-    """The similarity ``target_from_source`` with the least squared distances of points (N, 3) to points (N, 3).
+    """The similarity ``target_from_source`` with the least squared distances between points (N, 3) and points (N, 3).
 
-    Collinear points leave the rotation about their line free; points at one place, the scale.
+    Collinear points do not determine the rotation about their line; points at one place do not determine the scale.
     """
     centre, target_centre = source.mean(axis=0), target.mean(axis=0)
     here, there = source - centre, target - target_centre
@@ -158,9 +158,9 @@ def umeyama(source: Array, target: Array) -> Similarity:
 
 
 def read_positions(file: Path) -> dict[str, Array]:
-    """Known camera centres (3,) in metres by the name of the reference: a CSV file with columns name, x, y, z.
+    """Reads known camera centres (3,), metres, by the name of the reference: a CSV file with columns name, x, y, z.
 
-    A first line that has no numbers is a heading. ValueError names the line that is malformed.
+    A first line without numbers is a heading. ValueError names a malformed line.
     """
     try:
         rows = list(csv.reader(file.read_text(encoding="utf-8-sig").splitlines()))
@@ -188,7 +188,7 @@ def read_positions(file: Path) -> dict[str, Array]:
 
 
 class Finder:
-    """Frames by their ids, as they are read or as they will be stored, or by their photographs' file names."""
+    """Finds frames by their original or their new ids, or by their photographs' file names."""
 
     def __init__(self, frames: Sequence[Frame], id_prefix: str) -> None:
         self._frames: dict[str, Frame] = {}
@@ -199,7 +199,7 @@ class Finder:
         self._frames |= {f"{id_prefix}{frame.name}": frame for frame in frames} | {it.name: it for it in frames}
 
     def __call__(self, name: str) -> Frame:
-        """The frame of a name; ValueError if there is none."""
+        """Returns the frame of a name; ValueError if there is none."""
         if name not in self._frames:
             known = ", ".join(sorted(frame.name for frame in set(self._frames.values()))[:3])
             raise ValueError(f"the folder has no reference {name!r}, by its id or file name; it has {known}, ...")
@@ -207,7 +207,7 @@ class Finder:
 
     @property
     def extent(self) -> float:
-        """Largest coordinate difference of camera centres, units."""
+        """Largest difference of the camera centres' coordinates, units."""
         centres = np.array([frame.world_from_camera.translation for frame in self._frames.values()])
         return float(np.ptp(centres, axis=0).max())
 
@@ -229,15 +229,15 @@ def _aligned(file: Path, find: Finder) -> tuple[Similarity, list[str]]:
 
 
 def align(known: Mapping[str, Array], centres: Mapping[str, Array], where: str) -> tuple[Similarity, list[str]]:
-    """The similarity from the folder's frame and unit to that of known camera centres, and a line for each of them.
+    """Fits the similarity from the folder's frame and unit to known camera centres; also returns a line for each.
 
     Args:
-        known: (3,) each, metres, by name.
-        centres: (3,) each, in the folder's frame and unit, by the same names.
-        where: file of the known ones, for messages.
+        known: known camera centres (3,) by name, metres.
+        centres: camera centres (3,) by the same names, in the folder's frame and unit.
+        where: file of the known centres, for messages.
 
     Raises:
-        ValueError: they are too few, collinear, or contradict each other.
+        ValueError: the centres are too few, collinear, or contradict each other.
     """
     names = list(known)
     if len(names) < 3:
@@ -272,7 +272,7 @@ def align(known: Mapping[str, Array], centres: Mapping[str, Array], where: str) 
 
 
 def _check_spread(points: Array, residual: float, what: str) -> None:
-    """ValueError if points (N, 3), whose residual is known, lie at one place or on a line."""
+    """Raises ValueError if points (N, 3), whose residual is known, are at one place or on a line."""
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / math.sqrt(len(points))
     if not spread[0] > 0:
         raise ValueError(f"{what} are all at one place: three that are not on one line are needed")
@@ -285,12 +285,13 @@ def _check_spread(points: Array, residual: float, what: str) -> None:
 
 
 def _outlier(names: Sequence[str], residuals: Callable[[Array], Array], least: int) -> str:
-    """Names the one without which all others fit, if there is one and enough remain.
+    """Names the item without which all others fit, if there is one and enough remain.
 
     Args:
-        names: of the items.
-        residuals: of all items in units of their bounds, after a fit to those that are chosen (1, else 0).
-        least: fewer items show no single wrong one.
+        names: names of the items.
+        residuals: function that returns the residuals of all items, in units of their bounds, after a fit to the chosen
+            ones (1, else 0).
+        least: least number of items by which a single wrong one can be found.
     """
     if len(names) < least:
         return ""

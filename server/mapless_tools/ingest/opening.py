@@ -1,4 +1,4 @@
-"""The scene that an import fills: made, or there already with references whose unit of length must be the same."""
+"""The scene that an import fills: a new one, or an existing one whose unit of length must be the same."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ NO_METRES = "its unit of length is arbitrary: --scale, --distance or --align giv
 
 
 class WrongUnit(Exception):
-    """References and their scene have units that differ."""
+    """References and their scene have different units."""
 
 
 def open_scene(client: Client, scene: str, dataset: Dataset, chosen: Sequence[Frame]) -> list[Reference]:
-    """The references of a scene, which is made with the dataset's datum, down and unit if there is none.
+    """Returns the references of a scene, which is created with the dataset's datum, down and unit if missing.
 
     A scene without references gets the dataset's unit.
 
     Raises:
-        WrongUnit: its references are in metres and the dataset is not, or the other way round.
+        WrongUnit: its references are in metres and the dataset is not, or vice versa.
     """
     is_arbitrary = not dataset.metric
     try:
@@ -49,7 +49,7 @@ def open_scene(client: Client, scene: str, dataset: Dataset, chosen: Sequence[Fr
 
 
 def _share_positions(existing: Sequence[Reference], chosen: Sequence[Frame]) -> bool:
-    """Whether two references apart are in both, by id, at the same positions: then the unit is the same, too."""
+    """Whether both have two distant references with the same ids and positions, so that the unit is the same."""
     there = {reference.reference_id: reference.world_from_camera.translation for reference in existing}
     shared = [
         frame.world_from_camera.translation

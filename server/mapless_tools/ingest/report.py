@@ -1,4 +1,4 @@
-"""What an import did, for a person and for a program."""
+"""The report of an import, for people and for programs."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ ALREADY_THERE = "already there"
 
 @dataclass
 class ImportReport:
-    """Counts and reasons; what is refused is named as its file names it, what is skipped by its id.
+    """Counts and reasons; refused frames are named as in their file, skipped ones by id.
 
     Attributes:
         scene: id of the scene.
-        dataset: what was read.
-        chosen: frames of it that were to be imported.
+        dataset: the dataset.
+        chosen: its frames to import.
         verdict: of the epipolar check; None if there was none.
-        warnings: what contradicts itself among poses, datum, direction of gravity and unit.
+        warnings: contradictions of poses, datum, direction of gravity and unit.
         added: ids of references that this run stored.
-        blank: ids of those of them without local features, with which nothing can be matched.
-        skipped: references that are there already, and where.
-        refused: frames that are not in, each with the reason.
+        blank: ids of added references without local features, with which nothing can be matched.
+        skipped: references that exist already, and where.
+        refused: frames that were not imported, each with the reason.
         stopped: why the import ended before its end; empty if it did not.
-        seconds: that storing took.
+        seconds: duration of storing.
     """
 
     scene: str
@@ -53,19 +53,19 @@ class ImportReport:
 
     @property
     def untried_count(self) -> int:
-        """Frames that the import did not reach."""
+        """Number of frames that the import did not reach."""
         tried = len(self.added) + len(self.skipped) + len(self.refused) - len(self.dataset.refused)
         return 0 if self.is_dry else len(self.chosen) - tried
 
     @property
     def went_well(self) -> bool:
-        """Whether everything was imported; of a dry run, whether everything could be."""
+        """Whether everything was imported; for a dry run, whether everything could be."""
         wrong = self.verdict is not None and self.verdict.is_wrong
         return not (self.refused or self.stopped or self.untried_count or (self.is_dry and wrong))
 
 
 def verdict_lines(verdict: Verdict, frames: Sequence[Frame]) -> list[str]:
-    """What the epipolar check found, a sentence a line."""
+    """The result of the epipolar check, a sentence per line."""
     if not verdict.is_known:
         return [
             "warning: the poses could not be checked: none of the photographs that were compared have enough matches"
@@ -97,7 +97,7 @@ def verdict_lines(verdict: Verdict, frames: Sequence[Frame]) -> list[str]:
 
 
 def print_report(report: ImportReport, console: Console) -> None:
-    """The report, at most SHOWN reasons of a kind."""
+    """Prints the report, with at most SHOWN reasons of a kind."""
     _print_reasons("refused", report.refused, console)
     if report.is_dry:
         good = len(report.chosen) - (len(report.refused) - len(report.dataset.refused))
@@ -120,7 +120,7 @@ def print_report(report: ImportReport, console: Console) -> None:
 
 
 def to_json(report: ImportReport) -> dict[str, Any]:
-    """All of the report."""
+    """The whole report as JSON values."""
     verdict = report.verdict
     return {
         "scene": report.scene,

@@ -1,8 +1,8 @@
-"""Storing references through a server: several messages in flight, each whole or not at all.
+"""Stores references through a server: several concurrent messages, each stored completely or not at all.
 
-As many messages are read ahead as there are threads, and no more. What the server refuses is taken out of its message,
-and the rest is sent again; when it is busy or away it is waited for. A message whose answer was lost may have been
-stored nevertheless, so a reference that exists is compared before it is reported as a duplicate.
+At most as many messages as threads are read ahead. A reference that the server rejects is removed from its message, and
+the rest is sent again; if the server is busy or unreachable, the import waits. A message whose answer was lost may have
+been stored, so an existing reference is compared before it is reported as a duplicate.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ class UploadOptions:
     """Options of storing.
 
     Attributes:
-        parallel: messages in flight. The server describes their photographs side by side; more only wait.
+        parallel: number of concurrent messages. The server describes their photographs concurrently; more would only
+            wait.
         busy_patience_s: how long a server may be too busy before the import gives up.
         away_patience_s: how long it may be unreachable; a restart takes seconds.
     """
@@ -68,11 +69,11 @@ class UploadOptions:
 
 
 class _Stopped(Exception):
-    """The import ends; the reason is in the report."""
+    """Ends the import; the reason is in the report."""
 
 
 class Uploader:
-    """Stores frames and writes into a report what became of them."""
+    """Stores frames, and writes the results into a report."""
 
     def __init__(
         self,
@@ -91,7 +92,7 @@ class Uploader:
         self._lock = threading.Lock()
 
     def run(self) -> None:
-        """Stores the report's chosen frames. An interruption stops it soon, and is raised."""
+        """Stores the report's chosen frames; an interruption stops it soon and is raised."""
         batches = batches_of(self._report.chosen)
         total = len(self._report.chosen)
         self._progress("storing references", 0, total)
@@ -130,7 +131,7 @@ class Uploader:
             raise
 
     def _load(self, frame: Frame) -> Item | None:
-        """The frame with its image's bytes; None if it is not to be sent, for a reason in the report."""
+        """The frame with its image's bytes; None if it is not to be sent, with the reason in the report."""
         try:
             item = read_item(frame)
         except ValueError as error:
@@ -143,7 +144,7 @@ class Uploader:
         return None
 
     def _send(self, items: Sequence[Item]) -> None:
-        """Stores items, in one message if it is taken."""
+        """Stores items, in one message if the server accepts it."""
         waiting = Waiting(self._options, self._stop)
         left = list(items)
         while left:
@@ -177,7 +178,7 @@ class Uploader:
                 return
 
     def _reconcile(self, items: Sequence[Item], waiting: Waiting, error: AlreadyExists) -> list[Item]:
-        """Items that are not there yet, after an id was taken."""
+        """The items that do not exist yet, after an id was taken."""
         left = []
         for item in items:
             try:
@@ -198,14 +199,14 @@ class Uploader:
         return left
 
     def _without_guilty(self, items: Sequence[Item], error: InvalidArgument) -> list[Item]:
-        """Items without the one that the server names; those it does not name it are sent one by one."""
+        """The items without the one that the server names; if it names none, they are sent one by one."""
         named = _REQUEST.match(error.field or "")
         if named and int(named[1]) < len(items):
             return self._without(items, int(named[1]), error)
         return self._halves(items, error)
 
     def _halves(self, items: Sequence[Item], error: MaplessError) -> list[Item]:
-        """Nothing: what was refused together is sent in parts, and what is refused alone is refused."""
+        """Sends a rejected message in parts, and reports a rejected single item; returns no items."""
         if len(items) == 1:
             return self._without(items, 0, error)
         middle = len(items) // 2
@@ -238,7 +239,7 @@ class Uploader:
             self._report.added += [item.frame.name for item in items]
 
     def _end(self, reason: str) -> None:
-        """Ends the import; the first reason is the one that is reported."""
+        """Ends the import; the first reason is reported."""
         with self._lock:
             if not self._stop.is_set():
                 self._report.stopped = reason
@@ -255,12 +256,12 @@ class Item:
     stored: Stored
 
     def reference(self) -> NewReference:
-        """What the client sends."""
+        """The reference in the client's form."""
         return NewReference(self.frame.name, self.image, self.frame.camera, self.frame.world_from_camera)
 
 
 def read_item(frame: Frame) -> Item:
-    """A frame with its image's bytes; ValueError if they cannot be what its camera took."""
+    """Reads a frame's image; ValueError if it cannot be a photograph of the frame's camera."""
     file, camera = frame.image_path, frame.camera
     try:
         image = file.read_bytes()
@@ -276,7 +277,7 @@ def read_item(frame: Frame) -> Item:
 
 
 def batches_of(frames: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
-    """Frames in their order, as many together as one message shall have; their files are not read."""
+    """Yields frames in their order, as many together as one message should have; their files are not read."""
     batch: list[Frame] = []
     batch_bytes = 0
     for frame in frames:
@@ -294,7 +295,7 @@ def batches_of(frames: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
 
 
 class Waiting:
-    """Waiting for the server on behalf of one message."""
+    """Waits for the server on behalf of one message."""
 
     def __init__(self, options: UploadOptions, stop: threading.Event) -> None:
         self.lost_an_answer = False
@@ -304,14 +305,14 @@ class Waiting:
         self._away_s = 0.0
 
     def for_busy(self, retry_after_s: float) -> bool:
-        """Waits as long as the server requests; False when it has been busy for too long."""
+        """Waits as long as the server requests; returns False if it has been busy for too long."""
         if time.monotonic() - self._start_s > self._options.busy_patience_s:
             return False
         self._stop.wait(min(max(retry_after_s, 0.05), 30.0))
         return True
 
     def for_return(self) -> bool:
-        """Waits a little longer each time; False when it has been long enough."""
+        """Waits a little longer each time; returns False if it has waited for too long."""
         if self._away_s >= self._options.away_patience_s:
             return False
         pause_s = min(max(0.5, self._away_s / 2), 5.0)

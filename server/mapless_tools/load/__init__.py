@@ -1,4 +1,4 @@
-"""What the server does under load: its overhead, its latency and goodput up to three times its capacity, and a soak.
+"""Measures the server under load: overhead, latency and goodput up to three times its capacity, and a soak.
 
 `overhead`, `pipeline` and `soak` are the three measurements; each is made of steps (`step`, `driving`), in which calls
 planned beforehand (`arrivals`) are sent (`sender`) and counted (`records`), while the server is watched from outside

@@ -1,8 +1,8 @@
-"""When calls are made, by which client, and of what kind: decided before the first one is sent.
+"""The times, clients and kinds of calls, decided before the first call is sent.
 
 Several clients call independently of one another and of the answers (open loop), as many robots do; so each one's calls
-are a Poisson process. A closed loop, where a client calls again once it has its answer, asks less of a slow server and
-so makes it look better than it is.
+are a Poisson process. In a closed loop a client calls again when it has its answer, so a slow server gets fewer calls
+and seems better than it is.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from mapless_server.method.options import check_bounds
 
 
 class Kind(str, Enum):
-    """What kind of call is made."""
+    """Kinds of calls."""
 
     QUERY = "query"
     CANCELLED = "cancelled"
@@ -30,7 +30,7 @@ class Kind(str, Enum):
 
 @dataclass(frozen=True, eq=False)
 class Requests:
-    """Serialized requests to choose from, each as likely as the others; images of `bad` ones are to be refused."""
+    """Serialized requests, each chosen with the same probability; images of `bad` ones are to be rejected."""
 
     good: Sequence[bytes]
     bad: Sequence[bytes] = ()
@@ -38,15 +38,15 @@ class Requests:
 
 @dataclass(frozen=True)
 class Mix:
-    """What share of the calls is not a plain query.
+    """The shares of calls that are not plain queries.
 
     Attributes:
-        cancelled_share: of calls that are cancelled.
-        bad_share: of calls with a bad image.
-        cancel_within_s: a cancelled call is cancelled at any moment up to so long after it was sent; at twice what
-            an answer takes, about half of them come too late, so that both sides of the race are run.
-        hurried_share: of calls with a short deadline.
-        hurry_s: a short deadline is anything up to so long.
+        cancelled_share: share of calls that are cancelled.
+        bad_share: share of calls with a bad image.
+        cancel_within_s: largest time between sending and cancelling; if it is twice the time of an answer, about half
+            of the cancellations are too late, so that both cases occur.
+        hurried_share: share of calls with a short deadline.
+        hurry_s: largest short deadline.
     """
 
     cancelled_share: float = 0.0
@@ -67,12 +67,12 @@ class PlannedCall:
     """A call to make.
 
     Attributes:
-        at_s: when, seconds from the start. Latency counts from here, however late the call is sent.
+        at_s: its time, seconds from the start. Latency counts from here, also if the call is sent later.
         client: its number: 0, 1, ...
         kind: what kind of call it is.
-        request: what is sent.
+        request: the serialized request.
         cancel_after_s: when it is cancelled, seconds after sending; None if it is not.
-        deadline_s: its own; None for that of all others.
+        deadline_s: its own deadline; None for that of all others.
     """
 
     at_s: float
@@ -98,7 +98,8 @@ def plan_calls(
     """The calls of several clients, `rate_per_s` together, in order of time; the same for the same seed.
 
     Raises:
-        ValueError: no client, a rate or duration that is not above 0, or bad images are asked for and there are none.
+        ValueError: there is no client, a rate or duration is not above 0, or bad images are requested but there are
+            none.
     """
     if clients < 1:
         raise ValueError(f"clients must be at least 1, are {clients}")

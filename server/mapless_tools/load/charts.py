@@ -1,6 +1,6 @@
-"""Pictures of the measurements: latency and goodput against offered load, and the server's state during a soak.
+"""Charts of the measurements: latency and goodput against offered load, and the server's state during a soak.
 
-A good server answers as much at three times its load as at its best, and refuses at once.
+At three times its capacity, a good server answers as many calls as at its capacity, and rejects the others at once.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ PANELS: Mapping[str, str] = {
 
 
 def draw_load(result: PipelineResult) -> Figure:
-    """Above, how long answers and refusals took; below, how many there were; against the offered rate."""
+    """Draws latencies of answers and refusals (above) and their rates (below) against the offered rate."""
     figure = Figure(figsize=(12.5, 9), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(4, 3))
     options, steps = result.options, sorted(result.steps, key=lambda step: step.account.offered_per_s)
@@ -83,7 +83,7 @@ def draw_load(result: PipelineResult) -> Figure:
 
 
 def draw_soak(states: Sequence[ServerState], slopes: Mapping[str, Slope]) -> Figure:
-    """A panel for each figure of the server's state, with its slope where there is one."""
+    """Draws a panel for each figure of the server's state, with its slope if there is one."""
     figure = Figure(figsize=(12.5, 16), layout="constrained")
     minutes = [(state.at_s - states[0].at_s) / 60 for state in states]
     for axes, (field, label) in zip(figure.subplots(5, 2).flat, PANELS.items(), strict=False):

@@ -1,7 +1,7 @@
-"""What a server does beside queries: scenes and references that come and go, watchers, wrong requests.
+"""Calls besides queries: scenes and references that are created and deleted, watchers, and wrong requests.
 
-Each worker makes one kind of call again and again, at random moments, and counts how its calls end. An error that it
-caused itself, or another worker by deleting a scene, is expected; any other is a failure.
+Each worker makes one kind of call repeatedly, at random times, and counts how its calls end. An error that a worker has
+caused, also another one by deleting a scene, is expected; any other is a failure.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ UNCERTAIN = ("ALREADY_EXISTS", "NOT_FOUND")
 
 @dataclass
 class Outcomes:
-    """How calls ended.
+    """Counts how calls ended.
 
     Attributes:
-        counts: by worker and status.
+        counts: number of calls by worker and status.
         failures: unexpected ends; the first of each kind in full.
         localize_codes: statuses of the calls of Localize, for comparing with the server's account.
     """
@@ -58,7 +58,7 @@ class Outcomes:
     localize_codes: list[str] = field(default_factory=list)
 
     async def count(self, worker: str, call: Awaitable[object], *expected: str) -> bool:
-        """Awaits a call and counts its status; whether it is OK. Statuses that are `expected` are no failures."""
+        """Awaits a call and counts its status; returns whether it is OK. The `expected` statuses are no failures."""
         code, text = "OK", ""
         try:
             await call
@@ -85,11 +85,11 @@ WORK: Mapping[str, str] = {
 
 @dataclass(frozen=True)
 class Workers:
-    """Everything the workers need.
+    """The data that the workers share.
 
     Attributes:
-        address: of the server.
-        place: whose photographs are stored and sent.
+        address: address of the server.
+        place: place whose photographs are stored and sent.
         outcomes: counts how calls end.
         pace: times between a worker's calls are divided by this.
         stopping: set when workers are to end, each after its current calls.
@@ -144,7 +144,7 @@ class Workers:
         self.outcomes.localize_codes.append(code)
 
     async def watchers(self, chance: random.Random) -> None:
-        """Watches the scene's queries, and the server's health, for a while each, and cancels."""
+        """Watches the scene's queries and the server's health for a while each, and cancels."""
         async with _channel(self.address) as channel:
             for _ in self._rounds():
                 watched = rpcs.LocalizationServiceStub(channel).WatchQueries(
@@ -161,7 +161,7 @@ class Workers:
                         self.outcomes.failures.setdefault(f"{name}: {how}", "the server ended it")
 
     async def comers(self, chance: random.Random) -> None:
-        """Opens a connection each time, makes a call or two, and closes it; one in three in the middle of a call."""
+        """Opens a connection each time, makes a call or two, and closes it, sometimes in the middle of a call."""
         for _ in self._rounds():
             async with aio.Client(self.address, ONCE) as client:
                 await self.outcomes.count("comers", client.is_serving())
@@ -180,7 +180,7 @@ class Workers:
             await self._pause(chance, 3.0)
 
     async def wrong(self, chance: random.Random) -> None:
-        """Asks for scenes that do not exist, creates one that exists, and sends bytes that are no message."""
+        """Requests scenes that do not exist, creates one that exists, and sends bytes that are not a message."""
         photo = self.place.queries[0]
         async with aio.Client(self.address, ONCE) as client, _channel(self.address) as channel:
             raw: Any = channel.unary_unary("/mapless.v1.ReferenceService/GetScene")
@@ -211,7 +211,7 @@ class Workers:
 
 @asynccontextmanager
 async def churning(workers: Workers, seed: int) -> AsyncIterator[Outcomes]:
-    """All workers run until the block is left; RuntimeError if one has failed by itself."""
+    """Runs all workers until the end of the block; RuntimeError if one has failed."""
     kinds = (workers.references, workers.scenes, workers.watchers, workers.comers, workers.wrong)
     tasks = [asyncio.create_task(work(random.Random(seed + number))) for number, work in enumerate(kinds)]
     try:

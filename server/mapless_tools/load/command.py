@@ -144,7 +144,7 @@ def _soak(data: Path | None, quick: bool, output: Path, **given: Any) -> list[Ch
 
 
 def _new_log(output: Path, part: str) -> Path:
-    """An empty file for the log of the part's server, which would be in the way of progress and tables."""
+    """An empty file for the log of the part's server, which would otherwise mix with progress and tables."""
     output.mkdir(parents=True, exist_ok=True)
     log = output / f"{part}-server.log"
     log.write_bytes(b"")
@@ -154,7 +154,7 @@ def _new_log(output: Path, part: str) -> Path:
 def _report(
     output: Path, part: str, lines: list[str], checks: list[Check], figures: dict[str, Any], *files: Path
 ) -> None:
-    """Prints a part, puts it into the JSON file beside the others, and says where that and its other files are."""
+    """Prints a part, adds it to the JSON file, and names this and its other files."""
     from .report import check_lines, machine, update_json
 
     print("\n".join([f"## {part}", "", machine(), "", *lines, *check_lines(checks)]), flush=True)
@@ -165,7 +165,7 @@ def _report(
 
 @contextmanager
 def _measuring() -> Iterator[Progress]:
-    """Progress bars; a failure ends the command with one line."""
+    """Shows progress bars; a failure ends the command with one line."""
     from mapless_server.serve.signals import terminable
     from mapless_tools.progress import progress_bars
     from mapless_tools.usage import failures_end_command
@@ -175,5 +175,5 @@ def _measuring() -> Iterator[Progress]:
 
 
 def _finish(checks: list[Check]) -> None:
-    """Exit code 1 if a bar was missed."""
+    """Ends with exit code 1 if a bar was missed."""
     raise typer.Exit(1 if any(check.met is False for check in checks) else 0)

@@ -1,4 +1,4 @@
-"""The real server with a scene, and the ways to call it: side by side, as fast as it answers, and at a rate."""
+"""The real server with a scene, and calls to it: concurrent ones, as fast as possible, or at a rate."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ class LoadedServer:
     """A server with a scene, and requests to it.
 
     Attributes:
-        address: of its services.
+        address: address of its services.
         under_load: its process, metrics and store.
-        requests: that are ready to be sent.
+        requests: serialized requests.
     """
 
     address: str
@@ -45,12 +45,12 @@ class LoadedServer:
 def server_with_scene(
     place: Place, progress: Progress, environment: Mapping[str, str] | None = None, log: Path | None = None
 ) -> Iterator[LoadedServer]:
-    """A server of its own with the references of a place stored, that has answered every query once.
+    """Starts a server, stores the references of a place, and has it answer every query once.
 
-    Settings of the environment hold for it, and `environment` is added to it. Its log is added to the file `log`.
+    It uses the settings of the environment, to which `environment` is added. Its log is appended to the file `log`.
 
     Raises:
-        ServerFailed: it did not start.
+        ServerFailed: the server did not start.
         MaplessError: a call failed.
     """
     port = free_port()
@@ -68,7 +68,7 @@ def server_with_scene(
 
 
 def free_port() -> int:
-    """A port of the loopback interface that is free at the moment."""
+    """A port of the loopback interface that is free now."""
     with socket.socket() as found:
         found.bind(("127.0.0.1", 0))
         return int(found.getsockname()[1])
@@ -109,7 +109,7 @@ async def open_step(
     requests: Requests | None = None,
     beside: Callable[[], AbstractAsyncContextManager[object]] = nullcontext,
 ) -> Step:
-    """A step of Poisson arrivals, of the server's requests or of others; `beside` goes on meanwhile."""
+    """Runs a step of Poisson arrivals, of the server's requests or of others; `beside` runs meanwhile."""
     plan = plan_calls(rate_per_s, seconds, len(target.methods), requests or server.requests, mix or Mix(), seed)
 
     async def send() -> list[CallRecord]:

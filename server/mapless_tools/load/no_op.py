@@ -1,8 +1,8 @@
-"""A server that computes nothing, as a program: what is left is what serving itself costs.
+"""A server that computes nothing, as a program, which shows what serving itself costs.
 
-Everything is the real thing, from the sockets to the store, the queue and its threads; only the extractor finds no
-features in any photograph, and the method's three stages do nothing but pass the query on. `padded_photo` is what to
-send: as long as a photograph, and as small as one can be, so that decoding it costs nothing either.
+Everything is real, from the sockets to the store, the queue and its threads; only the extractor finds no features, and
+the method's three stages only pass the query on. `padded_photo` makes an image with the bytes of a photograph but few
+pixels, so that decoding it costs nothing either.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _MAX_COMMENT_BYTES = 65_000  # a JPEG's segment has room for 65,533
 
 
 class BlindExtractor:
-    """Finds no features, whatever it is shown."""
+    """Finds no features in any photograph."""
 
     name = "blind"
 
@@ -62,7 +62,7 @@ def padded_photo(size_bytes: int) -> bytes:
 
 @dataclass(frozen=True)
 class Nothing:
-    """What is known of a query of which nothing is computed; all such queries are of one bucket."""
+    """The state of a query for which nothing is computed; all such queries are of one bucket."""
 
     bucket: str = "nothing"
 

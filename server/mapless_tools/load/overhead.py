@@ -36,11 +36,11 @@ class OverheadOptions:
 
     Attributes:
         message_bytes: size of the photograph; 0.3 MB is a phone's at 1024 px.
-        rounds: the servers take turns so often, so that other work of the machine affects all alike.
-        unloaded_s: calls one after the other, a round.
-        saturated_s: calls side by side, a round.
-        concurrency: of these; enough to keep a server busy, and no more than it has room for.
-        clients: connections they come from.
+        rounds: number of rounds in which the servers take turns, so that other work of the machine affects all alike.
+        unloaded_s: time of sequential calls per round.
+        saturated_s: time of concurrent calls per round.
+        concurrency: number of concurrent calls; enough to keep a server busy, and no more than it admits.
+        clients: number of connections.
     """
 
     message_bytes: int = 300_000
@@ -57,7 +57,7 @@ class OverheadOptions:
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A server that is compared: its steps, one a round."""
+    """A compared server with its steps, one per round."""
 
     name: str
     unloaded: list[Step]
@@ -65,27 +65,27 @@ class Subject:
 
     @property
     def p50_ms(self) -> float:
-        """The median round's median latency of one call at a time."""
+        """Median latency of sequential calls, milliseconds, in the median round."""
         return median(self.p50s_ms)
 
     @property
     def p50s_ms(self) -> list[float]:
-        """Each round's median latency of one call at a time."""
+        """Median latency of sequential calls in each round, milliseconds."""
         return [step.account.answers.p50_ms or 0.0 for step in self.unloaded]
 
     @property
     def p99_ms(self) -> float:
-        """The median round's 99th percentile of one call at a time."""
+        """99th percentile of the latency of sequential calls, milliseconds, in the median round."""
         return median(step.account.answers.p99_ms or 0.0 for step in self.unloaded)
 
     @property
     def own_share(self) -> float:
-        """Of one core, used by the generator at saturation, in the median round."""
+        """Share of one core that the generator used at saturation, in the median round."""
         return median(step.own_share for step in self.saturated)
 
     @property
     def calls_per_s(self) -> float:
-        """The median round's rate at saturation."""
+        """Rate at saturation in the median round."""
         return median(step.account.completed_per_s for step in self.saturated)
 
 
@@ -94,9 +94,9 @@ class Called:
     """A server and the method that is called.
 
     Attributes:
-        address, process_id: of the server.
+        address, process_id: address and process of the server.
         method: path of the RPC.
-        outcome: of every call; empty: any.
+        outcome: expected outcome of every call; empty for any.
     """
 
     address: str
@@ -109,8 +109,8 @@ def measure_overhead(options: OverheadOptions, progress: Progress) -> list[Subje
     """Starts the bare server and the one that computes nothing, and calls them by turns.
 
     Raises:
-        ServerFailed: one did not start.
-        RuntimeError: a call did not end as it should.
+        ServerFailed: a server did not start.
+        RuntimeError: a call did not end as expected.
     """
     with ExitStack() as stack:
         data_dir = stack.enter_context(tempfile.TemporaryDirectory(prefix="mapless-load-"))
@@ -147,7 +147,7 @@ def overhead_checks(subjects: Sequence[Subject]) -> list[Check]:
 
 
 def overhead_lines(subjects: Sequence[Subject], options: OverheadOptions) -> list[str]:
-    """A table with a row a server."""
+    """A table with a row for each server."""
     lines = [
         f"Messages of {options.message_bytes / 1e6:g} MB, {options.rounds} rounds by turns, "
         f"{options.concurrency} calls side by side from {options.clients} connections; "
@@ -164,7 +164,7 @@ def overhead_lines(subjects: Sequence[Subject], options: OverheadOptions) -> lis
 
 
 def overhead_json(subjects: Sequence[Subject], options: OverheadOptions) -> dict[str, Any]:
-    """For programs."""
+    """The figures as JSON values."""
     return {
         "options": vars(options),
         "servers": [
@@ -181,7 +181,7 @@ def overhead_json(subjects: Sequence[Subject], options: OverheadOptions) -> dict
 
 
 def _prepared(server: ChildServer, options: OverheadOptions) -> bytes:
-    """A request to a scene that now exists."""
+    """Creates a scene; returns a request to it."""
     photo = no_op.padded_photo(options.message_bytes)
     references = [Photograph(f"r{i}", photo, no_op.CAMERA, RigidTransform.identity()) for i in range(2)]
     with Client(server.address) as client:
@@ -192,10 +192,10 @@ def _prepared(server: ChildServer, options: OverheadOptions) -> bytes:
 async def compare_by_turns(
     places: Mapping[str, Called], request: bytes, options: OverheadOptions, progress: Progress
 ) -> list[Subject]:
-    """Calls servers with the same request, one at a time and side by side, in rounds.
+    """Calls servers with the same request, sequentially and concurrently, in rounds.
 
     Raises:
-        RuntimeError: a call did not end as it should, or came too late.
+        RuntimeError: a call did not end as expected, or was too late.
     """
     subjects = {name: Subject(name, [], []) for name in places}
     async with AsyncExitStack() as stack:

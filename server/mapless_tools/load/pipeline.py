@@ -35,14 +35,15 @@ class PipelineOptions:
     """Options of the measurement.
 
     Attributes:
-        clients: that call independently, each on a connection of its own.
-        deadline_s: of every call: later a robot that calls once a second has no use for an answer.
-        unloaded_s: calls one after the other.
-        ramp_s: with each number of calls side by side, until more of them bring less than 3 % more answers.
-        step_s: at each share of saturation; a p99 needs some hundred calls.
-        settle_s: of each step, what its rates leave out: the queue fills meanwhile.
-        shares: of saturation that are offered.
-        seed: of the arrivals.
+        clients: number of independent clients, each with its own connection.
+        deadline_s: deadline of every call; a robot that calls once a second cannot use a later answer.
+        unloaded_s: time of sequential calls.
+        ramp_s: time with each number of concurrent calls, which is increased until more bring less than 3 % more
+            answers.
+        step_s: time at each share of saturation; a p99 needs some hundred calls.
+        settle_s: beginning of each step that its rates leave out, while the queue fills.
+        shares: offered shares of saturation.
+        seed: seed of the arrivals.
     """
 
     clients: int = 8
@@ -67,12 +68,12 @@ class PipelineResult:
     """What was measured.
 
     Attributes:
-        scene: in words.
-        options: of the measurement.
-        unloaded: one call at a time.
-        ramp: so many calls side by side: 2, 4, ...
-        saturation_per_s: the most answers a second of these.
-        steps: at the options' shares of it.
+        scene: description of the scene.
+        options: options of the measurement.
+        unloaded: step of sequential calls.
+        ramp: steps of 2, 4, ... concurrent calls.
+        saturation_per_s: largest rate of answers of these steps.
+        steps: steps at the options' shares of saturation.
     """
 
     scene: str
@@ -84,23 +85,23 @@ class PipelineResult:
 
     @property
     def all_steps(self) -> list[Step]:
-        """In order."""
+        """All steps in order."""
         return [self.unloaded, *self.ramp, *self.steps]
 
     def at(self, share: float) -> Step | None:
-        """The step at a share of saturation; None if it was not asked for."""
+        """The step at a share of saturation; None if it was not measured."""
         return dict(zip(self.options.shares, self.steps, strict=True)).get(share)
 
 
 def measure_pipeline(
     place: Place, options: PipelineOptions, progress: Progress, log: Path | None = None
 ) -> PipelineResult:
-    """Starts a server, finds the most it can answer, and offers shares of that.
+    """Starts a server, finds its largest rate of answers, and offers shares of it.
 
     Raises:
-        ServerFailed: it did not start.
+        ServerFailed: the server did not start.
         MaplessError: a call before the measurement failed.
-        RuntimeError: it answered nothing.
+        RuntimeError: the server answered no call.
     """
     with server_with_scene(place, progress, log=log) as server:
         return asyncio.run(_measure(place, server, options, progress))
@@ -127,7 +128,7 @@ def pipeline_checks(result: PipelineResult) -> list[Check]:
 
 
 def pipeline_json(result: PipelineResult) -> dict[str, Any]:
-    """For programs."""
+    """The figures as JSON values."""
     return {
         "scene": result.scene,
         "options": vars(result.options),

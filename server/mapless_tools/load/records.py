@@ -1,4 +1,4 @@
-"""How calls ended, each in exactly one way, and what they amount to."""
+"""How calls ended, each in exactly one way, and the figures of many calls."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ class CallRecord:
 
     Attributes:
         kind: what kind of call it was.
-        client: who made it.
-        at_s: when it was to be sent.
-        sent_s: when it was sent; a generator that is slow itself shows here.
-        ended_s: when its caller had the outcome.
+        client: number of its client.
+        at_s: when it was planned to be sent.
+        sent_s: when it was sent; later than planned if the generator is slow.
+        ended_s: when its caller received the outcome.
         deadline_s: seconds from sending.
         code: name of the gRPC status.
-        detail: of an answer its outcome, of an error its reason; empty for an error of the client's own side.
-        retry_after_s: when a refusal asks for another try, seconds, or None.
+        detail: outcome of an answer, or reason of an error; empty for an error of the client's own.
+        retry_after_s: seconds after which a refusal requests another attempt, or None.
     """
 
     kind: Kind
@@ -64,12 +64,12 @@ class CallRecord:
 
     @property
     def latency_s(self) -> float:
-        """From when it was to be sent: waiting that the server caused counts, on either side."""
+        """Time from the planned sending to the outcome, so that waiting on either side counts."""
         return self.ended_s - self.at_s
 
     @property
     def outcome(self) -> str:
-        """Status and detail in one."""
+        """Status and detail as one text."""
         return f"{self.code} {self.detail}".strip()
 
     @property
@@ -92,7 +92,7 @@ class CallRecord:
 
 @dataclass(frozen=True)
 class Latencies:
-    """Of a group of calls, milliseconds; None where there is none."""
+    """Latencies of a group of calls, milliseconds; None for an empty group."""
 
     count: int
     p50_ms: float | None
@@ -103,18 +103,18 @@ class Latencies:
 
 @dataclass(frozen=True)
 class Account:
-    """What calls amount to.
+    """The figures of the calls of a step.
 
     Attributes:
-        window_s: what rates are divided by: the step without its beginning.
-        sent: all calls, those of the beginning too; so are `fates` and `outcomes`, which add up to it.
+        window_s: time that rates refer to: the step without its beginning.
+        sent: number of all calls, including those of the beginning; `fates` and `outcomes` add up to it.
         offered_per_s: all calls; this and the next three by when they were to be sent.
         goodput_per_s: queries answered before their deadline, which counts from then, too.
         refused_per_s, overdue_per_s: calls that ended so.
-        completed_per_s: answers by when they came: what was done in the window, whenever it was asked for.
-        answers: of queries that were answered.
-        refusals: of calls that were refused.
-        send_lag: how late calls were sent, the generator's own fault. This and all before leave out the beginning.
+        completed_per_s: rate of answers received in the window, whenever they were requested.
+        answers: latencies of answered queries.
+        refusals: latencies of refused calls.
+        send_lag: delays of sending, caused by the generator. This and all before leave out the beginning.
     """
 
     window_s: float
@@ -131,7 +131,7 @@ class Account:
     outcomes: Mapping[str, int]
 
     def count(self, fate: Fate) -> int:
-        """How many calls ended so."""
+        """Number of calls that ended so."""
         return self.fates.get(fate.value, 0)
 
 
@@ -144,7 +144,7 @@ def latencies(seconds: Sequence[float]) -> Latencies:
 
 
 def account_of(records: Sequence[CallRecord], duration_s: float, settle_s: float = 0.0) -> Account:
-    """What the calls of a step amount to; rates leave out the first `settle_s`, when queues are still filling."""
+    """Figures of the calls of a step; rates leave out the first `settle_s`, while queues are filling."""
     window_s = duration_s - settle_s
     if not (settle_s >= 0 and window_s > 0):
         raise ValueError(f"of {duration_s:g} s nothing is left after {settle_s:g} s")

@@ -1,4 +1,4 @@
-"""Figures against their bars, and steps as a table: Markdown, as the project's other reports."""
+"""Figures with their bars, and steps as a table, in Markdown like the project's other reports."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from .step import TREND_CONFIDENCE, Step
 
 @dataclass(frozen=True)
 class Check:
-    """A figure and the bar it has to meet.
+    """A figure and the bar that it has to meet.
 
     Attributes:
-        figure: what was measured.
-        value: in words.
-        bar: in words.
-        met: whether the value meets it; None where it was not measured.
+        figure: name of the figure.
+        value: the value as text.
+        bar: the bar as text.
+        met: whether the value meets the bar; None if it was not measured.
     """
 
     figure: str
@@ -37,7 +37,7 @@ class Check:
 
 
 def machine() -> str:
-    """What the figures were measured with and on."""
+    """The software and the machine of the figures."""
     return f"mapless {__version__}; {cpu_model()}, {available_cores()} cores, load generator on the same"
 
 
@@ -49,7 +49,7 @@ def check_lines(checks: Sequence[Check]) -> list[str]:
 
 
 def step_lines(steps: Sequence[Step]) -> list[str]:
-    """A table with a row a step, and below it how every call ended."""
+    """A table with a row for each step, and below it how every call ended."""
     lines = [
         "| step | offered/s | sent | goodput/s | refused/s | answers p50 / p95 / p99 ms | refusals p50 / p99 / max ms "
         "| overdue | server CPU s/answer | RSS MiB, before > after | threads | fds | generator's core |",
@@ -83,7 +83,7 @@ def step_lines(steps: Sequence[Step]) -> list[str]:
 
 
 def loop_lag_check(steps: Sequence[Step], bar_s: float = 0.02) -> Check:
-    """Whether the server's event loop was never held up for longer."""
+    """Checks that the server's event loop was never delayed for longer."""
     lags = [step.scraped.longest_lag_s for step in steps if step.scraped is not None]
     longest = max((lag for lag in lags if lag is not None), default=None)
     value = (
@@ -94,12 +94,12 @@ def loop_lag_check(steps: Sequence[Step], bar_s: float = 0.02) -> Check:
 
 
 def machine_lines(checks: Sequence[Check], load: float, cores: int) -> list[str]:
-    """A hint where bars are missed and more wanted to run than there are cores for.
+    """A hint for missed bars if more threads were ready to run than there are cores.
 
     Args:
         checks: the bars.
-        load: how many threads ran or waited for a core, on average (the system's load average of a minute).
-        cores: that there are.
+        load: average number of threads that ran or waited for a core (the system's load average of a minute).
+        cores: number of cores.
     """
     if load <= cores or all(check.met is not False for check in checks):
         return []
@@ -112,7 +112,7 @@ def machine_lines(checks: Sequence[Check], load: float, cores: int) -> list[str]
 
 
 def trend_check(figure: str, found: Slope | None, unit: str) -> Check:
-    """Whether something does not grow."""
+    """Checks that a figure does not grow."""
     if found is None:
         return Check(figure, "-", "no growth", None)
     per_minute, low, high = (value / 60 for value in (found.per_hour, found.low, found.high))

@@ -1,4 +1,4 @@
-"""The requests that are sent, serialized beforehand, and the outcomes of answers."""
+"""The serialized requests, and the outcomes of answers."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def store_references(client: Client, references: Sequence[Photograph]) -> None:
 
 
 def requests_for(client: Client, queries: Sequence[Photograph]) -> Requests:
-    """Requests that name the references which the server would choose; and bad ones.
+    """Makes requests that name the references which the server would choose, and bad ones.
 
-    A robot that localizes once a second knows its neighbourhood; comparing with a whole scene would be another load.
+    A robot that localizes once a second knows its neighbourhood; searching a whole scene would be a different load.
     """
     good = []
     for query in queries:
@@ -40,7 +40,7 @@ def requests_for(client: Client, queries: Sequence[Photograph]) -> Requests:
 
 
 def mixed_requests(named: Requests, queries: Sequence[Photograph]) -> Requests:
-    """All kinds of good requests: with names, without, so that the server chooses, and some that it can only reject.
+    """Makes all kinds of good requests: with names, without names, and some that the server can only reject.
 
     Args:
         named: requests with names, and bad ones.

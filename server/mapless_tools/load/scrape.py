@@ -1,4 +1,4 @@
-"""The server's metrics at a moment: calls by status, delays of the event loop, and sums of all series."""
+"""The server's metrics at one time: calls by status, delays of the event loop, and sums of all series."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ LOOP_LAG = "mapless_event_loop_lag_seconds"
 
 @dataclass(frozen=True)
 class Scrape:
-    """Metrics at one moment, or the difference of two.
+    """Metrics at one time, or the difference of two.
 
     Attributes:
         started: calls of Localize that began.
-        handled: those that ended, by status.
+        handled: calls that ended, by status.
         terminated: admitted jobs that ended, by outcome.
-        lag_buckets: times that the event loop was late, by upper edge, seconds; each also counts in the wider ones.
-        totals: every series, its labels added up.
+        lag_buckets: cumulative number of the event loop's delays, by upper edge, seconds.
+        totals: sum of each metric over its labels.
     """
 
     started: int
@@ -35,7 +35,7 @@ class Scrape:
     totals: Mapping[str, float] = field(default_factory=dict)
 
     def since(self, before: Scrape) -> Scrape:
-        """What happened between two moments."""
+        """The difference from an earlier time."""
         return Scrape(
             self.started - before.started,
             _difference(self.handled, before.handled),
@@ -46,7 +46,7 @@ class Scrape:
 
     @property
     def longest_lag_s(self) -> float | None:
-        """The edge below which the event loop always was; infinite beyond the last one, None without the metric."""
+        """Upper bound of the event loop's delays; infinite beyond the last edge, None without the metric."""
         total = self.lag_buckets.get(math.inf, 0)
         if total == 0:
             return None
@@ -54,20 +54,20 @@ class Scrape:
 
     @property
     def mean_lag_ms(self) -> float:
-        """How late timers of the event loop were, on average; 0 if there were none."""
+        """Mean delay of the event loop's timers, milliseconds; 0 if there were none."""
         count = self.totals.get(f"{LOOP_LAG}_count", 0.0)
         return 1000 * self.totals[f"{LOOP_LAG}_sum"] / count if count else 0.0
 
 
 @dataclass(frozen=True)
 class Reconciliation:
-    """The client's account against the server's.
+    """Comparison of the client's and the server's counts.
 
     Attributes:
-        sent: calls that the client made.
-        handled: calls that the server says have ended.
-        running: calls that the server says have begun and not ended; all have ended for the client.
-        missing: calls of a status that only the server gives, which the server did not count: by status.
+        sent: number of calls that the client made.
+        handled: calls that have ended by the server's count.
+        running: calls that have begun but not ended by the server's count, although all have ended for the client.
+        missing: calls, by a status that only a server can give, which the server did not count.
         surplus: calls that the server counted beyond those that ended for the client and those it cancelled.
         unseen: calls that the client gave up before the server began with them.
     """
@@ -81,12 +81,12 @@ class Reconciliation:
 
     @property
     def complete(self) -> bool:
-        """Whether every call is accounted for."""
+        """Whether all calls are accounted for."""
         return not self.missing and self.surplus == 0 and self.running == 0 and self.unseen >= 0
 
 
 def read_metrics(address: str) -> Scrape | None:
-    """Scrapes the server; None if it serves no metrics there, OSError if it does not answer."""
+    """Reads the server's metrics; None if it serves no metrics, OSError if it does not answer."""
     try:
         with urllib.request.urlopen(f"http://{address}/metrics", timeout=TIMEOUT_S) as response:
             return parse_metrics(response.read().decode())
@@ -97,7 +97,7 @@ def read_metrics(address: str) -> Scrape | None:
 
 
 def parse_metrics(page: str) -> Scrape:
-    """The metrics of a page."""
+    """Parses a page of metrics."""
     started = 0
     handled: Counter[str] = Counter()
     terminated: Counter[str] = Counter()
@@ -118,7 +118,7 @@ def parse_metrics(page: str) -> Scrape:
 
 
 def reconcile(codes: Sequence[str], server: Scrape) -> Reconciliation:
-    """The statuses of a client's calls against what the server counted meanwhile.
+    """Compares the statuses of a client's calls with the server's counts in the same time.
 
     The two may differ in calls that the client gave up, by cancelling or at their deadline: the server may have
     finished these already, or never have begun.

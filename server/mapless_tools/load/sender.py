@@ -1,4 +1,4 @@
-"""Makes the calls: bytes out, bytes in, so that nothing is encoded or decoded while the server is measured.
+"""Sends the calls as bytes, so that nothing is encoded or decoded during the measurement.
 
 One process with one event loop is enough: it spends a third of a millisecond on a call of 0.3 MB.
 """
@@ -32,9 +32,9 @@ class Target:
     """The method that is called.
 
     Attributes:
-        methods: one of each client, on a connection of its own.
-        deadline_s: of calls without one of their own.
-        read_answer: gives the outcome of an answer.
+        methods: the method of each client, on its own connection.
+        deadline_s: deadline of calls without their own.
+        read_answer: function that returns the outcome of an answer.
     """
 
     methods: Sequence[Any]
@@ -46,14 +46,14 @@ class Target:
 async def connected(
     address: str, method: str, clients: int, deadline_s: float, read_answer: ReadAnswer
 ) -> AsyncIterator[Target]:
-    """Connections of several clients until the block is left.
+    """Makes connections of several clients until the end of the block.
 
     Args:
         address: host:port.
         method: path of the RPC, "/package.Service/Method".
-        clients: how many.
-        deadline_s: of calls without one of their own.
-        read_answer: gives the outcome of an answer.
+        clients: number of clients.
+        deadline_s: deadline of calls without their own.
+        read_answer: function that returns the outcome of an answer.
     """
     options = [
         # Channels to one address share a connection otherwise, and the server would see one client.
@@ -74,7 +74,7 @@ async def connected(
 
 
 async def send_open_loop(target: Target, plan: Sequence[PlannedCall], start_s: float | None = None) -> list[CallRecord]:
-    """Makes every call of a plan at its time, whatever the outcome of those before it.
+    """Makes every call of a plan at its time, independent of the outcomes of earlier calls.
 
     Args:
         target: the method that is called.
@@ -82,7 +82,7 @@ async def send_open_loop(target: Target, plan: Sequence[PlannedCall], start_s: f
         start_s: when the plan begins, by the event loop's clock; None for now.
 
     Returns:
-        one record a call, when all have ended; every one ends, since all have deadlines.
+        One record per call, after all have ended; all end, since they have deadlines.
     """
     loop = asyncio.get_running_loop()
     begin_s = loop.time() if start_s is None else start_s
@@ -100,8 +100,8 @@ async def send_closed_loop(
 ) -> list[CallRecord]:
     """Keeps so many calls in progress for a while: what a server can do at most; with one, what an unloaded one does.
 
-    It does not measure latency under load, since the callers wait for the server. A refused caller calls again when
-    the server asks for it: refusals are cheap, and would be most of what is measured.
+    It does not measure latency under load, since the callers wait for the server. A refused caller calls again when the
+    server requests it; otherwise cheap refusals would dominate the measurement.
     """
     loop = asyncio.get_running_loop()
     begin_s = loop.time()
@@ -161,5 +161,5 @@ async def _call(target: Target, planned: PlannedCall, begin_s: float) -> CallRec
 
 
 def _reason(known: MaplessError) -> str:
-    """The server's own; empty if it gave none, or did not answer."""
+    """The reason that the server gave; empty if it gave none, or did not answer."""
     return "" if known.reason == known.code and not known.request_id else known.reason

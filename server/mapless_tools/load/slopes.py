@@ -1,10 +1,10 @@
-"""Whether something grows: a slope that single samples do not move, and between which slopes the true one lies.
+"""Tests whether a figure grows, by a robust slope and its confidence interval.
 
 Neighbouring samples of a process's memory are correlated, and now and then one is far off. So the samples are divided
 into consecutive blocks, longer than the correlation, and the slope is that of Theil and Sen through their medians, with
 its interval (`scipy.stats.theilslopes`). Simulated, 240 samples in 40 minutes at a confidence of 99 %: noise
 without a slope, correlated over one or over five minutes (autoregressive), grows in less than 1 % of cases; a leak of a
-MiB a minute in noise of 3 MiB is found in 99 %. A warm-up that was not left out is taken for growth in 16 %.
+MiB a minute in noise of 3 MiB is found in 99 %. A warm-up that is not left out is reported as growth in 16 %.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ _UNCORRELATED = 0.05
 
 @dataclass(frozen=True)
 class Slope:
-    """How something develops.
+    """The trend of a figure.
 
     Attributes:
         level: median of the samples.
         per_hour: the slope.
-        low, high: between which the true slope lies, with the confidence that was asked for.
-        hours: that the samples span.
-        block: samples in a block.
+        low, high: confidence interval of the slope.
+        hours: time that the samples span.
+        block: number of samples in a block.
     """
 
     level: float
@@ -47,17 +47,17 @@ class Slope:
 
     @property
     def is_flat(self) -> bool:
-        """Whether it is indistinguishable from zero."""
+        """Whether the slope is indistinguishable from zero."""
         return self.low <= 0 <= self.high
 
     @property
     def grows(self) -> bool:
-        """Whether that it grows is beyond doubt."""
+        """Whether the slope is significantly above zero."""
         return self.low > 0
 
     @property
     def verdict(self) -> str:
-        """In words."""
+        """The trend as text."""
         return "flat" if self.is_flat else "grows" if self.grows else "falls"
 
 
@@ -82,7 +82,7 @@ def slope(times_s: Sequence[float], values: Sequence[float], confidence: float =
 
 
 def _block(residuals: Array) -> int:
-    """Samples in a block: three times the correlation time, but at least `MIN_BLOCKS` blocks are left."""
+    """Number of samples in a block: three times the correlation time, but at least `MIN_BLOCKS` blocks remain."""
     count, power = len(residuals), float(residuals @ residuals)
     correlated = 1.0
     for lag in range(1, count // 2):

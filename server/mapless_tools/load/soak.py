@@ -1,4 +1,4 @@
-"""A server in use for an hour: what it holds at the end it should have held after its first minutes.
+"""A server in use for an hour: its memory and other resources must not grow after the first minutes.
 
 Queries of all kinds come as a Poisson process: some are cancelled, some have too short a deadline, some a bad image;
 beside them run the workers of `churn`. The rate is nine tenths of the server's capacity, or one that is given.
@@ -54,17 +54,18 @@ class SoakOptions:
     """Options of the soak.
 
     Attributes:
-        minutes: how long.
-        rate_per_s: of calls of Localize; None for `share` of saturation, which is then looked for.
-        share: of saturation that is offered in good queries, those that are cancelled among them.
-        cancelled_share, hurried_share, bad_share: of all calls; bad images come on top of the good ones.
-        clients: that call independently.
-        deadline_s: of every call.
-        churn: how fast the workers beside the queries are; 0 for none.
-        ramp_s: with each number of calls side by side, to find saturation.
-        settle_share: of the time, what slopes leave out: memory is still being filled.
-        sample_every_s: between looks at the server.
-        seed: of the arrivals.
+        minutes: duration.
+        rate_per_s: rate of calls of Localize; None for `share` of saturation, which is then measured.
+        share: share of saturation that is offered as good queries, including cancelled ones.
+        cancelled_share, hurried_share, bad_share: shares of all calls; bad images are sent in addition to the good
+            ones.
+        clients: number of independent clients.
+        deadline_s: deadline of every call.
+        churn: speed of the other workers; 0 for none.
+        ramp_s: time with each number of concurrent calls, to find saturation.
+        settle_share: share of the time that slopes leave out, while caches fill.
+        sample_every_s: time between samples of the server.
+        seed: seed of the arrivals.
     """
 
     minutes: float = 10.0
@@ -95,15 +96,15 @@ class SoakResult:
     """What was measured.
 
     Attributes:
-        scene: in words.
-        options: of the soak.
-        before: one call at a time, then more of them until the server was saturated, if that was looked for.
-        rate_per_s: of calls of Localize that was asked for.
+        scene: description of the scene.
+        options: options of the soak.
+        before: the step of sequential calls, then those up to saturation, if that was measured.
+        rate_per_s: requested rate of calls of Localize.
         soak: the soak's own step.
-        states: of the server meanwhile.
-        slopes: of the states after the settling, by field; none if there are too few.
-        outcomes: of the calls beside the queries.
-        account: the client's account against the server's; None if the server serves no metrics.
+        states: states of the server meanwhile.
+        slopes: slopes of the states after the settling, by field; empty if there are too few.
+        outcomes: outcomes of the calls besides queries.
+        account: comparison of the client's and the server's counts; None if the server serves no metrics.
     """
 
     scene: str
@@ -118,19 +119,19 @@ class SoakResult:
 
 
 def measure_soak(place: Place, options: SoakOptions, progress: Progress, log: Path | None = None) -> SoakResult:
-    """Starts a server, finds what it can do unless a rate is given, and keeps it busy; its log is added to `log`.
+    """Starts a server, measures its saturation unless a rate is given, and keeps it busy; appends its log to `log`.
 
     Raises:
-        ServerFailed: it did not start.
+        ServerFailed: the server did not start.
         MaplessError: a call before the measurement failed.
-        RuntimeError: it answered nothing, or ended.
+        RuntimeError: the server answered no call, or ended.
     """
     with server_with_scene(place, progress, {"MAPLESS_ALLOW_WATCHING": "true"}, log) as server:
         return asyncio.run(_measure(place, server, options, progress))
 
 
 def slopes_of(found: Sequence[ServerState], settle_s: float) -> dict[str, Slope]:
-    """Slopes of what was seen after the settling; none if that is too little."""
+    """Slopes of the states after the settling; empty if there are too few."""
     settled = [state for state in found if state.at_s >= found[0].at_s + settle_s]
     if len(settled) < MIN_SAMPLES or settled[-1].at_s - settled[0].at_s < MIN_SETTLED_S:
         return {}
@@ -138,7 +139,7 @@ def slopes_of(found: Sequence[ServerState], settle_s: float) -> dict[str, Slope]
 
 
 def least_minutes(options: SoakOptions) -> int:
-    """How long a soak has to be for slopes."""
+    """Shortest duration of a soak for which slopes can be computed."""
     # The first look after the settling and the last one before the end each come up to one interval off.
     settled_s = max(MIN_SETTLED_S, (MIN_SAMPLES - 1) * options.sample_every_s) + 2 * options.sample_every_s
     return math.ceil(settled_s / (1 - options.settle_share) / 60 - 1e-9)
@@ -160,7 +161,7 @@ def soak_checks(result: SoakResult) -> list[Check]:
 
 
 def soak_lines(result: SoakResult) -> list[str]:
-    """What went on beside the queries."""
+    """Lines on what happened besides the queries."""
     counted: dict[str, list[str]] = {}
     for (worker, code), count in sorted(result.outcomes.counts.items()):
         counted.setdefault(worker, []).append(f"{count} {code}")
@@ -169,7 +170,7 @@ def soak_lines(result: SoakResult) -> list[str]:
 
 
 def soak_json(result: SoakResult) -> dict[str, Any]:
-    """For programs."""
+    """The figures as JSON values."""
     return {
         "scene": result.scene,
         "options": vars(result.options),

@@ -1,4 +1,4 @@
-"""One step of a measurement: calls are made for a while, and counted by the client and by the server."""
+"""One step of a measurement: calls for a while, counted by the client and by the server."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ class Step:
     """The result of a step.
 
     Attributes:
-        name: of the step.
+        name: name of the step.
         asked_per_s: rate of the Poisson process; None for a closed loop.
-        duration_s: while calls were made.
-        account: the client's.
+        duration_s: time in which calls were made.
+        account: figures of the client's calls.
         codes: statuses of all calls, for comparing with the server's account.
-        samples: of the server's process, from before the first call until all had ended.
+        samples: samples of the server's process, from before the first call until all had ended.
         settle_s: the beginning that rates leave out; trends do, too.
-        scraped: what the server counted meanwhile; None if it serves no metrics.
-        own_cpu_s: used by the generator itself.
-        wall_s: from the first sample to the last.
+        scraped: the server's counts meanwhile; None if it serves no metrics.
+        own_cpu_s: processor time of the generator itself.
+        wall_s: time from the first sample to the last.
     """
 
     name: str
@@ -52,22 +52,22 @@ class Step:
 
     @property
     def answers(self) -> int:
-        """All answers, those of the beginning too."""
+        """Number of all answers, including those of the beginning."""
         return self.account.count(Fate.ANSWERED)
 
     @property
     def cpu_s(self) -> float:
-        """Used by the server."""
+        """Processor time of the server, seconds."""
         return self.samples[-1].cpu_s - self.samples[0].cpu_s
 
     @property
     def cpu_s_per_answer(self) -> float:
-        """The server's, whatever it was spent on; infinite if there was no answer."""
+        """Processor time of the server per answer; infinite if there was no answer."""
         return self.cpu_s / self.answers if self.answers else math.inf
 
     @property
     def own_share(self) -> float:
-        """Of one core, used by the generator itself."""
+        """Share of one core that the generator itself used."""
         return self.own_cpu_s / self.wall_s
 
     def trend_of(self, field: str) -> Slope | None:
@@ -80,7 +80,7 @@ class Step:
 
     @property
     def _settled(self) -> list[ProcessSample]:
-        """Samples after `settle_s`; the last sample is taken when all is over, which is another state."""
+        """Samples after `settle_s`, without the last one, which is taken after all calls have ended."""
         begin_s = self.samples[0].at_s + self.settle_s
         return [sample for sample in self.samples[:-1] if sample.at_s >= begin_s]
 
@@ -125,13 +125,13 @@ async def run_step(
     """Makes calls, and measures client, server and process meanwhile.
 
     Args:
-        name: of the step.
-        server: what is watched.
-        send: makes the calls.
-        duration_s: for which it makes them.
-        asked_per_s: the rate that it was given.
-        settle_s: what rates and trends leave out.
-        sample_every_s: between samples of the process.
+        name: name of the step.
+        server: the server to measure.
+        send: function that makes the calls.
+        duration_s: time for which it makes them.
+        asked_per_s: the requested rate.
+        settle_s: beginning that rates and trends leave out.
+        sample_every_s: time between samples of the process.
     """
     before = server.scrape()
     own_s, start_s = time.process_time(), time.monotonic()
@@ -156,7 +156,7 @@ async def run_step(
 async def closed_loop_step(
     name: str, server: ServerUnderLoad, target: Target, requests: Sequence[bytes], concurrency: int, seconds: float
 ) -> Step:
-    """A step of so many calls side by side; rates leave out its first fifth."""
+    """Runs a step of this many concurrent calls; rates leave out its first fifth."""
     return await run_step(
         name,
         server,
@@ -171,5 +171,5 @@ def _plain(value: Any) -> Any:
 
 
 def _finite(value: float | None) -> float | str | None:
-    """JSON has no infinity."""
+    """The value, as text if it is infinite, since JSON has no infinity."""
     return value if value is None or math.isfinite(value) else "beyond the widest bucket"

@@ -1,4 +1,4 @@
-"""A server seen from outside: its process in /proc, its metrics and its data folder, at a moment and for a while."""
+"""Observes a server from outside: its process in /proc, its metrics and its data folder."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class ServerUnderLoad:
     """The server that is measured.
 
     Attributes:
-        process_id: of the server.
+        process_id: process of the server.
         metrics_address: "host:port" of its metrics; empty if it serves none.
-        data_dir: its data folder, where that is watched.
+        data_dir: its data folder, if that is observed.
     """
 
     process_id: int
@@ -33,20 +33,20 @@ class ServerUnderLoad:
     data_dir: Path = Path()
 
     def scrape(self) -> Scrape | None:
-        """Its metrics now; None if it serves none."""
+        """Reads its metrics; None if it serves none."""
         return read_metrics(self.metrics_address) if self.metrics_address else None
 
 
 @dataclass(frozen=True)
 class ProcessSample:
-    """A process at one moment.
+    """A process at one time.
 
     Attributes:
-        at_s: by the event loop's clock.
-        resident_mib: memory, with what it shares with other processes.
-        threads: how many.
+        at_s: time by the event loop's clock.
+        resident_mib: memory, including that shared with other processes.
+        threads: number of threads.
         descriptors: open files and sockets.
-        cpu_s: used so far by all its threads; the system counts in hundredths.
+        cpu_s: processor time of all its threads so far, in steps of 0.01 s.
     """
 
     at_s: float
@@ -58,15 +58,15 @@ class ProcessSample:
 
 @dataclass(frozen=True)
 class ServerState(ProcessSample):
-    """A server at a moment: its process, and more.
+    """The state of a server at one time: its process, and more.
 
     Attributes:
         unique_mib: memory that would be free without it.
-        python_blocks: pieces of memory that Python's objects hold, whatever the allocator keeps beside.
-        sockets: of the descriptors, sockets.
-        data_mib: the data folder on the disk.
-        waiting_jobs: in the queue.
-        loop_lag_ms: how late timers of the event loop ran, on average since the moment before.
+        python_blocks: number of memory blocks that Python's objects use.
+        sockets: number of descriptors that are sockets.
+        data_mib: size of the data folder on the disk.
+        waiting_jobs: number of jobs in the queue.
+        loop_lag_ms: mean delay of the event loop's timers since the previous state.
     """
 
     unique_mib: float
@@ -81,10 +81,10 @@ FIELDS = tuple(field.name for field in fields(ServerState) if field.name != "at_
 
 
 def read_process(process_id: int, at_s: float) -> ProcessSample:
-    """The process now.
+    """Samples the process now.
 
     Raises:
-        OSError: it is gone, or the system has no /proc.
+        OSError: the process has ended, or the system has no /proc.
     """
     folder = Path(f"/proc/{process_id}")
     status = dict(line.split(":", 1) for line in (folder / "status").read_text().splitlines())
@@ -100,10 +100,10 @@ def read_process(process_id: int, at_s: float) -> ProcessSample:
 
 
 def read_state(server: ServerUnderLoad, at_s: float, before: Scrape | None) -> tuple[ServerState, Scrape]:
-    """The state now, and its metrics, for the next time.
+    """Reads the present state, and the metrics for the next call.
 
     Raises:
-        OSError: the process is gone, or its metrics do not answer.
+        OSError: the process has ended, or its metrics do not answer.
     """
     process, folder = read_process(server.process_id, at_s), Path(f"/proc/{server.process_id}")
     scrape = server.scrape()
@@ -123,7 +123,7 @@ def read_state(server: ServerUnderLoad, at_s: float, before: Scrape | None) -> t
 
 @asynccontextmanager
 async def process_samples(process_id: int, every_s: float = SAMPLE_EVERY_S) -> AsyncIterator[list[ProcessSample]]:
-    """Samples of a process: one at once, one at the end of the block, and in between every so often."""
+    """Samples a process: once at the beginning, once at the end of the block, and regularly in between."""
     loop = asyncio.get_running_loop()
     async with _sampled(lambda: read_process(process_id, loop.time()), every_s) as samples:
         yield samples
@@ -132,7 +132,7 @@ async def process_samples(process_id: int, every_s: float = SAMPLE_EVERY_S) -> A
 
 @asynccontextmanager
 async def server_states(server: ServerUnderLoad, every_s: float) -> AsyncIterator[list[ServerState]]:
-    """States of a server until the block is left: one at once, then one every so often."""
+    """Reads states of a server until the end of the block: once at the beginning, then regularly."""
     loop = asyncio.get_running_loop()
     before: Scrape | None = None
 
@@ -147,7 +147,7 @@ async def server_states(server: ServerUnderLoad, every_s: float) -> AsyncIterato
 
 @asynccontextmanager
 async def _sampled(read: Callable[[], T], every_s: float) -> AsyncIterator[list[T]]:
-    """What `read` gives, at once and then every so often, each time in a thread; RuntimeError once it fails."""
+    """Calls `read` in a thread, at once and then regularly; RuntimeError once it fails."""
     loop = asyncio.get_running_loop()
     samples = [await asyncio.to_thread(read)]
 
@@ -175,13 +175,13 @@ def column(samples: Sequence[ServerState], field: str) -> list[float]:
 
 @contextmanager
 def priority_over(process_id: int) -> Iterator[None]:
-    """Gives this process priority over another, where both want a core, until the block is left.
+    """Gives this process priority over another one until the end of the block.
 
-    Callers are on other machines in earnest: one that waits for a core would count its own waiting as the server's.
-    With the right to do so this process raises its own priority; else it lowers the other's, below that of all others.
+    Real callers are on other machines; here, a generator that waits for a core would count its own waiting as the
+    server's. If permitted, this process raises its own priority; else it lowers the other's, below that of all others.
 
     Raises:
-        OSError: the process is gone, or the system has no /proc.
+        OSError: the process has ended, or the system has no /proc.
     """
     own_id, own = os.getpid(), os.getpriority(os.PRIO_PROCESS, 0)
     try:
@@ -197,7 +197,7 @@ def priority_over(process_id: int) -> Iterator[None]:
 
 
 def _set_niceness(process_id: int, niceness: int) -> None:
-    """Of all threads; those they start later inherit it."""
+    """Sets the niceness of all threads; threads that they start later inherit it."""
     for thread in os.listdir(f"/proc/{process_id}/task"):
         with suppress(ProcessLookupError):  # it has just ended
             os.setpriority(os.PRIO_PROCESS, int(thread), niceness)

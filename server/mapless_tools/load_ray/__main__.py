@@ -40,14 +40,14 @@ Part = tuple[list[str], list[Check], dict[str, Any]]
 
 
 def overhead(given: argparse.Namespace, progress: Progress) -> Part:
-    """Of the ingress."""
+    """Measures the cost of the ingress."""
     options = replace(OPTIONS, rounds=2, unloaded_s=0.5, saturated_s=0.5) if given.quick else OPTIONS
     ways = measure_overhead(options, progress)
     return overhead_lines(ways, options), overhead_checks(ways), overhead_json(ways, options)
 
 
 def throughput(given: argparse.Namespace, progress: Progress) -> Part:
-    """Of two replicas against one."""
+    """Measures the throughput of two replicas and of one."""
     options = ThroughputOptions(rounds=1, step_s=5.0) if given.quick else ThroughputOptions()
     place = place_of(given.data)
     rounds = measure_throughput(place, options, progress)
@@ -55,13 +55,13 @@ def throughput(given: argparse.Namespace, progress: Progress) -> Part:
 
 
 def failover(given: argparse.Namespace, progress: Progress) -> Part:
-    """Of kills of one replica."""
+    """Measures kills of one replica."""
     result = measure_replacements(kill_one, given.count or (2 if given.quick else KILLS), "failover", progress)
     return replacement_lines(result, "of which one is killed"), failover_checks(result), asdict(result)
 
 
 def redeploys(given: argparse.Namespace, progress: Progress) -> Part:
-    """Of replacements of all replicas."""
+    """Measures replacements of all replicas."""
     result = measure_replacements(redeploy, given.count or (1 if given.quick else REDEPLOYS), "redeploys", progress)
     return replacement_lines(result, "replaced one after the other"), redeploys_checks(result), asdict(result)
 
@@ -75,7 +75,7 @@ PARTS: dict[str, Callable[[argparse.Namespace, Progress], Part]] = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Exit code 1 if a check failed or the cluster did not start."""
+    """Runs the measurements; returns exit code 1 if a check failed or the cluster did not start."""
     parser = argparse.ArgumentParser(prog="python -m mapless_tools.load_ray", description=__doc__)
     parser.add_argument("part", choices=[*PARTS, "all"])
     parser.add_argument("--count", type=int, help=f"kills or redeploys; default: {KILLS} and {REDEPLOYS}")

@@ -42,12 +42,12 @@ MAX_FAILURES = 5
 
 @dataclass
 class BagReport:
-    """What became of a recording's images.
+    """The results of a recording's images.
 
     Attributes:
-        images: how many the recording has, as far as it was read.
+        images: number of images of the recording, as far as it was read.
         counts: localized images, and the others by the reason that their diagnostics begin with.
-        apart_cm, apart_deg: of each localized image, from the pose that the recording has in the same map frame.
+        apart_cm, apart_deg: distance of each localized pose from the recording's own in the same map frame.
         radii_cm: 95 % radii of the positions.
         server_s: times in the server.
         stopped: why it ended early; empty if it did not.
@@ -62,14 +62,14 @@ class BagReport:
     stopped: str = ""
 
     def add(self, outcome: Outcome) -> None:
-        """An image that was sent."""
+        """Adds an image that was sent."""
         self.counts["localized" if outcome.level == LOCALIZED else outcome.message.partition(":")[0]] += 1
         if outcome.level == LOCALIZED:
             self.radii_cm.append(100 * float(outcome.values["position_95_m"]))
             self.server_s.append(float(outcome.values["server_s"]))
 
     def lines(self) -> list[str]:
-        """For people."""
+        """The report as lines of text."""
         found = self.counts["localized"]
         others = ", ".join(f"{count} {reason}" for reason, count in self.counts.most_common() if reason != "localized")
         lines = [f"{found} of {self.counts.total()} localized{f'; {others}' if others else ''}"]
@@ -148,7 +148,7 @@ def replay_bag(
 
 
 def _poses(images: Images, bag: BagOptions) -> Poses | None:
-    """Those of the recording; None if it has none, and none are asked for."""
+    """Poses of the recording; None if it has none, and none are requested."""
     is_there = images.recording.topics(*POSES) or TF_TOPIC in images.recording.types
     return open_poses(images, bag) if is_there or bag.pose_topic else None
 
@@ -162,7 +162,7 @@ def _with_frames(options: LocalizerOptions, images: Images, poses: Poses | None)
 
 
 def _framed(message: Any, frame: str) -> Any:
-    """An image whose camera has a name, as tf needs one."""
+    """The image with a name for its camera's frame, as tf needs one."""
     message.header.frame_id = frame
     return message
 
@@ -177,7 +177,7 @@ def _looked_up(images: Images, tree: FrameTree, target: str, source: str, stamp_
 def _compare(
     report: BagReport, outcome: Outcome, poses: Poses | None, options: LocalizerOptions, images: Images
 ) -> None:
-    """Adds how far a pose is from the recording's own, if that is in the same frame."""
+    """Adds the distance of a pose from the recording's own, if both are in the same frame."""
     if poses is None or poses.world != options.map_frame or outcome.map_from_body is None:
         return
     try:
@@ -210,14 +210,14 @@ class _Output:
         self._writer.close()
 
     def copy_static(self, images: Images) -> None:
-        """What /tf_static has, at the time of the first image."""
+        """Writes the recording's /tf_static, at the time of the first image."""
         for topic, _, message in images.recording.messages([STATIC_TF_TOPIC]):
             if topic not in self._connections:
                 self._connections[topic] = self._writer.add_connection(topic, TF_TYPE, typestore=self._types)
             self._put(topic, images.begin_ns, message)
 
     def write(self, time_ns: int, outcome: Outcome, tree: FrameTree, images: Images) -> None:
-        """What is published of an image."""
+        """Writes what is published for an image."""
         self._put(DIAGNOSTICS_TOPIC, time_ns, self._messages.diagnostics(outcome, self._options.scene))
         if outcome.map_from_body is None:
             return

@@ -44,10 +44,10 @@ class Comparison:
     """An answer beside the same one computed again.
 
     Attributes:
-        is_identical: to the last bit.
+        is_identical: whether they are equal to the last bit.
         changes: the first differences, in the order of the fields.
-        apart_cm: how far the poses are apart; None where not both have one.
-        apart_deg: likewise, their rotations.
+        apart_cm: distance of the poses; None unless both have one.
+        apart_deg: angle between their rotations; None unless both have one.
     """
 
     is_identical: bool
@@ -57,7 +57,7 @@ class Comparison:
 
 
 def compare(then: Response, now: Response) -> Comparison:
-    """Compares an answer with that of now."""
+    """Compares a captured answer with a new one."""
     first, second = _essence(then), _essence(now)
     if first.SerializeToString(deterministic=True) == second.SerializeToString(deterministic=True):
         return Comparison(True)
@@ -69,13 +69,13 @@ def compare(then: Response, now: Response) -> Comparison:
 
 
 def changed(then: Mapping[str, str], now: Mapping[str, str]) -> list[Change]:
-    """The differences of versions, settings and weights."""
+    """Differences of versions, settings and weights."""
     names = [it for it in {**then, **now} if then.get(it, ABSENT) != now.get(it, ABSENT)]
     return [Change(it, then.get(it, ABSENT), now.get(it, ABSENT)) for it in names]
 
 
 def stage_seconds(response: Response) -> dict[str, float]:
-    """How long each stage took, of all photographs together."""
+    """Time of each stage, over all photographs."""
     seconds: dict[str, float] = {}
     for diagnostics in diagnostics_of(response):
         for it in diagnostics.stages:
@@ -84,7 +84,7 @@ def stage_seconds(response: Response) -> dict[str, float]:
 
 
 def outcome_of(response: Any) -> str:
-    """In a word: "localized", or the reason of the rejection."""
+    """The outcome in a word: "localized", or the reason of the rejection."""
     if response.HasField("localization"):
         return "localized"
     known = response.rejection.DESCRIPTOR.fields_by_name["reason"].enum_type.values_by_number
@@ -92,7 +92,7 @@ def outcome_of(response: Any) -> str:
 
 
 def _essence(response: Any) -> Any:
-    """A copy without what is no part of the answer."""
+    """A copy without the fields that are not part of the answer."""
     copy = type(response)()
     copy.CopyFrom(response)
     for diagnostics in diagnostics_of(copy):

@@ -1,8 +1,8 @@
-"""Computes the answer of a captured call again: the services and the method themselves, on the recorded inputs.
+"""Computes the answer of a captured call again, by the services and the method, on the recorded inputs.
 
-Instead of the engine and its queue, one computation after another, without deadlines. Where time limited the captured
-answer, this one is limited alike: features that were not tried to their end are not tried, and a pose that was not
-refined is not refined.
+Computations run one after another without the queue and without deadlines. If time limited the captured answer, this
+one is limited in the same way: features that were not completed are not tried, and a pose that was not refined is not
+refined.
 """
 
 from __future__ import annotations
@@ -54,13 +54,13 @@ def response_of(call: CapturedCall) -> Response:
 
 
 def recompute(call: CapturedCall, blobs: Blobs, tiers: Sequence[Tier], options: EngineOptions) -> Response:
-    """The answer to a captured call now.
+    """Computes the answer to a captured call again.
 
     Args:
-        call: that was captured.
-        blobs: of the references.
-        tiers: that compute now.
-        options: limits and defaults of now.
+        call: the captured call.
+        blobs: blobs of the references.
+        tiers: tiers that compute now.
+        options: present limits and defaults.
 
     Raises:
         CaptureError: a part of the capture is missing, or its method is not known.
@@ -148,7 +148,7 @@ class _Recomputing:
 
 
 def _compute(stages: QueryStages, job: Job) -> Result:
-    """The way through the stages, without a queue."""
+    """Runs a job through the stages, without a queue."""
     of_name = {PREPARE: stages.prepare, COARSE: stages.coarse, REFINE: stages.refine}
     while True:
         (result,) = of_name[job.step.stage]([job])
@@ -165,7 +165,7 @@ def _unfinished(stages: Sequence[str]) -> frozenset[str]:
 
 
 def _is_cut_short(request: Any, then: Response) -> bool:
-    """Whether the coarse pose was answered since there was no time to refine it."""
+    """Whether the coarse pose was the answer because there was no time to refine it."""
     if not isinstance(then, pb.LocalizeResponse) or not request.options.allow_coarse:
         return False
     is_coarse = then.localization.pose_stage == pb.POSE_STAGE_COARSE

@@ -35,7 +35,7 @@ class Blobs:
     """Photographs and features of references in a capture folder, cached for the next call.
 
     Attributes:
-        found_anew: keys of the references whose features this program could not read.
+        found_anew: keys of the references whose captured features this program cannot read.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -44,13 +44,13 @@ class Blobs:
         self._views: LruCache[View] = LruCache(_CACHE_BYTES)
 
     def view(self, tenant: str, reference: CapturedReference, extractor: FeatureExtractor) -> View:
-        """The features of a reference: those that were captured, or extracted again.
+        """The features of a reference: the captured ones, or else extracted again.
 
-        They are extracted again where those of this extractor were not captured, and where another version wrote them
-        in a form that this one cannot read; the latter is added to `found_anew`.
+        They are extracted again if this extractor's features were not captured, or if another version wrote them in a
+        form that this one cannot read; the latter is added to `found_anew`.
 
         Raises:
-            DamagedCapture: it is not there, or not what was written.
+            DamagedCapture: the photograph or its features are missing or damaged.
         """
         known = (reference.key, extractor.name)
         view = self._views.get(known)
@@ -60,7 +60,7 @@ class Blobs:
         return view
 
     def pixels(self, tenant: str, reference: CapturedReference) -> NDArray[np.uint8]:
-        """A reference's photograph, (H, W, 3) RGB; DamagedCapture if it is not there, or not what was written."""
+        """A reference's photograph, (H, W, 3) RGB; DamagedCapture if it is missing or damaged."""
         return decode_image(self._read(tenant, reference.image_sha256), STORED_IMAGES)
 
     def _read_view(self, tenant: str, reference: CapturedReference, extractor: FeatureExtractor) -> View:
@@ -84,13 +84,13 @@ class Blobs:
 
 @dataclass(frozen=True, eq=False)
 class RecordedSource:
-    """References and their choice as a captured call has them; see `ReferenceSource`.
+    """References and their choice from a captured call; see `ReferenceSource`.
 
     Attributes:
-        call: which was captured.
+        call: the captured call.
         part: one of its photographs.
-        blobs: of the references.
-        extractor: whose features photographs are compared by.
+        blobs: blobs of the references.
+        extractor: extractor of the features by which photographs are compared.
         is_described: whether the photograph was described for the choice, which takes a reference to compare it with.
     """
 
@@ -108,7 +108,7 @@ class RecordedSource:
         context: StageContext,
         waits: bool,
     ) -> Loaded:
-        """Implements ReferenceSource: those that were captured; one that was not could not be read then either."""
+        """Implements ReferenceSource with the captured references; others could not be read then either."""
         by_id = {it.reference_id: it for it in self.part.references}
         for index, reference_id in enumerate(reference_ids):
             if reference_id not in by_id:
@@ -127,7 +127,7 @@ class RecordedSource:
         selection: Selection,
         context: StageContext,
     ) -> Choice:
-        """Implements ReferenceSource: the captured choice, whatever the arguments; DamagedCapture if there is none."""
+        """Implements ReferenceSource with the captured choice, for any arguments; DamagedCapture if there is none."""
         if self.part.choice is None:
             raise DamagedCapture("no choice of references was captured")
         if self.is_described:
@@ -137,7 +137,7 @@ class RecordedSource:
         return self.part.choice
 
     def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
-        """Implements ReferenceSource: it was left out then, too."""
+        """Implements ReferenceSource: the reference was left out in the captured call, too."""
 
     def _posed_view(self, reference: CapturedReference, extractor: FeatureExtractor, scene_key: SceneKey) -> PosedView:
         tenant = self.call.tenant

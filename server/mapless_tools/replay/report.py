@@ -1,4 +1,4 @@
-"""A folder of captured calls, computed again: which calls, and what has changed since."""
+"""Computes a folder of captured calls again: which calls, and what has changed since."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Selection:
 
     Attributes:
         request_ids: calls of these ids.
-        last: the latest so many.
+        last: number of the latest calls.
         tenant: calls of this tenant.
         scene_id: calls in scenes of this id.
     """
@@ -58,12 +58,12 @@ class Replayed:
     """A captured call and its answer computed again.
 
     Attributes:
-        request_id, time, method, tenant, scene_id: of the call; the time is UTC.
-        verdict: see `IDENTICAL`.
+        request_id, time, method, tenant, scene_id: properties of the call; the time is UTC.
+        verdict: the result of the comparison, see `IDENTICAL`.
         outcome_then, outcome_now: "localized", or the reason of the rejection; empty without an answer.
         seconds_then, seconds_now: computing time of its stages.
-        stages_then, stages_now: of each stage.
-        apart_cm, apart_deg: how far the poses are apart; None where there are no two, or the answers are identical.
+        stages_then, stages_now: computing time of each stage.
+        apart_cm, apart_deg: distance of the poses; None unless there are two, or if the answers are identical.
         changes: the first differences.
         error: why there is no answer now.
         found_anew: references whose captured features this version cannot read, so that it extracted them again.
@@ -93,7 +93,7 @@ class Report:
     """The replayed calls, the oldest first.
 
     Attributes:
-        calls: each of them.
+        calls: the calls.
         circumstances: differences of versions, settings and weights, of any of the calls.
         unreadable: files that are damaged, and why.
     """
@@ -114,10 +114,11 @@ def replay(folder: Path, selection: Selection, settings: Settings) -> Report:
     Args:
         folder: a capture folder, whether a server uses it or not; nothing in it is changed.
         selection: which calls.
-        settings: of features, backend and so on; those of listening and storing have no effect.
+        settings: settings of features, backend and so on; those of listening and storing have no effect.
 
     Raises:
-        CaptureError: it is no capture folder, holds no such calls, or the settings ask for what is not there.
+        CaptureError: the folder is not a capture folder or has no such calls, or the settings name what is not
+            available.
     """
     check_format(folder)
     unreadable: list[str] = []

@@ -30,7 +30,7 @@ MAX_RAYS = 90
 
 
 class Drawing:
-    """Draws; what it gives is a handle of viser's, to change or remove what was drawn."""
+    """Draws shapes; returns viser's handles, to change or remove them."""
 
     def __init__(self, server: GuardedViser, scenery: Scenery) -> None:
         self._scene, self._scenery = server.scene, scenery
@@ -45,7 +45,7 @@ class Drawing:
         size: float,
         picture: Picture | None = None,
     ) -> Any:
-        """A frustum with its photograph, `size` times as large as the scenery has them."""
+        """Draws a frustum with its photograph, `size` times as large as the scenery's."""
         pose = self._scenery.placed(world_from_camera)
         q = pose.quaternion()
         return self._scene.add_camera_frustum(
@@ -65,7 +65,7 @@ class Drawing:
         )
 
     def points(self, name: str, placed: Array, colours: NDArray[np.uint8], size_m: float, visible: bool) -> Any:
-        """Points (N, 3), already in the scenery's place, with one colour or one each."""
+        """Draws points (N, 3), already in the scenery's place, with one colour or one each."""
         return self._scene.add_point_cloud(
             name,
             placed,
@@ -78,7 +78,7 @@ class Drawing:
         )
 
     def support(self, name: str, answer: LocalizationResult) -> list[Any]:
-        """What a pose rests on: its ellipsoid of 95 %, and lines to the matched points."""
+        """Draws a pose's 95 % ellipsoid, and lines to the matched points."""
         return self._ellipsoid(name, answer) + self._rays(name, answer)
 
     def _ellipsoid(self, name: str, answer: LocalizationResult) -> list[Any]:
@@ -121,7 +121,7 @@ class Drawing:
         return drawn
 
     def _set_the_view(self, server: GuardedViser) -> None:
-        """From behind and above the references, looking where they look."""
+        """Sets the view: from behind and above the references, in their direction."""
         scenery = self._scenery
         up = -scenery.down
         server.scene.set_up_direction(tuple(up.tolist()))

@@ -1,4 +1,4 @@
-"""Queries as they are answered, from WatchQueries, until it is closed, however often the connection ends."""
+"""Receives queries as they are answered, by WatchQueries, until it is closed; connects again when needed."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ class Feed:
         show: Callable[[Query], None],
         report: Callable[[str, bool], None],
     ) -> None:
-        """Begins at once.
+        """Begins to watch at once.
 
         Args:
-            address: of the server.
+            address: address of the server.
             options: how to connect.
-            scene: its id.
-            show: given each query; called in the feed's thread.
+            scene: id of the scene.
+            show: called with each query, in the feed's thread.
             report: called with the state of the watching, in a few words, and whether there will be queries.
         """
         self._channel = options.channel(address)

@@ -43,7 +43,7 @@ class GuardedViser(viser.ViserServer):
             raise RuntimeError(f"port {port} of {host} is taken: give another, or 0 for any")
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """There is none: what the viewer shows is not public."""
+        """Returns None: what the viewer shows is not public."""
         return None
 
 

@@ -13,11 +13,11 @@ _FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
 def ellipsoid(covariance: Array, steps: int = 18) -> tuple[Array, NDArray[np.uint32]]:
-    """Vertices (V, 3) around the origin and faces (F, 3) of the ellipsoid that holds 95 % of positions.
+    """Vertices (V, 3) around the origin and faces (F, 3) of the ellipsoid that contains 95 % of positions.
 
     Args:
         covariance: (3, 3) or more, of which the first three are the position; square metres.
-        steps: meridians; half as many parallels.
+        steps: number of meridians; there are half as many parallels.
     """
     values, axes = np.linalg.eigh(covariance[:3, :3])
     radii = np.sqrt(np.maximum(values, 0.0) * CHI2_95_IN_SPACE)
@@ -34,7 +34,7 @@ def ellipsoid(covariance: Array, steps: int = 18) -> tuple[Array, NDArray[np.uin
 
 
 def enlargement(covariance: Array, size_m: float) -> int:
-    """How many times an ellipsoid is to be drawn as large, so that it is seen beside something of a size."""
+    """Factor by which an ellipsoid is drawn larger, so that it is visible beside something of this size."""
     largest = float(np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0) * CHI2_95_IN_SPACE))
     if largest <= 0:
         return 1
@@ -42,7 +42,7 @@ def enlargement(covariance: Array, size_m: float) -> int:
 
 
 def rays(centre: Array, points: Array, count: int, longest_m: float) -> Array:
-    """Lines (N, 2, 3) from a camera's centre to points (M, 3), at most so many, evenly thinned, and none longer."""
+    """Lines (N, 2, 3) from a camera's centre to points (M, 3): at most `count`, evenly thinned, and none too long."""
     chosen = points
     if len(points) > count:
         chosen = points[np.linspace(0, len(points) - 1, count).round().astype(int)]

@@ -1,4 +1,4 @@
-"""Queries and photographs as the viewer shows them: small ones on frustums, a query's with what was matched in it."""
+"""Queries and photographs as the viewer shows them: small ones on frustums, and a query's with its matches."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mapless_server.images import ImageLimits, decode_image
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """A photograph, its camera, and what was answered; numbered as they come."""
+    """A photograph, its camera, and the answer; numbered in order of arrival."""
 
     number: int
     image: bytes
@@ -36,7 +36,7 @@ class Query:
         return f"#{self.number} localized" + (f" to {_length(radius.position_95_m)}" if radius is not None else "")
 
     def details(self) -> str:
-        """All details as Markdown; text from other sources is in code spans, where nothing is marked up."""
+        """All details as Markdown; text from other sources is in code spans, so that it is not interpreted."""
         answer, used = self.answer, self.answer.diagnostics
         lines = []
         if isinstance(answer, Rejected):
@@ -92,7 +92,7 @@ Picture = NDArray[np.uint8]
 
 
 def read_picture(image: bytes, max_side_px: int) -> Picture:
-    """A photograph (H, W, 3) RGB, its longer side at most so long; InvalidArgument if it cannot be read."""
+    """Reads a photograph (H, W, 3) RGB and limits its longer side; InvalidArgument if it cannot be read."""
     pixels = decode_image(image, _LIMITS)
     scale = max_side_px / max(pixels.shape[:2])
     if scale >= 1:
@@ -109,7 +109,7 @@ def colours_at(picture: Picture, camera: Camera, pixels: Array) -> NDArray[np.ui
 
 
 def overlay(query: Query) -> Picture:
-    """The photograph with its matches: where points are seen, and lines to where the pose puts them."""
+    """The photograph with its matches: the matched pixels, and lines to the points' projections."""
     picture = _enlarged(read_picture(query.image, OVERLAY_PX))
     debug = query.answer.debug
     if debug is None:
@@ -128,7 +128,7 @@ def overlay(query: Query) -> Picture:
 
 
 def _enlarged(picture: Picture) -> Picture:
-    """A small photograph made larger, so that what is drawn in it does not hide it."""
+    """Enlarges a small photograph, so that the drawing does not hide it."""
     factor = OVERLAY_PX // max(picture.shape[:2])
     if factor < 2:
         return picture
@@ -140,7 +140,7 @@ def _projected(camera: Camera, world_from_camera: RigidTransform, x_in_world: Ar
 
 
 def _lines(picture: Picture, seen: Array, placed: Array, is_inlier: NDArray[np.bool_]) -> None:
-    """Wrong matches first, and none longer than a tenth of the picture, so that they hide nothing."""
+    """Draws the lines, wrong matches first, and none longer than a tenth of the picture, so that they hide nothing."""
     step = placed - seen
     length = np.linalg.norm(step, axis=1, keepdims=True)
     end = seen + step * np.minimum(1.0, 0.1 * picture.shape[1] / np.maximum(length, 1e-9))

@@ -1,4 +1,4 @@
-"""The layout of a scene's references: where they are drawn, how large, and which of them with their photographs."""
+"""The layout of a scene's references: their places and sizes, and which of them have their photographs."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ class Scenery:
     """References as they are laid out.
 
     Attributes:
-        references: all of the scene.
-        pictured: indices of those that are drawn as frustums; each is far from those before it.
+        references: all references of the scene.
+        pictured: indices of the references that are drawn as frustums; each is far from the previous ones.
         origin: (3,) world position that is drawn at zero, since browsers compute in single precision.
-        down: (3,) unit vector.
+        down: (3,) unit vector of gravity.
         size_m: length of a frustum that does not hide its neighbours.
-        extent_m: how far the references reach.
+        extent_m: extent of the references.
     """
 
     references: tuple[Reference, ...]
@@ -38,11 +38,11 @@ class Scenery:
     extent_m: float
 
     def placed(self, pose: RigidTransform) -> RigidTransform:
-        """A pose as it is drawn."""
+        """A pose in drawn coordinates."""
         return pose.shifted(-self.origin)
 
     def neighbours(self, index: int, count: int) -> list[Reference]:
-        """References that see about what one sees: near it, and looking the same way."""
+        """References that show about the same as one: near it, and with a similar direction."""
         apart = np.linalg.norm(_spots(self.references) - _spots(self.references)[index], axis=1)
         return [self.references[i] for i in np.argsort(apart, kind="stable") if i != index][:count]
 
@@ -74,7 +74,7 @@ def spread_out(spots: Array, count: int) -> NDArray[np.intp]:
 
 
 def _spots(references: Sequence[Reference]) -> Array:
-    """(N, 6) where cameras stand, in spreads of the scene, and which way they look."""
+    """Positions and directions (N, 6) of the cameras, in units of the scene's spread."""
     centres = np.stack([it.world_from_camera.translation for it in references])
     spread = max(float(np.linalg.norm(centres.std(axis=0))), 1e-6)
     ahead = np.stack([it.world_from_camera.rotation[:, 2] for it in references])
@@ -82,7 +82,7 @@ def _spots(references: Sequence[Reference]) -> Array:
 
 
 def _down(scene: Scene, references: Sequence[Reference]) -> Array:
-    """As the scene says, or its datum; else the mean downward axis of the cameras."""
+    """The direction down of the scene or its datum; else the mean downward axis of the cameras."""
     if scene.down_in_world is not None:
         return np.asarray(scene.down_in_world, float)
     if scene.datum is not None:
@@ -93,7 +93,7 @@ def _down(scene: Scene, references: Sequence[Reference]) -> Array:
 
 
 def _size_m(centres: Array) -> float:
-    """A third of how far neighbours usually stand apart."""
+    """A third of the usual distance of neighbours."""
     if len(centres) < 2:
         return 0.3
     some = centres[:200]

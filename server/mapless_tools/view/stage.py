@@ -1,4 +1,4 @@
-"""The drawn scene, the panel beside it, and the dialogue of a query that was clicked."""
+"""The drawn scene, the panel beside it, and the dialogue of a selected query."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _WIDE = "<style>.mantine-Modal-content { flex: 0 0 min(1000px, 94vw) !important;
 
 @dataclass(eq=False)
 class _Shown:
-    """A query and what is drawn of it."""
+    """A query with its drawn shapes."""
 
     query: Query
     button: Any
@@ -48,13 +48,13 @@ class Stage:
     """The drawn scene; its methods may be called from any thread."""
 
     def __init__(self, server: GuardedViser, scenery: Scenery, title: str, open_photo: Callable[[str], bytes]) -> None:
-        """Draws the references, still without their photographs.
+        """Draws the references, at first without their photographs.
 
         Args:
-            server: where it is drawn.
+            server: viser's server.
             scenery: the references.
-            title: the scene's id.
-            open_photo: the photograph of a reference of an id.
+            title: id of the scene.
+            open_photo: function that returns the photograph of a reference by its id.
         """
         self._server, self._scenery, self._open_photo = server, scenery, open_photo
         self._drawing = Drawing(server, scenery)
@@ -68,17 +68,17 @@ class Stage:
         self._panel(title)
 
     def report(self, status: str, is_watching: bool) -> None:
-        """Shows the state of the watching, and whether there will be queries."""
+        """Shows the state of the watching, and whether queries will arrive."""
         with self._lock:
             self._status.content = f"Queries: **{status}**"
             self._nothing.content = _NONE_YET if is_watching else "None."
 
     def show_picture(self, reference_id: str, picture: Picture) -> None:
-        """Puts a photograph onto a reference's frustum."""
+        """Shows a photograph on a reference's frustum."""
         self._references[reference_id].image = picture
 
     def show_points(self, points: Array, colours: NDArray[np.uint8]) -> None:
-        """Adds points (N, 3) of the world with colours (N, 3) to those that are shown."""
+        """Adds points (N, 3) of the world with colours (N, 3)."""
         extent_m = self._scenery.extent_m
         placed = points - self._scenery.origin
         cells = np.round(placed / (_VOXEL_SHARE * extent_m)).astype(np.int64)
@@ -113,7 +113,7 @@ class Stage:
         self._select(shown)
 
     def _select(self, shown: _Shown) -> None:
-        """Draws the support of one query only."""
+        """Selects a query, and draws only its support."""
         with self._lock:
             self._selected = shown
             for it in self._shown:
@@ -148,7 +148,7 @@ class Stage:
         return handle
 
     def _draw_others(self) -> list[Any]:
-        """References that have no frustum."""
+        """Draws references that have no frustum."""
         scenery = self._scenery
         others = np.setdiff1d(np.arange(len(scenery.references)), scenery.pictured)
         if not len(others):
@@ -211,7 +211,7 @@ class Stage:
 
 
 def _dialogue(client: Any, title: str, picture: Picture, details: str) -> None:
-    """A picture with its details, for the browser that clicked."""
+    """Shows a picture with its details in the browser that requested it."""
     if client is None:  # it was closed meanwhile
         return
     with client.gui.add_modal(title) as modal:

@@ -1,4 +1,4 @@
-"""The viewer put together: a client of the server, the stage, and what fills it in the background."""
+"""The viewer: a client of the server, the stage, and the work in the background that fills it."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ class ViewOptions:
 
     Attributes:
         host: a loopback address: there is no authentication.
-        port: 0 takes any free one.
-        max_pictured: references drawn with their photographs, spread over the scene; more make browsers slow. The
-            others are dots.
-        seeds: references that are localized against their neighbours, so that there are points to begin with; half a
-            second of the server's computing each.
+        port: port of the page; 0 for any free one.
+        max_pictured: largest number of references drawn with their photographs, spread over the scene; more make
+            browsers slow. The others are dots.
+        seeds: number of references that are localized against their neighbours for the first points; half a second of
+            the server's computing each.
     """
 
     host: str = "127.0.0.1"
@@ -58,13 +58,13 @@ class ViewOptions:
 
 @contextmanager
 def viewer(address: str, connect: ConnectOptions, scene: str, options: ViewOptions) -> Iterator[str]:
-    """Shows a scene until the block is left; gives the page's address.
+    """Shows a scene until the end of the block; yields the page's address.
 
     Args:
-        address: of the server, "host:port".
+        address: address of the server, "host:port".
         connect: how to connect to it.
-        scene: its id.
-        options: see there.
+        scene: id of the scene.
+        options: options of the viewer.
 
     Raises:
         MaplessError: the server cannot be reached, or rejects a call.
@@ -90,7 +90,7 @@ def viewer(address: str, connect: ConnectOptions, scene: str, options: ViewOptio
 
 
 class _Background:
-    """What fills the stage after it is shown: photographs onto frustums, points, and live queries."""
+    """Fills the stage after it is shown: photographs on frustums, points, and live queries."""
 
     def __init__(self, client: Client, scene: str, scenery: Scenery, stage: Stage) -> None:
         self._client, self._scene, self._scenery, self._stage = client, scene, scenery, stage
@@ -99,7 +99,7 @@ class _Background:
         self._closing = threading.Event()
 
     def begin(self, feed: Feed, seeds: int) -> None:
-        """The first photographs, then points, then the other photographs, of which there may be many."""
+        """Loads the first photographs, then points, then the other photographs, of which there may be many."""
         loads = [partial(self._load, self._scenery.references[index]) for index in self._scenery.pictured]
         points = [partial(self._seed, feed, int(index)) for index in self._scenery.pictured[:seeds]]
         for work in (*loads[:_FIRST], *points, *loads[_FIRST:]):
@@ -138,7 +138,7 @@ class _Background:
         self._stage.show_picture(reference.reference_id, read_picture(image, THUMBNAIL_PX))
 
     def _seed(self, feed: Feed, index: int) -> None:
-        """Localizes a reference against its neighbours, for the points that they have in common."""
+        """Localizes a reference against its neighbours, for their common points."""
         reference = self._scenery.references[index]
         near = [it.reference_id for it in self._scenery.neighbours(index, SEED_NEIGHBOURS)]
         if len(near) < 2:

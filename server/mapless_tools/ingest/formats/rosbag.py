@@ -91,7 +91,7 @@ def read(path: Path, options: ReadOptions) -> Dataset:
 
 @dataclass
 class _Unposed:
-    """Images in a row without a pose, which are refused together: a gap of poses concerns hundreds."""
+    """Consecutive images without a pose, which are refused together, since a gap of poses concerns hundreds."""
 
     collector: Collector
     first: int = 0
@@ -101,13 +101,13 @@ class _Unposed:
     reason: str = ""
 
     def add(self, number: int, time_s: float, reason: str) -> None:
-        """An image; number and time are of the recording."""
+        """Adds an image; number and time are those of the recording."""
         if not self.first:
             self.first, self.begin_s, self.reason = number, time_s, reason
         self.last, self.end_s = number, time_s
 
     def end(self) -> None:
-        """Refuses those there are."""
+        """Refuses the images that were added."""
         if self.first:
             which = f"images {self.first} to {self.last}, {self.begin_s:.3f} to {self.end_s:.3f} s after the first"
             with self.collector.attempt(which):
@@ -118,9 +118,9 @@ class _Unposed:
 def keyframes(
     images: Iterator[tuple[int, Any, RigidTransform]], options: KeyframeOptions
 ) -> Iterator[tuple[int, Any, RigidTransform]]:
-    """Those of the images, with time and pose, that are far enough from the one before, and the sharpest around.
+    """Yields the images, with time and pose, that are far enough from the previous keyframe and the sharpest nearby.
 
-    An image that cannot be decoded is taken only where there is no other.
+    An image that cannot be decoded is used only if there is no other.
     """
     if options.takes_all:
         yield from images
@@ -146,7 +146,7 @@ def keyframes(
 
 
 def sharpness_of(message: Any) -> float:
-    """Variance of the Laplacian of an image at half its size; 0 of one that cannot be decoded."""
+    """Variance of the Laplacian of an image at half its size; 0 if it cannot be decoded."""
     try:
         pixels = pixels_from_image(message)
     except ValueError:
@@ -163,7 +163,7 @@ def _is_far(before: RigidTransform, now: RigidTransform, options: KeyframeOption
 
 
 def _given(intrinsics: Intrinsics | None, message: Any) -> RosCamera:
-    """The camera that a person gives, for an image of this size."""
+    """The camera that the user gives, for an image of this size."""
     assert intrinsics is not None
     height, width = pixels_from_image(message).shape[:2]
     return RosCamera(intrinsics.camera(width, height))

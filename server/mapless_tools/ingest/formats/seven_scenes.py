@@ -37,7 +37,7 @@ def fits(path: Path) -> bool:
 
 
 def read(path: Path, options: ReadOptions) -> Dataset:
-    """Reads it; see `read_dataset`."""
+    """Reads the folder; see `read_dataset`."""
     collector = Collector(path)
     splits = _splits(path)
     truth = find_ground_truth(options.ground_truth, path.resolve().name) if options.ground_truth else None

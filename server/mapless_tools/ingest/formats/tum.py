@@ -38,7 +38,7 @@ def fits(path: Path) -> bool:
 
 
 def read(path: Path, options: ReadOptions) -> Dataset:
-    """Reads it; see `read_dataset`."""
+    """Reads the folder; see `read_dataset`."""
     collector = Collector(path)
     lens = _lens(path) if options.intrinsics is None else None
     file = path / "groundtruth.txt"

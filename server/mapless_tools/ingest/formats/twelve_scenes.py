@@ -27,7 +27,7 @@ def fits(path: Path) -> bool:
 
 
 def read(path: Path, options: ReadOptions) -> Dataset:
-    """Reads it; see `read_dataset`."""
+    """Reads the folder; see `read_dataset`."""
     collector = Collector(path)
     size, found = _intrinsics(path / "info.txt")
     queries = _queries(path / "split.txt")
@@ -72,7 +72,7 @@ def _intrinsics(file: Path) -> tuple[tuple[int, int], Intrinsics]:
 
 
 def _queries(file: Path) -> range:
-    """Numbers of the frames of the first sequence; none if there is no split."""
+    """Numbers of the frames of the first sequence; empty if there is no split."""
     if not file.is_file():
         return range(0)
     first = next((line for line in read_text(file).splitlines() if line.strip()), "")

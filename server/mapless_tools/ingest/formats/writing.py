@@ -21,7 +21,7 @@ IMAGES = "images"
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """An image that lies in the layout's folder of images under `name`, with its camera and pose."""
+    """An image that is stored under `name` in the layout's folder of images, with its camera and pose."""
 
     name: str
     camera: Camera
@@ -29,23 +29,23 @@ class PosedImage:
 
 
 class Describe(Protocol):
-    """Contents of files by their paths."""
+    """Function that returns the contents of a layout's files by their paths."""
 
     def __call__(self, images: Sequence[PosedImage], source: str, scene: Scene | None = None) -> dict[str, str]:
-        """Of images, where they come from in words, and what is known of their scene as a whole."""
+        """Describes images, with their origin as a text, and the properties of their scene."""
         ...
 
 
 @dataclass(frozen=True)
 class Layout:
-    """A layout that is written: the files that describe the images, and the folder that these lie in."""
+    """A layout that can be written: its function that describes images, and the folder of the images."""
 
     files: Describe
     images: str = IMAGES
 
 
 def _properties(scene: Scene | None) -> dict[str, Any]:
-    """What is known of a scene as a whole: unit, datum, direction of gravity."""
+    """Known properties of a scene: unit, datum, direction of gravity."""
     content: dict[str, Any] = {"metric": scene is None or not scene.arbitrary_unit}
     if scene is not None and scene.datum is not None:
         content["datum"] = scene.datum.to_json()
@@ -64,12 +64,12 @@ def cameras_files(images: Sequence[PosedImage], source: str, scene: Scene | None
 
 
 def colmap_files(images: Sequence[PosedImage], source: str, scene: Scene | None = None) -> dict[str, str]:
-    """A COLMAP text model where COLMAP itself puts one."""
+    """A COLMAP text model, in the folder where COLMAP writes it."""
     return {f"sparse/0/{name}": f"# {source}\n{text}" for name, text in model_texts(images).items()}
 
 
 def model_texts(images: Sequence[PosedImage]) -> dict[str, str]:
-    """A COLMAP text model's files by name; images of one camera share it, and there are no points."""
+    """The files of a COLMAP text model by name; images with equal cameras share one, and there are no points."""
     camera_ids: dict[Camera, int] = {}
     for image in images:
         camera_ids.setdefault(image.camera, len(camera_ids) + 1)
@@ -85,7 +85,7 @@ def model_texts(images: Sequence[PosedImage]) -> dict[str, str]:
 
 
 def kapture_files(images: Sequence[PosedImage], source: str, scene: Scene | None = None) -> dict[str, str]:
-    """The tables of a kapture 1.1; each image has a time of its own, and images of one camera share it."""
+    """The tables of a kapture 1.1; each image has its own time, and images with equal cameras share one."""
     sensors: dict[Camera, str] = {}
     trajectories, records = [], []
     for time, image in enumerate(images):
@@ -114,14 +114,14 @@ LAYOUTS: Mapping[str, Layout] = {
 
 
 def image_name(reference_id: str, image: bytes) -> str:
-    """File name of a reference's image: its id, and the ending of what it is."""
+    """File name of a reference's image: its id, and the ending of its format."""
     if image.startswith(b"\x89PNG"):
         return f"{reference_id}.png"
     return f"{reference_id}.webp" if image.startswith(b"RIFF") else f"{reference_id}.jpg"
 
 
 def write_file(file: Path, content: bytes) -> None:
-    """Writes a file that is there whole or not at all."""
+    """Writes a file either completely or not at all."""
     unfinished = file.with_name(f".{file.name}.unfinished")
     try:
         with unfinished.open("wb") as stream:
@@ -149,12 +149,12 @@ def _entry(image: PosedImage) -> dict[str, Any]:
 
 
 def _camera_from_world(image: PosedImage, separator: str = " ") -> str:
-    """The pose as COLMAP and kapture have it: qw qx qy qz tx ty tz."""
+    """The pose in the form of COLMAP and kapture: qw qx qy qz tx ty tz."""
     pose = image.world_from_camera.inverse()
     q = pose.quaternion()
     return _words([q.w, q.x, q.y, q.z, *pose.translation.tolist()], separator)
 
 
 def _words(numbers: Sequence[float], separator: str = " ") -> str:
-    """Numbers that are read back as they were."""
+    """Numbers as text that is read back to the same numbers."""
     return separator.join(repr(float(number)) for number in numbers)
