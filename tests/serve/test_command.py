@@ -17,7 +17,9 @@ TOOLS = {
     "calibrate": ["folder"],
     "evaluate": ["folder"],
     "replay": ["folder"],
+    "replay-bag": ["recording", "scene", "out"],
     "view": ["scene"],
+    "gateway": [],
     "demo": [],
     "bench": ["folder"],
     "bench-network": [],
@@ -61,7 +63,7 @@ def test_a_wrong_flag_ends_serve_with_one_line(flags: list[str], message: str) -
 def test_a_tool_without_its_packages_says_what_to_install(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(commands, "missing_package", lambda extra: "absent")
     ended = CliRunner().invoke(commands.app, [name, *TOOLS[name]])
-    extra = "view" if name == "view" else "tools"
+    extra = name if name in ("view", "gateway") else "tools"
     assert ended.exit_code == 2
     assert ended.stderr == f"mapless-server: {name} needs the Python package absent: pip install 'mapless[{extra}]'\n"
 

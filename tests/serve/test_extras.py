@@ -16,7 +16,7 @@ else:
     import tomli as tomllib
 
 PROJECT = Path(__file__).parents[2] / "pyproject.toml"
-DISTRIBUTION_OF = {"PIL": "pillow", "opentelemetry": "opentelemetry-sdk"}
+DISTRIBUTION_OF = {"PIL": "pillow", "opentelemetry": "opentelemetry-sdk", "python_multipart": "python-multipart"}
 
 
 def test_every_extra_brings_its_packages() -> None:
