@@ -32,7 +32,7 @@ _DESCRIPTORS: Any = descriptor_pb2  # which is not annotated
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """A Markdown table."""
+    """Makes a Markdown table."""
     head = list(head)
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
@@ -80,7 +80,7 @@ def errors_table() -> str:
 
 
 def reasons_table() -> str:
-    """Every reason that the sources give to an error, with the messages that come with it."""
+    """Lists every reason that the sources give to an error, with its messages."""
     found: dict[str, dict[str, None]] = {refusal.name: {} for refusal in Refusal}
     for folder in ("server", "client/mapless"):
         for path in sorted((ROOT / folder).rglob("*.py")):
@@ -109,7 +109,7 @@ def _strings(value: ast.expr) -> list[str]:
 
 
 def _message(value: ast.expr) -> str:
-    """What a message says, its values as "..."; empty for a name, and where a variable holds the message."""
+    """The text of a message, with its values as "..."; empty for a name, or if a variable holds the message."""
     if isinstance(value, ast.JoinedStr):
         parts = [str(part.value) if isinstance(part, ast.Constant) else "..." for part in value.values]
         return "".join(parts).replace("<", "&lt;")
@@ -202,7 +202,7 @@ def interface(stem: str) -> str:
         return " ".join(comment(*path).split())
 
     def apart(*path: int) -> list[str]:
-        """Comments before an element that belong to none: those of the file, or of several elements."""
+        """Comments before an element that belong to no element: those of the file, or of several elements."""
         located = comments.get(path)
         texts = located.leading_detached_comments if located else ()
         return ["\n".join(line.removeprefix(" ") for line in text.splitlines()) for text in texts]
@@ -244,7 +244,7 @@ def _type(message: Any, field: Any, page: str) -> str:
 
 
 def _link(name: str, page: str) -> str:
-    """A message's name, which leads to where it is documented."""
+    """A link to where a message is documented."""
     there, short = _pages().get(name), name.rpartition(".")[2]
     if there is None:
         return f"`{name.removeprefix('.')}`"

@@ -1,4 +1,4 @@
-"""A robot's loop: a video in, poses out; it continues after the server was away.
+"""A robot's loop: reads a video and writes poses; it goes on after the server was unreachable.
 
     python robot_loop.py drive.mp4 --camera camera.json --scene hall --poses poses.jsonl --tum poses.tum
 
@@ -34,7 +34,7 @@ LONGEST_PAUSE_S = 5.0  # between two attempts to reach a lost server
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame, when it was taken, and how many came before it."""
+    """A frame, when it was taken, and how many frames came before it."""
 
     number: int
     capture_time: datetime
@@ -45,7 +45,7 @@ class LatestFrame:
     """Plays a video as a camera would deliver it, and keeps the newest frame only."""
 
     def __init__(self, video: Path, speed: float = 1.0) -> None:
-        """Begins at once; `speed`: how many times faster than it was recorded."""
+        """Begins at once; `speed` is relative to the speed of the recording."""
         if not video.is_file():
             raise OSError(f"there is no video {video}")
         self._video = video
@@ -61,7 +61,7 @@ class LatestFrame:
         threading.Thread(target=self._play, daemon=True).start()
 
     def __iter__(self) -> Iterator[Frame]:
-        """The newest frame at each step; ends with the video. ValueError if it has no frame."""
+        """Yields the newest frame at each step; ends with the video. ValueError if it has no frame."""
         seen = -1
         while (frame := self._newer_than(seen)) is not None:
             seen = frame.number
@@ -70,7 +70,7 @@ class LatestFrame:
             raise ValueError(f"{self._video} has no frame that can be decoded")
 
     def _newer_than(self, number: int) -> Frame | None:
-        """The newest frame, as soon as it is another than that; None after the last."""
+        """The newest frame, once it has another number; None after the last."""
 
         def new() -> Frame | None:
             return self._frame if self._frame is not None and self._frame.number > number else None
@@ -106,7 +106,7 @@ class Outputs:
     tum: TextIO | None = None
 
     def localized(self, frame: Frame, answer: mapless.LocalizationResult, took_s: float) -> None:
-        """A pose."""
+        """Writes a pose."""
         q, position = answer.world_from_camera.quaternion(), answer.world_from_camera.translation.tolist()
         self._write(
             frame,
@@ -122,7 +122,7 @@ class Outputs:
             print(*(f"{number:.9f}" for number in numbers), file=self.tum, flush=True)
 
     def lost(self, frame: Frame, reason: str, message: str) -> None:
-        """No pose, and why: for programs, and for people."""
+        """Writes that there is no pose, and why."""
         self._write(frame, reason=reason, message=message)
 
     def _write(self, frame: Frame, **fields: Any) -> None:
@@ -142,7 +142,7 @@ class Robot:
     pause_s: float = field(default=0.0, init=False)
 
     def look(self, frame: Frame) -> None:
-        """Localizes one frame, writes the answer, and waits if the server requests it or is away."""
+        """Localizes one frame, writes the answer, and waits if the server requests it or is unreachable."""
         encoded, jpeg = cv2.imencode(".jpg", frame.pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         assert encoded
         start_s = time.monotonic()
@@ -181,7 +181,7 @@ class Robot:
         return mapless.PosePrior(pose.world_from_camera, pose.covariance + np.diag(moved**2))
 
     def _wait(self, error: mapless.MaplessError) -> None:
-        """Waits as long as the server requests; longer each time while it is away."""
+        """Waits as long as the server requests; longer each time while it is unreachable."""
         if error.retry_after_s is None and self.pause_s == 0:
             print(f"no answer ({error}); retrying", file=sys.stderr)
         self.pause_s = min(max(2 * self.pause_s, 0.1), LONGEST_PAUSE_S)

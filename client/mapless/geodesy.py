@@ -109,12 +109,12 @@ class Datum:
         return ecef_from_enu.compose(RigidTransform(self.enu_from_world.matrix(), np.zeros(3)))
 
     def to_json(self) -> dict[str, Any]:
-        """As a JSON object with the attributes' names."""
+        """Converts it to a JSON object with the attributes' names."""
         return asdict(self)
 
     @staticmethod
     def from_json(content: object) -> Datum:
-        """From a JSON object; enu_from_world is optional.
+        """Reads it from a JSON object; enu_from_world is optional.
 
         Raises:
             ValueError: a member is missing, is no number or out of bounds.
@@ -159,7 +159,7 @@ class GeoPose:
         return GeoPosition(self.lat, self.lon, self.h)
 
     def to_json(self) -> dict[str, dict[str, float]]:
-        """As a JSON object with exactly the standard's members."""
+        """Converts it to a JSON object with exactly the standard's members."""
         position = {"lat": self.lat, "lon": self.lon, "h": self.h}
         return {
             part: {name: float(number) for name, number in numbers.items()}
@@ -168,7 +168,7 @@ class GeoPose:
 
     @staticmethod
     def from_json(content: object) -> GeoPose:
-        """From a JSON object; members that the standard does not define are ignored.
+        """Reads it from a JSON object; members that the standard does not define are ignored.
 
         Raises:
             ValueError: a member is missing, is no number or out of bounds.

@@ -1,7 +1,7 @@
 """Errors of requests: exceptions with a status, a reason and a text for the caller.
 
-Nothing here knows grpc: `code` is the name of a gRPC status, and `rpc` alone makes one of it. Every other exception is
-a fault of the server: the caller gets INTERNAL and nothing else, and the log has the details.
+This module does not import grpc: `code` is the name of a gRPC status, which only `rpc` converts. Every other exception
+    is a fault of the server: the caller gets only INTERNAL, and the log has the details.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ class RequestError(Exception):
         code: name of the gRPC status.
         reason: UPPER_SNAKE_CASE, stable, for programs; the class's `default_reason`, or the code, if none is given.
         field: path of the wrong field in the request, "intrinsics.focal_x_px", or None.
-        retry_after_s: when to try again, seconds, or None if a retry would change nothing.
-        resource: name of the scene or reference that does not exist or exists already; empty if it is about none.
+        retry_after_s: seconds until another attempt, or None if a retry would not help.
+        resource: name of the scene or reference that does not exist or exists already; else empty.
     """
 
     code = "INTERNAL"
@@ -87,12 +87,12 @@ class DeadlineExceeded(RequestError):
 
 
 class Unavailable(RequestError):
-    """The server drains, or the scene changes during the call; another try elsewhere or later succeeds."""
+    """The server drains, or the scene changes during the call; an attempt elsewhere or later succeeds."""
 
     code = "UNAVAILABLE"
 
 
 class DataLoss(RequestError):
-    """Stored bytes are not what was stored."""
+    """Stored bytes are damaged."""
 
     code = "DATA_LOSS"

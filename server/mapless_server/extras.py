@@ -1,4 +1,4 @@
-"""Which extra of mapless brings a Python package that is missing. Imports no package."""
+"""Finds which extra of mapless installs a missing Python package. Imports no package."""
 
 from __future__ import annotations
 

@@ -260,7 +260,7 @@ def _exceeds(settings: Settings, less: str, more: str) -> str:
 
 @dataclass(frozen=True)
 class LoadedSettings:
-    """Settings and where each value comes from: "flag", "environment", "file" or "default"."""
+    """Settings, and the source of each value: "flag", "environment", "file" or "default"."""
 
     settings: Settings
     origins: Mapping[str, str]
@@ -274,7 +274,7 @@ class LoadedSettings:
 
 
 def load_settings(flags: Mapping[str, Any], config: Path | None = None) -> LoadedSettings:
-    """Settings from all sources.
+    """Loads the settings from all sources.
 
     A ``data_dir`` among the flags voids a ``database_url`` of file and environment: a program that starts a server on a
     folder of its own must not write to the database that its environment names.
@@ -306,7 +306,7 @@ def load_settings(flags: Mapping[str, Any], config: Path | None = None) -> Loade
 
 
 def _overlap(first: Path, second: Path) -> bool:
-    """Whether one of two folders lies in the other, or is it."""
+    """Whether two folders are the same, or one contains the other."""
     first, second = first.resolve(), second.resolve()
     return first.is_relative_to(second) or second.is_relative_to(first)
 

@@ -49,15 +49,15 @@ class LocalizerOptions:
     Attributes:
         scene: the scene to localize in.
         map_frame: the scene's world, as tf names it.
-        odom_frame: the frame of the odometry, where it has one: then map > odom is computed; empty for none.
+        odom_frame: the frame of the odometry, for which map > odom is computed; empty without odometry.
         base_frame: the frame whose pose is published; empty for the camera's own.
-        rate_hz: images localized a second, at most; 0 for those only that are asked for.
-        use_last_pose: whether the last answer, moved by the odometry, is a prior of the next. Then errors of successive
-            answers have a common part, which a filter that takes them as independent does not know.
+        rate_hz: largest number of images localized per second; 0 for only those that are requested.
+        use_last_pose: whether the last answer, moved by the odometry, is a prior of the next. Errors of successive
+            answers then have a common part, so a filter must not treat them as independent.
         coverage: see `Client.localize`.
         timeout_s: deadline of a call.
-        sequence_length: where an image alone is rejected, it is localized together with those before it, so many at
-            most, and the odometry between them; 2 to 16, or 0 for never. It takes as long as all of them.
+        sequence_length: largest number of images, 2 to 16, with which an image that is rejected alone is localized
+            together, by the odometry between them; 0 for never. This takes as long as localizing all of them.
     """
 
     scene: str
@@ -272,12 +272,12 @@ class Localizer:
 
 
 def _prior_checks(answer: LocalizationResult | SequenceLocalization) -> tuple[PriorCheck, ...]:
-    """Of the newest image."""
+    """Prior checks of the newest image."""
     return answer.images[-1].prior_checks if isinstance(answer, SequenceLocalization) else answer.prior_checks
 
 
 def _values(answer: _Answer) -> dict[str, str]:
-    """What diagnostics show of an answer; of a sequence, of its newest image."""
+    """The values of an answer for diagnostics; for a sequence, those of its newest image."""
     about = answer.images[-1].diagnostics if isinstance(answer, SequenceLocalization) else answer.diagnostics
     values = {"request_id": about.request_id, "server_s": f"{about.total_s:.3f}", "queue_s": f"{about.queue_s:.3f}"}
     values["references"] = " ".join(it.name.rpartition("/")[2] for it in about.references)

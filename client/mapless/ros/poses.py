@@ -22,12 +22,12 @@ def time_of(stamp_ns: int) -> datetime:
 
 
 def transform_from_pose(pose: Any) -> RigidTransform:
-    """Of a geometry_msgs/Pose; ValueError if its numbers are none of a pose."""
+    """Converts a geometry_msgs/Pose; ValueError if its numbers are not a pose."""
     return _transform(pose.position, pose.orientation)
 
 
 def transform_from_message(transform: Any) -> RigidTransform:
-    """Of a geometry_msgs/Transform; ValueError if its numbers are none of a transform."""
+    """Converts a geometry_msgs/Transform; ValueError if its numbers are not a transform."""
     return _transform(transform.translation, transform.rotation)
 
 

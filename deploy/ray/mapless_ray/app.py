@@ -14,7 +14,7 @@ DRAIN_GRACE_S = 60.0
 
 
 def build(settings: dict[str, Any]) -> Application:
-    """One deployment; the config's `deployments` sets the number of replicas and the device of each.
+    """Makes the application of one deployment; the config's `deployments` sets the replicas and their devices.
 
     Args:
         settings: the config's `args`: settings of mapless by name. Secrets belong into the environment instead.

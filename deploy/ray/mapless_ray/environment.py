@@ -36,13 +36,13 @@ _LOST = """\
 
 
 def variables(max_message_mib: int = 32, leaving_s: float = LEAVING_S) -> dict[str, str]:
-    """The variables.
+    """Returns the variables.
 
     Serve's template of HAProxy's configuration ends its section for all proxies with the balancing algorithm, so that
     further lines in that variable are further lines of the section.
 
     Args:
-        max_message_mib: as in the settings, which Serve's gRPC servers do not use.
+        max_message_mib: the setting of this name, which Serve's gRPC servers do not read.
         leaving_s: see `LEAVING_S`.
     """
     lost = _LOST.format(502, "the replica ended") + _LOST.format(503, "no replica took the call")

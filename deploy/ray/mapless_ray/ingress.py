@@ -43,7 +43,7 @@ class ServeServer(Protocol):
         """Keeps Serve from replacing the service's handlers, which are added after this."""
 
     def add_generic_rpc_handlers(self, handlers: Any) -> None:
-        """As of grpc.aio.Server."""
+        """Registers handlers, as a grpc.aio.Server does."""
 
 
 _LAST_BYTES_S = 5.0
@@ -54,7 +54,7 @@ class Ingress:
     """Receives the calls of a replica; one a process. Implements `mapless_server.serve.running.Listener`.
 
     Attributes:
-        address: unknown: Serve chooses and opens the port when the replica is ready.
+        address: unknown, since Serve chooses and opens the port when the replica is ready.
     """
 
     address = "ray"
@@ -76,7 +76,7 @@ class Ingress:
         """Serve stops its server before it ends the replica."""
 
     def drained(self, stop: Stop) -> Stop:
-        """A server's `stop` that drains the services first, because endless streams would delay it."""
+        """Wraps a server's `stop` so that it drains the services first, because endless streams would delay it."""
 
         async def drain_and_stop(grace_s: float | None) -> None:
             await self.services.drain(0.0, grace_s or 0.0)
@@ -85,12 +85,12 @@ class Ingress:
         return drain_and_stop
 
     async def close(self) -> None:
-        """There is nothing to close."""
+        """Does nothing: there is nothing to close."""
         Ingress.current = None
 
 
 def add_services(_: object, server: ServeServer) -> None:
-    """Named in Serve's config; Serve calls it with each of its gRPC servers, in the server's event loop."""
+    """Adds the services to a gRPC server. Serve's config names it, and Serve calls it in each server's event loop."""
     ingress = Ingress.current
     if ingress is None:
         _add_refusals(server)
@@ -104,7 +104,7 @@ def add_services(_: object, server: ServeServer) -> None:
 
 
 def _add_refusals(server: ServeServer) -> None:
-    """For Serve's proxies, which receive calls when no replica is ready: UNAVAILABLE, and NOT_SERVING for health."""
+    """Adds handlers for Serve's proxies, which receive calls when no replica is ready: UNAVAILABLE, NOT_SERVING."""
     error = Unavailable("no replica is ready", reason="STARTING", retry_after_s=1.0)
     status = rpc_status.to_status(to_status(error))
 

@@ -46,10 +46,10 @@ class MaplessReplica:
         """Returns when the first localization has succeeded; then Serve sends calls.
 
         Args:
-            settings: of mapless, by name; the others come from the environment (MAPLESS_...).
+            settings: settings of mapless by name; the others come from the environment (MAPLESS_...).
 
         Raises:
-            StartupError: it cannot serve; Serve tries again a few times and then reports it to the operator.
+            StartupError: the replica cannot serve; Serve tries again a few times, and then reports it to the operator.
         """
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         loaded = load_settings({**settings, "host": SERVE_HOST})
@@ -67,7 +67,7 @@ class MaplessReplica:
         self._failing = asyncio.ensure_future(self._exit_when_failed())
 
     async def _exit_when_failed(self) -> None:
-        """Ends the process, which Serve notices at once, before its health checks do."""
+        """Ends the process, which Serve detects at once, before its health checks do."""
         await asyncio.wait({self._running.failed})
         await exit_failed()
 

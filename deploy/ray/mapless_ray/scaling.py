@@ -1,4 +1,4 @@
-"""The autoscaling policy: the number of replicas follows the devices' seconds, queued and spent.
+"""The autoscaling policy: the number of replicas follows the devices' queued and used computing time.
 
 Serve's own measure, the number of calls, means little if one takes 20 ms and another a second. A replica's queue has
 the predicted and the actual costs of its calls.
@@ -23,15 +23,15 @@ TARGET_BUSY = 0.7
 
 
 class Load(Protocol):
-    """The load of a replica's queue: seconds a thread, of the busiest lane."""
+    """The load of a replica's queue: seconds per thread, of the busiest lane."""
 
     @property
     def backlog_s(self) -> float:
-        """Computing that is admitted and not done."""
+        """Computing time of admitted jobs that is not used yet."""
 
     @property
     def busy_s(self) -> float:
-        """Computing done since the start."""
+        """Computing time used since the start."""
 
 
 class Reporter:
@@ -54,8 +54,8 @@ def replicas_for(queued_s: Iterable[float], busy: Iterable[float]) -> float:
     """The number of replicas that meet both targets with an evenly shared load.
 
     Args:
-        queued_s: of each replica; a new one that has not reported is idle.
-        busy: likewise, 0 to 1.
+        queued_s: queued computing time of each replica; a new one that has not reported is idle.
+        busy: used share of each replica, 0 to 1.
     """
     return max(sum(queued_s) / TARGET_QUEUED_S, sum(busy) / TARGET_BUSY)
 

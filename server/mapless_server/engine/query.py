@@ -30,13 +30,13 @@ DEFAULT_REFERENCE_COUNT = 10
 
 @dataclass(frozen=True, eq=False)
 class Tier:
-    """Features, and what works on them.
+    """Features, with the extractor and the pipeline that use them.
 
     Attributes:
-        extractor: finds them.
+        extractor: finds the features.
         pipeline: its matcher caches matches of these features, so no other tier may have the same one. Tiers may
             share a reconstructor.
-        uses_depths: whether its references come with the depths that are kept with them.
+        uses_depths: whether its references are loaded with the depths stored with them.
     """
 
     extractor: FeatureExtractor

@@ -99,19 +99,19 @@ class BundleProblem:
     """The cost and its derivatives; see `optimize.Problem`.
 
     Attributes:
-        observations: of the points in all views; their poses are not used.
-        view: (O,) of each.
+        observations: observations of the points in all views; the views' poses are not used.
+        view: (O,) index of the view of each observation.
         given: poses of the references.
-        information: C^-1, (6 (V - 1), 6 (V - 1)) of the prior that holds them there; 0 leaves them free.
-        loss_scale_sigma: of the Cauchy loss.
-        priors: on the query's pose.
+        information: C^-1, (6 (V - 1), 6 (V - 1)), of the prior on the references' poses; 0 leaves them free.
+        loss_scale_sigma: scale of the Cauchy loss, in standard deviations.
+        priors: priors on the query's pose.
         prior_weight: factor on their cost, relative to that of the observations.
         keypoint_motion: (O_q, 2, I) of the query's observations, in their order, by errors of its intrinsics, in
             standard deviations; I = 0 if they are no unknowns.
         intrinsics_information: (I,) inverse variances of the prior on these errors.
         intrinsics_offset: (I,) errors of the intrinsics that are removed already; the prior's mean is minus these.
-        planes: near which the points lie by kept depths, at the references' given poses: that these move by millimetres
-            does not matter to depths known to centimetres.
+        planes: planes near which the points lie by stored depths, at the references' given poses: motions of these by
+            millimetres do not matter for depths known to centimetres.
     """
 
     observations: Observations
@@ -197,12 +197,12 @@ class ViewColumns:
     """Observations sorted by view, one row for each component; column o is one observation (see `arrays.columns`).
 
     Attributes:
-        point, view: (O,) of each.
-        parts: the columns of each view.
+        point, view: (O,) indices of each observation's point and view.
+        parts: range of the columns of each view.
         focal, offset: (2, O) as in `observations.Columns`.
         sums: (P, O): a product with it sums over the observations of each point.
         by_intrinsics: (2, I, O_q) derivative of the last view's residuals by errors of its intrinsics.
-        planes: of the points, if any have kept depths.
+        planes: planes of the points, if any have stored depths.
     """
 
     point: NDArray[np.intp]
@@ -222,7 +222,7 @@ class ViewColumns:
         keypoint_motion: Array,
         planes: DepthPlanes | None = None,
     ) -> ViewColumns:
-        """From rows and the view (O,) of each; `keypoint_motion` and `planes` as in BundleProblem."""
+        """Makes the columns from rows and the view (O,) of each; `keypoint_motion` and `planes` as in BundleProblem."""
         order = np.argsort(view, kind="stable")
         sigma_px = observations.sigma_px[order, None]
         return ViewColumns._sorted(
@@ -408,7 +408,7 @@ class EliminatedPoints:
 
 
 def _block_diagonal(blocks: Sequence[Array]) -> Array:
-    """SciPy's takes six times as long for a dozen of small blocks."""
+    """Makes a block-diagonal matrix; SciPy's function takes six times as long for a dozen small blocks."""
     ends = list(itertools.accumulate(map(len, blocks), initial=0))
     matrix = np.zeros((ends[-1], ends[-1]))
     for block, begin, end in zip(blocks, ends[:-1], ends[1:], strict=True):

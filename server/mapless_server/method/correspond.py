@@ -194,10 +194,10 @@ class Matcher:
     queries take no more processor time, because each product is computed by one thread.
 
     Attributes:
-        options: see there.
+        options: options of matching.
         pair_matching: matches the query again with its best references, and references ahead of the queries; None if
-            nothing does. A query finds *strong* pairs of references, which it made, in `stored` only: it has no time to
-            make them, and matches the others by nearest neighbours. So its answer depends on which are stored.
+            nothing does. Its *strong* pairs of references are only looked up in `stored` by a query, which has no time
+            to make them, and matches the others by nearest neighbours. So its answer depends on which are stored.
         pair_s: mean time of `pair_matching` for a pair of the last queries, seconds; None before the first.
         stored: where pairs that are not cached are looked up; None looks up none.
     """
@@ -470,10 +470,10 @@ def mutual_matches(first: Features, second: Features, ratio: float, either: bool
 
 
 def cosine_blocks(first: Features, second: Features) -> Iterator[NDArray[np.float32]]:
-    """The matrix (N, M) of cosines, in blocks of rows.
+    """Yields the matrix (N, M) of cosines in blocks of rows.
 
-    Descriptors of int8 are multiplied as whole numbers where torch is loaded and the processor has instructions for
-    that, in half to four fifths of the time of float32. The processor's cache holds a block.
+    Descriptors of int8 are multiplied as integers if torch is loaded and the processor has instructions for that, in
+    half to four fifths of the time of float32. A block fits into the processor's cache.
     """
     torch = sys.modules.get("torch")
     is_whole = first.descriptors.dtype == second.descriptors.dtype == np.int8
@@ -490,7 +490,7 @@ def cosine_blocks(first: Features, second: Features) -> Iterator[NDArray[np.floa
 
 @cache
 def _multiplies_exactly(torch: Any) -> bool:
-    """Whether torch has fast products of int8 here: processors without AVX-VNNI or AVX512-VNNI saturate their sums."""
+    """Whether torch has fast products of int8 here; processors without AVX-VNNI or AVX512-VNNI saturate the sums."""
     if not torch.backends.cpu.get_cpu_capability().startswith("AVX"):
         return False
     largest = torch.full((_ROWS_AT_ONCE, 64), 127, dtype=torch.int8)
@@ -498,7 +498,7 @@ def _multiplies_exactly(torch: Any) -> bool:
 
 
 def _inverse_lengths(features: Features) -> NDArray[np.float32]:
-    """(N,) of descriptors of whole numbers."""
+    """Inverse lengths (N,) of descriptors of integers."""
     numbers = features.descriptors.astype(np.float32)
     return np.asarray(1 / np.sqrt(np.maximum(np.einsum("nd,nd->n", numbers, numbers), 1)), np.float32)
 

@@ -1,4 +1,4 @@
-"""Depth kept with the references: points where nothing can be triangulated, and better ones where little can.
+"""Depths stored with the references: points where nothing can be triangulated, and better ones where little can.
 
 A network has predicted the depth of each reference once, when it was added (see `scenes.depth`). A keypoint with depth
 d and relative standard deviation s, of a camera at C with the viewing direction z, then has its point near the plane
@@ -6,9 +6,9 @@ d and relative standard deviation s, of a camera at C with the viewing direction
     z . (x - C) = d,    with the standard deviation    s d.
 
 A triangulated point is moved by what its plane says, each weighted by its information, unless the two contradict each
-other. A keypoint that the photograph matches, and no other reference, becomes a point at its depth, which one reference
-observes. Its error is along the ray, so it moves the photograph's keypoint along the epipolar line; the final
-adjustment knows that, since it keeps the planes (see `bundle`).
+other. A reference's keypoint that only the query matches becomes a point at its depth, which one reference observes.
+Its error is along the ray, so it moves the photograph's keypoint along the epipolar line; the final adjustment knows
+that, since it keeps the planes (see `bundle`).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from .views import PosedView
 
 @dataclass(frozen=True)
 class KeptDepthOptions:
-    """Options of using kept depths.
+    """Options of using stored depths.
 
     Attributes:
         max_contradiction: a depth that is farther from its triangulated point, in standard deviations of both, is
@@ -50,16 +50,16 @@ def with_kept_depths(
     correspondences: Correspondences,
     options: KeptDepthOptions | None = None,
 ) -> Structure:
-    """A structure with the points that kept depths give, after those that are triangulated.
+    """Adds the points that stored depths give to a structure, after the triangulated ones.
 
     Args:
-        structure: triangulated; possibly without points.
-        references: in the order of its tracks; those without depths add nothing.
-        correspondences: of the query with each reference.
-        options: see there.
+        structure: the triangulated structure, possibly without points.
+        references: the references, in the order of its tracks; those without depths add nothing.
+        correspondences: matches of the query with each reference.
+        options: options of using stored depths.
 
     Returns:
-        The structure with its `planes`; the same if no reference has depths.
+        The structure with its `planes`; unchanged if no reference has depths.
     """
     if all(reference.depths is None for reference in references):
         return structure
@@ -70,12 +70,12 @@ def with_kept_depths(
 
 @dataclass(frozen=True, eq=False)
 class _KnownDepths:
-    """Of the N keypoints of all references.
+    """Known depths of the N keypoints of all references.
 
     Attributes:
         offsets: (K + 1,) of each reference's keypoints.
         centre, ray, axis: (N, 3) camera centre, viewing ray of depth 1 and viewing direction, world.
-        depth, sigma: (N,) in the unit of the poses; NaN where unknown.
+        depth, sigma: (N,) depth and standard deviation in the unit of the poses; NaN where unknown.
     """
 
     offsets: NDArray[np.intp]
@@ -98,7 +98,7 @@ class _KnownDepths:
         return _KnownDepths(offsets, *keypoint_rays(references), axis, depth, sigma)
 
     def planes(self, rows: NDArray[np.intp]) -> DepthPlanes:
-        """Of the points that these keypoints show, all with a depth."""
+        """Planes of the points that these keypoints show; all must have a depth."""
         normal = self.axis[rows]
         offset = (normal * self.centre[rows]).sum(axis=1) + self.depth[rows]
         return DepthPlanes(normal, offset, self.sigma[rows] ** -2.0)
@@ -107,7 +107,7 @@ class _KnownDepths:
 def _combined(
     structure: Structure, references: Sequence[PosedView], known: _KnownDepths, options: KeptDepthOptions
 ) -> Structure:
-    """The triangulated points, moved by the most precise depth of each that does not contradict it."""
+    """Moves each triangulated point by its most precise depth that does not contradict it."""
     tracks, count = structure.tracks, len(structure.x_in_world)
     none = DepthPlanes(np.zeros((count, 3)), np.zeros(count), np.zeros(count))
     row = known.offsets[tracks.view] + tracks.keypoint
@@ -136,7 +136,7 @@ def _combined(
 def _with_single(
     structure: Structure, references: Sequence[PosedView], correspondences: Correspondences, known: _KnownDepths
 ) -> Structure:
-    """With a point for each keypoint that the query matches, that has a depth and observes no point."""
+    """Adds a point for each matched keypoint that has a depth and observes no point."""
     tracks, count = structure.tracks, len(structure.x_in_world)
     matched = zip(correspondences.query_matches, known.offsets[:-1], strict=True)
     rows = np.unique(np.concatenate([pairs[:, 1] + start for pairs, start in matched]))

@@ -86,12 +86,12 @@ class KeypointNoise:
 
 @dataclass(frozen=True, eq=False)
 class DepthPlanes:
-    """What kept depths say of P points: each lies near a plane, normal . x = offset.
+    """Planes from stored depths: each of P points is near a plane, normal . x = offset.
 
     Attributes:
         normal: (P, 3) unit vectors, world.
         offset: (P,) metres.
-        information: (P,) inverse variance of the distance from the plane; 0 where nothing is known.
+        information: (P,) inverse variance of the distance from the plane; 0 if unknown.
     """
 
     normal: Array
@@ -102,7 +102,7 @@ class DepthPlanes:
         return DepthPlanes(self.normal[points], self.offset[points], self.information[points])
 
     def and_last(self, others: DepthPlanes) -> DepthPlanes:
-        """With those of further points."""
+        """Appends the planes of further points."""
         pairs = ((getattr(self, name), getattr(others, name)) for name in ("normal", "offset", "information"))
         return DepthPlanes(*map(np.concatenate, pairs))
 
@@ -111,7 +111,7 @@ class DepthPlanes:
         return float(self.information @ self.distance(x_in_world) ** 2)
 
     def distance(self, x_in_world: Array) -> Array:
-        """(P,) of points (P, 3) beyond their planes."""
+        """Signed distances (P,) of points (P, 3) from their planes."""
         return np.asarray((self.normal * x_in_world).sum(axis=1) - self.offset)
 
 
@@ -123,7 +123,8 @@ class Structure:
         x_in_world: (P, 3) metres.
         tracks: observations of these points by the references, in the order of the points.
         noise: noise of the keypoints, estimated from the residuals.
-        planes: of the points, where references have kept depths; points that a single reference observes are last.
+        planes: planes of the points, if references have stored depths; points that a single reference observes are
+            last.
     """
 
     x_in_world: Array
@@ -133,7 +134,7 @@ class Structure:
 
     @property
     def triangulated(self) -> NDArray[np.bool_]:
-        """(P,) which points several references observe."""
+        """Which points (P,) several references observe."""
         if self.planes is None:
             return np.ones(len(self.x_in_world), bool)
         return np.bincount(self.tracks.point, minlength=len(self.x_in_world)) > 1

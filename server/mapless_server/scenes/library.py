@@ -84,7 +84,7 @@ class ReferenceLibrary:
     """
 
     def __init__(self, store: Store, depths: DepthFinder | None = None) -> None:
-        """`depths` adds those that are kept with references; None adds none."""
+        """`depths` adds stored depths to references; None adds none."""
         self._store = store
         self._depths = depths
         self.locks = KeyedLocks()

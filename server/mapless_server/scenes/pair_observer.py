@@ -37,7 +37,7 @@ class PairObserver:
         """Making the depth of a reference failed; it is tried again."""
 
     def depths_wait(self, count: int) -> None:
-        """So many references wait for a network to predict their depth."""
+        """Reports how many references wait for a network to predict their depth."""
 
     def scene_calibrated(self, cpu_seconds: float) -> None:
         """References of a scene were localized against the others, and the calibration was stored."""

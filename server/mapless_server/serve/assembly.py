@@ -138,21 +138,21 @@ def engine_over(
     pair_observer: PairObserver | None = None,
     depth_network: Reconstructor | None = None,
 ) -> QueueEngine:
-    """An engine and the references in memory that it reads.
+    """Makes an engine, and the references in memory that it uses.
 
     Args:
-        store: of the references.
-        tiers: the cheapest first.
-        options: limits.
-        observer: see `Engine`.
-        quota: likewise.
-        method: likewise.
-        descriptor: for choosing references; None makes one of the first tier's features.
-        pair_observer: of matches and depths of references.
-        depth_network: makes the depths that are kept with references; None makes none.
+        store: store of the references.
+        tiers: the tiers, the cheapest first.
+        options: limits of the engine.
+        observer: see `QueueEngine`.
+        quota: see `QueueEngine`.
+        method: see `QueueEngine`.
+        descriptor: global descriptor for choosing references; None makes one from the first tier's features.
+        pair_observer: receives events of the matching and the depths of references.
+        depth_network: makes the depths stored with references; None makes none.
 
     Raises:
-        ValueError: no tier, two with the same extractor or matcher, or a descriptor of other features.
+        ValueError: there is no tier, two have the same extractor or matcher, or the descriptor uses other features.
     """
     check_tiers(tiers)
     extractors = [tier.extractor for tier in tiers]
@@ -254,7 +254,7 @@ def make_tiers(settings: Settings) -> tuple[Tier, ...]:
 
 
 def make_depth_network(settings: Settings, tiers: Sequence[Tier]) -> Reconstructor | None:
-    """The network that makes the depths kept with references; None if none does. Errors as `make_tiers`."""
+    """Makes the network of the depths stored with references; None without one. Errors as in `make_tiers`."""
     name = settings.reference_depth
     if name in (OFF, STORED):
         return None

@@ -1,8 +1,8 @@
-"""Depth that is kept with references, of one or more kinds.
+"""Depths that are stored with references, of one or more kinds.
 
-A *kind* names everything that determines a depth beside the photographs: the version of how it is made and checked, the
-network and its weights. Depth of another version is never read. Which references are done is known as for pairs (see
-`pairs`), under the kind's name; one without depth that is done was found wrong, or could not be checked.
+A *kind* names everything that determines a depth besides the photographs: the version of making and checking it, the
+    network and its weights. Depths of another version are never read. Finished references are recorded as for pairs
+    (see `pairs`), under the kind's name; if a finished one has no depth, this was found wrong, or could not be checked.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ def depth_kind(network: str, weights_sha256: str) -> str:
 
 @dataclass(frozen=True)
 class FoundDepths:
-    """What is kept with some references.
+    """The depths stored with some references.
 
     Attributes:
-        depths: by the key of the reference.
-        damaged: kinds and keys of those that are damaged; others of the same reference are used.
+        depths: depths by the key of the reference.
+        damaged: kinds and keys of damaged depths; others of the same reference are used.
     """
 
     depths: dict[str, KeptDepth]
@@ -45,7 +45,7 @@ class FoundDepths:
 
 
 def load_depths(database: Database, keys: Collection[str], kind: str | None = None) -> FoundDepths:
-    """The depths that are kept with references; of one kind, or of the first kind of today's version that there is."""
+    """Loads the depths stored with references, of one kind, or of the first existing kind of the present version."""
     column = reference_depth.c
     of_kind = column.kind.startswith(_OF_VERSION, autoescape=True) if kind is None else column.kind == kind
     stored: Select[Any] = select(column.reference_key, column.kind, column.data, column.sha256)
@@ -64,7 +64,7 @@ def load_depths(database: Database, keys: Collection[str], kind: str | None = No
 
 
 def list_without(database: Database, kind: str, keys: Collection[str]) -> list[str]:
-    """Those of these references, in order, with which no depth of a kind is kept."""
+    """Those of these references, in order, without a stored depth of a kind."""
     column = reference_depth.c
     with database.read() as connection:
         kept = set(
@@ -74,7 +74,7 @@ def list_without(database: Database, kind: str, keys: Collection[str]) -> list[s
 
 
 def keep_depths(database: Database, kind: str, depths: Mapping[str, KeptDepth]) -> None:
-    """Keeps depths with the references that still exist, unless there are some already."""
+    """Stores depths of the references that still exist, unless they have some already."""
     encoded = {key: codec.encode_depth(it) for key, it in sorted(depths.items())}
     with database.write() as connection:
         existing = select(reference.c.key).where(reference.c.key.in_(encoded)).order_by(reference.c.key)
@@ -95,7 +95,7 @@ def discard_depths(database: Database, damaged: Collection[tuple[str, str]]) -> 
 
 
 def list_kinds(database: Database) -> list[str]:
-    """The kinds of today's version that are kept with any reference."""
+    """The kinds of the present version that are stored with any reference."""
     column = reference_depth.c
     with database.read() as connection:
         kinds = select(column.kind).where(column.kind.startswith(_OF_VERSION, autoescape=True)).distinct()

@@ -1,10 +1,10 @@
-"""Which matchings have use: the pairs of those that no server has used for long are deleted.
+"""Which matchings are in use: pairs of those that no server has used for long are deleted.
 
-Kinds of self-calibrations and of kept depths are recorded likewise, and deleted with the matchings.
+Kinds of self-calibrations and of stored depths are recorded and deleted in the same way.
 
 Servers with other settings may share a database, and a server that is stopped is started again; so a matching is kept
-for `KEPT_S` after a server last recorded that it uses it. Should a server of other features come later than that, its
-pairs are made again.
+for `KEPT_S` after a server last recorded that it uses it. If a server with other features is started later than that,
+its pairs are made again.
 """
 
 from __future__ import annotations

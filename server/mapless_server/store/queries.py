@@ -1,6 +1,7 @@
 """Statements that several operations of the store share; each runs in the caller's transaction.
 
-And what has changed in a scene since a generation, so that indexes in memory are updated without reading it again.
+`read_changes` finds what has changed in a scene since a generation, so that indexes in memory are updated without
+reading the whole scene.
 """
 
 from __future__ import annotations

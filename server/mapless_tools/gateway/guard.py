@@ -120,7 +120,7 @@ class Guard:
 
 
 def check_json(text: bytes | bytearray, field: str | None = None) -> None:
-    """Refuses a JSON text of too many values, before it is parsed."""
+    """Rejects a JSON text with too many values, before it is parsed."""
     if sum(map(text.count, (b",", b"[", b"{"))) > MAX_VALUES:
         raise Failure(f"the JSON has more than {MAX_VALUES} values", field=field)
 

@@ -49,7 +49,7 @@ class _Application(ConnectASGIApplication[None]):
 
 
 class _JsonCodec:
-    """The library's, for texts that are parsed in a moment: the gateway answers nobody else meanwhile."""
+    """The library's codec for texts that are parsed quickly, since the gateway answers no other call meanwhile."""
 
     def __init__(self) -> None:
         codec = google_protobuf_json_codec()
@@ -109,7 +109,7 @@ def rpc_application(connect: Connect, max_message_bytes: int) -> ASGIApp:
 
 
 def _is_printable(text: bytes) -> bool:
-    """Whether it can be metadata of gRPC."""
+    """Whether a text can be metadata of gRPC."""
     return text.isascii() and text.decode("ascii").isprintable()
 
 

@@ -240,7 +240,7 @@ async def _listed(client: aio.Client) -> int:
 
 
 async def _seen_until(leaving: asyncio.Task[None], stream: Any) -> tuple[int, str]:
-    """Messages until `leaving` is over, and "left"; or the status if the server ended the stream before."""
+    """Counts messages until `leaving` ends, then returns "left"; or the status if the server ended the stream."""
     seen = 0
 
     async def read() -> None:

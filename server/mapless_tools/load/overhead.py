@@ -1,4 +1,4 @@
-"""What serving costs without computing: calls a second at most, and the time beyond that of a bare gRPC server."""
+"""The cost of serving without computing: the largest rate of calls, and the latency beyond a bare gRPC server's."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def measure_overhead(options: OverheadOptions, progress: Progress) -> list[Subje
 
 
 def overhead_checks(subjects: Sequence[Subject]) -> list[Check]:
-    """The bars; the server is compared with the bare one whose answers are as short, which is the harder comparison."""
+    """The bars; the server is compared with the bare one of equally short answers, the harder comparison."""
     by_name = {subject.name: subject for subject in subjects}
     ours, bare = by_name[MAPLESS], by_name[BARE]
     rounds = [a - b for a, b in zip(ours.p50s_ms, bare.p50s_ms, strict=True)]

@@ -68,7 +68,7 @@ def photo_request(image: bytes, camera: Camera, references: Sequence[str]) -> by
 
 
 def read_answer(data: bytes) -> str:
-    """Its outcome: "localized", "coarse" for a pose that there was no time to refine, or "rejected" and why."""
+    """Outcome of an answer: "localized", "coarse" for a pose without time to refine it, or "rejected" and why."""
     answer = pb.LocalizeResponse.FromString(data)
     if answer.WhichOneof("outcome") == "rejection":
         reasons: wire.ProtoEnum = pb.RejectionReason

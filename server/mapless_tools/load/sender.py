@@ -98,7 +98,7 @@ async def send_open_loop(target: Target, plan: Sequence[PlannedCall], start_s: f
 async def send_closed_loop(
     target: Target, requests: Sequence[bytes], concurrency: int, duration_s: float
 ) -> list[CallRecord]:
-    """Keeps so many calls in progress for a while: what a server can do at most; with one, what an unloaded one does.
+    """Keeps this many calls in progress, to measure the largest rate or, with one call, the unloaded latency.
 
     It does not measure latency under load, since the callers wait for the server. A refused caller calls again when the
     server requests it; otherwise cheap refusals would dominate the measurement.

@@ -18,5 +18,5 @@ class NoOpReplica(MaplessReplica):
 
 
 def build(settings: dict[str, Any]) -> Application:
-    """As `mapless_ray.app.build`."""
+    """Makes the application, as `mapless_ray.app.build` does."""
     return deployed(NoOpReplica, {"warm_up": False, **settings})

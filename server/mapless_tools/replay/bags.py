@@ -93,18 +93,18 @@ def replay_bag(
     progress: Progress,
     sequence_length: int = 0,
 ) -> BagReport:
-    """Localizes a recording; `out` is whole however it ends, with what was computed until then.
+    """Localizes a recording; `out` is a valid recording in any case, with what was computed so far.
 
     Args:
         path: the recording.
         out: folder to write, which must not exist.
-        client: of the server.
-        bag: where the recording holds what.
-        options: of the localizer. An empty `odom_frame` or `base_frame` is that of the recording's poses. The rate 0
-            takes every image.
-        camera: for a recording without CameraInfo.
-        progress: called with how far it is.
-        sequence_length: see LocalizerOptions, which can have it only where the recording has odometry.
+        client: client of the server.
+        bag: which topics and frames of the recording are used.
+        options: options of the localizer. An empty `odom_frame` or `base_frame` is that of the recording's poses. The
+            rate 0 takes every image.
+        camera: camera of a recording without CameraInfo.
+        progress: reports the progress.
+        sequence_length: see LocalizerOptions; only for recordings with odometry.
 
     Raises:
         ValueError: the recording or the options cannot be used; nothing is written then.

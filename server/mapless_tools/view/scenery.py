@@ -63,7 +63,7 @@ def lay_out(scene: Scene, references: Sequence[Reference], max_pictured: int) ->
 
 
 def spread_out(spots: Array, count: int) -> NDArray[np.intp]:
-    """Indices of at most so many rows of (N, D), each the furthest from all before it; the first is the middlemost."""
+    """Indices of at most `count` rows of (N, D), each the farthest from all before it, from the central one on."""
     first = int(np.argmin(np.linalg.norm(spots - np.median(spots, axis=0), axis=1)))
     chosen, apart = [first], np.linalg.norm(spots - spots[first], axis=1)
     while len(chosen) < min(count, len(spots)):

@@ -53,7 +53,7 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
     """Keeps the newest image, and a thread that localizes it."""
 
     def __init__(self) -> None:
-        """ValueError or OSError if a parameter cannot be used."""
+        """Raises ValueError or OSError if a parameter cannot be used."""
         super().__init__("mapless")
         self._given = {name: self.declare_parameter(name, value).value for name, value in PARAMETERS.items()}
         options = mapless.ros.LocalizerOptions(
@@ -171,7 +171,7 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
             self._edge = outcome.tf_edge
 
     def _broadcast(self) -> None:
-        """Repeats the last map > odom with the time of now, for those who ask where the robot is now."""
+        """Repeats the last map > odom with the present time, for nodes that need the present pose."""
         if self._edge is None:
             return
         child, map_from_child = self._edge
@@ -189,7 +189,7 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
 
 
 def main() -> None:
-    """Run the node until it is interrupted; exit code 1 if a parameter cannot be used."""
+    """Runs the node until it is interrupted; exit code 1 if a parameter cannot be used."""
     rclpy.init()
     node = None
     try:

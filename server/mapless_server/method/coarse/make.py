@@ -43,7 +43,7 @@ def make_reconstructor(
         backend: one of `BACKENDS`, or `auto`.
         weights_dir: the weights folder.
         device: "cpu" or a CUDA device.
-        options: of a network's backend.
+        options: options of a network's backend.
         compiled_views: number of views, the query included, for which a network is compiled, which takes minutes; for
             photographs of 4:3, landscape or portrait. 0 compiles nothing. Other queries are computed uncompiled.
         query_rays: see NetworkOptions.

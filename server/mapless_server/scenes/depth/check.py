@@ -1,9 +1,9 @@
-"""What is kept of the depths that a network predicts for references: what agrees with their poses.
+"""Checks the depths that a network predicts for references, and keeps those that agree with the poses.
 
 The network sees references whose poses are known, and one more photograph, whose pose is known too but not given. Its
-depths are compared with three things that it did not make:
+depths are compared with three independent results:
 
-    the pose of that photograph    the network has understood the place if it finds it about where it is;
+    the pose of that photograph    the network's depths are plausible if it finds this pose approximately;
     triangulated points            of each reference, matched with others: their median gives the reference's scale,
                                    and their spread the standard deviation of its depths;
     the other references           a pixel that lies in front of what others see there, more often than on it, is wrong:
@@ -37,16 +37,16 @@ class DepthCheckOptions:
     Attributes:
         max_off, max_off_deg: largest error of the predicted pose that was not given: of its position as a share of the
             median depth, and of its rotation. Networks are better by far where they understand a place.
-        min_parallax_deg: of triangulated points: at 2 degrees a keypoint's error of half a pixel, at a focal length of
-            500 px, is 3 % of the depth.
-        min_points: fewest triangulated points of a reference.
+        min_parallax_deg: least parallax of triangulated points: at 2 degrees a keypoint's error of half a pixel, at a
+            focal length of 500 px, is 3 % of the depth.
+        min_points: least number of triangulated points of a reference.
         max_scale: largest factor between a reference's scale and that of all together.
-        max_sigma: largest standard deviation of depths, relative: beyond, they place no point better than matches do.
-        min_sigma: the least that is believed.
+        max_sigma: largest relative standard deviation of depths; less accurate ones are no better than matches.
+        min_sigma: least assumed standard deviation.
         agreeing_sigma: depths of two references that differ by less, in their standard deviations, are of one surface.
         max_wrong: largest share of wrong pixels, of those that another reference sees.
         max_step: largest factor between the depths of neighbouring pixels that are of one surface.
-        min_confidence: of the network, below which nothing is kept.
+        min_confidence: least confidence of the network for which a depth is kept.
     """
 
     max_off: float = 0.1
@@ -78,15 +78,15 @@ def checked_depths(
     correspondences: Correspondences,
     options: DepthCheckOptions,
 ) -> list[KeptDepth | None]:
-    """What is kept of each reference's predicted depths.
+    """Returns the part of each reference's predicted depths that is kept.
 
     Args:
-        reconstruction: of the references and the photograph whose pose was not given.
+        reconstruction: reconstruction of the references and the photograph whose pose was not given.
         scale: its metric scale.
-        references: with their poses.
+        references: the references, with their poses.
         world_from_query: the pose that was not given.
         correspondences: matches of the references with one another.
-        options: see there.
+        options: options of the check.
 
     Returns:
         For each reference its depth, or None if nothing is kept.
@@ -123,7 +123,7 @@ def _scaled(
     structure: Structure,
     options: DepthCheckOptions,
 ) -> KeptDepth | None:
-    """A reference's depth in the scale of its triangulated points; None if it disagrees with them."""
+    """A reference's depth at the scale of its triangulated points; None if it disagrees with them."""
     point, keypoint = seen
     predicted = metres_per_unit * view.point_map[..., 2].astype(np.float64)
     usable = np.isfinite(predicted) & (predicted > 0) & (view.confidence >= options.min_confidence)
@@ -143,7 +143,7 @@ def _scaled(
 
 
 def _is_smooth(depth: Array, max_step: float) -> NDArray[np.bool_]:
-    """(H, W): whether a pixel and its neighbours are of one surface."""
+    """Mask (H, W) of the pixels that are of one surface with their neighbours."""
     known = np.isfinite(depth)
     around = np.ones((3, 3), np.uint8)
     nearest = cv2.erode(np.where(known, depth, np.inf), around)
@@ -154,7 +154,7 @@ def _is_smooth(depth: Array, max_step: float) -> NDArray[np.bool_]:
 def _confirmed(
     index: int, depths: Sequence[KeptDepth | None], references: Sequence[PosedView], options: DepthCheckOptions
 ) -> KeptDepth | None:
-    """A reference's depth without the pixels that others look through; None if these are too many."""
+    """Removes pixels in front of what others see there from a reference's depth; None if these are too many."""
     kept = depths[index]
     if kept is None:
         return None

@@ -1,4 +1,4 @@
-"""What queries find of the depths that are kept with references."""
+"""Lets queries find the depths stored with references."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _CACHE_BYTES = 32 * 2**20
 
 
 class DepthFinder:
-    """Adds kept depths to loaded references; thread-safe."""
+    """Adds stored depths to loaded references; thread-safe."""
 
     def __init__(self, database: Database, observer: PairObserver, kind: str | None = None) -> None:
-        """`kind` is that of the depths; None takes any of today's version, whichever server has made them."""
+        """`kind` is that of the depths; None for any kind of the present version, made by any server."""
         self._database = database
         self._observer = observer
         self._kind = kind
@@ -33,7 +33,7 @@ class DepthFinder:
         self._guard = threading.Lock()
 
     def with_depths(self, references: Sequence[PosedView], extractor: str) -> tuple[PosedView, ...]:
-        """The references with the depths that are kept at their keypoints, which are this extractor's; never raises."""
+        """Returns the references with the depths stored for their keypoints, of this extractor; never raises."""
         found = {it.key: self._cache.get((it.key, extractor)) for it in references}
         missing = [it for it in references if found[it.key] is None]
         if missing:
@@ -58,7 +58,7 @@ class DepthFinder:
         return found
 
     def take_damaged(self) -> frozenset[tuple[str, str]]:
-        """Kinds and keys of those that were found damaged since the last call."""
+        """Returns kinds and keys of the depths that were found damaged since the last call."""
         with self._guard:
             damaged, self._damaged = frozenset(self._damaged), set()
         return damaged

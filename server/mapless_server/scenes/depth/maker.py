@@ -1,4 +1,4 @@
-"""Depths of a reference and its neighbours, by a network."""
+"""Predicts depths of a reference and its neighbours by a network."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class DepthMakerOptions:
     """Options of making depths.
 
     Attributes:
-        neighbours: references that the network sees beside the one that is wanted, at most; as many as in a query of
-            ten references cost half of its memory.
-        shortlist: so many times the neighbours are matched with it, and the best taken.
-        check: of what is kept.
+        neighbours: largest number of references that the network gets besides the wanted one; as many as in a query of
+            ten references need half of its memory.
+        shortlist: number of references that are matched with it, as a multiple of `neighbours`; the best are used.
+        check: options of the check.
     """
 
     neighbours: int = 7
@@ -65,27 +65,27 @@ class DepthMaker:
 
     @property
     def kind(self) -> str:
-        """Of the depths."""
+        """Kind of the depths."""
         return depth_kind(self._network.name, self._network.weights_sha256)
 
     def make(
         self, scene_key: SceneKey, library: ReferenceLibrary, reference_id: str, check: Callable[[], None]
     ) -> dict[str, KeptDepth | None]:
-        """Depths of a reference and those of its neighbours that the network sees with it, by key.
+        """Makes the depths of a reference and of its neighbours that the network gets with it, by key.
 
-        None is for what is not kept. Nothing is returned of a reference that has fewer than two neighbours that share
+        A depth that is not kept is None. The result is empty if the reference has fewer than two neighbours that share
         matches with it.
 
         Args:
-            scene_key: of the scene.
+            scene_key: key of the scene.
             library: loads its references.
-            reference_id: of the reference.
+            reference_id: id of the reference.
             check: called between the steps; may raise, which ends it.
 
         Raises:
             NotFound: the reference or the scene was deleted.
             DataLoss: the reference is damaged.
-            Exception: of the network.
+            Exception: any exception of the network.
         """
         context = StageContext(check)
         _, (subject,) = library.load(scene_key, [reference_id], self._extractor, context)
@@ -140,7 +140,7 @@ class DepthMaker:
     def _load_usable(
         self, scene_key: SceneKey, library: ReferenceLibrary, wanted: Sequence[str], context: StageContext
     ) -> tuple[PosedView, ...]:
-        """Those that exist and are not damaged."""
+        """Loads those of the references that exist and are not damaged."""
 
         def report(damaged_id: str, error: RequestError) -> None:
             if isinstance(error, DataLoss):

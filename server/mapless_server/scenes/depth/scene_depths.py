@@ -1,4 +1,4 @@
-"""Makes the depths of references that have none, one after the other, for all servers of a database together."""
+"""Makes the depths of references without any, one after the other, for all servers of a database."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ _CACHE_BYTES = 32 * 2**20
 
 
 class SceneDepths:
-    """Depths of a store's references; of one thread."""
+    """Makes depths for the references of a store; for use by one thread."""
 
     def __init__(self, store: Store, finder: DepthFinder, maker: DepthMaker | None, observer: PairObserver) -> None:
-        """Without a maker, depths that other servers have made are used, and none made."""
+        """Without a maker, depths of other servers are used, but none are made."""
         self._store = store
         self._finder = finder
         self._maker = maker
@@ -39,12 +39,12 @@ class SceneDepths:
         self._is_abandoned = False
 
     def abandon(self) -> None:
-        """The store is about to be closed while the network computes: nothing is stored any more."""
+        """Ends storing, since the store will be closed while the network computes."""
         self._is_abandoned = True
 
     @property
     def kinds(self) -> list[str]:
-        """The kinds of depths in use, as `record_use` takes them."""
+        """The kinds of depths in use, for `record_use`."""
         return list_kinds(self._store.database) if self._maker is None else [self._maker.kind]
 
     def maintain(self) -> None:

@@ -73,7 +73,7 @@ def _add(
 
 
 def read_pose(file: Path) -> RigidTransform:
-    """The pose in a text file of 4x4 numbers; ValueError if there is none, as in frames where tracking was lost."""
+    """Reads the pose in a text file of 4x4 numbers; ValueError if there is none, as where tracking was lost."""
     if not file.is_file():
         raise ValueError(f"pose: there is no file {file}")
     try:

@@ -1,4 +1,4 @@
-"""Expand: depth that is kept with references."""
+"""Revision 7 (expand): depths that are stored with references."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ down_revision = "6"
 
 
 def upgrade() -> None:
-    """Adds a table that servers of revision 6 ignore; its rows go with the references that those delete."""
+    """Adds a table that servers of revision 6 ignore; its rows are deleted with the references."""
     op.create_table(
         "reference_depth",
         sa.Column("reference_key", sa.String(32), sa.ForeignKey("reference.key", ondelete="CASCADE"), primary_key=True),
