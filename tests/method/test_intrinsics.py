@@ -14,12 +14,12 @@ from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 from mapless.geometry import Array, Camera, Distortion, Fisheye, RadialTangential
 from mapless_server.method.adjust import adjust_pose
 from mapless_server.method.features import undistort_pixels
-from mapless_server.method.intrinsics import IntrinsicsEvidence, corrected, keypoint_motion
+from mapless_server.method.intrinsics import ContradictionOptions, IntrinsicsEvidence, corrected, keypoint_motion
 from mapless_server.method.options import IntrinsicsSigma
 from mapless_server.method.pose_problem import AdjustOptions, pose_problem, with_intrinsics
 from mapless_server.method.rejection import Advice, RejectionReason
 from mapless_server.method.results import PoseEstimate
-from mapless_server.method.trust.intrinsics import IntrinsicsOptions, intrinsics_checks, wrong_intrinsics
+from mapless_server.method.trust.intrinsics import intrinsics_checks, wrong_intrinsics
 
 LENSES = {
     "pinhole": None,
@@ -27,7 +27,7 @@ LENSES = {
     "fisheye": Fisheye(0.03, -0.015, 0.004, -0.001),
     "empty fisheye": Fisheye(),
 }
-ERRORS = {"focal length": (0.01, 0, 0, 0), "principal point": (0, 8.0, -6.0, 0), "k1": (0, 0, 0, 0.03)}
+ERRORS = {"focal length": (0.01, 0, 0, 0), "principal point": (0, 16.0, -14.0, 0), "k1": (0, 0, 0, 0.06)}
 
 
 @pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
@@ -77,6 +77,20 @@ def test_right_intrinsics_have_no_significant_errors() -> None:
     found = [adjusted(make_scene(random_for("right", i))).intrinsics for i in range(5)]
     normalized = np.array([it.value / it.sigma for it in found if it])
     assert np.abs(normalized).max() < 1.5
+
+
+def test_what_the_matches_of_a_reference_share_is_in_the_sigma() -> None:
+    """A wrong focal length of two references of five, by which the photograph's is off and more uncertain."""
+    scene = make_scene(random_for("shared error"), SceneOptions(reference_count=5))
+    wrong = [
+        replace(it, view=replace(it.view, camera=corrected(it.view.camera, (error, 0, 0, 0)).pinhole()))
+        for it, error in zip(scene.references, (0.02, 0, -0.015, 0, 0), strict=True)
+    ]
+    right, off = (adjusted(replace(scene, references=tuple(it))).intrinsics for it in (scene.references, wrong))
+    assert right
+    assert off
+    assert off.sigma[0] > 2 * right.sigma[0]
+    assert abs(off.value[0]) < 3 * off.sigma[0]
 
 
 def test_a_flat_wall_does_not_determine_the_focal_length() -> None:
@@ -130,7 +144,7 @@ def test_a_contradicted_parameter_is_estimated_with_the_pose(case: str) -> None:
     assert (np.abs(found.intrinsics.value - errors) < 3 * sigma)[wrong].all()
     assert (np.abs(found.intrinsics.removed - errors) < 1.5 * found.intrinsics.prior_sigma).all()
     assert_pose_close(found.world_from_camera, scene.world_from_query, metres=0.012, degrees=0.2)
-    judged = wrong_intrinsics(found.intrinsics, "best", IntrinsicsOptions())
+    judged = wrong_intrinsics(found.intrinsics, "best", ContradictionOptions())
     assert judged
     assert [it.conflict for it in judged.intrinsics_checks] == wrong.tolist()
 
@@ -143,7 +157,7 @@ def test_a_wide_prior_leaves_the_intrinsics_to_the_photograph(case: str) -> None
     assert found.intrinsics
     assert (found.intrinsics.removed != 0).any()
     assert_pose_close(found.world_from_camera, scene.world_from_query, metres=0.012, degrees=0.2)
-    assert wrong_intrinsics(found.intrinsics, "best", IntrinsicsOptions()) is None
+    assert wrong_intrinsics(found.intrinsics, "best", ContradictionOptions()) is None
 
 
 def test_a_prior_as_wide_as_that_of_estimates_ends() -> None:
@@ -161,7 +175,7 @@ def test_right_intrinsics_are_never_rejected() -> None:
         found = adjusted(scene)
         assert found.intrinsics
         assert found.view is None
-        assert wrong_intrinsics(found.intrinsics, "best", IntrinsicsOptions()) is None
+        assert wrong_intrinsics(found.intrinsics, "best", ContradictionOptions()) is None
 
 
 def test_a_flat_wall_contradicts_no_focal_length() -> None:
@@ -170,7 +184,7 @@ def test_a_flat_wall_contradicts_no_focal_length() -> None:
     found = adjusted(misread(make_scene(random_for("wall"), frontal), (0.05, 0, 0, 0)))
     assert found.view is None
     assert found.intrinsics
-    assert wrong_intrinsics(found.intrinsics, "best", IntrinsicsOptions()) is None
+    assert wrong_intrinsics(found.intrinsics, "best", ContradictionOptions()) is None
 
 
 def evidence_of(lens: Distortion | None, value: tuple[float, ...]) -> IntrinsicsEvidence:
@@ -196,7 +210,7 @@ def evidence_of(lens: Distortion | None, value: tuple[float, ...]) -> Intrinsics
 def test_a_rejection_names_the_parameter_and_its_value(
     lens: Distortion | None, value: tuple[float, ...], message: str, advice: str
 ) -> None:
-    rejection = wrong_intrinsics(evidence_of(lens, value), "scenes/hall/references/a", IntrinsicsOptions())
+    rejection = wrong_intrinsics(evidence_of(lens, value), "scenes/hall/references/a", ContradictionOptions())
     assert rejection
     assert rejection.reason is RejectionReason.GATE
     assert re.search(message.replace("+-", r"\+-"), rejection.message), rejection.message
@@ -207,14 +221,14 @@ def test_a_rejection_names_the_parameter_and_its_value(
 
 def test_what_the_prior_allows_is_no_conflict() -> None:
     """One percent of the focal length is significant, but three of both standard deviations together."""
-    (focal, *_) = intrinsics_checks(evidence_of(None, (0.0105, 0, 0, 0)), IntrinsicsOptions())
+    (focal, *_) = intrinsics_checks(evidence_of(None, (0.0105, 0, 0, 0)), ContradictionOptions())
     assert not focal.conflict
     assert focal.used
     assert focal.estimated == pytest.approx(1050 * np.exp(0.0105))
     wider = replace(evidence_of(None, (0.03, 0, 0, 0)), prior_sigma=np.array([0.02, 2, 2, 0.01]))
-    assert wrong_intrinsics(wider, "best", IntrinsicsOptions()) is None
+    assert wrong_intrinsics(wider, "best", ContradictionOptions()) is None
     unsure = replace(evidence_of(None, (0.3, 0, 0, 0)), sigma=np.array([0.05, 1, 1, 0.01]))
-    assert wrong_intrinsics(unsure, "best", IntrinsicsOptions()) is None
+    assert wrong_intrinsics(unsure, "best", ContradictionOptions()) is None
 
 
 def test_reduced_equations_equal_those_of_plain_rows() -> None:

@@ -14,7 +14,7 @@ from support.planted import NOISE, disturbed, drifted, metric_scale, stages, tru
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, Similarity
-from mapless_server.method.adjust import adjust_pose, pose_covariance
+from mapless_server.method.adjust import adjust_pose, with_covariance
 from mapless_server.method.perturbation import rotation_vector
 from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.pose_problem import AdjustOptions
@@ -96,7 +96,8 @@ def test_covariance_of_scale_noise_equals_sampling() -> None:
         errors.append(error(estimate.world_from_camera, scene.world_from_query))
         scale = replace(UNSCALED, deviation=0.02)
         covariances.append(scale_covariance(estimate.world_from_camera, centroid, scale.deviation))
-        stated = pose_covariance(support_of(scene, wrong, estimate), scale, PLAIN_ADJUST, points_are_predicted=True)
+        support = support_of(scene, wrong, estimate)
+        stated = with_covariance(support, scale, PLAIN_ADJUST, points_are_predicted=True).covariance
         assert np.linalg.eigvalsh(stated - covariances[-1]).min() > -1e-12  # it comes on top of everything else
     position = true_by_stated(errors, covariances, POSITION)
     assert position == pytest.approx(1, abs=0.4)
@@ -119,10 +120,10 @@ def test_an_initial_poses_covariance_covers_its_errors() -> None:
     errors_px = np.full(len(matches), 2.0)
     initial = replace(estimate, world_from_camera=moved, stage=PoseStage.INITIAL, errors_px=errors_px)
     wide = replace(PLAIN_ADJUST, loss_scale_sigma=100.0)
-    covariance = pose_covariance(support_of(scene, structure, initial), UNSCALED, wide)
+    covariance = with_covariance(support_of(scene, structure, initial), UNSCALED, wide).covariance
     along = off / np.linalg.norm(off)
     assert np.sqrt(along @ covariance[:3, :3] @ along) == pytest.approx(0.05, rel=0.3)
-    refined = pose_covariance(support_of(scene, structure, estimate), UNSCALED, wide)
+    refined = with_covariance(support_of(scene, structure, estimate), UNSCALED, wide).covariance
     assert np.sqrt(along @ refined[:3, :3] @ along) < 0.02
 
 
@@ -130,19 +131,20 @@ def test_factors_multiply_standard_deviations() -> None:
     scene = make_scene(random_for("factors"), FEW)
     structure, _, estimate = stages(scene, scene.references)
     support = support_of(scene, structure, estimate)
-    plain = pose_covariance(support, UNSCALED, PLAIN_ADJUST)
-    factored = pose_covariance(
-        support, UNSCALED, AdjustOptions(uncertainty=replace(PLAIN, position_factor=2.0, rotation_factor=3.0))
-    )
+    factors = AdjustOptions(uncertainty=replace(PLAIN, position_factor=2.0, rotation_factor=3.0))
+    plain, factored = (with_covariance(support, UNSCALED, options) for options in (PLAIN_ADJUST, factors))
+    assert plain.intrinsics
     factor = np.repeat([2.0, 3.0], 3)
-    np.testing.assert_allclose(factored, factor[:, None] * plain * factor)
+    of_intrinsics = plain.intrinsics.pose_covariance  # without factors
+    expected = factor[:, None] * (plain.covariance - of_intrinsics) * factor + of_intrinsics
+    np.testing.assert_allclose(factored.covariance, expected, atol=1e-15)
 
 
 def test_matches_with_one_point_keep_the_former_covariance() -> None:
     scene = make_scene(random_for("spot"), FEW)
     structure, _, estimate = stages(scene, scene.references)
     nowhere = replace(structure, x_in_world=np.zeros_like(structure.x_in_world))
-    covariance = pose_covariance(support_of(scene, nowhere, estimate), UNSCALED, PLAIN_ADJUST)
+    covariance = with_covariance(support_of(scene, nowhere, estimate), UNSCALED, PLAIN_ADJUST).covariance
     np.testing.assert_array_equal(covariance, estimate.covariance)
 
 
@@ -151,4 +153,4 @@ def test_a_support_without_a_pose_is_refused() -> None:
     structure, matches = true_structure(scene)
     support = Support(scene.query, scene.references, structure, matches, None, np.zeros(3))
     with pytest.raises(ValueError, match="estimate must not be None"):
-        pose_covariance(support, UNSCALED, PLAIN_ADJUST)
+        with_covariance(support, UNSCALED, PLAIN_ADJUST)

@@ -21,11 +21,11 @@ from mapless.geometry import Array
 
 from .optimize import MinimizeOptions, minimize
 from .options import IntrinsicsSigma
-from .pose_problem import AdjustOptions, adjusted_estimate, pose_problem
+from .pose_problem import AdjustOptions, adjusted_estimate, errors_of_pose, pose_problem
 from .priors.known import NO_PRIORS, Priors
 from .recalibrate import recalibrated
 from .results import MetricScale, PointMatches, PoseEstimate, PoseStage, Structure, Support
-from .uncertainty.covariance import adjusted_covariance, scale_covariance
+from .uncertainty.covariance import scale_covariance
 from .views import PosedView, View
 
 SHARED_CAMERA = 0.03
@@ -92,24 +92,31 @@ def _adjusted(
     problem, start = pose_problem(query, references, structure, matches, used, estimate.world_from_camera, options)
     with_priors = replace(problem, priors=priors, prior_weight=options.error_inflation**2)
     bundle = minimize(with_priors, start, MinimizeOptions(options.iterations, options.min_decrease))
-    usual = (intrinsics or IntrinsicsSigma()).of(query.camera)
-    is_shared = 2 * sum(query.has_camera_of(it.view) for it in references) > len(references)
-    held = SHARED_CAMERA * usual if intrinsics is None and is_shared else usual
-    terms = (query, np.zeros(4), usual, held)
+    terms = intrinsics_terms(query, references, intrinsics)
     found = adjusted_estimate(query, structure, matches, used, estimate, problem, bundle, options, terms)
-    if found and found.intrinsics and found.intrinsics.contradicted(options.suspicion).any():
-        found = recalibrated(query, references, structure, matches, found, options, priors, usual)
+    if found and found.intrinsics:
+        found = recalibrated(query, references, structure, matches, found, options, priors, terms[2])
     return found and replace(found, covariance=priors.sharpened(found.covariance, found.world_from_camera))
 
 
-def pose_covariance(
+def intrinsics_terms(
+    query: View, references: Sequence[PosedView], intrinsics: IntrinsicsSigma | None
+) -> tuple[View, Array, Array, Array]:
+    """A photograph with its intrinsics as given, for `errors_of_pose`."""
+    usual = (intrinsics or IntrinsicsSigma()).of(query.camera)
+    is_shared = 2 * sum(query.has_camera_of(it.view) for it in references) > len(references)
+    return query, np.zeros(4), usual, SHARED_CAMERA * usual if intrinsics is None and is_shared else usual
+
+
+def with_covariance(
     support: Support,
     scale: MetricScale,
     options: AdjustOptions,
     priors: Priors = NO_PRIORS,
     points_are_predicted: bool = False,
-) -> Array:
-    """Covariance (6, 6) of a pose, order x y z rx ry rz, fixed world axes, metres and radians.
+    intrinsics: IntrinsicsSigma | None = None,
+) -> PoseEstimate:
+    """The estimate with the covariance of its pose, and the evidence of errors of its intrinsics.
 
     Args:
         support: the pose's support, with an estimate of any stage.
@@ -118,6 +125,7 @@ def pose_covariance(
         priors: on the pose; those that were used reduce the covariance.
         points_are_predicted: whether the structure's points are predicted by the reconstruction, rather than
             triangulated from the references' poses.
+        intrinsics: standard deviations of the query's intrinsics; None for the defaults.
 
     Raises:
         ValueError: there is no estimate.
@@ -126,16 +134,27 @@ def pose_covariance(
     if estimate is None:
         raise ValueError("support.estimate must not be None")
     if estimate.is_adjusted:
-        return estimate.covariance
+        return estimate
     used = np.flatnonzero(estimate.errors_px < options.max_error_px)
     if len(used) < 3:
-        return estimate.covariance
+        return estimate
     pose, is_initial = estimate.world_from_camera, estimate.stage is PoseStage.INITIAL
     problem, bundle = pose_problem(support.query, references, support.structure, matches, used, pose, options)
-    covariance = adjusted_covariance(problem, bundle, options.uncertainty, is_initial)
-    if covariance is None:
-        return estimate.covariance
+    terms = intrinsics_terms(support.query, references, intrinsics)
+    errors = errors_of_pose(support.query, problem, bundle, options, terms, is_initial)
+    if errors is None:
+        return estimate
+    covariance, evidence = errors
     if is_initial or points_are_predicted:
         centroid = np.mean([it.world_from_camera.translation for it in references], axis=0)
         covariance = covariance + scale_covariance(pose, centroid, scale.deviation)
-    return priors.consistent(estimate.prior_checks).sharpened(covariance, pose)
+    covariance = priors.consistent(estimate.prior_checks).sharpened(covariance, pose)
+    found = replace(estimate, covariance=covariance, intrinsics=evidence)
+    if evidence is None:
+        return found
+    # The pose stays as it is; but an error is not seen in full before it is estimated.
+    given = support.query, references, support.structure, matches
+    estimated = recalibrated(*given, found, options, NO_PRIORS, terms[2]).intrinsics
+    if estimated is not None and estimated.contradicted(options.contradiction, terms[2]).any():
+        found = replace(found, intrinsics=estimated)
+    return found

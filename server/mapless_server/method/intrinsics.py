@@ -11,7 +11,9 @@ where D is the given lens model: dD/dk1 = y |y|^2 for radial-tangential distorti
 theta^3 y / |y| for a fisheye.
 
 With all other unknowns eliminated from the normal equations of an adjustment, what is left is the information that the
-photograph's matches have of these errors. Of a flat wall that is next to none: the standard deviations say so.
+photograph's matches have of these errors. Of a flat wall that is next to none: the standard deviations say so. They
+contain what matches share, errors of the references and whatever a region of the photograph has in common, because they
+measure how the estimate changes without each of these parts.
 """
 
 from __future__ import annotations
@@ -38,22 +40,68 @@ class ContradictionOptions:
     """Options that define when a photograph contradicts a parameter of its intrinsics.
 
     Attributes:
-        sigmas: the parameter is off by more than this many standard deviations of its estimate. These do not contain
-            errors that matches share: right parameters were off by at most 3.2 with SIFT in eleven scenes, by 4.3 with
-            EdgePoint2 and five references of a kitchen, and by 7.5 among internet photographs (localized to 3 % of the
-            distance), whose references have wrong intrinsics themselves.
+        sigmas: it is off by more standard deviations of the given and the estimated value together.
         focal_share, principal_share, k1: standard deviations (of the focal length and the width, as shares) above
             which a photograph does not determine a parameter. Noise in the depth of a flat wall's points looks like
             relief of the wall: its focal length was off by 72 % with a standard deviation of 8.5 %.
     """
 
-    sigmas: float = 8.0
+    sigmas: float = 4.5
     focal_share: float = 0.02
     principal_share: float = 0.02
     k1: float = 0.05
 
     def __post_init__(self) -> None:
         check_bounds(self, "sigmas focal_share principal_share k1", above=0)
+
+    def contradicted(self, value: Array, sigma: Array, given_sigma: Array, width_px: int) -> NDArray[np.bool_]:
+        """(4,): which errors of these values and standard deviations are too large for given ones of `given_sigma`."""
+        limit_px = self.principal_share * width_px
+        determined = sigma < np.array([self.focal_share, limit_px, limit_px, self.k1])
+        return np.asarray(determined & (np.abs(value) > self.sigmas * np.hypot(given_sigma, sigma)))
+
+
+@dataclass(frozen=True, eq=False)
+class IntrinsicsEquations:
+    """Normal equations of the I errors of the intrinsics, all other unknowns eliminated; see `uncertainty.dispersion`.
+
+    Attributes:
+        matrices, gradients: (1 + K, I, I) and (1 + K, I): of all data, and without each of K references.
+        region_matrices, region_gradients: (G, I, I) and (G, I): the parts of G regions of the photograph.
+        motion: (6, I) how the pose moves with each error, as a left perturbation of camera_from_world.
+    """
+
+    matrices: Array
+    gradients: Array
+    region_matrices: Array
+    region_gradients: Array
+    motion: Array
+
+    def estimate(
+        self, removed: Array, information: Array, inflation: float, region_factor: float
+    ) -> tuple[Array, Array]:
+        """The errors (4,), and their covariance (4, 4), which contains what matches share.
+
+        As that of a pose, it is the sum of the jackknife over references and over regions, these at the errors that are
+        found; to which come what the prior leaves and what the residuals say, for few references may agree by chance.
+
+        Args:
+            removed: (4,) errors that are removed from the intrinsics at which the equations are linearized.
+            information: (4,) inverse variances of the errors without the photograph.
+            inflation: of standard deviations that follow from residuals; weighs the data against the prior.
+            region_factor: see `UncertaintyOptions`.
+
+        Raises:
+            np.linalg.LinAlgError: the data do not determine an error without a prior.
+        """
+        matrices, prior = self.matrices / inflation**2, np.diag(information)
+        inverse = np.linalg.inv(matrices + prior)
+        change, *without = -(inverse @ (self.gradients / inflation**2 + information * removed)[:, :, None])[:, :, 0]
+        parts = (self.region_gradients + self.region_matrices @ change) @ inverse[0] / inflation**2
+        references = np.array(without) - np.mean(without, axis=0) if without else np.zeros((1, len(removed)))
+        regions = region_factor * (parts - parts.mean(axis=0))
+        count, chance = len(references), inverse[0] @ (prior + matrices[0] / inflation**2) @ inverse[0]
+        return removed + change, (count - 1) / count * references.T @ references + regions.T @ regions + chance
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +111,10 @@ class IntrinsicsEvidence:
     Attributes:
         given: the camera, in pixels of the processed image, with its distortion.
         sent: the same in pixels of the photograph as it was sent.
-        value: (4,) each error as the photograph alone gives it, the other three held by their priors.
-        sigma: (4,) standard deviations of these; they contain errors of points and reference poses.
+        value: (4,) each error as the photograph alone gives it, the other three held by their priors. One that is not
+            removed is too small by up to a third: it takes weight from the matches that show it.
+        sigma: (4,) standard deviations of these; they contain errors of points, reference poses and all that matches
+            share.
         prior_sigma: (4,) standard deviations of the errors without the photograph, as of a camera of its own.
         covariance: (4, 4) about zero, of the errors that remain in the intrinsics with which the pose was computed:
             what the photograph and the prior say together, uncertainty and value.
@@ -87,67 +137,60 @@ class IntrinsicsEvidence:
         """What these errors add to the covariance (6, 6) of a pose that was computed without them."""
         return np.asarray(self.motion @ self.covariance @ self.motion.T)
 
-    def contradicted(self, options: ContradictionOptions) -> NDArray[np.bool_]:
-        """Which parameters (4,) are significantly wrong, and by more than one standard deviation of the prior.
+    def contradicted(self, options: ContradictionOptions, prior_sigma: Array | None = None) -> NDArray[np.bool_]:
+        """(4,): which parameters are significantly wrong.
 
-        A prior that is wider than the default does not raise this limit: the photograph is then more accurate.
+        `prior_sigma` (4,): standard deviations of the given values; by default those of the request, unless they are
+        wider than the usual ones: the photograph then knows better.
         """
-        width_px, size = self.given.width_px, np.abs(self.value)
-        usual = np.minimum(self.prior_sigma, IntrinsicsSigma().of(self.given))
-        limit = np.array(
-            [options.focal_share, options.principal_share * width_px, options.principal_share * width_px, options.k1]
-        )
-        significant = (size > options.sigmas * self.sigma) & (size > usual)
-        return np.asarray(significant & (self.sigma < limit))
+        usual = np.minimum(self.prior_sigma, IntrinsicsSigma().of(self.given)) if prior_sigma is None else prior_sigma
+        return options.contradicted(self.value, self.sigma, usual, self.given.width_px)
 
 
 def intrinsics_evidence(
-    matrix: Array,
-    gradient: Array,
+    equations: IntrinsicsEquations,
     given: View,
     removed: Array,
     prior_sigma: Array,
     held_sigma: Array,
     inflation: float,
+    region_factor: float,
+    suspicion: ContradictionOptions,
     to_world: Array,
 ) -> IntrinsicsEvidence | None:
-    """Computes the evidence from normal equations of poses and intrinsics; None if they are singular.
+    """The evidence in normal equations of the errors of the intrinsics; None if they are singular.
 
     Args:
-        matrix: (U, U), with the points eliminated; the last 4 unknowns are errors of the intrinsics, without their
-            prior, and the 6 before them the query's pose.
-        gradient: (U,) of the same unknowns.
+        equations: of these errors.
         given: the photograph, with its intrinsics as given.
         removed: (4,) errors that are removed from the intrinsics at which they are linearized.
         prior_sigma: (4,) see `IntrinsicsEvidence`.
         held_sigma: (4,) the same where the pose was computed: less for a camera that the references share, more for
             parameters that the photograph contradicts.
-        inflation: factor on standard deviations that follow from residuals.
+        inflation: see `IntrinsicsEquations.estimate`.
+        region_factor: see there.
+        suspicion: an error that exceeds this counts in full in the pose's covariance: given intrinsics are right or far
+            off, and the latter more often than a normal distribution says.
         to_world: (6, 6) derivative of the world error by the pose's unknowns.
     """
-    split = len(gradient) - 4
+    value, sigma = np.zeros(4), np.zeros(4)
     try:
-        solved = np.linalg.solve(matrix[:split, :split], np.column_stack([matrix[:split, split:], gradient[:split]]))
-        information = (matrix[split:, split:] - matrix[split:, :split] @ solved[:, :4]) / inflation**2
-        slope = (gradient[split:] - matrix[split:, :split] @ solved[:, 4]) / inflation**2
-        held = np.diag(held_sigma**-2.0)
-        value, sigma = np.zeros(4), np.zeros(4)
         for i in range(4):
-            others = held.copy()
-            others[i, i] = 0.0
-            alone = np.linalg.inv(information + others)
-            value[i] = removed[i] - alone[i] @ (slope + others @ removed)
-            sigma[i] = np.sqrt(alone[i, i])
-        covariance = np.linalg.inv(information + held)
+            others = prior_sigma**-2.0
+            others[i] = 0.0
+            found, covariance = equations.estimate(removed, others, inflation, region_factor)
+            value[i], sigma[i] = found[i], np.sqrt(covariance[i, i])
+        doubtful = suspicion.contradicted(value, sigma, prior_sigma, given.camera.width_px)
+        held = np.where(doubtful, np.maximum(held_sigma, np.abs(value)), held_sigma)
+        found, covariance = equations.estimate(removed, held**-2.0, inflation, region_factor)
     except np.linalg.LinAlgError:
         return None
-    left = covariance @ (slope + held @ removed)
-    motion = -to_world @ solved[split - 6 :, :4]
+    left = found - removed
     camera = replace(given.camera, distortion=given.distortion)
     sent = given.photograph.camera if given.photograph else camera
-    total = covariance + np.outer(left, left)
-    found = IntrinsicsEvidence(camera, sent, value, sigma, prior_sigma, total, motion, removed)
-    return found if np.isfinite(found.pose_covariance).all() and np.isfinite(sigma).all() else None
+    total, motion = covariance + np.outer(left, left), to_world @ equations.motion
+    evidence = IntrinsicsEvidence(camera, sent, value, sigma, prior_sigma, total, motion, removed)
+    return evidence if np.isfinite(evidence.pose_covariance).all() and np.isfinite(sigma).all() else None
 
 
 def keypoint_motion(camera: Camera, distortion: Distortion | None, pixels: Array) -> Array:

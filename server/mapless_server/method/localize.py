@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from .adjust import adjust_pose, pose_covariance
+from .adjust import adjust_pose, with_covariance
 from .alternatives import from_one_reference, from_two_views
 from .answer import Answer, Localization, is_better
 from .options import LocalizeOptions, StageContext, Variant
@@ -122,15 +122,14 @@ def _solve(coarse: Coarse, counts_agreement: bool) -> Answer:
     failure = gate_failure(query.camera, matches, inliers, options.pnp.inlier_px, options.gate, chance)
     if failure:
         return coarse.answer(Rejection(RejectionReason.GATE, failure), replace(support, estimate=estimate))
+    sigma = prepared.options.intrinsics
     if prepared.options.variant is Variant.BEST:
         with stage("adjust"):
-            sigma = prepared.options.intrinsics
             estimate = adjust_pose(query, references, structure, matches, estimate, options.adjust, priors, sigma)
     support = replace(support, estimate=estimate, query=estimate.view or query)
     with stage("uncertainty"):
         predicted = not prepared.structure_options.optimize
-        covariance = pose_covariance(support, scale, options.adjust, priors, predicted)
-    estimate = replace(estimate, covariance=covariance)
+        estimate = with_covariance(support, scale, options.adjust, priors, predicted, sigma)
     support = replace(support, estimate=estimate)
     with stage("judge"):
         judged = judge(support, query_matches, prepared.options.coverage, options.judge, chance)

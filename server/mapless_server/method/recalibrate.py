@@ -1,6 +1,7 @@
 """Intrinsics that the photograph contradicts are estimated together with the pose.
 
-The most significant one is estimated first; then the keypoints are undistorted again with its value.
+First all together, which shows the wrong ones; then these alone, the most significant one first. The photograph is read
+again with each value.
 """
 
 from __future__ import annotations
@@ -39,29 +40,34 @@ def recalibrated(
     priors: Priors,
     usual: Array,
 ) -> PoseEstimate:
-    """Returns the estimate with the parameters that the photograph contradicts; `found` if it contradicts none."""
-    held, is_held = usual.copy(), np.ones(4, bool)
+    """The estimate with the parameters that the photograph contradicts; the one found if it contradicts none."""
+    held, untried = usual, np.ones(4, bool)
     wide = np.maximum(usual, WIDE_SIGMA * np.array([1, query.camera.width_px, query.camera.width_px, 1]))
-    while (worst := _contradicted(found, options.suspicion, is_held)) is not None:
-        is_held[list(worst)] = False
-        held[list(worst)] = wide[list(worst)]
-        better = _with_errors(query, references, structure, matches, found, options, priors, usual, held)
+    if _contradicted(found, options.suspicion, untried) is None and found.inliers.mean() >= options.agreeing_share:
+        return found
+    # With all estimated, the wrong ones stand out: an error that is held looks like errors of the others.
+    given = query, references, structure, matches
+    guide = _with_errors(*given, found, options, priors, usual, wide) or found
+    while (worst := _contradicted(guide, options.suspicion, untried)) is not None:
+        untried[list(worst)] = False
+        freed = held.copy()
+        freed[list(worst)] = wide[list(worst)]
+        better = _with_errors(*given, guide, options, priors, usual, freed)
         if better is None or better.intrinsics is None:
-            break
-        if not better.intrinsics.contradicted(options.contradiction)[list(worst)].any():
-            break
-        found = better
+            continue
+        if better.intrinsics.contradicted(options.contradiction)[list(worst)].any():
+            guide, found, held = better, better, freed
     return found
 
 
 def _contradicted(
-    found: PoseEstimate, options: ContradictionOptions, is_held: NDArray[np.bool_]
+    found: PoseEstimate, options: ContradictionOptions, among: NDArray[np.bool_]
 ) -> tuple[int, ...] | None:
-    """The held parameter that the photograph contradicts most; both coordinates of the principal point are one."""
+    """The parameter, or both of the principal point, that the photograph contradicts most, among these (4,)."""
     evidence = found.intrinsics
     if evidence is None:
         return None
-    wrong = evidence.contradicted(options) & is_held
+    wrong = evidence.contradicted(options) & among
     worst = int(np.argmax(np.where(wrong, np.abs(evidence.value) / evidence.sigma, 0.0)))
     if not wrong[worst]:
         return None

@@ -180,8 +180,8 @@ class PoseEstimate:
         errors_px: (M,) reprojection errors; NaN for points behind the camera.
         covariance: (6, 6), order x y z rx ry rz, fixed world axes, metres and radians.
         prior_checks: comparison with each prior.
-        is_adjusted: whether the pose is that of the adjustment. The covariance of any other pose follows from the
-            residuals alone, without correlated errors (see `adjust.pose_covariance`).
+        is_adjusted: whether the pose is that of the adjustment. The covariance of another is from the residuals alone
+            and leaves out correlated errors (see `adjust.with_covariance`).
         without_priors: the estimate before priors were used; None if none was used.
         intrinsics: what the matches with points say of errors of the photograph's intrinsics, which the covariance of
             an adjusted pose contains; None without an adjustment.

@@ -9,34 +9,15 @@ it was estimated with the photograph's value: the camera's next photograph will 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 
 from mapless.geometry import Fisheye
 
 from ..intrinsics import ContradictionOptions, IntrinsicsEvidence
-from ..options import check_bounds
 from ..rejection import Advice, Hint, IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason
 
 
-@dataclass(frozen=True)
-class IntrinsicsOptions:
-    """Options of the check.
-
-    Attributes:
-        sigmas: a parameter is in conflict if it is off by more standard deviations of prior and estimate together.
-        contradiction: when a photograph contradicts a parameter at all.
-    """
-
-    sigmas: float = 3.0
-    contradiction: ContradictionOptions = field(default_factory=ContradictionOptions)
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "sigmas", above=0)
-
-
-def intrinsics_checks(evidence: IntrinsicsEvidence, options: IntrinsicsOptions) -> tuple[IntrinsicsCheck, ...]:
+def intrinsics_checks(evidence: IntrinsicsEvidence, options: ContradictionOptions) -> tuple[IntrinsicsCheck, ...]:
     """The checks of all parameters, in pixels of the photograph as it was sent."""
     sent, scale = evidence.sent, evidence.sent.width_px / evidence.given.width_px
     k1 = sent.distortion.k1 if sent.distortion else 0.0
@@ -44,8 +25,7 @@ def intrinsics_checks(evidence: IntrinsicsEvidence, options: IntrinsicsOptions) 
     unit = np.array([sent.focal_x_px, scale, scale, 1.0])
     change = unit * evidence.value
     change[0] = sent.focal_x_px * np.expm1(evidence.value[0])
-    together = np.hypot(evidence.prior_sigma, evidence.sigma)
-    conflict = evidence.contradicted(options.contradiction) & (np.abs(evidence.value) > options.sigmas * together)
+    conflict = evidence.contradicted(options, evidence.prior_sigma)
     return tuple(
         IntrinsicsCheck(*row)
         for row in zip(
@@ -61,8 +41,10 @@ def intrinsics_checks(evidence: IntrinsicsEvidence, options: IntrinsicsOptions) 
     )
 
 
-def wrong_intrinsics(evidence: IntrinsicsEvidence, best_reference: str, options: IntrinsicsOptions) -> Rejection | None:
-    """A rejection that names each parameter in conflict, the most significant first; None without a conflict."""
+def wrong_intrinsics(
+    evidence: IntrinsicsEvidence, best_reference: str, options: ContradictionOptions
+) -> Rejection | None:
+    """A rejection that names each parameter in conflict, the most significant first; None if there is none."""
     checks = intrinsics_checks(evidence, options)
     wrong = sorted(
         (it for it in checks if it.conflict), key=lambda it: -abs(it.estimated - it.given) / it.estimated_sigma

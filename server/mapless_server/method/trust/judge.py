@@ -24,13 +24,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ..intrinsics import ContradictionOptions
 from ..options import check_bounds
 from ..rejection import Hypothesis, Rejection, RejectionReason
 from ..results import Support
 from ..views import Matches
 from .ambiguity import AmbiguityOptions, find_rival
 from .evidence import AgreementOptions, Evidence, Votes, evidence_of, votes_of
-from .intrinsics import IntrinsicsOptions, wrong_intrinsics
+from .intrinsics import wrong_intrinsics
 
 _RARE = (0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075)
 LEVELS = (*_RARE, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
@@ -58,7 +59,7 @@ class JudgeOptions:
     agreement_weight: float = 0.3
     agreement: AgreementOptions = field(default_factory=AgreementOptions)
     ambiguity: AmbiguityOptions = field(default_factory=AmbiguityOptions)
-    intrinsics: IntrinsicsOptions = field(default_factory=IntrinsicsOptions)
+    intrinsics: ContradictionOptions = field(default_factory=ContradictionOptions)
 
     def __post_init__(self) -> None:
         check_bounds(self, "agreement_weight", at_least=0)

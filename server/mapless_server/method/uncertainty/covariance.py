@@ -35,10 +35,9 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform
 
-from ..bundle import Bundle, BundleProblem
 from ..options import check_bounds
 from ..perturbation import world_jacobian
-from .dispersion import disperse
+from .dispersion import Dispersion
 
 
 @dataclass(frozen=True)
@@ -63,25 +62,22 @@ class UncertaintyOptions:
         check_bounds(self, "region_factor position_factor rotation_factor max_matches", above=0)
 
 
-def adjusted_covariance(
-    problem: BundleProblem, bundle: Bundle, options: UncertaintyOptions, is_offset: bool = False
-) -> Array | None:
-    """Covariance (6, 6) of a pose without the part of the scale, with the factors; None if it is not determined.
+def dispersed_covariance(
+    dispersion: Dispersion, world_from_camera: RigidTransform, options: UncertaintyOptions, is_offset: bool = False
+) -> Array:
+    """All parts of a pose's covariance (6, 6) but those of scale and intrinsics, with the factors.
 
     Args:
-        problem: problem of the adjustment; its priors on the query's pose are not used.
-        bundle: its optimum.
-        options: options of the covariance.
-        is_offset: whether the bundle is known not to be at the optimum.
+        dispersion: of the pose.
+        world_from_camera: the pose.
+        options: see there.
+        is_offset: whether the pose is known not to be at the optimum.
     """
-    dispersion = disperse(problem, bundle, options.max_matches)
-    if dispersion is None:
-        return None
     covariance = dispersion.covariance(options.region_factor)
     if is_offset:
         covariance = covariance + np.outer(dispersion.offset, dispersion.offset)
     factor = np.repeat([options.position_factor, options.rotation_factor], 3)
-    to_world = factor[:, None] * world_jacobian(bundle.world_from_query)
+    to_world = factor[:, None] * world_jacobian(world_from_camera)
     covariance = to_world @ covariance @ to_world.T
     return np.asarray((covariance + covariance.T) / 2)
 

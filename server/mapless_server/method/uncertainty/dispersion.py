@@ -23,18 +23,25 @@ A by the point, with a = L_p^-1 A^T, then fits its point up to
 
 and leaving it out subtracts F_p a S^-1 a^T F_p^T from the matrix and adds F_p a S^-1 e to the gradient. So K steps cost
 one product of matrices with two columns an observation, and no point is eliminated twice.
+
+Errors of the query's intrinsics may be unknowns of the same equations. The poses q are those with the intrinsics as
+they are; with the poses eliminated too, what is left says what the data and their parts know of the intrinsics (see
+`intrinsics`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapless.geometry import Array
 
 from ..arrays import take
 from ..bundle import Bundle, BundleProblem, EliminatedPoints, ViewColumns
+from ..intrinsics import IntrinsicsEquations
 from ..optimize import cauchy_weight
 
 DAMPING = 1e-9
@@ -62,11 +69,13 @@ class Dispersion:
         references: (K, 6) change of the optimum without each reference's observations.
         regions: (G, 6) influence of the matches in each region of the photograph.
         offset: (6,) the Gauss-Newton step from the pose to the optimum.
+        intrinsics: what the data say of errors of the intrinsics; None if the problem has not these unknowns.
     """
 
     references: Array
     regions: Array
     offset: Array
+    intrinsics: IntrinsicsEquations | None = None
 
     def covariance(self, region_factor: float) -> Array:
         """Covariance C_r + f^2 C_p (6, 6)."""
@@ -88,32 +97,53 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
     seen, bundle, thinning = _thinned(problem.by_view, bundle, max_matches)
     equations = seen.equations(bundle, problem.loss_scale_sigma)
     data, gradient, points = equations.reduced(DAMPING)
+    query, posed = problem.query_rows, slice(problem.query_rows.stop)
     prior, prior_gradient = np.zeros_like(data), np.zeros_like(gradient)
-    prior[:-6, :-6] = problem.information / thinning
-    prior_gradient[:-6] = prior[:-6, :-6] @ problem.reference_motion(bundle).ravel()
-    to_pose = _rows_of_pose(data + prior)
+    held = slice(query.start)
+    prior[held, held] = problem.information / thinning
+    prior_gradient[held] = prior[held, held] @ problem.reference_motion(bundle).ravel()
+    to_pose = _rows_of_pose((data + prior)[posed, posed])
     if to_pose is None:
         return None
     residual, by_point, by_pose = seen.linearized(bundle)
     weight = cauchy_weight((residual**2).sum(axis=0), problem.loss_scale_sigma)
-    slopes = (by_pose * (weight * residual)[:, None]).sum(axis=0)
-    regions = _influences(seen, to_pose, slopes, points)
 
     gain, misfit = _whitened(seen, residual, by_point, weight, points)
     cross = points.cross.reshape(len(data), 3, -1)
-    matrices, gradients = np.tile(prior, (len(seen.parts) - 1, 1, 1)), np.tile(prior_gradient, (len(seen.parts) - 1, 1))
+    matrices, gradients = np.tile(prior, (len(seen.parts), 1, 1)), np.tile(prior_gradient, (len(seen.parts), 1))
+    matrices[0] += data
+    gradients[0] += gradient
     for i, part in enumerate(seen.parts[:-1]):
         lost = np.einsum("uan,abn->ubn", take(cross, seen.point[part]), gain[:, :, part]).reshape(len(data), -1)
         others = np.ones(len(data), bool)
         others[6 * i : 6 * i + 6] = False  # only the prior is left of its own pose
-        matrices[i] += np.where(np.outer(others, others), data - lost @ lost.T, 0)
-        gradients[i] += np.where(others, gradient + lost @ misfit[:, part].ravel(), 0)
-    matrices[:, -6:, -6:] += LEAST_LEFT * data[-6:, -6:]
-    offset = -to_pose @ (gradient + prior_gradient)
-    references = -np.linalg.solve(matrices, gradients[:, :, None])[:, -6:, 0] - offset
-    if not (np.isfinite(references).all() and np.isfinite(regions).all()):
+        matrices[i + 1] += np.where(np.outer(others, others), data - lost @ lost.T, 0)
+        gradients[i + 1] += np.where(others, gradient + lost @ misfit[:, part].ravel(), 0)
+    matrices[1:, query, query] += LEAST_LEFT * data[query, query]
+    right = np.concatenate([matrices[:, posed, posed.stop :], gradients[:, posed, None]], axis=2)
+    solved = np.linalg.solve(matrices[:, posed, posed], right)
+    poses = -solved[:, query, -1]
+    rest = np.concatenate([matrices[:, posed.stop :, posed.stop :], gradients[:, posed.stop :, None]], axis=2)
+    rest -= matrices[:, posed.stop :, posed] @ solved  # of the intrinsics, with the poses eliminated
+
+    to_rest = np.hstack([-solved[0, :, :-1].T, np.eye(len(data) - posed.stop)])
+    regions = _regions(seen)
+    to_both = np.vstack([np.hstack([-to_pose, np.zeros((6, len(to_rest)))]), to_rest])
+    influences = _influences(seen, regions, to_both, residual, by_pose, weight, points)
+    if not (np.isfinite(poses).all() and np.isfinite(influences).all()):
         return None
-    return Dispersion(references, regions, offset)
+    found = Dispersion(poses[1:] - poses[0], influences[:, :6], poses[0])
+    if not len(to_rest):
+        return found
+    observing = [0, *(i + 1 for i, part in enumerate(seen.parts[:-1]) if part.start < part.stop)]
+    intrinsics = IntrinsicsEquations(
+        thinning * rest[observing, :, :-1],
+        thinning * rest[observing, :, -1],
+        thinning * _information(seen, regions, to_rest, by_pose, weight, points),
+        thinning * influences[:, 6:],
+        -solved[0, query, :-1],
+    )
+    return replace(found, intrinsics=intrinsics)
 
 
 def _thinned(seen: ViewColumns, bundle: Bundle, max_matches: int) -> tuple[ViewColumns, Bundle, int]:
@@ -124,7 +154,7 @@ def _thinned(seen: ViewColumns, bundle: Bundle, max_matches: int) -> tuple[ViewC
         return seen, bundle, 1
     chosen = np.zeros(len(bundle.points), bool)
     chosen[of_query[::thinning]] = True
-    return seen.of_points(chosen), Bundle(bundle.poses, bundle.points[chosen]), thinning
+    return seen.of_points(chosen), Bundle(bundle.poses, bundle.points[chosen], bundle.intrinsics), thinning
 
 
 def _rows_of_pose(matrix: Array) -> Array | None:
@@ -147,20 +177,72 @@ def _is_definite(covariance: Array) -> bool:
     return bool(unit.min() > 0 and np.linalg.eigvalsh(information / np.outer(unit, unit))[0] > LEAST_EIGENVALUE)
 
 
-def _influences(seen: ViewColumns, to_pose: Array, slopes: Array, points: EliminatedPoints) -> Array:
-    """Influences (G, 6) of the regions, from the gradients (6, O) of the observations by their cameras' poses."""
-    of_observation = np.concatenate(
-        [to_pose[:, 6 * i : 6 * i + 6] @ slopes[:, part] for i, part in enumerate(seen.parts)], axis=1
-    )
-    of_match = np.stack([seen.sums @ row for row in of_observation])
-    of_match -= ((to_pose @ points.cross).reshape(6, 3, -1) * points.gradient).sum(axis=1)
+def _regions(seen: ViewColumns) -> list[NDArray[np.intp]]:
+    """The points of the matches in each region of the photograph."""
     query = seen.parts[-1]
     ideal, match = -seen.offset[:, query] / seen.focal[:, query], seen.point[query]
-    regions = [
+    columns = (
         match[rows[np.argsort(ideal[1, rows], kind="stable")]]
         for rows in np.array_split(np.argsort(ideal[0], kind="stable"), REGIONS)
+    )
+    return [it for column in columns for it in np.array_split(column, REGIONS)]
+
+
+def _by_camera(seen: ViewColumns, by_pose: Array) -> Iterator[tuple[slice, slice, Array]]:
+    """Of each view: its observations (O,), its unknowns, and the derivatives of the residuals by them, (2, U, O)."""
+    *references, query = seen.parts
+    for i, part in enumerate(references):
+        yield part, slice(6 * i, 6 * i + 6), by_pose[:, :, part]
+    slopes = by_pose[:, :, query]
+    if seen.by_intrinsics.size:
+        slopes = np.concatenate([slopes, seen.by_intrinsics], axis=1)
+    yield query, slice(6 * len(references), None), slopes
+
+
+def _influences(
+    seen: ViewColumns,
+    regions: Sequence[NDArray[np.intp]],
+    rows: Array,
+    residual: Array,
+    by_pose: Array,
+    weight: Array,
+    points: EliminatedPoints,
+) -> Array:
+    """(G, R): each region's part of the gradient, points eliminated, in combinations (R, U) of the unknowns."""
+    weighted = weight * residual
+    of_observation = np.concatenate(
+        [
+            rows[:, unknowns] @ (slopes * weighted[:, None, part]).sum(axis=0)
+            for part, unknowns, slopes in _by_camera(seen, by_pose)
+        ],
+        axis=1,
+    )
+    of_match = np.stack([seen.sums @ row for row in of_observation])
+    of_match -= ((rows @ points.cross).reshape(len(rows), *points.gradient.shape) * points.gradient).sum(axis=1)
+    return np.stack([of_match[:, it].sum(axis=1) for it in regions])
+
+
+def _information(
+    seen: ViewColumns,
+    regions: Sequence[NDArray[np.intp]],
+    rows: Array,
+    by_pose: Array,
+    weight: Array,
+    points: EliminatedPoints,
+) -> Array:
+    """(G, R, R): each region's part of the matrix, as for `_influences`."""
+    slopes = [rows[:, unknowns] @ by_camera for _, unknowns, by_camera in _by_camera(seen, by_pose)]
+    of_observation = np.swapaxes(np.concatenate(slopes, axis=2) * np.sqrt(weight), 0, 1)
+    lost = (rows @ points.cross).reshape(len(rows), *points.gradient.shape)
+    region = np.empty(lost.shape[2], np.intp)
+    for i, it in enumerate(regions):
+        region[it] = i
+    of_view = region[seen.point]
+    parts = [
+        (of_observation[:, :, of_view == i].reshape(len(rows), -1), lost[:, :, it].reshape(len(rows), -1))
+        for i, it in enumerate(regions)
     ]
-    return -np.stack([of_match[:, it].sum(axis=1) for column in regions for it in np.array_split(column, REGIONS)])
+    return np.stack([kept @ kept.T - gone @ gone.T for kept, gone in parts])
 
 
 def _whitened(
