@@ -21,7 +21,7 @@ from mapless.geometry import Array
 
 from .optimize import MinimizeOptions, minimize
 from .options import IntrinsicsSigma
-from .pose_problem import AdjustOptions, adjusted_estimate, errors_of_pose, pose_problem
+from .pose_problem import AdjustOptions, adjusted_estimate, errors_of_pose, pose_problem, shares_camera
 from .priors.known import NO_PRIORS, Priors
 from .recalibrate import recalibrated
 from .results import MetricScale, PointMatches, PoseEstimate, PoseStage, Structure, Support
@@ -104,8 +104,8 @@ def intrinsics_terms(
 ) -> tuple[View, Array, Array, Array]:
     """A photograph with its intrinsics as given, for `errors_of_pose`."""
     usual = (intrinsics or IntrinsicsSigma()).of(query.camera)
-    is_shared = 2 * sum(query.has_camera_of(it.view) for it in references) > len(references)
-    return query, np.zeros(4), usual, SHARED_CAMERA * usual if intrinsics is None and is_shared else usual
+    is_shared = intrinsics is None and shares_camera(query, references)
+    return query, np.zeros(4), usual, SHARED_CAMERA * usual if is_shared else usual
 
 
 def with_covariance(

@@ -40,13 +40,15 @@ class ContradictionOptions:
     """Options that define when a photograph contradicts a parameter of its intrinsics.
 
     Attributes:
-        sigmas: it is off by more standard deviations of the given and the estimated value together.
+        sigmas: it is off by more standard deviations of the given and the estimated value together. With the default
+            under 1 % of right photographs are contradicted in each of eleven scenes; with 4.75 in ten of these. In the
+            other each photograph's given intrinsics were estimated from it alone.
         focal_share, principal_share, k1: standard deviations (of the focal length and the width, as shares) above
             which a photograph does not determine a parameter. Noise in the depth of a flat wall's points looks like
             relief of the wall: its focal length was off by 72 % with a standard deviation of 8.5 %.
     """
 
-    sigmas: float = 4.5
+    sigmas: float = 6.75
     focal_share: float = 0.02
     principal_share: float = 0.02
     k1: float = 0.05
@@ -181,6 +183,9 @@ def intrinsics_evidence(
             found, covariance = equations.estimate(removed, others, inflation, region_factor)
             value[i], sigma[i] = found[i], np.sqrt(covariance[i, i])
         doubtful = suspicion.contradicted(value, sigma, prior_sigma, given.camera.width_px)
+        doubtful &= (held_sigma >= prior_sigma) | np.array(
+            [False, False, False, True]
+        )  # K of a shared camera errs alike
         held = np.where(doubtful, np.maximum(held_sigma, np.abs(value)), held_sigma)
         found, covariance = equations.estimate(removed, held**-2.0, inflation, region_factor)
     except np.linalg.LinAlgError:

@@ -113,6 +113,11 @@ def with_intrinsics(problem: BundleProblem, bundle: Bundle, query: View) -> tupl
     return wider, replace(bundle, intrinsics=np.zeros(4))
 
 
+def shares_camera(query: View, references: Sequence[PosedView]) -> bool:
+    """Whether most references are of the query's camera."""
+    return 2 * sum(query.has_camera_of(it.view) for it in references) > len(references)
+
+
 def adjusted_estimate(
     query: View,
     structure: Structure,

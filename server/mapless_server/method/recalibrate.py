@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array
 
-from .intrinsics import PRINCIPAL, ContradictionOptions, corrected_view
+from .intrinsics import PRINCIPAL, ContradictionOptions, IntrinsicsEvidence, corrected_view
 from .optimize import MinimizeOptions, minimize
 from .perturbation import reprojection_errors_px
-from .pose_problem import AdjustOptions, adjusted_estimate, pose_problem, with_intrinsics
+from .pose_problem import AdjustOptions, adjusted_estimate, pose_problem, shares_camera, with_intrinsics
 from .priors.known import Priors
 from .results import PointMatches, PoseEstimate, Structure
 from .views import PosedView, View
@@ -57,7 +57,26 @@ def recalibrated(
             continue
         if better.intrinsics.contradicted(options.contradiction)[list(worst)].any():
             guide, found, held = better, better, freed
+        elif better.intrinsics.contradicted(options.suspicion)[list(worst)].any():
+            found = _doubted(found, better.intrinsics, worst, shares_camera(query, references))
     return found
+
+
+def _doubted(
+    found: PoseEstimate, estimated: IntrinsicsEvidence, parameters: tuple[int, ...], is_shared: bool
+) -> PoseEstimate:
+    """The estimate with a covariance that contains these errors, which are suspected, in full.
+
+    The points of references of the same camera share errors of its focal length and principal point.
+    """
+    assert found.intrinsics is not None
+    errors = np.zeros(4)
+    errors[list(parameters)] = (estimated.value - found.intrinsics.removed)[list(parameters)]
+    if is_shared:
+        errors[:3] = 0.0
+    moved = found.intrinsics.motion @ errors
+    evidence = replace(found.intrinsics, value=estimated.value, sigma=estimated.sigma)
+    return replace(found, covariance=found.covariance + np.outer(moved, moved), intrinsics=evidence)
 
 
 def _contradicted(
