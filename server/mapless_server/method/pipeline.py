@@ -215,7 +215,7 @@ def reconstruct(batch: Sequence[Prepared]) -> list[Coarse | Answer | Exception]:
         Exception: of the batch as a whole; splitting it shows which query caused it.
     """
     if len({id(prepared.pipeline.reconstructor) for prepared in batch}) > 1:
-        raise ValueError("one batch has one reconstructor")
+        raise ValueError("batch must have queries of one reconstructor only")
     outcomes: list[Any] = _each(lambda prepared: prepared.context.check(), batch)
     wanted = [prepared for prepared, outcome in zip(batch, outcomes, strict=True) if outcome is None]
     start_s = time.perf_counter()

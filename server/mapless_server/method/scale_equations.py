@@ -46,21 +46,21 @@ class ScaleOptions:
             angle of 1 deg gives a depth to 7 %, about the 5 % of `max_deviation`. 0 keeps every match.
         min_ratios: fewest depth ratios, two per match, for stage 1. The median of 12 matches errs by 1.25 / sqrt(12) of
             their spread: 3.6 % for a spread of 10 %, within `max_deviation`. With fewer, stage 2 gives the scale.
-        max_matches: most matches to triangulate, evenly thinned: 32 references can have 400 000, but the median of
-            20 000 errs by less than a hundredth of their spread.
+        max_matches: largest number of matches to triangulate, evenly thinned: 32 references can have 400 000, but the
+            median of 20 000 errs by less than a hundredth of their spread.
         max_deviation: deviation below which the scale of stage 1 is adopted at once (of the paper).
         inlier_distance_m: largest distance between the aligned and the known centre of a camera that is an inlier of a
             scale of stage 2 (of the paper).
-        max_pair_cameras: stage 2 tries every pair of so many cameras, evenly thinned. All 496 pairs of 32 replace the
-            paper's 500 random ones, so that an answer is reproducible.
+        max_pair_cameras: stage 2 tries every pair of at most this many cameras, evenly thinned. All 496 pairs of 32
+            replace the paper's 500 random ones, so that an answer is reproducible.
         min_radius_m: smallest trajectory radius of the references that determines a scale: poses are accurate to about
             1 cm.
         min_radius_per_depth: the same for the predicted trajectory, as a share of the scene's depth. At 0.002 the
             references' images differ by a parallax of 1.6 px at a focal length of 800 px: the noise of a keypoint.
-        metre_sigma: relative standard deviation of the reconstruction's unit, if that is about the metre: a stage whose
-            scale is off from 1 by more than `max_metre_sigmas` of it is not used where the other's is not. Where both
-            are off, they are two against one, and stand. None if the unit is arbitrary, as in the paper.
-        max_metre_sigmas: see there; with 20 %, three are a factor of 1.8.
+        metre_sigma: relative standard deviation of the reconstruction's unit, if that is approximately the metre: a
+            stage whose scale differs from 1 by more than `max_metre_sigmas` of it is not used if the other stage's does
+            not. If both differ, both may be used. None if the unit is arbitrary, as in the paper.
+        max_metre_sigmas: bound for `metre_sigma`; with 20 %, three are a factor of 1.8.
     """
 
     strategy: ScaleStrategy = ScaleStrategy.TWO_STAGE

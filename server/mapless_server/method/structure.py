@@ -111,7 +111,7 @@ def build_structure(
 def triangulated_structure(
     references: Sequence[PosedView], correspondences: Correspondences, options: StructureOptions
 ) -> Structure:
-    """The same from the references' poses alone."""
+    """Triangulates the structure from the references' poses alone."""
     observations = observe(tracks_of(references, correspondences, options), references, options.first_noise)
     return _refined(observations, triangulate(observations), options)
 

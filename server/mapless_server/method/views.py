@@ -110,7 +110,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class KeypointDepths:
-    """Depths that are kept with a reference, at its keypoints.
+    """Depths that are stored with a reference, at its keypoints.
 
     Attributes:
         depth: (N,) float32, in the unit of its pose, along the viewing direction; NaN where nothing is kept.
@@ -123,10 +123,10 @@ class KeypointDepths:
 
 @dataclass(frozen=True, eq=False)
 class KeptDepth:
-    """The depth that is kept with a reference.
+    """The depth map that is stored with a reference.
 
     Attributes:
-        camera: pinhole, in pixels of the map; the reference's own, moved and scaled along the axes.
+        camera: pinhole camera in pixels of the map: the reference's own, moved and scaled along the axes.
         depth: (H, W) float32, in the unit of its pose, along the viewing direction; NaN where nothing is kept.
         relative_sigma: standard deviation of a depth, as a share of it, above 0.
     """
@@ -142,7 +142,7 @@ class KeptDepth:
             raise ValueError(f"relative_sigma must be above 0, is {self.relative_sigma}")
 
     def at_keypoints(self, view: View) -> KeypointDepths:
-        """The same at the keypoints of the reference, nearest neighbour."""
+        """The depths at the keypoints of the reference, nearest neighbour."""
         rows, columns, inside = map_cells(self.camera, view.features.keypoints, view.camera)
         return KeypointDepths(np.where(inside, self.depth[rows, columns], np.float32(np.nan)), self.relative_sigma)
 
@@ -157,7 +157,7 @@ class PosedView:
         name: "scenes/{scene}/references/{reference}".
         view: camera and features.
         world_from_camera: its pose, metric.
-        depths: kept with it, if any.
+        depths: depths stored with it, if any.
     """
 
     key: str

@@ -25,7 +25,8 @@ and convergence is quadratic at the end; if the root is double, a step halves th
 def nearest_rotation(matrices: Tensor) -> Tensor:
     """The rotations R (..., 3, 3) that maximize trace(R^T M): U diag(1, 1, det(U V^T)) V^T for M = U S V^T.
 
-    By Markley's closed form (1993, "FOAM"), with n = |M|^2, C the cofactors of M and l the greatest root of
+    It is computed by Markley's closed form (1993, "FOAM"), with n = |M|^2, C the cofactors of M and l the greatest root
+    of
 
         (l^2 - n)^2 - 8 l det M - 4 |C|^2 = 0,      k = (l^2 - n) / 2:
 

@@ -30,13 +30,13 @@ _DROPOUT = nn.Identity
 
 
 class PointLinear(nn.Conv2d):
-    """A linear layer for tokens whose weights are stored as those of a 1 x 1 convolution."""
+    """A linear layer for tokens whose weights are stored like those of a 1 x 1 convolution."""
 
     def __init__(self, width: int, width_out: int) -> None:
         super().__init__(width, width_out, 1)
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """(..., in) to (..., out)."""
+        """Tokens (..., in) to (..., out)."""
         return F.linear(tokens, self.weight.flatten(1), self.bias)
 
 
@@ -45,8 +45,8 @@ class Salad(nn.Module):
 
     Args:
         width: channels of a token.
-        hidden: between the two layers of each of the three perceptrons.
-        clusters: how many.
+        hidden: channels between the two layers of each of the three perceptrons.
+        clusters: number of clusters.
         cluster_width: channels of a cluster's part.
         token_width: channels of the class token's part.
     """
@@ -75,10 +75,10 @@ def transport(scores: Tensor, dustbin_score: Tensor) -> Tensor:
 
     Args:
         scores: (B, M, N) of cluster and patch, higher for a better fit.
-        dustbin_score: (), of the dustbin with any patch.
+        dustbin_score: scalar, of the dustbin with any patch.
 
     Raises:
-        ValueError: no more patches than clusters; nothing would be left for the dustbin.
+        ValueError: there are no more patches than clusters, so nothing would be left for the dustbin.
     """
     batch, clusters, patches = scores.shape
     if patches <= clusters:

@@ -2,7 +2,7 @@
 
 Pi3X takes intrinsics and poses as conditions, and its output is roughly metric. Given poses fix neither the frame nor
 the scale of the output: align it with them afterwards, as with Pi3. The official network's part for given depths, a
-fifth of its weights, is left out: no query comes with depths.
+fifth of its weights, is left out, since no query has depths.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ class Sizes:
 
     Attributes:
         width: channels of a token.
-        heads: of attention.
+        heads: heads of attention.
         encoder_depth, decoder_depth: blocks of the encoder and of the main decoder.
         head_depth: blocks of each head's decoder.
         camera_width: channels in the camera head.
         conv_stages, conv_last_width: channels of the convolutional heads (Pi3X).
-        metric_width, metric_heads, metric_depth: of the metric decoder (Pi3X).
+        metric_width, metric_heads, metric_depth: channels, heads and blocks of the metric decoder (Pi3X).
     """
 
     width: int = 1024
@@ -55,7 +55,7 @@ class Sizes:
 
 
 class PiNetwork(Network):
-    """What Pi3 and Pi3X have in common."""
+    """The common part of Pi3 and Pi3X."""
 
     file_names = FileNames(unused_prefixes=UNUSED)
     image_mean: Tensor
@@ -94,7 +94,7 @@ class PiNetwork(Network):
         return make_layout(grid, self.sizes.width // self.sizes.heads, self.register_token.device)
 
     def encode(self, images: Tensor, layout: TokenLayout, intrinsics: Tensor | None = None) -> Tensor:
-        """See Network.encode; after block 0 of the decoder."""
+        """See Network.encode; the tokens are those after block 0 of the decoder."""
         return self.begin(self.embed(images, intrinsics), layout)
 
     @abstractmethod
@@ -240,7 +240,7 @@ class Pi3X(PiNetwork):
         return NetworkOutput(points * metric[:, None, None, None, None], logits, cameras)
 
     def _injection(self, poses: Tensor, posed: Tensor, grid: tuple[int, int]) -> Injection:
-        """Adds the update by the posed views' cameras to these views' patches."""
+        """Makes the injection that updates the posed views' patches by these views' cameras."""
         known = torch.take_along_dim(poses, posed[:, :, None, None], dim=1)
         positions = prope(known, grid, self.sizes.width // self.sizes.heads)
 
@@ -257,12 +257,12 @@ class Pi3X(PiNetwork):
         return inject
 
     def _metric(self, decoded: Tensor, layout: TokenLayout) -> Tensor:
-        """Scale (B,) of each scene, about metres per unit."""
+        """Scale (B,) of each scene, approximately metres per unit."""
         scale: Tensor = self.metric_head(self.metric_decoder(self.metric_token, decoded.flatten(1, 2), layout.rope))
         return scale.exp()[:, 0]
 
     def read_maps(self, decoded: Tensor, layout: TokenLayout) -> tuple[Tensor, Tensor]:
-        """See PiNetwork.read_maps; before the metric scale."""
+        """See PiNetwork.read_maps; the result is without the metric scale."""
         x, y, log_z = self.point_head(self.point_decoder(decoded, layout.rope), layout.grid).unbind(-1)
         z = torch.exp(log_z.clamp_max(MAX_LOG_DEPTH))
         confidence = self.conf_head(self.conf_decoder(decoded, layout.rope), layout.grid)
@@ -270,7 +270,7 @@ class Pi3X(PiNetwork):
 
 
 def _scaling_column(scale: Tensor) -> Tensor:
-    """Factors (B, 1, 4, 1) of the last column of a pose that scale its translation by (B,)."""
+    """Factors (B, 1, 4, 1) for the last column of poses, which scale their translations by (B,)."""
     column = scale[:, None].repeat(1, 4)
     column[:, 3] = 1
     return column[:, None, :, None]

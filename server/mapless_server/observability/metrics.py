@@ -278,7 +278,7 @@ class Metrics(Observer, PairObserver):
         self._depth_failures.inc()
 
     def depths_wait(self, count: int) -> None:
-        """So many references wait for a network to predict their depth."""
+        """Sets how many references wait for a network to predict their depth."""
         self._depth_waiting.set(count)
 
     def scene_calibrated(self, cpu_seconds: float) -> None:

@@ -94,17 +94,17 @@ class BackgroundMatching:
         calibrations: SceneCalibrations | None = None,
         depths: SceneDepths | None = None,
     ) -> None:
-        """Nothing is matched before `start`, or `match_waiting`.
+        """Makes the object; nothing is matched before `start` or `match_waiting`.
 
         Args:
-            store: of the references.
+            store: store of the references.
             indexes: by which references are chosen for queries.
-            matchings: what is made, the most important first; and what queries find of it.
+            matchings: the matchings to make, the most important first, with the finder that queries use for each.
             is_idle: whether the server computes nothing for a caller.
             observer: receives the events.
-            options: see there.
-            calibrations: of scenes, made when all references are matched; None makes none.
-            depths: of references, made before the calibrations, whose photographs use them; None makes none.
+            options: options of the matching.
+            calibrations: calibrates scenes when all references are matched; None calibrates none.
+            depths: makes depths of references, before the calibrations, which use them; None makes none.
         """
         self._store = store
         self._pairs = PairStore(store.database)
@@ -137,9 +137,10 @@ class BackgroundMatching:
         self._thread.start()
 
     def close(self) -> None:
-        """Ends the thread after its current pair; what it has made is stored.
+        """Ends the thread after its current pair; finished pairs are stored.
 
-        A network that predicts depths on a CPU takes minutes: it is waited for only for a time, and stores nothing.
+        A network that predicts depths on a CPU takes minutes, so the wait for it is limited, and its result is not
+        stored.
         """
         self._closing.set()
         if self._thread is None:

@@ -290,7 +290,7 @@ def encode_depth(kept: KeptDepth) -> bytes:
     """
     known = np.isfinite(kept.depth)
     if not (kept.depth[known] > 0).all():
-        raise ValueError("a kept depth must be above 0")
+        raise ValueError(f"a stored depth must be above 0, the smallest is {kept.depth[known].min():.3g}")
     logarithm = np.log(kept.depth, where=known, out=np.zeros(kept.depth.shape), dtype=np.float64)
     first = float(logarithm[known].min(initial=np.inf)) if known.any() else 0.0
     steps = np.where(known, np.rint((logarithm - first) / _DEPTH_STEP), 0).astype(np.int64)

@@ -218,7 +218,7 @@ class Store(StoreReader):
                 is given, or one without any features.
         """
         if not references:
-            raise ValueError("no reference to add")
+            raise ValueError("references must have at least one item")
         now = _now()
         # Encoding takes milliseconds per reference, so it is done before other writers have to wait.
         records = [rows.new_record(scene_key, new, now) for new in references]

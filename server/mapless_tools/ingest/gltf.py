@@ -63,7 +63,7 @@ _UNLIT = "KHR_materials_unlit"
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A reference, its photograph (small, JPEG), and what it sees: points (N, 3) of the world, colours (N, 3)."""
+    """A reference, its small photograph (JPEG), and the points (N, 3) in the world, with colours, that it shows."""
 
     reference: Reference
     thumbnail: bytes | None = None

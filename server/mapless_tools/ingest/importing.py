@@ -63,7 +63,7 @@ class ImportOptions:
         if self.split not in ("", "train", "test"):
             raise ValueError(f"split must be train or test, not {self.split!r}")
         if self.stride < 1 or (self.max_count is not None and self.max_count < 1):
-            raise ValueError("stride and max must be at least 1")
+            raise ValueError(f"stride and max must be at least 1, not {self.stride} and {self.max_count}")
         if self.id_prefix:
             check_id(f"{self.id_prefix}0")
 

@@ -65,7 +65,8 @@ class UploadOptions:
         if not 1 <= self.parallel <= 64:
             raise ValueError(f"--parallel is the number of messages in flight, 1 to 64, not {self.parallel}")
         if not (self.busy_patience_s > 0 and self.away_patience_s > 0):
-            raise ValueError("times must be above 0")
+            given = f"{self.busy_patience_s} and {self.away_patience_s}"
+            raise ValueError(f"busy_patience_s and away_patience_s must be above 0, not {given}")
 
 
 class _Stopped(Exception):

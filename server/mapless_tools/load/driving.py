@@ -77,7 +77,7 @@ def free_port() -> int:
 async def find_saturation(
     server: LoadedServer, target: Target, seconds: float, progress: Progress
 ) -> tuple[list[Step], float]:
-    """Ever more calls side by side, until more of them bring no more answers; and the most answers a second."""
+    """Increases the number of concurrent calls until the rate stops to grow; also returns the largest rate."""
     steps: list[Step] = []
     best_per_s = 0.0
     for power in itertools.count(1):

@@ -119,7 +119,7 @@ class _Background:
             log.warning("query %d cannot be shown: %s", query.number, error)
 
     def _do(self, work: Callable[[], None]) -> None:
-        """Runs it, again if the server is busy, unless the viewer closes; a failure is logged, and the rest goes on."""
+        """Runs `work`, again if the server is busy, unless the viewer closes; a failure is logged only."""
         for _ in range(_TRIES):
             if self._closing.is_set():
                 return

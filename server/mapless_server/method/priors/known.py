@@ -196,7 +196,7 @@ class PosePrior:
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.world_from_camera.matrix()).all():
-            raise ValueError("the pose must be finite")
+            raise ValueError("PosePrior.world_from_camera must be finite")
         check_covariance(self.covariance, 6)
 
     def term(self, world_from_camera: RigidTransform) -> Term:
@@ -348,7 +348,7 @@ def check_covariance(covariance: Array, size: int) -> None:
         raise ValueError(f"a covariance must be {size}x{size} finite numbers")
     deviations = np.sqrt(np.diag(c).clip(min=0))
     if not deviations.min() > 0:
-        raise ValueError("a covariance must have positive variances")
+        raise ValueError(f"a covariance must have variances above 0, the smallest is {np.diag(c).min():.3g}")
     # Compared as correlations: metres and radians, or an unknown height, differ by orders of magnitude.
     correlation = c / np.outer(deviations, deviations)
     if np.abs(correlation - correlation.T).max() > 1e-6:

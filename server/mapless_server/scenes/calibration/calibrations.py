@@ -47,7 +47,7 @@ class SceneCalibrations:
     def __init__(
         self, store: Store, calibrator: Calibrator, observer: PairObserver, depths: DepthFinder | None = None
     ) -> None:
-        """`observer` receives the events; `depths` are those that queries use."""
+        """The `observer` receives the events; `depths` are those that queries use."""
         self._depths = depths
         self._store = store
         self._calibrator = calibrator
