@@ -45,6 +45,10 @@ std::string ServiceConfig(int max_attempts) {
   return config + "}";
 }
 
+bool IsVisible(const std::string& text) {
+  return !text.empty() && std::all_of(text.begin(), text.end(), [](char c) { return c > ' ' && c < '\x7f'; });
+}
+
 std::shared_ptr<grpc::Channel> Connect(const ConnectOptions& options) {
   if (options.max_attempts < 1 || options.max_attempts > 5) throw std::invalid_argument("max_attempts must be 1 to 5");
   if (options.max_message_mib < 1 || options.max_message_mib > 2047)
@@ -52,6 +56,10 @@ std::shared_ptr<grpc::Channel> Connect(const ConnectOptions& options) {
   if (options.batch_count < 1 || !(options.batch_mib > 0)) throw std::invalid_argument("batches must not be empty");
   if (options.address.find("://") != std::string::npos)
     throw std::invalid_argument("an address is host:port, without scheme, is " + options.address);
+  // gRPC ends the program where metadata has anything else, such as the line break at the end of a token's file.
+  for (const auto& [name, value] : {std::pair("token", options.token), std::pair("client_id", options.client_id)})
+    if (!value.empty() && !IsVisible(value))
+      throw std::invalid_argument(std::string(name) + " must be visible ASCII characters, without spaces or line breaks");
   const int max_bytes = options.max_message_mib << 20;
   grpc::ChannelArguments arguments;
   arguments.SetMaxSendMessageSize(max_bytes);
@@ -87,10 +95,6 @@ std::string SceneOf(const google::protobuf::Message& request) {
     return value.substr(0, value.find("/references/"));
   }
   return "";
-}
-
-bool IsVisible(const std::string& text) {
-  return !text.empty() && std::all_of(text.begin(), text.end(), [](char c) { return c > ' ' && c < '\x7f'; });
 }
 
 [[noreturn]] void Throw(const grpc::Status& status, const grpc::ClientContext& context) {

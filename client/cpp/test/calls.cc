@@ -116,6 +116,11 @@ int main(int count, char** arguments) {
   options.client_id = "calls";
   const Client client(options);
   const std::string photo = ReadFile(arguments[2]);
+  for (auto member : {&ConnectOptions::token, &ConnectOptions::client_id}) {
+    ConnectOptions broken = options;
+    broken.*member = "a line\n";
+    Fails<std::invalid_argument>([&] { Client{broken}; }, "a line break, with which gRPC would end the program");
+  }
   Check(client.IsServing(), "the server serves");
   Scenes(client, photo);
   Queries(client, photo);
