@@ -226,7 +226,8 @@ class LocalizationResult:
         in_axes: the same pose in the requested axes, with `world_from_session`.
         geo_pose: the same pose on the Earth; None unless the scene has a datum.
         prior_checks: how the answer compares with each soft prior.
-        intrinsics_checks: what the photograph says of each parameter of its intrinsics; empty if it was not asked.
+        intrinsics_checks: comparison of each intrinsic parameter with the photograph; empty for a pose without
+            refinement.
         arbitrary_unit: whether lengths are in the scene's own, arbitrary unit, also where a name says metres.
         scale_source: what its lengths rest on: "REFERENCES", or "NETWORK" for a single reference.
         pose_stage: "REFINED" or "INITIAL"; "COARSE" for an unverified pose, either of a call with `allow_coarse` that
@@ -277,7 +278,7 @@ class Rejected:
         message: one sentence for a person, with the numbers that decided.
         hint: advice.
         hypotheses: contradictory poses, the best supported first, if the reason is "AMBIGUOUS".
-        intrinsics_checks: what the photograph says of its intrinsics, if a conflict with them is the reason.
+        intrinsics_checks: comparison of the intrinsics with the photograph, if a conflict is the reason.
         debug: the matches, if requested and found.
         capture_time, session_from_camera: as they were sent.
         is_final: always True.

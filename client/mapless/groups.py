@@ -39,7 +39,7 @@ class RigImage:
         camera: its camera, in pixels of the file as it is stored, before any EXIF rotation.
         rig_from_camera: pose of the camera in the rig, metres, OpenCV's axes; the rig's frame is arbitrary.
         references: the references to use, at most 64; empty: the server chooses.
-        priors: what is known of this camera's pose; soft ones are weighed in the joint pose.
+        priors: priors on this camera's pose; soft ones are terms of the joint estimate.
     """
 
     image: ImageSource
@@ -59,7 +59,7 @@ class SequenceFrame:
         session_from_camera: the pose that the device tracked, in the axes of the call.
         capture_time: time of the photograph, with time zone.
         references: the references to use, at most 64; empty: the server chooses.
-        priors: what is known of this camera's pose; soft ones are weighed in the joint poses.
+        priors: priors on this camera's pose; soft ones are terms of the joint estimate.
     """
 
     image: ImageSource
@@ -148,7 +148,7 @@ class SequenceLocalization:
             of the call; its scale is 1 unless it was estimated.
         scale_sigma: standard deviation of that scale; 0 unless it was estimated.
         world_from_camera: pose of each photograph, corrected for drift and jumps, OpenCV's axes.
-        covariance: (6, 6) of the last of them, order x y z rx ry rz, metres and radians about fixed world axes.
+        covariance: (6, 6) of the last pose, order x y z rx ry rz, metres and radians about fixed world axes.
         accuracy: radii of the same pose.
         inlier_count, match_count: number of 2D-3D matches of all photographs that agree with the poses, and of all.
         reprojection_error_px: median of the inliers, pixels of the processed images.

@@ -1,4 +1,4 @@
-"""Messages from JSON that people write: a wrong field is named as they wrote it, with its value and what it may be."""
+"""Reads messages from JSON that people write: a wrong field is named as written, with its value and bounds."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _WHOLE = (FieldDescriptor.TYPE_INT32, FieldDescriptor.TYPE_INT64)
 
 
 def read_message(source: str, message: M, required: Sequence[str], convert: Callable[[M, str], T], what: str) -> T:
-    """What a JSON file, or JSON text, describes.
+    """Reads what a JSON file, or JSON text, describes.
 
     Args:
         source: the file, or the text.
@@ -52,7 +52,7 @@ def read_message(source: str, message: M, required: Sequence[str], convert: Call
 
 
 def read_json(text: str | bytes) -> Any:
-    """JSON that names no field twice.
+    """Parses JSON that names no field twice.
 
     Raises:
         ValueError: it is something else; says what.
@@ -71,7 +71,7 @@ def read_json(text: str | bytes) -> Any:
 
 
 def shown(value: object) -> str:
-    """A value of JSON in a message, cut where it is long."""
+    """Formats a JSON value for a message; a long one is cut."""
     text = json.dumps(value)
     return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
 

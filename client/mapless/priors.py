@@ -1,4 +1,4 @@
-"""Priors: what is known of a camera's pose before its photograph is used.
+"""Priors: knowledge of a camera's pose before its photograph is used.
 
 A hard prior is a limit: a pose beyond it is rejected. A soft prior has a value and a covariance: it helps to find the
 pose and is compared with it (`PriorCheck`); a soft prior that contradicts the photograph is not used.
@@ -95,7 +95,7 @@ class PosePrior:
 
 @dataclass(frozen=True, eq=False)
 class Priors:
-    """The priors of a request; None for none of its kind. At most one of `position` and `geo_position`."""
+    """The priors of a request; None for a kind without a prior. At most one of `position` and `geo_position`."""
 
     position: PositionPrior | None = None
     geo_position: GeoPositionPrior | None = None

@@ -46,7 +46,7 @@ def create_request(scene_name: str, reference: NewReference) -> reference_pb.Cre
     Raises:
         OSError: the file cannot be read.
         TypeError: a value has another type; names it.
-        ValueError: the pose's rotation is none.
+        ValueError: the pose's rotation is not a rotation.
     """
     if not isinstance(reference.reference_id, str):
         raise TypeError(f"reference_id must be a text, is {reference.reference_id!r}")
@@ -67,7 +67,7 @@ def create_request(scene_name: str, reference: NewReference) -> reference_pb.Cre
 
 
 def read_image(image: ImageSource) -> bytes:
-    """The file's bytes; TypeError for pixels, which have to be encoded first."""
+    """Reads the file's bytes; TypeError for an array of pixels, which has to be encoded first."""
     if isinstance(image, bytes):
         return image
     try:

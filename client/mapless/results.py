@@ -44,9 +44,9 @@ class Reference:
     Attributes:
         scene_id, reference_id: where it is.
         camera, world_from_camera: as they were given.
-        image_sha256: of the file, hexadecimal.
+        image_sha256: hash of the file, hexadecimal.
         feature_count: local features found in it; with none it is blank, and nothing can be matched with it.
-        create_time: by the server's clock.
+        create_time: when it was stored, by the server's clock.
         image: the file's bytes, if requested.
         warnings: contradictions of the scene's datum, direction of gravity and unit and the poses stored in the same
             message, which `add_reference` and `add_references` found; else empty.

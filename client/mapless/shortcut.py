@@ -45,7 +45,7 @@ def localize(
         scene: the scene; None for MAPLESS_SCENE, or else the server's only scene, which costs another call.
         address: "host:port"; None for MAPLESS_ADDRESS, or else localhost:50051.
         options: options of the connection; None for no encryption, with the token of MAPLESS_TOKEN if it is set.
-        priors: what is known of the pose before the photograph is used.
+        priors: knowledge of the pose before the photograph is used, for example its position.
         axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: of `LocalizationResult.in_axes`.
         timeout_s: deadline of the call.
 

@@ -72,7 +72,7 @@ def checked_id(value: str, field: str) -> str:
 
 
 def filled(kind: type[T], message: Any, /, **values: Any) -> T:
-    """A dataclass with the given values; each other field has the message's value of the same name, or its default."""
+    """A dataclass with the given values; other fields have the message's values of the same names, or defaults."""
     given: Any = kind
     names_of = {it.name for it in dataclasses.fields(given)} - set(values)
     same = names_of.intersection(message.DESCRIPTOR.fields_by_name)
@@ -80,7 +80,7 @@ def filled(kind: type[T], message: Any, /, **values: Any) -> T:
 
 
 def optional(message: Any, field: str, read: Callable[..., T], *arguments: Any) -> T | None:
-    """`read(part, *arguments)` of a message's part; None if the message has no such part."""
+    """Reads `read(part, *arguments)` of a message's part; None if the message has no such part."""
     return read(getattr(message, field), *arguments) if message.HasField(field) else None
 
 

@@ -62,7 +62,7 @@ def localize(
         camera: the camera that took it, in pixels of the file as it is stored, before any EXIF rotation.
         scene: the scene to localize in.
         references: the references to use, most similar first, at most 64; empty: the server chooses.
-        priors: what is known of the pose before the photograph is used.
+        priors: knowledge of the pose before the photograph is used, for example its position.
         intrinsics_uncertainty: standard deviations of the camera's intrinsics; None for the defaults, which are smaller
             where the references have the same camera.
         variant: "best" (default), "full", "no_structure" or "coarse".

@@ -27,7 +27,7 @@ def define(picture: Picture, camera: Camera) -> str:
 
 
 def image_of(picture: Picture, camera: Camera, attributes: str = "") -> str:
-    """A picture scaled to its camera's pixels, or an empty frame; (0, 0) is the centre of the first pixel."""
+    """Draws a picture scaled to its camera's pixels, or an empty frame; (0, 0) is the centre of the first pixel."""
     place = f'x="-0.5" y="-0.5" width="{camera.width_px}" height="{camera.height_px}"'
     if not picture.uri:
         return f'<rect {attributes} {place} class="empty"/>'
@@ -35,7 +35,7 @@ def image_of(picture: Picture, camera: Camera, attributes: str = "") -> str:
 
 
 def overlay(debug: Debug, camera: Camera, world_from_camera: RigidTransform | None) -> str:
-    """The figure; without a pose, it has no residuals."""
+    """Draws the figure; without a pose, it has no residuals."""
     dot = camera.width_px / 1000
     inlier = debug.is_inlier
     layers = []

@@ -35,7 +35,7 @@ def pair(
     name: str,
     picture: Picture,
 ) -> str:
-    """One figure; empty without matches."""
+    """Draws one figure; empty without matches."""
     rows = _rows(debug, uses, name)
     if not rows.any():
         return ""
@@ -88,7 +88,7 @@ def _rows(debug: Debug, uses: Sequence[ReferenceUse], name: str) -> np.ndarray:
 
 
 def _some(rows: np.ndarray, start: Array, count: int) -> np.ndarray:
-    """The rows to draw: all, or a selection evenly from left to right."""
+    """Selects the rows to draw: all, or `count` of them evenly from left to right."""
     found = np.flatnonzero(rows)
     found = found[np.argsort(start[found, 0], kind="stable")]
     if len(found) <= count:

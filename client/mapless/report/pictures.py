@@ -69,7 +69,7 @@ def _without_metadata(image: bytes, kind: str) -> bytes | None:
 
 
 def _clean_jpeg(image: bytes) -> bytes:
-    """The file up to its end, without comments and without application segments that a decoder does not need.
+    """Cuts a JPEG after its end, and removes comments and application segments that a decoder does not need.
 
     A missing end marker, which decoders accept, is added.
     """
@@ -110,7 +110,7 @@ def _clean_png(image: bytes) -> bytes:
 
 
 def _clean_webp(image: bytes) -> bytes:
-    """The chunks within the size that the file states."""
+    """Keeps only the chunks within the size that the file states."""
     parts, position = [], 12
     image = image[: 8 + int.from_bytes(image[4:8], "little")]
     while position < len(image):

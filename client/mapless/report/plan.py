@@ -57,14 +57,14 @@ def plan_view(
     points: Array,
     down_in_world: ArrayLike | None,
 ) -> str:
-    """The figure; empty without poses.
+    """Draws the plan; empty without poses.
 
     Args:
         references: by name.
         used: names of the references used.
         poses: poses of the photograph, with names; several if they contradict each other.
-        camera: the photograph's.
-        covariance: of the first pose.
+        camera: camera of the photograph.
+        covariance: covariance of the first pose.
         points: (N, 3) points of its inliers.
         down_in_world: direction of gravity; None to estimate it from the cameras.
     """
@@ -131,7 +131,7 @@ def _guess_down(cameras: Sequence[RigidTransform]) -> Array:
 
 
 def _basis(down: Array) -> Array:
-    """Right and up on the page, seen from above, along horizontal world axes if there are any."""
+    """Directions to the right and up on the page, seen from above, along horizontal world axes if there are any."""
     up = -down / np.linalg.norm(down)
     flat = np.eye(3) - np.outer(up, up)
     first = flat[int(np.argmax(np.linalg.norm(flat, axis=1) > 0.9))]

@@ -1,4 +1,4 @@
-"""What ROS 2 and mapless exchange: images, cameras, poses, and a robot's localizer; without rclpy.
+"""Conversion between ROS 2 and mapless: images, cameras, poses, and a robot's localizer; without rclpy.
 
 Messages are read by their fields, so those of rclpy and of the package `rosbags` will do; `messages` builds them from
 the classes that it is given. `localizer` is what `deploy/ros2/mapless_ros` runs on a robot and `mapless-server

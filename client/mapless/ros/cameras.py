@@ -19,10 +19,10 @@ RATIONAL_COUNTS = (8, 12, 14)
 
 @dataclass(frozen=True, eq=False)
 class RosCamera:
-    """A camera as mapless takes it, and how its images become photographs of it.
+    """A camera in mapless's form, and how its images become photographs of it.
 
     Attributes:
-        camera: of the photographs that `photo` returns.
+        camera: camera of the photographs that `photo` returns.
         undistortion: OpenCV's maps from the images to a pinhole; None where mapless has the lens.
     """
 
@@ -30,10 +30,10 @@ class RosCamera:
     undistortion: tuple[NDArray[Any], NDArray[Any]] | None = None
 
     def photo(self, message: Any, lossless: bool = False) -> bytes:
-        """The file to send for a sensor_msgs/Image or CompressedImage.
+        """Makes the file to send for a sensor_msgs/Image or CompressedImage.
 
         Raises:
-            ValueError: it cannot be read, or has another size than the camera.
+            ValueError: the image cannot be read, or has another size than the camera.
         """
         size = (self.camera.width_px, self.camera.height_px)
         if hasattr(message, "encoding") and (message.width, message.height) != size:
@@ -49,15 +49,15 @@ class RosCamera:
 def camera_from_info(message: Any, rectified: bool = False) -> RosCamera:
     """The camera of a sensor_msgs/CameraInfo.
 
-    Lenses `plumb_bob` and `equidistant` are mapless's own. It has no `rational_polynomial`: one with zeros after
-    the fifth coefficient is `plumb_bob`; images of others are undistorted to a pinhole, cropped to what the lens saw.
+    The lenses `plumb_bob` and `equidistant` exist in mapless. A `rational_polynomial` with zeros after the fifth
+    coefficient is a `plumb_bob`; images of other ones are undistorted to a pinhole, cropped to the lens's field.
 
     Args:
         message: the CameraInfo.
-        rectified: whether the images are rectified already: then P is their camera, and not K and D.
+        rectified: whether the images are rectified already; then their camera is P instead of K and D.
 
     Raises:
-        ValueError: not calibrated, an unknown lens, or an image that is binned or a part of the sensor's.
+        ValueError: the camera is not calibrated, its lens is unknown, or its image is binned or cropped.
     """
     name, matrix, columns = ("p", list(message.p), 4) if rectified else ("k", list(message.k), 3)
     focal_x, focal_y, principal_x, principal_y = (float(matrix[i]) for i in (0, columns + 1, 2, columns + 2))

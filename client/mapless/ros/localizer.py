@@ -1,4 +1,4 @@
-"""One image of a robot after the other: its prior, the call, and what is published of the answer."""
+"""Localizes one image of a robot after the other: its prior, the call, and what is published of the answer."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class LocalizerOptions:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What became of an image.
+    """The result of an image.
 
     Attributes:
         stamp_ns: when it was taken.
@@ -97,8 +97,8 @@ class Outcome:
         frame: the frame whose pose it is.
         map_from_body: its pose in the map; None if not localized.
         covariance: (6, 6) of that pose, ROS's order, metres and radians about the map's fixed axes.
-        tf_edge: child frame and map_from_child of what tf is told: the odometry's, or without one the body's; None if
-            not localized, or if the odometry is not known at that time.
+        tf_edge: child frame and map_from_child to publish on tf: those of the odometry, or without odometry those of
+            the body; None if not localized, or if the odometry is unknown at that time.
     """
 
     stamp_ns: int
@@ -113,7 +113,7 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class _Guess:
-    """A pose of the body that was true at a time, and where odometry was then."""
+    """A pose of the body at a time, with the odometry at that time."""
 
     map_from_body: RigidTransform
     covariance: Array
@@ -135,7 +135,7 @@ class Localizer:
         self._recent: deque[SequenceFrame] = deque(maxlen=options.sequence_length)
 
     def is_due(self, stamp_ns: int) -> bool:
-        """Whether the rate has come round to an image of this time; also when time has jumped back."""
+        """Whether an image of this time is due by the rate; also if time has jumped back."""
         if not self._options.rate_hz:
             return False
         since_ns = None if self._last_ns is None else stamp_ns - self._last_ns
@@ -143,10 +143,10 @@ class Localizer:
         return since_ns is None or since_ns < 0 or since_ns >= 0.95e9 / self._options.rate_hz
 
     def guess(self, message: Any, now_ns: int) -> None:
-        """Takes a geometry_msgs/PoseWithCovarianceStamped of the base in the map, as of /initialpose, as a prior.
+        """Uses a geometry_msgs/PoseWithCovarianceStamped of the base in the map, as of /initialpose, as a prior.
 
         Raises:
-            ValueError: it is given in another frame, or its numbers are none of a pose.
+            ValueError: it is given in another frame, or its numbers are not a pose.
         """
         frame = message.header.frame_id.lstrip("/")
         if frame != self._options.map_frame:
@@ -165,7 +165,7 @@ class Localizer:
             self._guess = _Guess(map_from_base, covariance, stamp_ns, odom_from_base)
 
     def localize(self, message: Any, camera: RosCamera) -> Outcome:
-        """Localizes a sensor_msgs/Image or CompressedImage; what fails is an outcome, too."""
+        """Localizes a sensor_msgs/Image or CompressedImage; a failure is an outcome, too."""
         stamp_ns = stamp_ns_of(message.header.stamp)
         if self._last_ns is not None and stamp_ns < self._last_ns:
             self._recent.clear()
@@ -240,7 +240,7 @@ class Localizer:
         return Outcome(stamp_ns, LOCALIZED, message, values, body, pose, covariance, edge)
 
     def _odometry(self, body: str, stamp_ns: int) -> RigidTransform | None:
-        """odom_from_body; None without odometry, or where it does not reach."""
+        """The pose odom_from_body; None without odometry, or if it is unknown at this time."""
         if not self._options.odom_frame:
             return None
         try:
@@ -251,7 +251,7 @@ class Localizer:
     def _prior(
         self, stamp_ns: int, odom_from_body: RigidTransform | None, body_from_camera: RigidTransform
     ) -> PosePrior | None:
-        """The guess, moved to now by odometry, with what that adds to its covariance; of the camera."""
+        """The prior of the camera: the guess, moved by odometry until now, with the covariance that this adds."""
         with self._lock:
             guess = self._used = self._guess
         if guess is None:

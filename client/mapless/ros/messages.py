@@ -72,7 +72,7 @@ class Messages:
         return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
     def _geometry(self, kind: str, *, of: RigidTransform, **parts: str) -> Any:
-        """A Pose or a Transform: the names of its two fields, and their types."""
+        """Makes a Pose or a Transform with its two fields and their types."""
         (place, place_kind), (turn, turn_kind) = parts.items()
         x, y, z = map(float, of.translation)
         q = of.quaternion()

@@ -37,7 +37,7 @@ def pose_of_body(
     """The pose of the body that carries a camera, and its covariance (6, 6).
 
     Both covariances are in ROS's order: x, y, z, then rotations about the map's fixed x, y, z; metres and radians.
-    The inverse: the pose of the camera from that of the body, with `body_from_camera` inverted.
+    With `body_from_camera` inverted, it computes the camera's pose from the body's.
     """
     map_from_body = map_from_camera.compose(body_from_camera.inverse())
     # A body that stands r away from the camera moves by dt + w x r when the camera moves by dt and turns by w.

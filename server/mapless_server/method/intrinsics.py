@@ -140,10 +140,10 @@ class IntrinsicsEvidence:
         return np.asarray(self.motion @ self.covariance @ self.motion.T)
 
     def contradicted(self, options: ContradictionOptions, prior_sigma: Array | None = None) -> NDArray[np.bool_]:
-        """(4,): which parameters are significantly wrong.
+        """Which parameters (4,) are significantly wrong.
 
         `prior_sigma` (4,): standard deviations of the given values; by default those of the request, unless they are
-        wider than the usual ones: the photograph then knows better.
+        wider than the usual ones: the photograph is then more accurate.
         """
         usual = np.minimum(self.prior_sigma, IntrinsicsSigma().of(self.given)) if prior_sigma is None else prior_sigma
         return options.contradicted(self.value, self.sigma, usual, self.given.width_px)
@@ -160,17 +160,17 @@ def intrinsics_evidence(
     suspicion: ContradictionOptions,
     to_world: Array,
 ) -> IntrinsicsEvidence | None:
-    """The evidence in normal equations of the errors of the intrinsics; None if they are singular.
+    """Computes the evidence from normal equations of the errors of the intrinsics; None if they are singular.
 
     Args:
-        equations: of these errors.
+        equations: the normal equations of these errors.
         given: the photograph, with its intrinsics as given.
         removed: (4,) errors that are removed from the intrinsics at which they are linearized.
         prior_sigma: (4,) see `IntrinsicsEvidence`.
         held_sigma: (4,) the same where the pose was computed: less for a camera that the references share, more for
             parameters that the photograph contradicts.
         inflation: see `IntrinsicsEquations.estimate`.
-        region_factor: see there.
+        region_factor: see `UncertaintyOptions`.
         suspicion: an error that exceeds this counts in full in the pose's covariance: given intrinsics are right or far
             off, and the latter more often than a normal distribution says.
         to_world: (6, 6) derivative of the world error by the pose's unknowns.

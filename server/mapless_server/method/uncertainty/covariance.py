@@ -65,12 +65,12 @@ class UncertaintyOptions:
 def dispersed_covariance(
     dispersion: Dispersion, world_from_camera: RigidTransform, options: UncertaintyOptions, is_offset: bool = False
 ) -> Array:
-    """All parts of a pose's covariance (6, 6) but those of scale and intrinsics, with the factors.
+    """Covariance (6, 6) of a pose without the parts of scale and intrinsics, with the factors.
 
     Args:
-        dispersion: of the pose.
+        dispersion: dispersion of the pose.
         world_from_camera: the pose.
-        options: see there.
+        options: options of the covariance.
         is_offset: whether the pose is known not to be at the optimum.
     """
     covariance = dispersion.covariance(options.region_factor)
