@@ -27,6 +27,7 @@ from mapless_tools.child import CONNECT, ChildServer, child_server
 from mapless_tools.dataset import Dataset, Frame, read_folder
 from mapless_tools.evaluate.plan import EvaluationOptions, split_frames
 from mapless_tools.evaluate.run import SCENE, store_references
+from mapless_tools.usage import UsageError, failures_end_command, usage_errors
 
 TURNS = (0, 1, 1, 0)
 RESAMPLES = 2000
@@ -57,11 +58,13 @@ def main(
     rounds: Annotated[int, typer.Option(min=1, help="Times that each is localized A B B A.")] = 1,
 ) -> None:
     """Compare what a warm query costs two commits; settings are those of the environment (MAPLESS_...)."""
-    dataset = read_folder(data / scene)
-    with terminable(), ExitStack() as stack:
-        servers = [stack.enter_context(_server(commit)) for commit in (before, after)]
-        measured = measure(servers, dataset, EvaluationOptions(references, photographs), rounds)
-    print("\n".join(report(measured, (before, after or "working tree"))))
+    with failures_end_command():
+        with usage_errors():
+            dataset = read_folder(data / scene)
+        with terminable(), ExitStack() as stack:
+            servers = [stack.enter_context(_server(commit)) for commit in (before, after)]
+            measured = measure(servers, dataset, EvaluationOptions(references, photographs), rounds)
+        print("\n".join(report(measured, (before, after or "working tree"))))
 
 
 @contextmanager
@@ -72,7 +75,9 @@ def _server(commit: str) -> Iterator[ChildServer]:
         tree = Path.cwd()
         if commit:
             tree = Path(folder) / "tree"
-            subprocess.run(["git", "worktree", "add", "--quiet", "--detach", str(tree), commit], check=True)
+            added = subprocess.run(["git", "worktree", "add", "--quiet", "--detach", str(tree), commit], check=False)
+            if added.returncode:
+                raise UsageError(f"git has no commit {commit!r} here")
             stack.callback(subprocess.run, ["git", "worktree", "remove", "--force", str(tree)], check=False)
         environment["PYTHONPATH"] = f"{tree / 'client'}:{tree / 'server'}"
         with child_server(Path(folder) / "data", environment=environment) as server:
