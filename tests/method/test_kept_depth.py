@@ -12,7 +12,7 @@ from mapless.geometry import Array
 from mapless_server.method.answer import Localization
 from mapless_server.method.bundle import BundleProblem, bundle_of
 from mapless_server.method.correspond import Correspondences, Matcher
-from mapless_server.method.kept_depth import with_kept_depths
+from mapless_server.method.kept_depth import KeptDepthOptions, with_kept_depths
 from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions, Variant
 from mapless_server.method.pipeline import Pipeline
@@ -24,6 +24,8 @@ from mapless_server.method.views import Features, KeptDepth, KeypointDepths, Pos
 
 SCENE = make_scene(random_for("kept depth"), SceneOptions(point_count=500, reference_count=3, baseline_m=0.8))
 SIGMA = 0.02
+ALWAYS = KeptDepthOptions(enough_matches=10**6)
+"""Also where many triangulated points are matched."""
 
 
 def true_depth(index: int) -> Array:
@@ -68,7 +70,7 @@ def test_a_keypoint_that_only_the_query_matches_gets_a_point() -> None:
     nothing = np.empty(0, np.intp)
     structure = Structure(np.empty((0, 3)), Tracks(nothing, nothing, nothing), StructureOptions().first_noise)
     correspondences = Matcher().correspond(SCENE.query, references)
-    found = with_kept_depths(structure, references, correspondences)
+    found = with_kept_depths(structure, references, correspondences, ALWAYS)
     assert len(found.x_in_world) > 200
     assert not found.triangulated.any()
     numbers = point_numbers(found, references)
@@ -79,7 +81,7 @@ def test_a_keypoint_that_only_the_query_matches_gets_a_point() -> None:
 def test_triangulated_points_come_first_and_single_ones_are_matched() -> None:
     references = tuple(with_depths(i) for i in range(3))
     structure, correspondences = matched(references)
-    found = with_kept_depths(structure, references, correspondences)
+    found = with_kept_depths(structure, references, correspondences, ALWAYS)
     count = len(structure.x_in_world)
     assert found.triangulated[:count].all()
     assert not found.triangulated[count:].any()
@@ -90,30 +92,42 @@ def test_triangulated_points_come_first_and_single_ones_are_matched() -> None:
     assert len(set(pairs)) == len(pairs), "no keypoint observes two points"
 
 
-def test_a_triangulated_point_moves_by_what_its_depth_knows() -> None:
-    """Along the plane's normal it is the mean of both, weighted by their information."""
-    references = (with_depths(0), *SCENE.references[1:])
+def test_a_point_that_its_depth_knows_better_moves_by_what_both_know() -> None:
+    """Along the plane's normal it is the mean of both, weighted by their information; others stay."""
+    references = (with_depths(0, noise=0.001), *SCENE.references[1:])
     structure, correspondences = matched(references)
-    found = with_kept_depths(structure, references, correspondences)
+    found = with_kept_depths(structure, references, correspondences, ALWAYS)
     assert found.planes is not None
-    used = np.flatnonzero(found.planes.information[: len(structure.x_in_world)])
     _, jacobian = observations_of(structure.tracks, references, structure.noise).linearized(structure.x_in_world)
     information = structure.tracks.sum_by_point(np.swapaxes(jacobian, 1, 2) @ jacobian)
-    for point in used[:20]:
-        plane = found.planes.information[point] * np.outer(found.planes.normal[point], found.planes.normal[point])
+    used = found.planes.information[: len(structure.x_in_world)] > 0
+    assert used.sum() > 20
+    for point in np.flatnonzero(used)[:20]:
+        normal, known = found.planes.normal[point], found.planes.information[point]
+        assert normal @ np.linalg.solve(information[point], normal) > 1 / known
         wanted = np.linalg.solve(
-            information[point] + plane,
-            information[point] @ structure.x_in_world[point]
-            + found.planes.information[point] * found.planes.offset[point] * found.planes.normal[point],
+            information[point] + known * np.outer(normal, normal),
+            information[point] @ structure.x_in_world[point] + known * found.planes.offset[point] * normal,
         )
         assert found.x_in_world[point] == pytest.approx(wanted, abs=1e-6)
+    assert (found.x_in_world[: len(used)] == structure.x_in_world)[~used].all()
+
+
+def test_where_triangulated_points_suffice_the_answer_is_the_same() -> None:
+    references = tuple(with_depths(i) for i in range(3))
+    structure, correspondences = matched(references)
+    assert with_kept_depths(structure, references, correspondences) is structure
+    poses = [localize(SCENE.query, it, Pipeline(), LocalizeOptions()).outcome for it in (references, SCENE.references)]
+    assert all(isinstance(it, Localization) for it in poses)
+    first, second = (it.world_from_camera.matrix() for it in poses if isinstance(it, Localization))
+    np.testing.assert_array_equal(first, second)
 
 
 @pytest.mark.parametrize("factor", [0.7, 1.4])
 def test_depths_that_contradict_triangulation_are_not_used(factor: float) -> None:
     references = (with_depths(0, factor=factor), *SCENE.references[1:])
     structure, correspondences = matched(references)
-    found = with_kept_depths(structure, references, correspondences)
+    found = with_kept_depths(structure, references, correspondences, ALWAYS)
     assert found.planes is not None
     count = len(structure.x_in_world)
     assert (found.planes.information[:count] > 0).mean() < 0.02
@@ -124,7 +138,7 @@ def test_depths_that_contradict_triangulation_are_not_used(factor: float) -> Non
 def test_planes_are_in_the_normal_equations_as_in_the_cost() -> None:
     references = tuple(with_depths(i) for i in range(3))
     structure, correspondences = matched(references)
-    found = with_kept_depths(structure, references, correspondences)
+    found = with_kept_depths(structure, references, correspondences, ALWAYS)
     chosen = np.arange(len(found.x_in_world))
     observations, start, _ = bundle_of(found.tracks, references, found, chosen)
     assert found.planes is not None

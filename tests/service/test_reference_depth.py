@@ -20,6 +20,7 @@ from support.waiting import wait_until
 from mapless import Client, LocalizationResult, NewReference
 from mapless.geometry import RigidTransform
 from mapless_server.engine.queue_engine import QueueEngine
+from mapless_server.method import kept_depth
 from mapless_server.method.coarse import Bucket, Outcome, Reconstructor, Request
 from mapless_server.method.views import PosedView, ReconstructedView, Reconstruction, View
 from mapless_server.observability.metrics import Metrics
@@ -28,6 +29,9 @@ from mapless_server.serve.assembly import engine_options, engine_over, make_tier
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 from mapless_tools.demo import Photograph, depth_map_m, room
+
+pytestmark = pytest.mark.nightly
+"""References are matched with one another first; the parts are tested in `scenes`, `store` and `method`."""
 
 REFERENCES = 7
 UNIT_M = 1.7
@@ -131,6 +135,12 @@ def fill(data_dir: Path) -> None:
         client.add_references("room", [NewReference(it.name, it.data, it.camera, it.world_from_camera) for it in added])
 
 
+@pytest.fixture(autouse=True)
+def needed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The demo's photographs match so many triangulated points that depths would not be used."""
+    monkeypatch.setattr(kept_depth, "vote", lambda *_: [])
+
+
 @pytest.fixture(scope="module")
 def filled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     data_dir = tmp_path_factory.mktemp("filled") / "data"
@@ -189,7 +199,6 @@ def test_queries_use_what_is_kept_without_the_network(kept: Path) -> None:
     assert network.runs == 0
 
 
-@pytest.mark.nightly
 def test_depths_are_found_once_they_are_made(data_dir: Path) -> None:
     with serving(data_dir, **STORED) as server:
         assert poses(server)
@@ -201,7 +210,6 @@ def test_depths_are_found_once_they_are_made(data_dir: Path) -> None:
         assert server.value("mapless_stored_depths_total", result="stored") > 0
 
 
-@pytest.mark.nightly
 @pytest.mark.parametrize(
     "damage", ["data = zeroblob(40)", "sha256 = 'no'", "kind = replace(kind, 'depth-1/', 'depth-0/')"]
 )
@@ -223,7 +231,6 @@ def test_damaged_depths_and_other_versions_change_no_answer_and_are_made_again(k
         wait_until(is_made)
 
 
-@pytest.mark.nightly
 @pytest.mark.parametrize("factor", [1.6, float("nan")], ids=["another scale", "NaN"])
 def test_a_network_that_is_wrong_keeps_nothing(data_dir: Path, factor: float) -> None:
     """All depths 1.6 times as large as its own poses say: triangulated points contradict them."""
@@ -240,7 +247,6 @@ def test_a_network_that_is_wrong_keeps_nothing(data_dir: Path, factor: float) ->
     assert Folder(data_dir).fetch("SELECT count(*) FROM reference_depth") == [(0,)]
 
 
-@pytest.mark.nightly
 def test_two_references_cannot_be_checked(tmp_path: Path) -> None:
     data_dir, network = tmp_path / "data", PlantedNetwork()
     with serving(data_dir, network, **MAKING) as server, Client(server.address) as client:

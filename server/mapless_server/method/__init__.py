@@ -16,8 +16,8 @@ intrinsics                   errors of the query's intrinsics, and the evidence 
 results                      scale, structure, matches, pose estimate and its support: data between stages
 scale_equations, scale       metric scale, initial pose
 observations, structure      metric points
-kept_depth                   (ours) points from depths that are kept with the references
 match                        2D-3D matches of the query
+kept_depth                   (ours) points from depths that are kept with the references
 pnp                          pose and inliers
 resection                    pose and focal length from fixed points
 pose_errors                  (ours) errors of the references' given poses: how large, and how alike for neighbours

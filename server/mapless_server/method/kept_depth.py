@@ -5,10 +5,12 @@ d and relative standard deviation s, of a camera at C with the viewing direction
 
     z . (x - C) = d,    with the standard deviation    s d.
 
-A triangulated point is moved by what its plane says, each weighted by its information, unless the two contradict each
-other. A reference's keypoint that only the query matches becomes a point at its depth, which one reference observes.
-Its error is along the ray, so it moves the photograph's keypoint along the epipolar line; the final adjustment knows
-that, since it keeps the planes (see `bundle`).
+Where the photograph matches many triangulated points, depths are not used: a network's errors are shared by all points
+of a surface, so that they do not average out, and the references' own poses follow them. Otherwise a point that its
+plane determines better than its rays is moved by what both say, each weighted by its information, unless they
+contradict each other. A reference's keypoint that only the query matches becomes a point at its depth, which one
+reference observes. Its error is along the ray, so it moves the photograph's keypoint along the epipolar line; the final
+adjustment knows that, since it keeps the planes (see `bundle`).
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array
 
 from .correspond import Correspondences
+from .match import vote
 from .options import check_bounds
 from .results import DepthPlanes, Structure
 from .structure import observe
@@ -36,12 +39,17 @@ class KeptDepthOptions:
     Attributes:
         max_contradiction: a depth that is farther from its triangulated point, in standard deviations of both, is
             wrong: it is at an edge, or the keypoint shows a reflection.
+        enough_matches: with so many matches with triangulated points depths are not used. In `euroc-v101-drone`, with
+            five references and over a thousand, depths with shared errors of some per cent cost 5 cm; in the kitchen,
+            where most photographs have fewer, 100 instead of 200 costs a tenth of the gain.
     """
 
     max_contradiction: float = 3.0
+    enough_matches: int = 200
 
     def __post_init__(self) -> None:
         check_bounds(self, "max_contradiction", above=0)
+        check_bounds(self, "enough_matches", at_least=1)
 
 
 def with_kept_depths(
@@ -59,12 +67,16 @@ def with_kept_depths(
         options: options of using stored depths.
 
     Returns:
-        The structure with its `planes`; unchanged if no reference has depths.
+        The structure with its `planes`; unchanged if no reference has depths, or they are not needed.
     """
+    options = options or KeptDepthOptions()
     if all(reference.depths is None for reference in references):
         return structure
+    counts = [len(reference.view.features) for reference in references]
+    if len(vote(structure, counts, correspondences)) >= options.enough_matches:
+        return structure
     known = _KnownDepths.of(references)
-    triangulated = _combined(structure, references, known, options or KeptDepthOptions())
+    triangulated = _combined(structure, references, known, options)
     return _with_single(triangulated, references, correspondences, known)
 
 
@@ -107,7 +119,7 @@ class _KnownDepths:
 def _combined(
     structure: Structure, references: Sequence[PosedView], known: _KnownDepths, options: KeptDepthOptions
 ) -> Structure:
-    """Moves each triangulated point by its most precise depth that does not contradict it."""
+    """Moves each triangulated point that a depth determines better, and does not contradict, by that depth."""
     tracks, count = structure.tracks, len(structure.x_in_world)
     none = DepthPlanes(np.zeros((count, 3)), np.zeros(count), np.zeros(count))
     row = known.offsets[tracks.view] + tracks.keypoint
@@ -125,7 +137,8 @@ def _combined(
     across = np.einsum("pij,pj->pi", covariance, planes.normal)
     variance = (across * planes.normal).sum(axis=1) + 1 / planes.information
     off = planes.offset - (planes.normal * x).sum(axis=1)
-    agrees = off**2 <= options.max_contradiction**2 * variance
+    is_better = variance > 2 / planes.information
+    agrees = is_better & (off**2 <= options.max_contradiction**2 * variance)
     moved = structure.x_in_world.copy()
     moved[chosen[agrees]] += (across * (off / variance)[:, None])[agrees]
     for name in ("normal", "offset", "information"):
