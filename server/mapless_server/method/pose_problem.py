@@ -47,8 +47,8 @@ class AdjustOptions:
         min_decrease: stop when a step lowers the cost by a smaller share.
         suspicion: when the intrinsics are estimated with the pose. A large error leaves few inliers, of which those
             with other errors are missing.
-        agreeing_share: or when fewer of the matches are inliers. Of photographs with five references in a kitchen whose
-            k1 was off by 0.3 none of six aroused suspicion, and four of six were then found by this.
+        agreeing_share: or when fewer of the matches are inliers. In a kitchen with five references, where k1 was off by
+            0.3, one pose of six aroused suspicion; of the others this finds four.
         contradiction: when this estimate is used.
         rounds: how often, at most, the query's keypoints are corrected by an estimated parameter.
         pose_errors: options of the errors of the references' poses.
