@@ -16,7 +16,7 @@ from mapless_tools.connection import Connection, with_connection_flags
 def gateway_command(
     scene: Annotated[str, typer.Option(help="Id of the scene of requests that name none.")] = "",
     host: Annotated[str, typer.Option(help="Address that it listens on.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="Port; 0 takes any free one.")] = 8080,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes any free one.")] = 8080,
     allow_origin: Annotated[
         list[str] | None,
         typer.Option(help="Origin whose pages may call, https://app.example; may be repeated; * for all."),
