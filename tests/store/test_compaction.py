@@ -62,6 +62,13 @@ def test_keypoints_far_outside_the_photograph_come_back() -> None:
     np.testing.assert_allclose(again.keypoints, features.keypoints, rtol=0, atol=2**-7)
 
 
+def test_keypoints_in_columns_are_stored_as_those_in_rows() -> None:
+    """An extractor may give either order."""
+    rows = small_features(3, 7, 8)
+    columns = replace(rows, keypoints=np.asfortranarray(rows.keypoints))
+    assert codec.encode_view(View(CAMERA, columns)) == codec.encode_view(View(CAMERA, rows))
+
+
 def test_a_keypoint_that_is_nowhere_is_refused() -> None:
     features = replace(small_features(3, 2, 8), keypoints=np.array([[np.nan, 1.0], [2.0, 3.0]], np.float32))
     with pytest.raises(ValueError, match="not finite"):

@@ -177,7 +177,7 @@ def _encode_small_view(view: View) -> bytes:
     origin = np.floor(keypoints.min(axis=0, initial=0.0))
     span = float((keypoints - origin).max(initial=1.0))
     step = 2.0 ** (np.frexp(span)[1] - 24)
-    steps = np.minimum(np.rint((keypoints - origin) / step), _STEPS - 1).astype("<u4")
+    steps = np.minimum(np.rint((keypoints - origin) / step), _STEPS - 1).astype("<u4", order="C")
     sizes = np.clip(features.sizes_px, 0, np.finfo(_FLOAT16).max).astype(_FLOAT16)
     kind = "histogram" if features.descriptors.dtype == np.uint8 else "direction"
     how = {"kind": kind, "origin": origin.tolist(), "step": step}
