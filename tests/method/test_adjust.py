@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +13,9 @@ from support.jacobians import assert_jacobian
 from support.planted import NOISE, disturbed, drifted, stages, true_correspondences, true_structure
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
-from mapless.geometry import Array, RigidTransform
+from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.adjust import adjust_pose
-from mapless_server.method.bundle import Bundle, BundleProblem
+from mapless_server.method.bundle import Bundle, BundleProblem, Poses
 from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.pose_problem import AdjustOptions, pose_problem
 from mapless_server.method.results import PointMatches, PoseEstimate
@@ -61,6 +62,28 @@ def test_gradient_equals_finite_differences_of_the_cost(moved: float, tolerance:
     assert_jacobian(
         2 * gradient, lambda v: problem.cost(from_vector(state, v)), np.zeros(len(gradient)), tolerance=tolerance
     )
+
+
+def test_cameras_turn_together_as_each_alone_to_the_last_bit() -> None:
+    random = random_for("turns")
+    motion = random.normal(size=(500, 6)) * 10.0 ** random.uniform(-12, 0.5, (500, 1))
+    motion[0] = 0
+    turned = Poses(np.tile(np.eye(3), (500, 1, 1)), np.zeros((500, 3))).moved(motion).rotation
+    np.testing.assert_array_equal(turned, [rotation_from_vector(it[3:]) @ np.eye(3) for it in motion])
+
+
+def test_replaced_problems_share_sorted_observations_and_cost_the_same() -> None:
+    problem, state = problem_of("replaced")
+    motion = random_for("replaced").normal(size=(int((problem.view == 3).sum()), 2, 4))
+    changes: dict[str, Any] = {
+        "keypoint_motion": motion,
+        "intrinsics_information": np.ones(4),
+        "intrinsics_offset": np.ones(4),
+    }
+    state = replace(state, intrinsics=np.array([1e-3, 0.5, -0.5, 2e-3]))
+    wider, sorted_again = problem.replaced(**changes), replace(problem, **changes)
+    assert wider.by_view.sums is problem.by_view.sums
+    assert wider.cost(state) == sorted_again.cost(state)
 
 
 def residuals(problem: BundleProblem, state: Bundle) -> Array:

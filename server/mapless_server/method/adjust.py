@@ -90,7 +90,7 @@ def _adjusted(
     if len(used) < 3:  # two equations each, for six unknowns
         return None
     problem, start = pose_problem(query, references, structure, matches, used, estimate.world_from_camera, options)
-    with_priors = replace(problem, priors=priors, prior_weight=options.error_inflation**2)
+    with_priors = problem.replaced(priors=priors, prior_weight=options.error_inflation**2)
     bundle = minimize(with_priors, start, MinimizeOptions(options.iterations, options.min_decrease))
     terms = intrinsics_terms(query, references, intrinsics)
     found = adjusted_estimate(query, structure, matches, used, estimate, problem, bundle, options, terms)

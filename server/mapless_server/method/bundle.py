@@ -11,8 +11,9 @@ them. The points are eliminated (Schur complement), which leaves a dense system 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless.geometry import Array, RigidTransform
 
 from .arrays import apply_columns, columns, symmetric_products, take
 from .observations import Observations
@@ -64,7 +65,7 @@ class Poses:
 
     def moved(self, motion: Array) -> Poses:
         """Returns the poses after left perturbations (V, 6)."""
-        turn = np.stack([rotation_from_vector(w) for w in motion[:, 3:]])
+        turn = _rotations(motion[:, 3:])
         return Poses(turn @ self.rotation, (turn @ self.translation[:, :, None])[..., 0] + motion[:, :3])
 
     def motion_from(self, given: Poses) -> Array:
@@ -131,6 +132,12 @@ class BundleProblem:
         """The observations sorted by view, in columns."""
         view_count = len(self.given.rotation) + 1
         return ViewColumns.of(self.observations, self.view, view_count, self.keypoint_motion, self.planes)
+
+    def replaced(self, **changes: Any) -> BundleProblem:
+        """Returns the problem with other priors or `keypoint_motion`; the same observations are not sorted again."""
+        other = replace(self, **changes)
+        vars(other)["by_view"] = replace(self.by_view, by_intrinsics=_by_intrinsics(other.keypoint_motion))
+        return other
 
     @property
     def query_rows(self) -> slice:
@@ -230,7 +237,7 @@ class ViewColumns:
             view[order],
             columns(observations.focal_px[order] / sigma_px),
             columns((observations.principal_px - observations.pixel)[order] / sigma_px),
-            np.ascontiguousarray(np.moveaxis(keypoint_motion, 0, 2)),
+            _by_intrinsics(keypoint_motion),
             view_count,
             planes,
         )
@@ -405,6 +412,22 @@ class EliminatedPoints:
         z = z / zz
         y = (y - yz * z) / yy
         return np.stack([(x - xy * y - xz * z) / xx, y, z], axis=1)
+
+
+def _by_intrinsics(keypoint_motion: Array) -> Array:
+    """`keypoint_motion` (O, 2, I) of a problem in columns, (2, I, O)."""
+    return np.ascontiguousarray(np.moveaxis(keypoint_motion, 0, 2))
+
+
+def _rotations(vectors: Array) -> Array:
+    """Rotations (V, 3, 3) about vectors (V, 3) as `rotation_from_vector` makes each, the same bits."""
+    angles = np.sqrt(vectors[:, None] @ vectors[:, :, None]).ravel().tolist()
+    small = [angle < 1e-8 for angle in angles]
+    first = np.array([1.0 if s else math.sin(a) / a for s, a in zip(small, angles, strict=True)])
+    second = np.array([0.5 if s else (1 - math.cos(a)) / a**2 for s, a in zip(small, angles, strict=True)])
+    cross = np.zeros((len(vectors), 3, 3))
+    cross[:, [2, 0, 1], [1, 2, 0]], cross[:, [1, 2, 0], [2, 0, 1]] = vectors, -vectors
+    return np.asarray(np.eye(3) + first[:, None, None] * cross + second[:, None, None] * cross @ cross)
 
 
 def _block_diagonal(blocks: Sequence[Array]) -> Array:

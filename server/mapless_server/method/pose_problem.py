@@ -100,7 +100,7 @@ def pose_problem(
     matrix, gradient, _ = problem.linearize(start).reduced(LEAST_DAMPING)
     own, drift = most_probable(errors, matrix, gradient, options.pose_errors)
     covariance = errors.covariance(own, drift)
-    return replace(problem, information=np.asarray(np.linalg.inv(covariance), np.float64)), start
+    return problem.replaced(information=np.asarray(np.linalg.inv(covariance), np.float64)), start
 
 
 def with_intrinsics(problem: BundleProblem, bundle: Bundle, query: View) -> tuple[BundleProblem, Bundle]:
@@ -109,7 +109,7 @@ def with_intrinsics(problem: BundleProblem, bundle: Bundle, query: View) -> tupl
     observations = problem.observations
     motion = keypoint_motion(query.camera, query.distortion, observations.pixel[is_query])
     motion = motion / observations.sigma_px[is_query, None, None]
-    wider = replace(problem, keypoint_motion=motion, intrinsics_information=np.zeros(4), intrinsics_offset=np.zeros(4))
+    wider = problem.replaced(keypoint_motion=motion, intrinsics_information=np.zeros(4), intrinsics_offset=np.zeros(4))
     return wider, replace(bundle, intrinsics=np.zeros(4))
 
 

@@ -116,11 +116,11 @@ def _with_errors(
         if len(used) < LEAST_MATCHES:
             return None
         problem, start = pose_problem(view, references, structure, matches, used, pose, options)
-        problem = replace(problem, priors=priors, prior_weight=options.error_inflation**2)
+        problem = problem.replaced(priors=priors, prior_weight=options.error_inflation**2)
         if not left or (change is not None and (np.abs(change) < usual / 10).all()):
             break
         wider, there = with_intrinsics(problem, start, view)
-        wider = replace(wider, intrinsics_information=held**-2.0, intrinsics_offset=errors)
+        wider = wider.replaced(intrinsics_information=held**-2.0, intrinsics_offset=errors)
         bundle = minimize(wider, there, steps)
         pose, change = bundle.world_from_query, bundle.intrinsics
         errors = errors + change
