@@ -67,8 +67,8 @@ def is_doubtful(answer: Answer, options: EscalationOptions) -> bool:
     """Whether stronger features could improve the answer.
 
     They cannot if the intrinsics are wrong: other features do not correct them, but may determine them too little to
-        detect it. A pose that nothing has checked (`Variant.COARSE`) has no trust and claims nothing, so there is
-        nothing to doubt.
+    detect it. A pose that nothing has checked (`Variant.COARSE`) has no trust and claims nothing, so there is
+    nothing to doubt.
     """
     outcome = answer.outcome
     if isinstance(outcome, Rejection):

@@ -159,8 +159,8 @@ class Prepared:
         """Whether a pose may be estimated from two-view matches after this answer.
 
         It may not if a stage has found the cause of the rejection: a second place, wrong intrinsics, or references at
-            one place. Nor if 2D-3D matches gave a pose that was not accepted: the same matches without points are no
-            better evidence. Of four photographs accepted in this way in `office-lockers`, two had wrong poses.
+        one place. Nor if 2D-3D matches gave a pose that was not accepted: the same matches without points are no
+        better evidence. Of four photographs accepted in this way in `office-lockers`, two had wrong poses.
         """
         outcome = answer.outcome
         if self.options.variant is not Variant.BEST or len(self.references) < 2 or isinstance(outcome, Localization):

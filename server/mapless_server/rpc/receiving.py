@@ -1,8 +1,8 @@
 """Receives the one message of a call in limited time.
 
 For methods with one request message, grpc receives it before it calls the handler, however long that takes: a call
-    whose caller sends only the headers would count as a concurrent call as long as its connection exists. So all
-    methods are served as if their callers sent streams, of which the first message is read here.
+whose caller sends only the headers would count as a concurrent call as long as its connection exists. So all
+methods are served as if their callers sent streams, of which the first message is read here.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ class Sender:
         """Sends the headers of a stream; raises the same exceptions as `message`.
 
         Otherwise the headers would be sent with the first message, and no status could be sent while that message
-            waits: it would contain the headers, too, and grpc rejects headers that it already has.
+        waits: it would contain the headers, too, and grpc rejects headers that it already has.
         """
         await self._in_time(context.send_initial_metadata(()), SEND_LIMIT_S)
 

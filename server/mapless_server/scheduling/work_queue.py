@@ -51,7 +51,7 @@ class WorkQueue:
     """Computes jobs. Methods must be called on one event loop, unless stated otherwise.
 
     The threads take batches from the scheduler themselves: passing every step through the event loop would cost as much
-        as a small step, and leave threads idle whenever the loop is busy.
+    as a small step, and leave threads idle whenever the loop is busy.
 
     Attributes:
         on_fatal: called on the event loop when the queue cannot continue.

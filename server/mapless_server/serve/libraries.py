@@ -36,9 +36,9 @@ def _share_one_heap() -> None:
     """Makes all threads allocate from the same heap, if the C library is glibc.
 
     By default glibc gives each thread its own heap, which keeps the tens of megabytes that the features of one
-        photograph need for a short time: a server without references had 415 MiB instead of 225. Threads have Python's
-        lock for most allocations, so they do not wait for the heap. The heap keeps up to 128 MiB free for the next
-        query, because requesting them from the system took 16 ms per query.
+    photograph need for a short time: a server without references had 415 MiB instead of 225. Threads have Python's
+    lock for most allocations, so they do not wait for the heap. The heap keeps up to 128 MiB free for the next
+    query, because requesting them from the system took 16 ms per query.
     """
     if sys.platform == "linux" and (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
         for option, value in _MALLOC_OPTIONS.items():

@@ -1,8 +1,8 @@
 """Depths that are stored with references, of one or more kinds.
 
 A *kind* names everything that determines a depth besides the photographs: the version of making and checking it, the
-    network and its weights. Depths of another version are never read. Finished references are recorded as for pairs
-    (see `pairs`), under the kind's name; if a finished one has no depth, this was found wrong, or could not be checked.
+network and its weights. Depths of another version are never read. Finished references are recorded as for pairs
+(see `pairs`), under the kind's name; if a finished one has no depth, this was found wrong, or could not be checked.
 """
 
 from __future__ import annotations

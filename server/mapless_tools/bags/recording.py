@@ -1,7 +1,7 @@
 """Messages of a recording: a folder of rosbag2, or one of its files (.mcap, .db3).
 
 Standard messages are the same in every version of ROS 2, so they are read by the definitions of one version, not by
-    those in the recording: many recordings have no definitions, or unreadable ones of messages that are not needed.
+those in the recording: many recordings have no definitions, or unreadable ones of messages that are not needed.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Whole queries on photographs of the rendered room: K = 10 stored references, everything in this process.
 
 A query is everything from the encoded photograph to the answer: decoding, features, matching, network, scale,
-    refinement. Protocol and store, which a call adds, are not included.
+refinement. Protocol and store, which a call adds, are not included.
 """
 
 from __future__ import annotations

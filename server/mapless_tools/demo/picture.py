@@ -1,7 +1,7 @@
 """A picture that shows whether a pose is right.
 
 Left: the photograph with known structure projected by the found pose. Right: the nearest reference with the same
-    structure. Below: the numbers and a plan of the place.
+structure. Below: the numbers and a plan of the place.
 """
 
 from __future__ import annotations

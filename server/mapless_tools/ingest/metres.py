@@ -80,7 +80,7 @@ def in_metres(dataset: Dataset, options: MetreOptions, id_prefix: str = "") -> D
     """Converts the dataset to metres, with notes on what was done; unchanged without options.
 
     A position file has its own frame: the dataset and its direction of gravity are transformed to it. The dataset's
-        datum, which belongs to its former frame, is dropped.
+    datum, which belongs to its former frame, is dropped.
 
     Raises:
         ValueError: a reference is unknown, the known values contradict each other or do not suffice, or a pose would

@@ -1,9 +1,9 @@
 """Trust in the joint pose of a group, as in `judge`, from the evidence of all photographs together.
 
 The photographs count as one camera with several images, mounted as the joint pose says: shares are computed from sums
-    over the photographs (that of matches on epipolar lines is a mean weighted by inliers), the covered parts of the
-    images are added, and halves of all matches, or of all references, give poses by generalized PnP. With one
-    photograph this is the evidence of `judge`, so that trust means the same for both.
+over the photographs (that of matches on epipolar lines is a mean weighted by inliers), the covered parts of the
+images are added, and halves of all matches, or of all references, give poses by generalized PnP. With one
+photograph this is the evidence of `judge`, so that trust means the same for both.
 """
 
 from __future__ import annotations

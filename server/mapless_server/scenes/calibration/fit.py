@@ -153,8 +153,8 @@ def _trust_quantiles(right: Array, highest_wrong: float, options: FitOptions) ->
     """Quantiles of the generic trust of the scene's right answers at `LEVELS`.
 
     They are never above the generic ones: references are often taken on one walk, and do not show how much harder
-        photographs from elsewhere are. Nor are they so low that a wrong answer in this scene would be accepted that is
-        rejected otherwise.
+    photographs from elsewhere are. Nor are they so low that a wrong answer in this scene would be accepted that is
+    rejected otherwise.
     """
     trust = np.linspace(0, 1, 1001)
     of_scene = np.searchsorted(np.sort(right), trust, side="right") / len(right)

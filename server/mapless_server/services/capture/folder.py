@@ -1,9 +1,9 @@
 """Captured calls in a folder, with a limit of age and one of size, which always hold while the server runs.
 
 A call expires by the clock, or when its time has passed since it was written or found, whichever is earlier: setting
-    the clock cannot prolong it. `expire` deletes expired calls; `_make_room` deletes the oldest before a file is
-    written. A file that cannot be deleted stays counted, and is tried again. Opening a folder deletes every call that
-    is damaged, incomplete or outside the limits. Methods may be called from any thread.
+the clock cannot prolong it. `expire` deletes expired calls; `_make_room` deletes the oldest before a file is
+written. A file that cannot be deleted stays counted, and is tried again. Opening a folder deletes every call that
+is damaged, incomplete or outside the limits. Methods may be called from any thread.
 """
 
 from __future__ import annotations
