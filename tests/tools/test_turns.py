@@ -7,8 +7,9 @@ import time
 
 import numpy as np
 import pytest
+import typer
 
-from mapless_tools.bench.turns import Measured, _processor_s, ratio_with_interval, report
+from mapless_tools.bench.turns import Measured, _processor_s, main, ratio_with_interval, report
 
 
 def test_a_planted_ratio_lies_in_its_interval() -> None:
@@ -31,3 +32,9 @@ def test_a_rejected_photograph_counts_for_the_time_alone() -> None:
 def test_the_clock_of_a_process_is_its_own() -> None:
     begin_s = _processor_s(os.getpid())
     assert begin_s == pytest.approx(time.process_time(), abs=0.05)
+
+
+def test_without_a_commit_nothing_is_measured(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(typer.Exit):
+        main("")
+    assert "BEFORE=commit" in capsys.readouterr().err

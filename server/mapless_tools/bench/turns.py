@@ -60,6 +60,8 @@ def main(
     """Compare what a warm query costs two commits; settings are those of the environment (MAPLESS_...)."""
     with failures_end_command():
         with usage_errors():
+            if not before:
+                raise UsageError("no commit to compare with was given: make bench-turns BEFORE=commit")
             dataset = read_folder(data / scene)
         with terminable(), ExitStack() as stack:
             servers = [stack.enter_context(_server(commit)) for commit in (before, after)]
