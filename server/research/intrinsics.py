@@ -11,23 +11,21 @@ intrinsics are wrong themselves take no part: `statue-of-liberty-internet` has o
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from mapless.geometry import Camera, Fisheye
 from mapless_server.method.answer import Localization
-from mapless_server.method.features import FeatureExtractor, make_extractor, undistort_pixels
+from mapless_server.method.features import FeatureExtractor, undistort_pixels
 from mapless_server.method.intrinsics import ContradictionOptions, corrected
 from mapless_server.method.rejection import IntrinsicsParameter
 from mapless_server.method.uncertainty.radii import accuracy_from_covariance
 from mapless_server.method.views import Features, View
 
-from .places import METRIC, Measured, Pair, Place, answered, read_place, right_pairs, spread
+from .places import METRIC, Measured, Pair, Place, answered, read_place, right_pairs, samples_of_command, spread
 
 PLANTED = (*METRIC, ("euroc-v101-drone", None))
 """Folders with errors planted, and how many frames are references; None leaves one out."""
@@ -206,20 +204,7 @@ def wrong_lines(samples: Sequence[Sample], key: Callable[[Sample], str]) -> Iter
 
 def main() -> None:
     """Measures and prints."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("data", type=Path, help="folder of the scenes' folders")
-    parser.add_argument("--weights", type=Path, help="folder with edgepoint2-l64.safetensors, for these features too")
-    parser.add_argument("--samples", type=Path, help="read from this file if it is there, else written to it")
-    arguments = parser.parse_args()
-    if arguments.samples and arguments.samples.is_file():
-        samples = [Sample(**it) for it in json.loads(arguments.samples.read_text())]
-    else:
-        samples = list(collect(arguments.data, "sift", make_extractor("sift")))
-        if arguments.weights:
-            name = "edgepoint2-l64"
-            samples += collect(arguments.data, name, make_extractor(name, arguments.weights / f"{name}.safetensors"))
-        if arguments.samples:
-            arguments.samples.write_text(json.dumps([asdict(it) for it in samples]))
+    samples = samples_of_command(__doc__, collect, lambda it: Sample(**it))
     print(f"sigmas = {threshold(samples):.2f}\n")
     for lines in (
         right_lines(samples),

@@ -5,11 +5,14 @@ The method's own modules work on them in this process, without a server. Folders
 
 from __future__ import annotations
 
+import argparse
+import json
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -28,6 +31,11 @@ from mapless_server.method.views import PosedView, View
 from mapless_tools.dataset import Frame, read_folder
 from mapless_tools.evaluate.metrics import pose_error
 from mapless_tools.evaluate.references import choose_references
+
+S = TypeVar("S")
+
+EDGEPOINT2 = {"edgepoint2-l64": "edgepoint2-l64.safetensors"}
+"""Learned features, and the file of their weights."""
 
 RIGHT_SHARE, RIGHT_M, RIGHT_DEG = 0.05, 0.25, 5.0
 """An answer is wrong that is off by a larger share of the distance to what the photograph shows, by more degrees or,
@@ -274,3 +282,25 @@ def _distance_seen(support: Support, true_pose: RigidTransform) -> float:
     projected = camera.project(x_in_camera)
     inside = ((projected >= 0) & (projected < [camera.width_px, camera.height_px])).all(axis=1)
     return float(np.median(x_in_camera[inside, 2])) if inside.any() else 0.0
+
+
+def samples_of_command(
+    description: str | None,
+    collect: Callable[[Path, str, FeatureExtractor], Iterator[S]],
+    from_json: Callable[[dict[str, Any]], S],
+    learned: Mapping[str, str] = EDGEPOINT2,
+) -> list[S]:
+    """Returns what a program measures (dataclasses) with SIFT and learned features, or has written to `--samples`."""
+    parser = argparse.ArgumentParser(description=(description or "").splitlines()[0])
+    parser.add_argument("data", type=Path, help="folder of the scenes' folders")
+    parser.add_argument("--weights", type=Path, help=f"folder with {', '.join(learned.values())}, for these too")
+    parser.add_argument("--samples", type=Path, help="read from this file if it is there, else written to it")
+    arguments = parser.parse_args()
+    if arguments.samples and arguments.samples.is_file():
+        return [from_json(it) for it in json.loads(arguments.samples.read_text())]
+    samples = list(collect(arguments.data, "sift", make_extractor("sift")))
+    for name, file in learned.items() if arguments.weights else ():
+        samples += collect(arguments.data, name, make_extractor(name, arguments.weights / file))
+    if arguments.samples:
+        arguments.samples.write_text(json.dumps([asdict(it) for it in samples]))  # type: ignore[call-overload]
+    return samples

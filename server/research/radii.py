@@ -13,10 +13,8 @@ Answers that are wrong do not count: telling these is what trust is for (`resear
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,14 +22,14 @@ from scipy.special import bdtrik
 
 from mapless.geometry import Array
 from mapless_server.method.answer import Localization
-from mapless_server.method.features import FeatureExtractor, make_extractor
+from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import StageOptions
 from mapless_server.method.pose_problem import AdjustOptions
 from mapless_server.method.uncertainty.covariance import UncertaintyOptions
 from mapless_server.method.uncertainty.radii import error_radii
 
-from .places import ALL, KS, answered, natural_pairs, read_places, weights_alike
+from .places import ALL, KS, answered, natural_pairs, read_places, samples_of_command, weights_alike
 
 TAIL_SHARE = 0.97
 """With 95 %, half of the unseen scenes would have fewer within."""
@@ -133,21 +131,7 @@ def _quantile(values: Sequence[float], weights: Array, probability: float) -> fl
 
 def main() -> None:
     """Measures, fits and prints."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("data", type=Path, help="folder of the scenes' folders")
-    parser.add_argument("--weights", type=Path, help="folder with edgepoint2-l64.safetensors, for these features too")
-    parser.add_argument("--samples", type=Path, help="read from this file if it is there, else written to it")
-    arguments = parser.parse_args()
-    if arguments.samples and arguments.samples.is_file():
-        answers = [Answered(**it) for it in json.loads(arguments.samples.read_text())]
-    else:
-        answers = list(collect(arguments.data, "sift", make_extractor("sift")))
-        if arguments.weights:
-            name = "edgepoint2-l64"
-            extractor = make_extractor(name, arguments.weights / f"{name}.safetensors")
-            answers += collect(arguments.data, name, extractor)
-        if arguments.samples:
-            arguments.samples.write_text(json.dumps([asdict(it) for it in answers]))
+    answers = samples_of_command(__doc__, collect, lambda it: Answered(**it))
     constants = fit(answers)
     print(f"position_factor = {constants.position:.2f}, rotation_factor = {constants.rotation:.2f}")
     print(f"TAIL_95 = {constants.tail:.2f}\n")

@@ -10,18 +10,17 @@ constants are tried on a grid, and chosen for each place by what the others say,
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array
-from mapless_server.method.features import FeatureExtractor, make_extractor
+from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.trust.judge import trust_in_scene
 from mapless_server.method.uncertainty import radii as uncertainty
@@ -31,7 +30,7 @@ from mapless_server.scenes.calibration.fit import FitOptions, LeftOut, fit
 from mapless_server.services.messages.radii import Factors, scaled_accuracy
 from mapless_server.store import SelfCalibration
 
-from .places import KITCHEN, QUERIES, Measured, Pair, Place, answered, read_places, spread
+from .places import KITCHEN, QUERIES, Measured, Pair, Place, answered, read_places, samples_of_command, spread
 
 SETTINGS: dict[str, tuple[int, ...]] = {
     KITCHEN: (30, 10, 5),
@@ -181,31 +180,16 @@ def _cells(it: Tested) -> str:
     return ", ".join(f"{100 * share:.0f}" for share in (*(it.ratios <= 1).mean(axis=0), it.accepted.mean()))
 
 
-def _read(path: Path) -> list[Sample]:
-    def result(content: dict[str, object] | None) -> LeftOut | None:
-        if content is None:
-            return None
-        return LeftOut(**{**content, "claimed": Accuracy(**content["claimed"])})  # type: ignore[arg-type]
-
-    return [Sample(**{**it, "result": result(it["result"])}) for it in json.loads(path.read_text())]
+def _read(content: dict[str, Any]) -> Sample:
+    result = content["result"]
+    if result is not None:
+        result = LeftOut(**{**result, "claimed": Accuracy(**result["claimed"])})
+    return Sample(**{**content, "result": result})
 
 
 def main() -> None:
     """Localizes, chooses and prints."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("data", type=Path, help="folder of the scenes' folders")
-    parser.add_argument("--weights", type=Path, help="folder with edgepoint2-l64.safetensors, for these features too")
-    parser.add_argument("--samples", type=Path, help="read from this file if it is there, else written to it")
-    arguments = parser.parse_args()
-    if arguments.samples and arguments.samples.is_file():
-        samples = _read(arguments.samples)
-    else:
-        samples = list(collect(arguments.data, "sift", make_extractor("sift")))
-        if arguments.weights:
-            name = "edgepoint2-l64"
-            samples += collect(arguments.data, name, make_extractor(name, arguments.weights / f"{name}.safetensors"))
-        if arguments.samples:
-            arguments.samples.write_text(json.dumps([asdict(it) for it in samples]))
+    samples = samples_of_command(__doc__, collect, _read)
     growth, options = choose(samples)
     print(f"growth = {growth:g}, factor_log = {options.factor_log:g}, noise_share = {options.noise_share:g}\n")
     print("\n".join(left_out_places(samples)))

@@ -14,11 +14,10 @@ accepted where 97 % were promised. To test them each place is left out once, and
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +26,7 @@ from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.answer import Localization
 from mapless_server.method.correspond import make_matcher
-from mapless_server.method.features import FeatureExtractor, make_extractor
+from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.rejection import RejectionReason
 from mapless_server.method.trust.evidence import AgreementOptions, Evidence, evidence_of, votes_of
@@ -45,6 +44,7 @@ from .places import (
     natural_pairs,
     read_places,
     right_pairs,
+    samples_of_command,
     weights_alike,
 )
 
@@ -209,23 +209,13 @@ def _share(part: NDArray[np.bool_], whole: NDArray[np.bool_]) -> str:
     return f"{part.sum()} of {whole.sum()} ({100 * part.sum() / whole.sum():.1f} %)" if whole.any() else "-"
 
 
+def _read(content: dict[str, Any]) -> Sample:
+    return Sample(**{**content, "evidence": Evidence(**content["evidence"])})
+
+
 def main() -> None:
     """Fits and prints."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("data", type=Path, help="folder of the scenes' folders")
-    parser.add_argument("--weights", type=Path, help="folder with EdgePoint2's and ALIKED's, for these features too")
-    parser.add_argument("--samples", type=Path, help="read from this file if it is there, else written to it")
-    arguments = parser.parse_args()
-    if arguments.samples and arguments.samples.is_file():
-        read = json.loads(arguments.samples.read_text())
-        samples = [Sample(**{**it, "evidence": Evidence(**it["evidence"])}) for it in read]
-    else:
-        samples = list(collect(arguments.data, "sift", make_extractor("sift")))
-        for name, file in LEARNED.items() if arguments.weights else ():
-            extractor = make_extractor(name, arguments.weights / file)
-            samples += collect(arguments.data, name, extractor)
-        if arguments.samples:
-            arguments.samples.write_text(json.dumps([asdict(it) for it in samples]))
+    samples = samples_of_command(__doc__, collect, _read, LEARNED)
     print(f"scores = {tuple(np.round(fit(samples), 3).tolist())}\n")
     print("\n".join(left_out(samples)))
 
