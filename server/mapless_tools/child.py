@@ -32,12 +32,7 @@ class ServerFailed(Exception):
 
 @dataclass(frozen=True)
 class Memory:
-    """Memory of a process.
-
-    Attributes:
-        resident_mib: present size.
-        peak_mib: largest size so far (VmHWM).
-    """
+    """Memory of a process, at present and at most so far (VmHWM)."""
 
     resident_mib: float
     peak_mib: float
@@ -71,16 +66,9 @@ def child_server(
 ) -> Iterator[ChildServer]:
     """Runs a server on a free port of the loopback interface until the end of the block.
 
-    It uses the settings of the environment, except its address, its store, and those of `more_flags`.
-
-    Args:
-        store: a data folder, or the URL of a database that servers share.
-        more_flags: flags of the command `serve`, with their values.
-        environment: variables that are added to those of this process.
-        log: file that its log is appended to; None for this process's standard error.
-
-    Raises:
-        ServerFailed: the server ended, or did not listen within `START_TIMEOUT_S`.
+    It uses the settings of the environment, except its address, its store (a data folder, or the URL of a database that
+    servers share), and those of `more_flags` of the command `serve`. Its log is appended to a file, by default to this
+    process's standard error. ServerFailed if it ended, or did not listen within `START_TIMEOUT_S`.
     """
     flags = {
         "--host": "127.0.0.1",
@@ -114,14 +102,7 @@ def temporary_server() -> Iterator[Client]:
 def child_module(
     module: str, *arguments: str, environment: Mapping[str, str] | None = None, log: Path | None = None
 ) -> Iterator[ChildServer]:
-    """Runs a module as a server that prints its address as `mapless-server serve` does; see `child_server`.
-
-    Args:
-        module: name of the module.
-        arguments: arguments of its command line.
-        environment: variables that are added to those of this process, or replace them.
-        log: file that its standard error is appended to; None for that of this process.
-    """
+    """Runs a module as a server that prints its address as `mapless-server serve` does; see `child_server`."""
     with nullcontext() if log is None else log.open("ab") as errors:
         process = subprocess.Popen(
             [sys.executable, "-m", module, *arguments],

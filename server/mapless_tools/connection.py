@@ -79,9 +79,7 @@ def with_connection_flags(command: Callable[..., None]) -> Callable[..., None]:
 def connected(connection: Connection, settings: Settings) -> Iterator[Client]:
     """A client until the end of the block; without an address, of a server that is started on the settings' store.
 
-    Raises:
-        ValueError: the connection's options do not fit together, or the settings' server would reject the client.
-        ServerFailed: the server did not start.
+    ValueError if the connection's options do not fit together, or the settings' server would reject the client.
     """
     from mapless import Client
     from mapless.cli.suggesting import suggesting

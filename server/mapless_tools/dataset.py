@@ -35,14 +35,10 @@ Parsed = TypeVar("Parsed")
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A photograph whose pose is known.
+    """A photograph whose pose is known, in metres, or in the dataset's unit if it is not metric.
 
-    Attributes:
-        name: its name, unique in the dataset, and a legal reference id.
-        image_path: the file; its EXIF orientation is not to be applied.
-        camera: its camera, with the distortion of the file's pixels.
-        world_from_camera: its pose; metres, or the dataset's unit if it is not metric.
-        split: "train" for those a benchmark builds its references from, "test" for its queries, empty if unknown.
+    Its name is a legal reference id; the EXIF orientation of its file is not to be applied. The split is "train" for
+    frames that a benchmark builds its references from, "test" for its queries, empty if unknown.
     """
 
     name: str
@@ -58,12 +54,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Refusal:
-    """A frame of a dataset that cannot be used.
-
-    Attributes:
-        frame: its name in the file.
-        reason: one clause that names file and field.
-    """
+    """A frame of a dataset that cannot be used, as it is named there, and a clause with the reason: file and field."""
 
     frame: str
     reason: str
@@ -75,19 +66,10 @@ class Refusal:
 
 @dataclass(frozen=True)
 class Dataset:
-    """Frames of one place, in one world frame.
+    """Frames of one place, in one world frame, in the order of the file; what the file does not say is empty or None.
 
-    Attributes:
-        name: name of the folder.
-        frames: the frames, in the order of the file.
-        metric: whether lengths are metres.
-        source: where the photographs come from; empty if the file does not say.
-        ground_truth: how the poses were found ("SfM (COLMAP)", "KinectFusion"); empty if the file does not say.
-        format: name of the layout it was read from.
-        refused: frames that are not among `frames`, and why.
-        notes: notes for the user on how it was read, such as a choice that was made or a unit other than metres.
-        datum: position of the world on the Earth; None if the file does not say.
-        down_in_world: unit vector of gravity; None if the file does not say.
+    `ground_truth` says how the poses were found ("SfM (COLMAP)", "KinectFusion"), `notes` how the folder was read, such
+    as a choice that was made or a unit other than metres. `down_in_world` is a unit vector of gravity.
     """
 
     name: str
@@ -109,14 +91,9 @@ def printable(text: str) -> str:
 
 
 def read_folder(path: Path, skips_unusable: bool = False) -> Dataset:
-    """Reads the frames of a folder; images are not opened.
+    """Reads the frames of a folder; images are not opened. ValueError names the frame and the field that is wrong.
 
-    Args:
-        path: the folder.
-        skips_unusable: whether malformed frames are only listed in `refused`, if at least one frame is usable.
-
-    Raises:
-        ValueError: no `cameras.json`, or something in it is missing or malformed; the message names frame and field.
+    With `skips_unusable`, malformed frames are only listed in `refused`, if at least one frame is usable.
     """
     file = path / FILE_NAME
     content = read_json(file)
@@ -209,11 +186,7 @@ def legal_id(stem: str, taken: Container[str]) -> str:
 
 
 def image_file(folder: Path, image: str) -> Path:
-    """The file of an image that a layout names.
-
-    Raises:
-        ValueError: the path leads out of the folder, or there is no such file.
-    """
+    """The file of an image that a layout names; ValueError if there is none, or the path leads out of the folder."""
     if PurePosixPath(image).is_absolute() or ".." in PurePosixPath(image).parts:
         raise ValueError(f"image: {image!r} leads out of {folder}")
     file = folder / image

@@ -101,12 +101,9 @@ def queries_of(dataset: Dataset, case: Case) -> list[Query]:
 
 
 class SceneDatabase:
-    """COLMAP's database of a scene: features of frames, and matches of pairs.
+    """COLMAP's database of a scene, put into `folder`: features of frames, and matches of pairs.
 
-    Args:
-        root: folder of the scene; images are named by their paths from it.
-        folder: where the database is put.
-        orientations: of a place at most; each makes a keypoint.
+    Images are named by their paths from `root`. Each of at most so many orientations of a place makes a keypoint.
     """
 
     def __init__(self, root: Path, folder: Path, orientations: int = 2) -> None:
@@ -266,14 +263,10 @@ def measure(dataset: Dataset, case: Case, database: SceneDatabase) -> dict[str, 
 
 @dataclass(frozen=True)
 class Cells:
-    """What one system reached on a case.
+    """What one system reached on a case: medians, infinite where half of the queries are lost, and seconds of a query.
 
-    Attributes:
-        localized: how many queries.
-        wrong: how many of these are off by more than `RIGHT_M`, or `RIGHT_SHARE` of the distance to the references
-            where the unit is arbitrary, or by more than `RIGHT_DEG`.
-        translation, rotation_deg: medians; infinite where half of the queries are lost.
-        seconds: median of a query.
+    Localized queries are wrong if they are off by more than `RIGHT_M`, or `RIGHT_SHARE` of the distance to the
+    references where the unit is arbitrary, or by more than `RIGHT_DEG`.
     """
 
     localized: int

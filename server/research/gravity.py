@@ -24,15 +24,10 @@ from .places import KITCHEN, RIGHT_DEG, Measured, Pair, Place, answered, read_pl
 
 @dataclass(frozen=True)
 class Setting:
-    """Which references a query is given.
+    """Which references of a scene a query is given: at most so many, those with the most matches.
 
-    Attributes:
-        folder: of the scene.
-        given: at most so many, those with the most matches.
-        stored: so many of the frames are references, evenly spread, and queries are taken between them; None leaves
-            one out.
-        frames_apart: frames within so many of the query are not used.
-        metric: whether 10 cm mean anything.
+    So many `stored` frames are references, evenly spread, and queries are taken between them; None leaves one out,
+    without frames within so many of the query. In a scene that is not metric, 10 cm mean nothing.
     """
 
     folder: str

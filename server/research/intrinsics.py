@@ -73,18 +73,11 @@ ERRORS: dict[str, tuple[IntrinsicsParameter, Callable[[Camera], Camera]]] = {
 
 @dataclass(frozen=True)
 class Sample:
-    """A photograph's answer.
+    """A photograph's answer, with one of the planted `ERRORS`, or empty for intrinsics as given.
 
-    Attributes:
-        place: of the scene and the number of references.
-        features: their kind.
-        error: of `ERRORS`; empty for intrinsics as given.
-        right: whether the pose is right, accepted or not, see `Measured`.
-        answered: whether it was accepted.
-        inside: whether the position and the angle are within their 95 % radii.
-        named: parameters that the rejection names.
-        sigmas: of each parameter, its error by the estimate's standard deviation, and by both together; of those that
-            the photograph determines, else zero.
+    It may be right (see `Measured`) without being accepted. `inside` says whether position and angle are within their
+    95 % radii, `named` which parameters the rejection names. `sigmas` are of each parameter, its error by the
+    estimate's standard deviation, and by both together; of those that the photograph determines, else zero.
     """
 
     place: str

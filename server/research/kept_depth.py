@@ -39,9 +39,8 @@ FLAT, NEAR_PX = 0.03, 40.0
 class Noise:
     """Errors of planted depths.
 
-    Attributes:
-        each, common: relative standard deviations, of each depth and of all of a reference.
-        wrong: share of the depths that are off by a factor of up to 2.
+    `each` and `common` are relative standard deviations, of each depth and of all of a reference; `wrong` is the share
+    of the depths that are off by a factor of up to 2.
     """
 
     each: float = SIGMA

@@ -42,14 +42,10 @@ COVERAGE = 0.97
 
 @dataclass(frozen=True)
 class Case:
-    """A pose from one reference.
+    """A pose from one reference, and whether its position is within its radius of 68 %.
 
-    Attributes:
-        place: of the photographs.
-        score: see `Found`.
-        off: error of the position, as a share of the distance to what the reference shows; infinite for another place.
-        off_deg: of the rotation.
-        holds: whether the position is within its radius of 68 %.
+    `off` is the error of the position, as a share of the distance to what the reference shows; infinite for another
+    place.
     """
 
     place: str

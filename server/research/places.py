@@ -84,13 +84,7 @@ CROSS_REFERENCES = 30
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A scene's photographs, with their features.
-
-    Attributes:
-        name: of its folder.
-        views, poses: by the frame's index.
-        metric: whether the unit of the poses is the metre.
-    """
+    """A scene's photographs with their features, by the frame's index."""
 
     name: str
     views: dict[int, View]
@@ -112,15 +106,9 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """A query and the references that it is given, the most similar first.
+    """A query and the references that it is given, at most k, the most similar first.
 
-    Attributes:
-        title: of the setting, for tables.
-        k: how many references were asked for.
-        query, references: photographs.
-        true_pose: of the query; None in another place.
-        priors: of the pose, for the method.
-        metric: whether the unit of the poses is the metre.
+    `true_pose` is None in another place.
     """
 
     title: str
@@ -188,12 +176,8 @@ def right_pairs(
 ) -> Iterator[Pair]:
     """Queries of a scene with k of its references each, or all where it has fewer.
 
-    Args:
-        place: the scene.
-        reference_count: references, evenly spread, and queries between them; None leaves one out.
-        ks: numbers of references.
-        frames_apart: references within so many frames of the query are not used.
-        features: kind of the views' features.
+    So many references are evenly spread, and queries between them; None leaves one out. References within so many
+    frames of the query are not used.
     """
     indices = sorted(place.views)
     references, queries = indices, indices

@@ -43,11 +43,7 @@ UNFITTED = StageOptions(
 class Answered:
     """An answer's errors by the radii that the model claims without factors.
 
-    Attributes:
-        scene: its folder.
-        features: their kind.
-        k: references asked for, of `KS`; the photographs of a small scene have fewer.
-        position_68, position_95, rotation_68, rotation_95: error by radius.
+    A small scene has fewer than k references.
     """
 
     scene: str

@@ -56,13 +56,9 @@ GRID = tuple(
 
 @dataclass(frozen=True)
 class Sample:
-    """An answer to a photograph of a scene.
+    """An answer to a photograph of a scene, a reference that was left out or a query; as the calibration sees it.
 
-    Attributes:
-        scene, features: what answered.
-        is_reference: whether the photograph is a reference that was left out; else a query.
-        is_right: by the scene's own scale (`Measured.right`); wrong answers are judged by trust, not by radii.
-        result: as the calibration sees it; None if it was rejected.
+    It is right by the scene's own scale (`Measured.right`); wrong answers are judged by trust, not by radii.
     """
 
     scene: str
@@ -101,10 +97,7 @@ def _result(place: Place, index: int, it: Measured) -> LeftOut | None:
 class Tested:
     """What one way of calibrating a scene is worth: errors by radii of 68 and 95 %, of right answers, and acceptance.
 
-    Attributes:
-        scene, features: of the answers.
-        ratios: (N, 4) position and rotation at 68 %, then both at 95 %.
-        accepted: (N,) at `COVERAGE`.
+    The ratios (N, 4) are of position and rotation at 68 %, then both at 95 %; (N,) are accepted at `COVERAGE`.
     """
 
     scene: str

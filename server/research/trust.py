@@ -60,15 +60,10 @@ DIFFICULT_PLACES, DIFFICULTY_LEVEL = 1 / 3, 0.05
 
 @dataclass(frozen=True)
 class Sample:
-    """A pose that passed the gate.
+    """A pose that passed the gate, with its evidence, and whether it is near enough to the truth (`Measured.right`).
 
-    Attributes:
-        kind: "natural", "cross", "mirrored", "moved" (wrong reference poses), "elsewhere" (references that look away)
-            or "thinned".
-        place: of the references.
-        features: kind of features.
-        right: whether it is near enough to the truth (`Measured.right`).
-        evidence: for it.
+    Its kind is "natural", "cross", "mirrored", "moved" (wrong reference poses), "elsewhere" (references that look away)
+    or "thinned".
     """
 
     kind: str

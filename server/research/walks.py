@@ -45,15 +45,11 @@ REPORTED_M = 0.3
 
 @dataclass(frozen=True)
 class Setting:
-    """A scene and the photographs of it that are walked along.
+    """A scene and the photographs of it that are walked along, in stretches of a length.
 
-    Attributes:
-        title: for the table.
-        folder: of the scene.
-        reference_count: so many frames, evenly spread, are references; None: all others are, of each photograph.
-        stretches: the first frames between the references of each stretch; without them all are one.
-        length: of a stretch.
-        is_ordered: whether frames follow one another; else a walk goes to the nearest one left.
+    So many frames, evenly spread, are references; None: all others are, of each photograph. The first frames of
+    stretches are between the references; without them all frames are one stretch. Unless frames follow one another, a
+    walk goes to the nearest one left.
     """
 
     title: str
@@ -84,14 +80,9 @@ class Photograph:
 
 @dataclass(frozen=True, eq=False)
 class Walk:
-    """A walk and its session.
+    """A walk and its session as tracked, perhaps in a unit that is not known.
 
-    Attributes:
-        photographs: in order.
-        session_from_camera: as tracked.
-        unit_is_free: whether the unit of the session is unknown.
-        at: the first photograph after the jump; 0 without a jump.
-        jump_m, jump_deg: of the tracking there.
+    The tracking jumps before the photograph `at`, by `jump_m` and `jump_deg`; 0 without a jump.
     """
 
     photographs: tuple[Photograph, ...]

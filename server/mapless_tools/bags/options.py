@@ -11,16 +11,12 @@ from mapless.geometry import RigidTransform
 class BagOptions:
     """Which topics and frames of a recording are used; empty for unambiguous ones.
 
-    Attributes:
-        image_topic: topic of images.
-        camera_topic: topic of the images' CameraInfo.
-        pose_topic: topic of Odometry, PoseStamped, PoseWithCovarianceStamped, TransformStamped, or /tf.
-        world_frame: frame of the poses, for /tf: by default the root of its tree.
-        body_frame: frame whose poses a topic without child_frame_id has: by default the root of the camera's static
-            frames.
-        body_from_camera: pose of the camera's optical frame on that body; None for that of /tf_static.
-        max_pose_gap_s: largest time between an image and the poses before and after it. At 10 Hz there is one every 0.1
-            s; between two of them a robot that accelerates by 2 m/s2 is off a straight line by 2.5 mm.
+    A `pose_topic` has Odometry, PoseStamped, PoseWithCovarianceStamped or TransformStamped, or is /tf, whose poses are
+    in `world_frame`, by default the root of its tree. `body_frame` is the frame whose poses a topic without
+    child_frame_id has, by default the root of the camera's static frames; `body_from_camera` is the pose of the
+    camera's optical frame on it, None for that of /tf_static. An image is used if there are poses within
+    `max_pose_gap_s` before and after it. At 10 Hz there is one every 0.1 s; between two of them a robot that
+    accelerates by 2 m/s2 is off a straight line by 2.5 mm.
     """
 
     image_topic: str = ""

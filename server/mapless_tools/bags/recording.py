@@ -30,11 +30,7 @@ _HINTS = (
 class Recording:
     """A recording, open until the end of its block.
 
-    Attributes:
-        path: path of the folder or file.
-        types: type of the messages of each topic that has messages, "sensor_msgs/msg/Image".
-        counts: number of messages of each topic.
-        typestore: the classes of its messages.
+    `types` and `counts` are the type and number of each topic's messages.
     """
 
     def __init__(self, path: Path) -> None:
@@ -64,8 +60,7 @@ class Recording:
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
         """Yields topic, time of recording (nanoseconds) and message of these topics, in the order of recording.
 
-        Raises:
-            ValueError: the recording is damaged; names the topic, the message and the time.
+        ValueError if the recording is damaged: names the topic, the message and the time.
         """
         connections = [it for it in self._connections if it.topic in topics]
         if not connections:
@@ -104,10 +99,9 @@ class Recording:
 
 
 def stamp_of(message: Any, previous_ns: int | None, what: str) -> int:
-    """Stamp of a message's header, nanoseconds; `previous_ns` is the latest stamp before it.
+    """Stamp of a message's header, nanoseconds.
 
-    Raises:
-        ValueError: there is no stamp, or time jumps back; the message names `what` it is.
+    ValueError, naming `what` it is, without a stamp, or if time jumps back.
     """
     stamp_ns = int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)
     if not stamp_ns:

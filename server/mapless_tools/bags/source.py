@@ -28,14 +28,9 @@ RECTIFIED = "image_rect"
 
 @dataclass(frozen=True, eq=False)
 class Images:
-    """The images of one camera of a recording.
+    """The images of one camera of a recording, with its frame and, if the recording has them, its intrinsics.
 
-    Attributes:
-        recording: the recording.
-        topic: topic of the images.
-        frame: frame of the camera, as in its messages.
-        camera: its intrinsics; None if the recording has none.
-        begin_ns: the time from which times in seconds are counted.
+    Times in seconds count from `begin_ns`.
     """
 
     recording: Recording
@@ -61,13 +56,7 @@ class Images:
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """The frames of a recording.
-
-    Attributes:
-        tree: tree of all frames.
-        topic: topic of the poses.
-        world, body: frames of these poses.
-    """
+    """The tree of a recording's frames, and the topic of its poses, which are those of `body` in `world`."""
 
     tree: FrameTree
     topic: str
@@ -88,8 +77,7 @@ def open_images(recording: Recording, options: BagOptions) -> Images:
 def open_poses(images: Images, options: BagOptions) -> Poses:
     """Opens the poses of the options' topic, or of the only one, with the frames from the camera to them.
 
-    Raises:
-        ValueError: there is no such topic, there are several, or no frames connect them; names the flag that helps.
+    ValueError if there is no such topic, there are several, or no frames connect them; names the flag that helps.
     """
     recording = images.recording
     topic = _pose_topic(recording, options)

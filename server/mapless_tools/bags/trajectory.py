@@ -74,9 +74,7 @@ class FrameTree:
     def lookup(self, target: str, source: str, time_s: float) -> RigidTransform:
         """target_from_source at a time.
 
-        Raises:
-            LookupError: no chain of frames connects the two.
-            ValueError: one of the chain's poses is not known at that time.
+        LookupError if no frames connect the two, ValueError if a pose is not known then.
         """
         ancestors = self.lineage(target)
         common = next((it for it in self.lineage(source) if it in ancestors), None)

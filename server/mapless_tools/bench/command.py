@@ -26,10 +26,7 @@ COLD_STARTS = 5
 def bench(data: Path, quick: bool) -> None:
     """Measures all scenes in a folder, prints Markdown and writes `OUTPUT`; absent scenes are named and skipped.
 
-    Raises:
-        UsageError: no scene is present, one is damaged, or a setting is wrong.
-        ServerFailed: the server did not start.
-        MaplessError: a call failed.
+    UsageError if no scene is present, one is damaged, or a setting is wrong.
     """
     folders = [*dict.fromkeys(scene.folder for scene in SCENES), *OTHER_FOLDERS]
     absent = [folder for folder in folders if not (data / folder / "cameras.json").is_file()]

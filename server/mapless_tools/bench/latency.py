@@ -20,13 +20,10 @@ REFERENCE_COUNT = 30
 
 @dataclass(frozen=True)
 class Latency:
-    """The cost of calls, milliseconds.
+    """The cost of calls on a filled store, and the memory after them.
 
-    Attributes:
-        cold_ms: the first call of each of several fresh servers on a filled store, with a different photograph each.
-        first_pass: the first call of every query on one server, without the cold one.
-        warm: the same calls again.
-        memory: memory of that server after these calls; None without /proc.
+    `cold_ms` are those of the first call of each of several fresh servers, with a different photograph each;
+    `first_pass` those of every query for the first time on one server, without the cold one; `warm` the same again.
     """
 
     cold_ms: tuple[float, ...]

@@ -25,15 +25,9 @@ from .scenes import KITCHEN, BenchScene, Figures, met
 
 @dataclass(frozen=True, eq=False)
 class BenchResult:
-    """All that was measured.
+    """All that was measured: scenes with a target and without, latency if its scene is there, and absent folders.
 
-    Attributes:
-        machine: processor and cores.
-        scenes: scenes with a target.
-        others: scenes without a target.
-        latency: None if its scene is absent.
-        absent: missing folders.
-        quick: whether queries were left out, so that targets do not apply.
+    A `quick` one leaves out queries, so that targets do not apply.
     """
 
     machine: str

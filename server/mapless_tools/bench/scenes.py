@@ -20,8 +20,7 @@ class Figures:
 class BenchScene:
     """A measurement with its target, and the accuracy of COLMAP 4.2 with a map built from all references beforehand.
 
-    Attributes:
-        references: number of references; None for leave-one-out.
+    Without a number of references, each photograph is localized from all others.
     """
 
     folder: str

@@ -35,12 +35,9 @@ RESAMPLES = 2000
 
 @dataclass(frozen=True)
 class Measured:
-    """The cost of one photograph.
+    """The cost of one photograph: (2, T) processor time of each commit's server and time that the client measures.
 
-    Attributes:
-        processor_s: (2, T) processor time of each commit's server, for its calls in order.
-        wall_s: (2, T) time that the client measures.
-        apart_m: distance between the two commits' positions; None if one has no position.
+    `apart_m` is the distance between the two commits' positions; None if one has no position.
     """
 
     processor_s: Array

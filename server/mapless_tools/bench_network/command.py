@@ -45,13 +45,8 @@ REPEATS, QUICK_REPEATS = 20, 3
 def bench_network(quick: bool = False, only: Sequence[str] | None = None, output: Path = OUTPUT) -> list[Figure]:
     """Measures and prints a table; writes `network.json` and `network.md` after each part.
 
-    Args:
-        quick: whether to use few repetitions and to compile nothing, to check that it runs.
-        only: names of `PARTS`; None for all that this machine can run.
-        output: folder, made if needed.
-
-    Returns:
-        All figures.
+    With `quick`, few repetitions and nothing compiled, to check that it runs. `only` names `PARTS`; None for all that
+    this machine can run.
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if device.type == "cpu":

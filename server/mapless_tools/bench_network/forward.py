@@ -141,8 +141,7 @@ def measure_forward(name: str, rates: Rates, device: torch.device, repeats: int,
 def _check(forward: Forward, step: Step) -> float:
     """Runs a step; returns its largest difference from the eager pass.
 
-    Raises:
-        ArithmeticError: the output is not finite, or differs too much.
+    ArithmeticError if the output is not finite, or differs too much.
     """
     output = forward.run(step.work, step.compiled)
     if not all(bool(tensor.isfinite().all()) for tensor in vars(output).values()):

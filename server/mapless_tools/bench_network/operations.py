@@ -35,12 +35,8 @@ PRODUCTS: frozenset[Any] = frozenset(
 class Rates:
     """The limits of a device.
 
-    Attributes:
-        device: its name.
-        matrix_flops: operations per second of a large bfloat16 matrix product.
-        copy_bytes: bytes read plus bytes written per second of a large copy.
-        launch_s: the host's time to launch a kernel.
-        measured: whether they were measured on this device.
+    They are operations per second of a large bfloat16 product, bytes read plus bytes written per second of a large
+    copy, and the host's time to launch a kernel.
     """
 
     device: str
@@ -56,17 +52,12 @@ H200 = Rates("NVIDIA H200", 790e12, 4.3e12)
 
 @dataclass(frozen=True)
 class Operations:
-    """What a computation executes.
+    """What a computation executes: operations (a multiply-add counts as two), kernels, and bytes between the products.
 
-    Attributes:
-        flop: operations of matrix products and convolutions; a multiply-add counts as two.
-        attention_flop: those of attention itself, q k^T and the weighted sum of v.
-        tf32_flop: those of convolutions in float32.
-        float32_flop: those of linear layers in float32.
-        kernels: number of kernels, if every operation is one.
-        eager_bytes: bytes read and written by operations between the products, if every operation is a kernel.
-        fused_bytes: the same if all operations between two products are one kernel, which reads the output of one
-            product and writes the input of the next; the residual stream is read and written at each addition.
+    Of `flop`, attention itself (q k^T and the weighted sum of v) has `attention_flop`, convolutions and linear layers
+    in float32 the other two. `eager_bytes` are read and written if every operation is a kernel. `fused_bytes`, if all
+    operations between two products are one kernel, which reads the output of one product and writes the input of the
+    next; the residual stream is read and written at each addition.
     """
 
     flop: int = 0

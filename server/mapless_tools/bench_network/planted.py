@@ -35,11 +35,7 @@ class Truth:
 
 
 class PlantedReconstructor:
-    """A `Reconstructor` that waits for the network and returns the truth.
-
-    Attributes:
-        network: the network that computes.
-    """
+    """A `Reconstructor` that waits for the network, which computes, and returns the truth."""
 
     uses_correspondences = False
     is_batched = True

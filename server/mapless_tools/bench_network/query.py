@@ -45,13 +45,7 @@ THREADS = 8
 
 @dataclass(frozen=True)
 class QueryOptions:
-    """Options of the measurement.
-
-    Attributes:
-        features: name of the local features; `sift` is used if their weights are missing.
-        query_count: number of different photographs.
-        rounds: how often each one is localized in one measurement.
-    """
+    """Options of the measurement; `sift` is used if the weights of the local features are missing."""
 
     features: str = "aliked"
     query_count: int = 8

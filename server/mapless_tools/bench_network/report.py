@@ -12,17 +12,7 @@ from typing import Any
 class Figure:
     """One measured or counted number; less is better unless `target_is_least`.
 
-    Attributes:
-        part: the part it belongs to.
-        name: its name.
-        value: the number; None if it was not measured.
-        unit: unit of the number, of `again` and of `target`.
-        again: the same measured a second time.
-        floor_ms: the least possible time.
-        predicted_ms: the time predicted before the measurement.
-        target: the value to reach.
-        target_is_least: whether the target is a lower bound, so that more is better.
-        note: a remark; the reason, if it was not measured.
+    `again` is the same measured a second time. Without a value, `note` is the reason.
     """
 
     part: str

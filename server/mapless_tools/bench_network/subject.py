@@ -83,12 +83,8 @@ def _scaled(key: str, noise: Tensor) -> Tensor:
 class Work:
     """One forward pass of a scene.
 
-    Attributes:
-        encoded: number of views that are encoded; the tokens of the others are given.
-        mapped: number of views whose points and confidence are computed.
-        views: number of views of the scene.
-        grid: rows and columns of patches.
-        query_only: whether only the last view's pose is computed, which only MapAnything can.
+    Of its views, so many are encoded, the tokens of the others being given, and points and confidence of so many are
+    computed; or the last view's pose alone (`query_only`), which only MapAnything can.
     """
 
     encoded: int

@@ -46,13 +46,7 @@ _TRIED = np.exp(np.linspace(np.log(MIN_FACTOR), np.log(MAX_FACTOR), 2305))
 
 @dataclass(frozen=True, eq=False)
 class Claim:
-    """An error and the radii claimed for it, in one unit.
-
-    Attributes:
-        error: distance to the truth.
-        radius_68, radius_95: radii claimed not to be exceeded with this probability.
-        radii: (L,) the same for `LEVELS`, not decreasing.
-    """
+    """An error and the radii claimed for it, in one unit; `radii` (L,) are those of the probabilities `LEVELS`."""
 
     error: float
     radius_68: float
@@ -61,17 +55,10 @@ class Claim:
 
     @classmethod
     def of(cls, error: float, radius_68: float, radius_95: float, covariance: Array) -> Claim:
-        """Makes the claim of an answer.
+        """Makes the claim of an answer, which states two radii and a covariance (3, 3), in the unit of `error`.
 
-        An answer states two radii and a covariance. The radius for another probability p is the covariance's
-        (`error_radii`) times what the stated ones are of the covariance's own: exactly at 68 and 95 %, linear in p
-        between, constant beyond.
-
-        Args:
-            error: distance to the truth.
-            radius_68: the stated radius, unit of `error`.
-            radius_95: the stated radius, unit of `error`.
-            covariance: (3, 3), square of the unit of `error`.
+        The radius for another probability p is the covariance's (`error_radii`) times what the stated ones are of the
+        covariance's own: exactly at 68 and 95 %, linear in p between, constant beyond.
         """
         at = (0.68, 0.95)
         own = error_radii(covariance, LEVELS)

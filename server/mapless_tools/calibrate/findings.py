@@ -62,14 +62,9 @@ class Share:
 
 @dataclass(frozen=True)
 class Held:
-    """How often the truth is within a claimed radius.
+    """How often the truth is within a claimed radius, without a factor and with the factor from all other answers.
 
-    Attributes:
-        claim: "position" or "rotation".
-        probability: the claimed probability.
-        before: the share without any factor.
-        factor: the factor that corrects it; None if there are too few answers.
-        after: the share with the factor from all other answers; None if there are too few.
+    There is no factor if there are too few answers.
     """
 
     claim: str
@@ -83,12 +78,7 @@ class Held:
 class Operating:
     """The result of accepting every answer with at least a given score.
 
-    Attributes:
-        score: the smallest accepted.
-        coverage: share of the right answers that are accepted.
-        risk: share of wrong ones among the accepted.
-        accepted: number of accepted answers.
-        wrong: number of wrong ones among these.
+    The coverage is the share of the right answers that are accepted, the risk that of wrong ones among the accepted.
     """
 
     score: float
@@ -102,18 +92,10 @@ class Operating:
 class Findings:
     """All results of a calibration.
 
-    Attributes:
-        outcomes: of all photographs, in their order.
-        conditions: what computed the calibrated answers, which are the majority.
-        sample: claims of those answers.
-        others: number of answers that were computed under other conditions, and are left out.
-        factors: factors of the sample; None if it is too small, which `refusal` says.
-        after: the sample, each claim with the factors from all others; None if it is too small.
-        held: a row for each kind and probability.
-        rejections: number of rejections by reason.
-        right: number of right answers.
-        trusted: risk against coverage, by trust; empty if answers have none.
-        auroc: probability that a right answer has more trust than a wrong one; NaN if there is none of either.
+    The sample has the claims of answers that were computed under the same conditions as the majority; the number of
+    `others` is left out. If it is too small, as `refusal` says, there are no factors, and no `after`, in which each
+    claim has the factors from all others. `trusted` is risk against coverage by trust, empty if answers have none;
+    `auroc` the probability that a right answer has more trust than a wrong one, NaN if there is none of either.
     """
 
     outcomes: tuple[Outcome, ...]

@@ -37,12 +37,9 @@ EXPLAINED = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """A photograph, and the references that it is compared with.
+    """A photograph, and the references that it is compared with; without any, the server chooses among all.
 
-    Attributes:
-        frame: the photograph with its true pose in the scene's world.
-        references: names of the references; empty if the server chooses among all.
-        reranked: whether the server chooses `count` among `references`.
+    If `reranked`, the server chooses among them.
     """
 
     frame: Frame
@@ -52,18 +49,9 @@ class Query:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """The answer to a photograph, compared with the truth.
+    """The answer to a photograph, compared with the truth: metres and degrees, infinite without a pose.
 
-    Attributes:
-        name: name of the frame.
-        error_m, error_deg: errors of the answered pose; infinite if there is none.
-        position, rotation: the claims, in metres and degrees; None without radii.
-        trust: trust of the answer; None if it has none.
-        inlier_count, match_count: counts of the answer.
-        rejection, message: why there is no pose; empty if there is one.
-        conditions: what computed it; None if the server refused the photograph.
-        true_pose: true world_from_camera.
-        pose: the answered pose.
+    Claims are None without radii, conditions if the server refused the photograph.
     """
 
     name: str
@@ -89,9 +77,7 @@ def planned_queries(queries: Sequence[PlannedQuery]) -> list[Query]:
 def scene_queries(client: Client, scene: str, frames: Sequence[Frame], progress: Progress) -> list[Query]:
     """Makes queries for a stored scene: no photograph is compared with itself or a copy of itself.
 
-    Raises:
-        UsageError: the scene has too few references, or a photograph's poses in the folder and in the scene differ.
-        MaplessError: a call failed.
+    UsageError if the scene has too few references, or a photograph's poses in the folder and in the scene differ.
     """
     known = list(client.list_references(scene, page_size=1000))
     if len(known) < 2:
@@ -111,18 +97,7 @@ def scene_queries(client: Client, scene: str, frames: Sequence[Frame], progress:
 
 
 def localize(client: Client, scene: str, query: Query, *, count: int, variant: str) -> Outcome:
-    """Localizes one photograph, as if the scene had no calibration.
-
-    Args:
-        client: client of the server.
-        scene: id of the scene.
-        query: the photograph.
-        count: number of references that the server chooses, if it does.
-        variant: form of the method.
-
-    Raises:
-        MaplessError: the call failed, for another reason than the photograph.
-    """
+    """Localizes one photograph as if the scene had no calibration, with `count` references where the server chooses."""
     frame = query.frame
     try:
         answer = client.localize(
@@ -147,12 +122,7 @@ def localize(client: Client, scene: str, query: Query, *, count: int, variant: s
 
 @dataclass(frozen=True)
 class OtherWorld:
-    """The position of a folder's world in the scene's, by the answers.
-
-    Attributes:
-        moved_m, turned_deg: motion of the folder's frame.
-        left_m: median error after undoing this motion.
-    """
+    """The motion of a folder's frame in the scene's, by the answers; `left_m` is the median error after undoing it."""
 
     moved_m: float
     turned_deg: float

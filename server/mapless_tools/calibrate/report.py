@@ -42,15 +42,9 @@ RULES = (
 
 @dataclass(frozen=True, eq=False)
 class CalibrationReport:
-    """The figures of a calibration, and what they were measured on.
+    """The figures of a calibration, what they were measured on, and a sentence on what was done with the factors.
 
-    Attributes:
-        dataset: the folder.
-        scene: the scene that was calibrated; empty for the folder alone.
-        references: number of references of the scene.
-        count: number of references of a query.
-        stored: one sentence on what was done with the factors.
-        found: all figures.
+    The scene is empty if the folder alone was measured. `count` is the number of references of a query.
     """
 
     dataset: Dataset

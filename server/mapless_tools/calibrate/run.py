@@ -35,15 +35,7 @@ OWN_SCENE = "calibration"
 
 @dataclass(frozen=True)
 class CalibrateOptions:
-    """Options of a calibration.
-
-    Attributes:
-        scene: the scene to calibrate; empty for the folder by itself.
-        layout: layout of the folder.
-        evaluation: how the folder is split and its photographs are localized.
-        right: what counts as a right answer.
-        dry_run: whether to store nothing.
-    """
+    """Options of a calibration, of a scene, or of a folder by itself."""
 
     scene: str = ""
     layout: str = "auto"
@@ -61,13 +53,7 @@ class CalibrateOptions:
 
 
 def clear_calibration(folder: Path | None, scene: str, connection: Connection) -> None:
-    """Removes a scene's calibration.
-
-    Raises:
-        UsageError: no scene is named, or a folder is.
-        ServerFailed: the server did not start.
-        MaplessError: the call failed.
-    """
+    """Removes a scene's calibration; UsageError if no scene is named, or a folder is."""
     with usage_errors():
         if folder is not None or not scene:
             raise ValueError("--clear takes --scene and no folder")
@@ -78,22 +64,9 @@ def clear_calibration(folder: Path | None, scene: str, connection: Connection) -
 
 
 def calibrate(folder: Path, options: CalibrateOptions, connection: Connection, output: Path) -> bool:
-    """Measures, prints, writes the report, and stores the factors if there is a scene.
+    """Measures, prints, writes the report, and stores the factors if there is a scene; returns whether there are any.
 
-    Args:
-        folder: the folder with photographs and their poses.
-        options: options of the calibration.
-        connection: connection to the scene's server.
-        output: folder of the report, created if missing.
-
-    Returns:
-        Whether factors were found.
-
-    Raises:
-        UsageError: a wrong folder, file or setting; or the folder's poses are not in the scene's world.
-        ServerFailed: the server did not start.
-        MaplessError: a call failed.
-        OSError: the report cannot be written.
+    UsageError for a wrong folder, file or setting, or if the folder's poses are not in the scene's world.
     """
     with usage_errors():
         settings = load_settings({}).settings

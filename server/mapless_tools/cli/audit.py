@@ -95,14 +95,9 @@ def audit_command(
 
 @dataclass
 class Examined:
-    """The findings of an audit that may have ended early.
+    """The findings of an audit.
 
-    Attributes:
-        scene: its id.
-        audits: audits of the references so far, in the server's order.
-        total: number of references of the scene; None before it is known.
-        stopped: why it ended early; empty if it did not.
-        warnings: contradictions of the scene's datum, down and unit and the poses of its references.
+    `stopped` says why it ended early, `warnings` what contradicts the references' poses.
     """
 
     scene: str

@@ -33,12 +33,7 @@ class Photograph:
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """Edges of a room and its larger furniture, world, metres.
-
-    Attributes:
-        edges: (E, 2, 3) all edges.
-        visible_edges: (S, 2, 3) by the names of the queries: the parts that are not hidden in them.
-    """
+    """Edges of a room and its larger furniture, world, metres: (E, 2, 3), all and those visible in each query."""
 
     edges: Array
     visible_edges: Mapping[str, Array]
@@ -46,14 +41,7 @@ class Outline:
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """References and queries of one place.
-
-    Attributes:
-        title: shown to the user.
-        references, queries: the photographs; none is in both.
-        metric: whether lengths are metres.
-        outline: None if it is not known.
-    """
+    """References and queries of one place; none is in both. The outline is None if it is not known."""
 
     title: str
     references: Sequence[Photograph]

@@ -37,13 +37,7 @@ GREEN, RED, AMBER = "#46dc78", "#ff5046", "#ffbe3c"
 
 @dataclass(frozen=True, eq=False)
 class Scenery:
-    """What is known of the place, for drawing.
-
-    Attributes:
-        points: points triangulated from references.
-        outline: (E, 2, 3) edges, world; none for a real place.
-        visible_outline: (S, 2, 3) the parts of edges that are not hidden in the photograph.
-    """
+    """What is known of the place, for drawing: triangulated points, (E, 2, 3) edges, and the visible parts of edges."""
 
     points: SparsePoints
     outline: Array = field(default_factory=lambda: np.empty((0, 2, 3)))
@@ -58,15 +52,10 @@ def draw(
     scenery: Scenery,
     caption: Sequence[str],
 ) -> Canvas:
-    """Draws the picture (H, W, 3) uint8 RGB of one answer.
+    """Draws the picture (H, W, 3) uint8 RGB of one answer; the first line of the caption is its heading.
 
-    Args:
-        query: the photograph with its true pose.
-        world_from_query: the found pose; None if the photograph was rejected, then nothing is drawn on it.
-        nearest: the reference that the answer rests on most.
-        references: all references, for the plan.
-        scenery: what to draw.
-        caption: lines; the first one is the heading.
+    Nothing is drawn on a photograph that was rejected. `nearest` is the reference that the answer rests on most; the
+    plan has all.
     """
     figure = Figure((SIZE_PX[0] / 100, SIZE_PX[1] / 100), dpi=100, facecolor=BACKGROUND)
     left, right = (figure.add_axes((x, STRIP, 0.5, 1 - STRIP)) for x in (0.0, 0.5))

@@ -42,21 +42,10 @@ class Outcome:
 
 
 def run_demo(data: Path | None, output: Path, console: Console | None = None) -> bool:
-    """Runs the whole demo.
+    """Runs the whole demo, on the rendered room or on a folder with `images/` and `cameras.json`.
 
-    Args:
-        data: a folder with `images/` and `cameras.json`; None for the rendered room.
-        output: folder for the pictures; made if needed.
-        console: where to write; None for the standard output.
-
-    Returns:
-        Whether it succeeded: all queries of the rendered room are localized with small median errors, or more than half
-            of those of a real folder are localized.
-
-    Raises:
-        ValueError: the folder is malformed.
-        ServerFailed: the server did not start.
-        MaplessError: a call failed.
+    Returns whether it succeeded: all queries of the rendered room are localized with small median errors, or more than
+    half of those of a real folder are localized. ValueError if the folder is malformed.
     """
     console = console or Console()
     place = place_of(data)

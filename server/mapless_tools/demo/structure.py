@@ -31,14 +31,7 @@ MIN_PARALLAX_DEG = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A decoded photograph with its pose.
-
-    Attributes:
-        name: name of the reference or query.
-        image: (H, W, 3) uint8 RGB.
-        camera: its camera, in the pixels of `image`.
-        world_from_camera: its known pose.
-    """
+    """A decoded photograph (H, W, 3) uint8 RGB with its pose, and its camera in the image's pixels."""
 
     name: str
     image: NDArray[np.uint8]
@@ -127,9 +120,8 @@ def triangulate(a: Shot, b: Shot, pixels_a: Array, pixels_b: Array) -> tuple[Arr
 def find_in(points: SparsePoints, shot: Shot, max_offset_px: float) -> tuple[NDArray[np.int64], Array]:
     """Finds which of the points a photograph shows, by their descriptors alone.
 
-    Returns:
-        Indices (M,) of points and the pixels (M, 2) that show them, at most `max_offset_px` from their projections by
-        the shot's pose.
+    Returns indices (M,) of points and the pixels (M, 2) that show them, at most `max_offset_px` from their projections
+    by the shot's pose.
     """
     pixels, descriptors = shot.features
     pairs = match(points.descriptors, descriptors)

@@ -17,15 +17,10 @@ Key = tuple[str, int, Method]
 
 @dataclass(frozen=True)
 class Average:
-    """Figures of one method in one setting over scenes.
+    """Figures of one method in one setting over scenes: means of the scenes' medians, shares and times.
 
-    Attributes:
-        scenes: the scenes.
-        complete: whether these are all scenes that the paper averages over; True without figures of the paper.
-        median_translation_m, median_rotation_deg: mean of the scenes' medians; infinite if one is.
-        recall: mean of the scenes' shares within `RECALL_BARS`.
-        localized, queries: numbers over all scenes.
-        latency_p50_ms, latency_p95_ms: means of the scenes' values.
+    Infinite if one is. `complete` says whether these are all scenes that the paper averages over; True without figures
+    of the paper.
     """
 
     scenes: tuple[str, ...]
@@ -41,14 +36,9 @@ class Average:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Runs on scenes of one layout.
+    """Runs on scenes of one layout, without those that could not be measured, and their summaries.
 
-    Attributes:
-        benchmark: None for folders with cameras.json.
-        scenes: scenes to measure, in order.
-        settings, methods: settings and methods to measure, in order.
-        runs: runs by scene, setting and method, without those that could not be measured.
-        summaries: their summaries by scene, setting and method.
+    The benchmark is None for folders with cameras.json.
     """
 
     layout: str

@@ -16,15 +16,10 @@ MAX_DEPTH = 2
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A benchmark of the paper.
+    """A benchmark of the paper, and the layout of its scenes on the disk.
 
-    Attributes:
-        layout: name of its layout on the disk, as in `formats`.
-        title: its name in reports.
-        scenes: names in the paper's tables by name of the folder, in the paper's order.
-        sparse: numbers of references that the paper keeps, the densest first.
-        ground_truth: ground truth of the paper's figures.
-        paper: figures of the paper.
+    `scenes` are names in the paper's tables by name of the folder, in the paper's order; `sparse` numbers of references
+    that the paper keeps, the densest first; `ground_truth` that of the paper's figures.
     """
 
     layout: str
@@ -95,10 +90,7 @@ LAYOUTS = ("auto", *BENCHMARKS, "cameras")
 class ScenePlace:
     """A scene on the disk.
 
-    Attributes:
-        name: its name, unique among the found ones; the paper's folder name, if it has one, in any case.
-        path: its folder.
-        layout: its layout.
+    Its name is the paper's folder name, if it has one, in any case, and unique among the found ones.
     """
 
     name: str
@@ -114,8 +106,7 @@ class ScenePlace:
 def find_scenes(folder: Path, layout: str = "auto") -> tuple[ScenePlace, ...]:
     """Finds the scene that a folder is, or those in it, in the paper's order, others after them by name.
 
-    Raises:
-        UsageError: there is no such folder, or no scene of this layout in it.
+    UsageError if there is no such folder, or no scene of this layout in it.
     """
     if layout not in LAYOUTS:
         raise UsageError(f"layout must be one of {', '.join(LAYOUTS)}, not {layout!r}")

@@ -33,12 +33,7 @@ NO_POSE = ("pose:", "ground truth:")
 def evaluate_folder(folder: Path, json_file: Path | None, **options: Any) -> None:
     """Measures the server on a folder with cameras.json, prints the table, and writes the JSON file, if named.
 
-    `options` are those of EvaluationOptions.
-
-    Raises:
-        UsageError: a wrong folder, option, file or setting.
-        ServerFailed: the server did not start.
-        MaplessError: a call failed.
+    `options` are those of EvaluationOptions. UsageError for a wrong folder, option, file or setting.
     """
     with usage_errors():
         checked = EvaluationOptions(**options)
@@ -65,20 +60,16 @@ def evaluate_benchmarks(
 ) -> bool:
     """Measures the server on a scene, or on all scenes of a folder, and writes the report.
 
+    Returns whether it is complete.
+
     Args:
         folder: a scene, or a folder of scenes.
-        output: folder of the report, created if missing. Its results of the same evaluation are not measured again.
+        output: folder of the report. Its results of the same evaluation are not measured again.
         pairs: references of each query, a file or a folder with one for each scene; None: see the options' `choice`.
         ground_truth: poses instead of the layout's own, see `ReadOptions`.
         partial: whether images that are missing or damaged may be left out; the report names them.
         worst: how many queries of each scene are shown as pictures.
         options: fields of SuiteOptions.
-
-    Returns:
-        Whether everything was measured.
-
-    Raises:
-        UsageError: a wrong folder, option, file or setting; nothing was measured.
     """
     from .figures import write_figures
     from .page import page, print_suite

@@ -17,23 +17,12 @@ RECALL_BARS = {"1cm_1deg": (0.01, 1.0), "5cm_5deg": (0.05, 5.0), "25cm_2deg": (0
 
 @dataclass(frozen=True)
 class QueryResult:
-    """The result of one query; a rejected one has infinite errors.
+    """The result of one query; a rejected one has infinite errors, counts of 0, and no pose.
 
-    Attributes:
-        name: name of the frame.
-        references: names of the references it was given, in order.
-        translation_error: distance between true and answered camera centre, the dataset's unit.
-        rotation_error_deg: angle between true and answered orientation.
-        reference_distance: median distance from the true camera centre to those of its references, the dataset's unit.
-        position_68: the claimed radius, a position error not exceeded in 68 % of cases; None without one.
-        inlier_count, match_count: counts of the answer; 0 for a rejection.
-        rejection: reason; empty if localized.
-        message: the rejection's sentence.
-        latency_ms: time of the call that the client measures.
-        stage_ms: time inside the server, by stage.
-        backend, features: what computed it.
-        best_reference: name of the one with the most inliers; empty for a rejection.
-        pose: the answered world_from_camera: x y z and the quaternion x y z w; None for a rejection.
+    Lengths are in the dataset's unit; `reference_distance` is the median distance from the true camera centre to those
+    of its references. `position_68` is the claimed radius, None without one. The latency is measured by the client,
+    `stage_ms` in the server. The best reference has the most inliers. The pose is the answered world_from_camera: x y z
+    and the quaternion x y z w.
     """
 
     name: str
@@ -63,18 +52,9 @@ class QueryResult:
 class Summary:
     """All queries together. Medians, p90 and recall are over all queries, infinite if too many were rejected.
 
-    Attributes:
-        query_count, localized_count: numbers of queries and of localized ones.
-        median_translation, p90_translation: the dataset's unit.
-        median_rotation_deg: degrees.
-        median_relative: translation error over the distance to the query's references, no unit.
-        recall: share of queries within each of `RECALL_BARS`; meaningless if the dataset is not metric.
-        claim_held: share of claimed 68 % radii that held; None if nothing was claimed.
-        latency_p50_ms, latency_p95_ms: latency of calls, without the first if there are more.
-        latency_first_ms: latency of the first call, with empty caches.
-        stage_share: share of each stage in the total time.
-        rejections: number of rejections by reason.
-        features: number of answers by the features that gave them; several if stronger ones are tried.
+    Translations are in the dataset's unit; `median_relative` is over the distance to the query's references.
+    `claim_held` is the share of claimed 68 % radii that held, None if nothing was claimed. p50 and p95 are without the
+    first call, which has empty caches, if there are more. Several `features` have answers if stronger ones are tried.
     """
 
     query_count: int

@@ -124,14 +124,10 @@ MAX_POINTS = 400
 
 @dataclass(frozen=True)
 class Measure:
-    """An error that is shown in charts.
+    """An error that is shown in charts: of a query, and the mean over scenes of its median.
 
-    Attributes:
-        name: "translation error" or "rotation error".
-        unit: unit of the values.
-        of_query, of_average: the error of one query, and the mean over scenes of the median error.
-        smallest: smaller values are drawn as this one, since no ground truth is so accurate.
-        paper_index: index of the value in the paper's medians.
+    Values smaller than `smallest` are drawn as this one, since no ground truth is so accurate. `paper_index` is the
+    index of the value in the paper's medians.
     """
 
     name: str

@@ -25,15 +25,10 @@ VARIANT_OF = {"L3 coarse": "coarse", "L3 w/o optim.": "no_structure", "L3": "ful
 
 @dataclass(frozen=True)
 class PaperMethod:
-    """A line of the paper's tables.
+    """A line of the paper's tables: a method and its group (FM, APR, SCR, NVS or "ours").
 
-    Attributes:
-        name: name as printed.
-        kind: the paper's group: FM, APR, SCR, NVS or "ours".
-        scenes: dense medians by scene.
-        average: mean of the medians over all scenes by number of references (DENSE for all); None for a failure in at
-            least one scene.
-        recall_percent: share of queries within an error ("5cm_5deg"), dense, averaged over scenes.
+    Its figures are dense medians by scene, means of the medians over all scenes by number of references (None for a
+    failure in at least one scene), and the share of queries within an error ("5cm_5deg"), dense, averaged over scenes.
     """
 
     name: str
@@ -50,12 +45,7 @@ class PaperMethod:
 
 @dataclass(frozen=True)
 class PaperTables:
-    """The paper's tables of a benchmark.
-
-    Attributes:
-        dense_table, sparse_table: the tables' titles.
-        methods: the methods, in the paper's order.
-    """
+    """The paper's tables of a benchmark: their titles, and the methods in the paper's order."""
 
     dense_table: str
     sparse_table: str

@@ -37,13 +37,7 @@ GREEN, RED = (40, 200, 90), (230, 60, 50)
 
 @dataclass(frozen=True)
 class WorstQuery:
-    """A query and its picture.
-
-    Attributes:
-        data_uri: the picture, a JPEG file.
-        reference: name of the reference beside it; empty if there is none.
-        matches, fitting: number of matches, and of those that fit the true poses.
-    """
+    """A query and its picture, beside a reference if there is one; `fitting` of their matches fit the true poses."""
 
     run: Run
     result: QueryResult
@@ -130,8 +124,7 @@ def data_uri(picture: Picture) -> str:
 class _Shown:
     """A photograph, reduced for the page, with its features.
 
-    Attributes:
-        keypoints: (N, 2) pixels of `image`, with the lens distortion that it has.
+    Keypoints (N, 2) in pixels of `image`, distorted as it is.
     """
 
     frame: Frame

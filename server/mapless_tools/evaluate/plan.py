@@ -39,14 +39,8 @@ MAX_MATCHED = 1000
 class EvaluationOptions:
     """Options of an evaluation.
 
-    Attributes:
-        reference_count: frames that are references, evenly spread; None leaves one out: every frame is localized from
-            all others.
-        query_count: number of frames to localize, evenly spread; None for 40 with `reference_count`, and for all frames
-            without.
-        k: number of references of a query.
-        variant: form of the method.
-        scale_strategy: how the metric scale is estimated.
+    The references are so many frames, evenly spread; None leaves one out: every frame is localized from all others. The
+    queries are evenly spread, too; None for 40 beside references, else for all frames.
     """
 
     reference_count: int | None = None
@@ -70,12 +64,9 @@ class SuiteOptions:
     """Options of an evaluation as in the paper.
 
     Attributes:
-        layout: layout of the scenes on the disk; "auto" to recognize it.
-        protocols: dense, sparse or both.
         sparse: numbers of references; empty for those of the paper.
         variants: forms of the method, each with the first of `scales`.
         scales: strategies of the metric scale; those after the first are run only with the variant `ablated`.
-        k: number of references of a query, as in the paper.
         stride: in the dense setting every n-th training frame is a reference; 1, as in the paper, for all.
         max_queries: largest number of queries of a scene, evenly spread; None, as in the paper, for all.
         choice: how a query's references are chosen: by the server's "retrieval", as for a request that names none; by
@@ -119,8 +110,7 @@ class SuiteOptions:
     def settings(self, place: ScenePlace) -> tuple[int, ...]:
         """Numbers of references of a scene: DENSE first, then in decreasing order.
 
-        Raises:
-            UsageError: a sparse setting is requested, without numbers, for a scene of no benchmark.
+        UsageError if a sparse setting is requested, without numbers, for a scene of no benchmark.
         """
         sparse: tuple[int, ...] = ()
         if "sparse" in self.protocols:
@@ -155,12 +145,9 @@ class Split:
 
 @dataclass(frozen=True, eq=False)
 class SceneSplit:
-    """References and queries of a scene in one setting.
+    """References and queries of a scene; the setting is the number of references, DENSE for all.
 
-    Attributes:
-        setting: requested number of references; DENSE for all.
-        references, queries: the frames.
-        test_count: number of queries of the benchmark, of which `queries` may be a part.
+    The queries may be a part of the benchmark's, which are `test_count`.
     """
 
     setting: int
@@ -175,14 +162,11 @@ def setting_name(setting: int) -> str:
 
 
 def split_frames(frame_count: int, options: EvaluationOptions) -> Split:
-    """Splits F frames into references and queries.
+    """Splits F frames into references and queries; UsageError if there are too few.
 
     With N references: those at round(linspace(0, F - 1, N)), and those of round(linspace(3, F - 4, M)) that are not
     references as queries; fewer than 8 frames have no room for that margin, there it is round(linspace(0, F - 1, M)).
     Without N, every frame is a reference of all others.
-
-    Raises:
-        UsageError: there are too few frames.
     """
     if options.reference_count is None:
         if frame_count < 3:
@@ -204,12 +188,10 @@ def split_frames(frame_count: int, options: EvaluationOptions) -> Split:
 
 
 def split_scene(dataset: Dataset, setting: int, options: SuiteOptions) -> SceneSplit:
-    """Splits a scene into references and queries in a setting.
+    """Splits a scene into references and queries.
 
-    A folder with cameras.json may have no split; sparse, it is then split as `split_frames` does.
-
-    Raises:
-        UsageError: the dataset has no split, or fewer training frames than are asked for.
+    UsageError if it has no split, or fewer training frames than asked for. A folder with cameras.json may have no
+    split; sparse, it is then split as `split_frames` does.
     """
     train = [frame for frame in dataset.frames if frame.split == "train"]
     test = [frame for frame in dataset.frames if frame.split == "test"]

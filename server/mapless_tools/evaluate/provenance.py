@@ -17,13 +17,9 @@ from mapless_server.settings import Settings, available_cores
 class Provenance:
     """The origin of figures.
 
-    Attributes:
-        version: version of mapless.
-        commit: `git describe` of a checkout, with a digest of what is not committed; empty for an installed package.
-        weights: SHA-256 of each network's file that these settings use; "not recorded" for a file copied by hand.
-        settings: settings that figures depend on.
-        machine: processor, cores, and the GPU if networks use one.
-        date: when it began, UTC.
+    The commit is `git describe` of a checkout, with a digest of what is not committed; empty for an installed package.
+    Weights are the SHA-256 of each network's file that the settings use; "not recorded" for a file copied by hand. The
+    machine includes the GPU if networks use one; the date is when it began, UTC.
     """
 
     version: str

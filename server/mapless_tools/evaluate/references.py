@@ -36,13 +36,7 @@ class PlannedQuery:
 
 @dataclass(frozen=True, eq=False)
 class Matcher:
-    """The features by which queries and references are compared.
-
-    Attributes:
-        extractor: finds the features.
-        ratio: ratio of a match with the query.
-        limits: limits of photographs.
-    """
+    """The features by which queries and references are compared, and the ratio of their matches."""
 
     extractor: FeatureExtractor
     ratio: float
@@ -52,8 +46,7 @@ class Matcher:
     def of(cls, settings: Settings) -> Matcher:
         """Makes the matcher with the first features that a server with these settings has.
 
-        Raises:
-            UsageError: the settings name features that are not available.
+        UsageError if it has none.
         """
         try:
             features, extractor = make_first_features(settings)
@@ -65,8 +58,7 @@ class Matcher:
 def check_images(frames: Iterable[Frame], limits: ImageLimits) -> None:
     """Reads the images' headers.
 
-    Raises:
-        UsageError: an image is missing, too large, no JPEG, PNG or WebP, or of another size than its camera.
+    UsageError if one is missing, too large, no JPEG, PNG or WebP, or of another size than its camera.
     """
     for frame in frames:
         try:
@@ -98,10 +90,7 @@ def rank_by_matches(
     """Chooses for each query the k references, except itself, that share the most feature matches with it.
 
     The true poses are not used. The ranking is the server's own, computed here so that a query that is left out is not
-    compared with itself.
-
-    Raises:
-        UsageError: an image is damaged.
+    compared with itself. UsageError if an image is damaged.
     """
     used = tuple(dict.fromkeys((*references, *queries)))
 
@@ -125,8 +114,7 @@ def rank_by_matches(
 def pairs_file(path: Path, scene: str, scene_count: int) -> Path:
     """The file of a scene's pairs: the given file, or the one of the scene's name in the given folder.
 
-    Raises:
-        UsageError: there is no such file, or one file is given for several scenes.
+    UsageError if there is no such file, or one file is given for several scenes.
     """
     if path.is_dir():
         path = path / f"{scene.replace('/', '_')}.txt"
@@ -140,11 +128,8 @@ def pairs_file(path: Path, scene: str, scene_count: int) -> Path:
 def read_pairs(file: Path, dataset: Dataset, folder: Path) -> Pairs:
     """Reads the references of each query in hloc's form: lines "query reference", most similar first.
 
-    An image is named by its path from the scene's folder, or by its frame's name.
-
-    Raises:
-        UsageError: the file cannot be read, a line is no pair, an image is unknown, a query is no test frame, or a
-            reference is no training frame.
+    An image is named by its path from the scene's folder, or by its frame's name. UsageError names a line that is no
+    pair, or names an image that is unknown or in the wrong split.
     """
     frames = _by_name(dataset, folder)
     pairs: dict[str, list[Frame]] = {}
@@ -173,11 +158,7 @@ def read_pairs(file: Path, dataset: Dataset, folder: Path) -> Pairs:
 
 
 def paired(pairs: Pairs, query: Frame, references: Set[str], k: int) -> PlannedQuery:
-    """Makes a query with the first k of its pairs that are references of the setting.
-
-    Raises:
-        UsageError: there are no such pairs.
-    """
+    """Makes a query with the first k of its pairs that are references of the setting; UsageError if there are none."""
     chosen = tuple(frame for frame in pairs.get(query.name, ()) if frame.name in references)[:k]
     if not chosen:
         raise UsageError(f"the pairs file names no reference of the query {query.name} among those of the setting")

@@ -34,13 +34,9 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """The results of an evaluation, with its dataset and options.
+    """The results of an evaluation, one for each query, with its dataset and options.
 
-    Attributes:
-        dataset, options: the inputs of the evaluation.
-        reference_count: number of references of the scene, including the query if one is left out.
-        trajectory_radius: trajectory radius of the references, in the dataset's unit.
-        results: one for each query.
+    `reference_count` includes the query if one is left out; the references' trajectory radius is in the dataset's unit.
     """
 
     dataset: Dataset
@@ -51,13 +47,7 @@ class Evaluation:
 
 
 def evaluate(dataset: Dataset, options: EvaluationOptions, settings: Settings, progress: Progress) -> Evaluation:
-    """Measures the server on a folder; starts a server and ends it.
-
-    Raises:
-        UsageError: the folder does not suffice for the options.
-        ServerFailed: the server does not start.
-        MaplessError: a call failed.
-    """
+    """Measures a server of its own on a folder; UsageError if the folder does not suffice for the options."""
     plan = plan_for(dataset, options, settings, progress)
     with temporary_server() as client:
         store_references(client, SCENE, plan.references, progress)
@@ -69,9 +59,8 @@ def evaluate(dataset: Dataset, options: EvaluationOptions, settings: Settings, p
 def plan_for(dataset: Dataset, options: EvaluationOptions, settings: Settings, progress: Progress) -> Plan:
     """Chooses references and queries, and ranks the references of each query by their feature matches with it.
 
-    Raises:
-        UsageError: too few frames; an image is missing, damaged or of another size than its camera; or the settings
-            ask for features that are not there.
+    UsageError if there are too few frames; an image is missing, damaged or of another size than its camera; or the
+    settings ask for features that are not there.
     """
     matcher = Matcher.of(settings)
     split = split_frames(len(dataset.frames), options)
@@ -81,11 +70,7 @@ def plan_for(dataset: Dataset, options: EvaluationOptions, settings: Settings, p
 
 
 def store_references(client: Client, scene: str, references: Sequence[Frame], progress: Progress) -> None:
-    """Creates a scene with these references.
-
-    Raises:
-        MaplessError: a call failed.
-    """
+    """Creates a scene with these references."""
     client.create_scene(scene)
     new = (NewReference(f.name, f.image_path, f.camera, f.world_from_camera) for f in references)
     total = len(references)
@@ -109,18 +94,7 @@ def localize_queries(
 def localize_query(
     client: Client, scene: str, query: PlannedQuery, options: EvaluationOptions, references: Mapping[str, Frame]
 ) -> QueryResult:
-    """Localizes one query.
-
-    Args:
-        client: client of the server.
-        scene: id of the scene.
-        query: the query with its references; without any, the server chooses k.
-        options: variant, scale strategy and k.
-        references: references of the scene, by name.
-
-    Raises:
-        MaplessError: the call failed.
-    """
+    """Localizes one query; if it has no references, the server chooses k of those of the scene, given by name."""
     frame = query.frame
     image = frame.image_path.read_bytes()
     start_s = time.perf_counter()

@@ -31,13 +31,7 @@ from .run import localize_query, store_references
 
 @dataclass(frozen=True, eq=False)
 class SceneWork:
-    """A scene that is ready for measurement.
-
-    Attributes:
-        place, dataset: the scene.
-        splits: one for each setting.
-        pairs: the references of its queries; None unless they were given.
-    """
+    """A scene that is ready for measurement, with a split for each setting, and pairs if they were given."""
 
     place: ScenePlace
     dataset: Dataset
@@ -47,13 +41,7 @@ class SceneWork:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """The results of one method in one setting of one scene, in the order of its queries.
-
-    Attributes:
-        scene, split, method: of the run.
-        results: one for each query.
-        journal: the file that they are in.
-    """
+    """The results of one method in one setting of one scene, in the order of its queries."""
 
     scene: SceneWork
     split: SceneSplit
@@ -74,11 +62,8 @@ class Failure:
 class Suite:
     """Everything that was measured, and its circumstances.
 
-    Attributes:
-        options, provenance, scenes: what was measured.
-        runs: complete runs, in the order of scenes, settings and methods.
-        failures: what is missing, and why.
-        pairs: file or folder of given pairs; None without.
+    Runs are complete, in the order of scenes, settings and methods; failures say what is missing, and why. `pairs` is
+    the file or folder of given pairs.
     """
 
     options: SuiteOptions
@@ -91,14 +76,7 @@ class Suite:
 
 @dataclass(frozen=True)
 class RunSetup:
-    """What all runs have in common.
-
-    Attributes:
-        options, provenance: those of the suite.
-        matcher: ranks references, if they are chosen by matches.
-        journals: existing folder of the journals.
-        progress: progress of the command.
-    """
+    """What all runs have in common."""
 
     options: SuiteOptions
     matcher: Matcher
@@ -112,11 +90,7 @@ def measure(
 ) -> Suite:
     """Measures all scenes; results that a journal already has are not measured again.
 
-    Args:
-        scenes: scenes to measure.
-        setup: what all runs have in common.
-        pairs: file or folder of given pairs, for the report.
-        on_scene: called with everything so far after each scene.
+    `pairs` is for the report; `on_scene` is called with everything so far after each scene.
     """
     runs: list[Run] = []
     failures: list[Failure] = []
@@ -145,13 +119,7 @@ class Journal:
     """
 
     def __init__(self, folder: Path, name: str, identity: Mapping[str, Any]) -> None:
-        """Reads the existing file, if any.
-
-        Args:
-            folder: an existing folder.
-            name: name of the run.
-            identity: what the run's results depend on, as JSON values.
-        """
+        """Reads the existing file, if any, of the run whose results depend on `identity`, JSON values."""
         self._head = json.dumps(identity, sort_keys=True)
         self.path = folder / f"{name}.{hashlib.sha256(self._head.encode()).hexdigest()[:12]}.jsonl"
         self.results: dict[str, QueryResult] = {}

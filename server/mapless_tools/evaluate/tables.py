@@ -34,13 +34,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """A table for people.
-
-    Attributes:
-        head: headings of the columns; the first column names the lines.
-        notes: notes for the reader.
-        wide: whether it is too wide for a terminal.
-    """
+    """A table for people; the first column names the lines. A `wide` one is too wide for a terminal."""
 
     title: str
     head: tuple[str, ...]

@@ -49,13 +49,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class GatewayOptions:
-    """What is served, and to whom.
-
-    Attributes:
-        scene: scene of requests that name none; "" for none.
-        pages: folder that is served at "/"; None for none.
-        guard: limits of accepted requests.
-    """
+    """What is served, and to whom: the scene of requests that name none, if any, and a folder of pages for "/"."""
 
     scene: str = ""
     pages: Path | None = None
@@ -65,10 +59,8 @@ class GatewayOptions:
 def gateway(connect: Callable[[], Client], options: GatewayOptions, rpc: ASGIApp | None = None) -> ASGIApp:
     """Makes the application.
 
-    Args:
-        connect: function that makes the client, called when the event loop runs.
-        options: what is served.
-        rpc: application for browsers' calls, at the paths of gRPC; None for none.
+    `connect` makes the client, and is called when the event loop runs. `rpc` is the application for browsers' calls, at
+    the paths of gRPC.
     """
     handlers = _Handlers(connect, options)
     routes: list[BaseRoute] = [

@@ -23,13 +23,10 @@ _STATUS = {
 
 
 class Failure(Exception):
-    """A request that is not answered.
+    """A request that is not answered: an HTTP status, and the members of `error` in the JSON.
 
-    Attributes:
-        status: HTTP status.
-        content: the members of `error` in the JSON; those without a value are left out. The message begins with the
-            field.
-        retry_after_s: seconds until another attempt; None if that would not help.
+    Members without a value are left out; the message begins with the field. `retry_after_s` is None if another attempt
+    would not help.
     """
 
     def __init__(

@@ -55,16 +55,10 @@ _EXIF_FOCAL_SIGMA = 0.03
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """The contents of a request.
+    """The contents of a request; its id and time are for the response.
 
-    Attributes:
-        request_id, timestamp_ms: for the response: the request's id and the photograph's time.
-        image: the file's bytes.
-        camera: the camera that took it.
-        uncertainty: uncertainty of the camera; None for that of a calibrated one.
-        priors: what is known of the pose.
-        prior_fields: path of each prior in the request, by the field of the call.
-        is_confidential: whether the photograph is used for the answer only.
+    The uncertainty is None for a calibrated camera. `prior_fields` has the path of each prior in the request, by the
+    field of the call. If confidential, the photograph is used for the answer only.
     """
 
     request_id: str

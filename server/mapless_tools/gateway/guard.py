@@ -25,11 +25,10 @@ class GuardOptions:
         origins: origins of pages that may call, besides the gateway's own, "https://app.example"; ("*",) for all.
         is_loopback: whether it listens on this machine only. Then host names other than its own and those of `origins`
             are rejected: a page whose name resolves to this machine would count as the gateway's own.
-        max_body_bytes: largest body of a request. A photograph of 16 MiB, the largest that servers accept, has 22.4 MB
-            in base64.
+        max_body_bytes: of a request. A photograph of 16 MiB, the largest that servers accept, has 22.4 MB in base64.
         max_requests: largest number of concurrent requests; further ones are rejected.
-        max_held_bytes: largest size of all concurrent requests; further ones are rejected. It limits the memory, which
-            is four times as much: text, photograph, call, and the bytes being sent.
+        max_held_bytes: largest size of all concurrent requests. It limits the memory, which is four times as much:
+            text, photograph, call, and the bytes being sent.
         body_s: time in which a request has to arrive.
     """
 
@@ -130,11 +129,7 @@ def _busy(message: str) -> Failure:
 
 
 class _Body:
-    """The body of a request, with limits on its size and time.
-
-    Attributes:
-        size: bytes that have arrived.
-    """
+    """The body of a request, with limits on its size and time; `size` is that of the bytes that have arrived."""
 
     def __init__(self, guard: Guard, receive: Receive) -> None:
         self._guard = guard

@@ -20,13 +20,7 @@ _MAX_PART_BYTES = 2**20
 
 
 async def read_form(headers: Headers, body: AsyncGenerator[bytes, None], default_scene: str) -> pb.LocalizeRequest:
-    """Reads the request that a form describes; Failure names the wrong field.
-
-    Args:
-        headers: headers of the HTTP request.
-        body: its body.
-        default_scene: scene if the form names none; may be empty.
-    """
+    """Reads the request that a form describes; Failure names the wrong field. The default scene may be empty."""
     if not headers.get("content-type", "").startswith("multipart/form-data"):
         example = "curl -F image=@photo.jpg -F intrinsics=@camera.json"
         raise Failure(f"must be multipart/form-data, as of {example}", 415, field="content-type")

@@ -64,9 +64,7 @@ class _JsonCodec:
 def rpc_application(connect: Connect, max_message_bytes: int) -> ASGIApp:
     """Makes the application that serves the interface's methods at gRPC's paths.
 
-    Args:
-        connect: function that makes the channel to the server, called when the event loop runs.
-        max_message_bytes: largest size of a request.
+    `connect` makes the channel to the server, and is called when the event loop runs.
     """
     channel: list[grpc.aio.Channel] = []
 

@@ -20,12 +20,9 @@ _GRACE_S = 10
 
 @dataclass(frozen=True)
 class Binding:
-    """Where to listen.
+    """Where to listen; port 0 for any free one, and no certificate (PEM, with its key) for no TLS.
 
-    Attributes:
-        host, port: the address; port 0 for any free one.
-        certificate, key: files, PEM; None for no TLS.
-        insecure: whether to listen beyond this machine without TLS, or to a server without tokens.
+    `insecure` allows to listen beyond this machine without TLS, or to a server without tokens.
     """
 
     host: str
@@ -55,16 +52,8 @@ class Binding:
 def run(server: str, connect: ConnectOptions, options: GatewayOptions, binding: Binding) -> None:
     """Serves until a signal ends it.
 
-    Args:
-        server: its address.
-        connect: how to connect to it.
-        options: what to serve.
-        binding: where to listen.
-
-    Raises:
-        ValueError: the server needs no token, and `insecure` is not set.
-        MaplessError: the server cannot be reached to find that out.
-        OSError: the port is taken.
+    ValueError if the server needs no token, and `insecure` is not set; MaplessError if it cannot be reached to find
+    that out; OSError if the port is taken.
     """
     if not (binding.is_loopback or binding.insecure):
         _check_tokens(server, replace(connect, token=None))

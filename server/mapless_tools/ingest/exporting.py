@@ -29,16 +29,11 @@ def check_target(folder: Path, layout: str) -> None:
 def export_scene(client: Client, scene: str, folder: Path, layout: str, progress: Progress) -> Export:
     """Writes a scene's references into a folder, except damaged ones.
 
-    The layouts `cameras` and `kapture` also have the scene's datum, down and unit. A calibration is not exported, since
-    it holds for this server version only; a backup keeps it.
+    ValueError as in `check_target`, or without references. The layouts `cameras` and `kapture` also have the scene's
+    datum, down and unit. A calibration is not exported, since it holds for this server version only; a backup keeps it.
 
     The description is written last, so a folder without it is an interrupted export. If every reference is damaged,
     nothing is left in the folder.
-
-    Raises:
-        ValueError: as in `check_target`, or the scene is empty.
-        OSError: a file cannot be written.
-        MaplessError: a call failed.
     """
     check_target(folder, layout)
     if layout == "gltf":

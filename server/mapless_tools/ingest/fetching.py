@@ -19,12 +19,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Export:
-    """The result of an export.
-
-    Attributes:
-        written: number of written references.
-        damaged: the server's messages about the others, by their ids, in their order.
-    """
+    """The number of written references, and the server's messages about damaged ones by their ids, in their order."""
 
     written: int
     damaged: Mapping[str, str]
@@ -44,15 +39,7 @@ def fetch_all(
 ) -> tuple[list[T], dict[str, str]]:
     """Calls `take`, in threads, for each reference; returns its results in order, and messages about damaged ones.
 
-    Args:
-        client: a client of the server.
-        scene: id of the scene.
-        take: function that is called with each reference.
-        progress: reports how many references are done.
-        pictures: number of evenly spread references that have their photographs; None for all.
-
-    Raises:
-        ValueError: the scene has no references.
+    So many `pictures`, evenly spread, have their photographs; None for all. ValueError if the scene has no references.
     """
     references = _reference_ids(client, scene)
     if not references:

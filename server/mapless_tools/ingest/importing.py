@@ -39,14 +39,12 @@ class ImportOptions:
 
     Attributes:
         format: name of the folder's layout, or "auto".
-        read: options of its reader.
         metres: how lengths become metres, if the folder's unit is another.
         split: the split whose frames are used, "train" or "test"; empty for all.
         stride: every n-th frame is used.
         max_count: largest number of frames, evenly spread; None for all.
         id_prefix: prefix of every reference's id, for several folders in one scene.
         check: whether to compare photographs with the poses first.
-        upload: how references are sent.
     """
 
     format: str = "auto"
@@ -78,11 +76,8 @@ def run_import(
 ) -> bool:
     """Runs an import, a dry one without a connection; prints what it does and finds.
 
-    Returns:
-        Whether everything was imported; for a dry run, whether everything could be.
-
-    Raises:
-        ValueError: the folder, the scene's id or the connection cannot be used.
+    Returns whether everything was imported, or could be. ValueError if the folder, the scene's id or the connection
+    cannot be used.
     """
     check_id(scene)
     if report_file is not None:
@@ -115,8 +110,7 @@ def run_import(
 def read_frames(folder: Path, options: ImportOptions) -> tuple[Dataset, tuple[Frame, ...]]:
     """Reads the dataset, and selects the frames to import.
 
-    Raises:
-        ValueError: the folder cannot be read, its metres or its datum contradict it, or nothing is left to import.
+    ValueError if it cannot be read, its metres or its datum contradict it, or nothing is left to import.
     """
     dataset = in_metres(read_dataset(folder, options.format, options.read), options.metres, options.id_prefix)
     _attributes(dataset)

@@ -54,12 +54,10 @@ class KnownDistance:
 
 @dataclass(frozen=True)
 class MetreOptions:
-    """How lengths become metres; at most one of the three.
+    """How lengths become metres.
 
-    Attributes:
-        scale: metres per unit of the folder; None if not given.
-        distances: measured distances between camera centres.
-        positions: CSV file of camera centres with known coordinates; None if not given.
+    At most one of: metres per unit of the folder, measured distances between camera centres, and a CSV file of camera
+    centres with known coordinates.
     """
 
     scale: float | None = None
@@ -80,11 +78,8 @@ def in_metres(dataset: Dataset, options: MetreOptions, id_prefix: str = "") -> D
     """Converts the dataset to metres, with notes on what was done; unchanged without options.
 
     A position file has its own frame: the dataset and its direction of gravity are transformed to it. The dataset's
-    datum, which belongs to its former frame, is dropped.
-
-    Raises:
-        ValueError: a reference is unknown, the known values contradict each other or do not suffice, or a pose would
-            lie too far from the origin.
+    datum, which belongs to its former frame, is dropped. ValueError if a reference is unknown, the known values
+    contradict each other or do not suffice, or a pose would lie too far from the origin.
     """
     if not options:
         return dataset
@@ -229,15 +224,10 @@ def _aligned(file: Path, find: Finder) -> tuple[Similarity, list[str]]:
 
 
 def align(known: Mapping[str, Array], centres: Mapping[str, Array], where: str) -> tuple[Similarity, list[str]]:
-    """Fits the similarity from the folder's frame and unit to known camera centres; also returns a line for each.
+    """Fits the similarity from the folder's frame and unit to known camera centres (3,), metres, of the same names.
 
-    Args:
-        known: known camera centres (3,) by name, metres.
-        centres: camera centres (3,) by the same names, in the folder's frame and unit.
-        where: file of the known centres, for messages.
-
-    Raises:
-        ValueError: the centres are too few, collinear, or contradict each other.
+    Also returns a line for each. ValueError, beginning with `where`, if they are too few, collinear, or contradict each
+    other.
     """
     names = list(known)
     if len(names) < 3:
@@ -285,13 +275,9 @@ def _check_spread(points: Array, residual: float, what: str) -> None:
 
 
 def _outlier(names: Sequence[str], residuals: Callable[[Array], Array], least: int) -> str:
-    """Names the item without which all others fit, if there is one and enough remain.
+    """Names the item without which all others fit, if there is one and at least `least` items to find it among.
 
-    Args:
-        names: names of the items.
-        residuals: function that returns the residuals of all items, in units of their bounds, after a fit to the chosen
-            ones (1, else 0).
-        least: least number of items by which a single wrong one can be found.
+    `residuals` returns those of all items, in units of their bounds, after a fit to the chosen ones (1, else 0).
     """
     if len(names) < least:
         return ""

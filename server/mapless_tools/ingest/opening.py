@@ -21,10 +21,8 @@ class WrongUnit(Exception):
 def open_scene(client: Client, scene: str, dataset: Dataset, chosen: Sequence[Frame]) -> list[Reference]:
     """Returns the references of a scene, which is created with the dataset's datum, down and unit if missing.
 
-    A scene without references gets the dataset's unit.
-
-    Raises:
-        WrongUnit: its references are in metres and the dataset is not, or vice versa.
+    A scene without references gets the dataset's unit. WrongUnit if its references are in metres and the dataset is
+    not, or vice versa.
     """
     is_arbitrary = not dataset.metric
     try:

@@ -21,18 +21,10 @@ ALREADY_THERE = "already there"
 class ImportReport:
     """Counts and reasons; refused frames are named as in their file, skipped ones by id.
 
-    Attributes:
-        scene: id of the scene.
-        dataset: the dataset.
-        chosen: its frames to import.
-        verdict: of the epipolar check; None if there was none.
-        warnings: contradictions of poses, datum, direction of gravity and unit.
-        added: ids of references that this run stored.
-        blank: ids of added references without local features, with which nothing can be matched.
-        skipped: references that exist already, and where.
-        refused: frames that were not imported, each with the reason.
-        stopped: why the import ended before its end; empty if it did not.
-        seconds: duration of storing.
+    Of the chosen frames, `added` are the ids of stored references, `blank` those without local features, with which
+    nothing can be matched; skipped ones exist already. Warnings are contradictions of poses, datum, direction of
+    gravity and unit. `stopped` says why the import ended before its end. The verdict is None if there was no epipolar
+    check.
     """
 
     scene: str

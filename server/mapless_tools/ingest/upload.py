@@ -50,11 +50,9 @@ _REQUEST = re.compile(r"requests\[(\d+)\]")
 class UploadOptions:
     """Options of storing.
 
-    Attributes:
-        parallel: number of concurrent messages. The server describes their photographs concurrently; more would only
-            wait.
-        busy_patience_s: how long a server may be too busy before the import gives up.
-        away_patience_s: how long it may be unreachable; a restart takes seconds.
+    The server describes the photographs of parallel messages concurrently; more would only wait. The import gives up if
+    the server is too busy for longer than `busy_patience_s`, or unreachable for longer than `away_patience_s`; a
+    restart takes seconds.
     """
 
     parallel: int = 3

@@ -40,13 +40,8 @@ class Requests:
 class Mix:
     """The shares of calls that are not plain queries.
 
-    Attributes:
-        cancelled_share: share of calls that are cancelled.
-        bad_share: share of calls with a bad image.
-        cancel_within_s: largest time between sending and cancelling; if it is twice the time of an answer, about half
-            of the cancellations are too late, so that both cases occur.
-        hurried_share: share of calls with a short deadline.
-        hurry_s: largest short deadline.
+    Calls are cancelled within `cancel_within_s` of sending; if that is twice the time of an answer, about half of the
+    cancellations are too late, so that both cases occur. Hurried calls have deadlines of up to `hurry_s`.
     """
 
     cancelled_share: float = 0.0
@@ -64,15 +59,9 @@ class Mix:
 
 @dataclass(frozen=True, eq=False)
 class PlannedCall:
-    """A call to make.
+    """A call to make `at_s` seconds from the start. Latency counts from there, also if the call is sent later.
 
-    Attributes:
-        at_s: its time, seconds from the start. Latency counts from here, also if the call is sent later.
-        client: its number: 0, 1, ...
-        kind: what kind of call it is.
-        request: the serialized request.
-        cancel_after_s: when it is cancelled, seconds after sending; None if it is not.
-        deadline_s: its own deadline; None for that of all others.
+    It is cancelled so many seconds after sending, if at all, and has the deadline of all others unless it has its own.
     """
 
     at_s: float
@@ -95,12 +84,7 @@ def poisson_times(rate_per_s: float, duration_s: float, random: np.random.Genera
 def plan_calls(
     rate_per_s: float, duration_s: float, clients: int, requests: Requests, mix: Mix, seed: int
 ) -> list[PlannedCall]:
-    """The calls of several clients, `rate_per_s` together, in order of time; the same for the same seed.
-
-    Raises:
-        ValueError: there is no client, a rate or duration is not above 0, or bad images are requested but there are
-            none.
-    """
+    """The calls of several clients, `rate_per_s` together, in order of time; the same for the same seed."""
     if clients < 1:
         raise ValueError(f"clients must be at least 1, are {clients}")
     if mix.bad_share > 0 and not requests.bad:

@@ -45,12 +45,9 @@ UNCERTAIN = ("ALREADY_EXISTS", "NOT_FOUND")
 
 @dataclass
 class Outcomes:
-    """Counts how calls ended.
+    """Counts how calls ended, by worker and status; of each kind of unexpected end, the first is kept in full.
 
-    Attributes:
-        counts: number of calls by worker and status.
-        failures: unexpected ends; the first of each kind in full.
-        localize_codes: statuses of the calls of Localize, for comparing with the server's account.
+    The statuses of the calls of Localize are kept for comparing with the server's account.
     """
 
     counts: Counter[tuple[str, str]] = field(default_factory=Counter)
@@ -87,12 +84,8 @@ WORK: Mapping[str, str] = {
 class Workers:
     """The data that the workers share.
 
-    Attributes:
-        address: address of the server.
-        place: place whose photographs are stored and sent.
-        outcomes: counts how calls end.
-        pace: times between a worker's calls are divided by this.
-        stopping: set when workers are to end, each after its current calls.
+    Times between a worker's calls are divided by `pace`. `stopping` is set when workers are to end, each after its
+    current calls.
     """
 
     address: str

@@ -28,13 +28,7 @@ _RAMP_GAIN = 1.03
 
 @dataclass(frozen=True)
 class LoadedServer:
-    """A server with a scene, and requests to it.
-
-    Attributes:
-        address: address of its services.
-        under_load: its process, metrics and store.
-        requests: serialized requests.
-    """
+    """The address of a server with a scene; its process, metrics and store; and serialized requests to it."""
 
     address: str
     under_load: ServerUnderLoad
@@ -48,10 +42,6 @@ def server_with_scene(
     """Starts a server, stores the references of a place, and has it answer every query once.
 
     It uses the settings of the environment, to which `environment` is added. Its log is appended to the file `log`.
-
-    Raises:
-        ServerFailed: the server did not start.
-        MaplessError: a call failed.
     """
     port = free_port()
     with tempfile.TemporaryDirectory(prefix="mapless-load-") as data_dir:

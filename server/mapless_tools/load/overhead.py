@@ -34,13 +34,8 @@ BARE, ECHO, MAPLESS = "bare, short answer", "bare echo", "mapless, no-op"
 class OverheadOptions:
     """Options of the comparison.
 
-    Attributes:
-        message_bytes: size of the photograph; 0.3 MB is a phone's at 1024 px.
-        rounds: number of rounds in which the servers take turns, so that other work of the machine affects all alike.
-        unloaded_s: time of sequential calls per round.
-        saturated_s: time of concurrent calls per round.
-        concurrency: number of concurrent calls; enough to keep a server busy, and no more than it admits.
-        clients: number of connections.
+    A photograph of 0.3 MB is a phone's at 1024 px. The servers take turns in rounds, so that other work of the machine
+    affects all alike. The concurrent calls are enough to keep a server busy, and no more than it admits.
     """
 
     message_bytes: int = 300_000
@@ -91,13 +86,7 @@ class Subject:
 
 @dataclass(frozen=True)
 class Called:
-    """A server and the method that is called.
-
-    Attributes:
-        address, process_id: address and process of the server.
-        method: path of the RPC.
-        outcome: expected outcome of every call; empty for any.
-    """
+    """A server, the method that is called, and the expected outcome of every call; empty for any."""
 
     address: str
     process_id: int
@@ -106,12 +95,7 @@ class Called:
 
 
 def measure_overhead(options: OverheadOptions, progress: Progress) -> list[Subject]:
-    """Starts the bare server and the one that computes nothing, and calls them by turns.
-
-    Raises:
-        ServerFailed: a server did not start.
-        RuntimeError: a call did not end as expected.
-    """
+    """Starts the bare server and the one that computes nothing, and calls them by turns."""
     with ExitStack() as stack:
         data_dir = stack.enter_context(tempfile.TemporaryDirectory(prefix="mapless-load-"))
         bare = stack.enter_context(child_module("mapless_tools.load.echo"))
@@ -194,8 +178,7 @@ async def compare_by_turns(
 ) -> list[Subject]:
     """Calls servers with the same request, sequentially and concurrently, in rounds.
 
-    Raises:
-        RuntimeError: a call did not end as expected, or was too late.
+    RuntimeError if a call did not end as expected, or was too late.
     """
     subjects = {name: Subject(name, [], []) for name in places}
     async with AsyncExitStack() as stack:

@@ -42,8 +42,6 @@ class PipelineOptions:
             answers.
         step_s: time at each share of saturation; a p99 needs some hundred calls.
         settle_s: beginning of each step that its rates leave out, while the queue fills.
-        shares: offered shares of saturation.
-        seed: seed of the arrivals.
     """
 
     clients: int = 8
@@ -65,15 +63,9 @@ class PipelineOptions:
 
 @dataclass(frozen=True, eq=False)
 class PipelineResult:
-    """What was measured.
+    """What was measured: sequential calls, 2, 4 and more concurrent ones, and the options' shares of saturation.
 
-    Attributes:
-        scene: description of the scene.
-        options: options of the measurement.
-        unloaded: step of sequential calls.
-        ramp: steps of 2, 4, ... concurrent calls.
-        saturation_per_s: largest rate of answers of these steps.
-        steps: steps at the options' shares of saturation.
+    Saturation is the largest rate of answers of the ramp.
     """
 
     scene: str
@@ -98,10 +90,7 @@ def measure_pipeline(
 ) -> PipelineResult:
     """Starts a server, finds its largest rate of answers, and offers shares of it.
 
-    Raises:
-        ServerFailed: the server did not start.
-        MaplessError: a call before the measurement failed.
-        RuntimeError: the server answered no call.
+    RuntimeError if the server answered no call.
     """
     with server_with_scene(place, progress, log=log) as server:
         return asyncio.run(_measure(place, server, options, progress))

@@ -38,18 +38,10 @@ INFEASIBLE = "DEADLINE_INFEASIBLE"
 
 @dataclass(frozen=True)
 class CallRecord:
-    """A call that has ended; times are seconds from the start of its step.
+    """A call that has ended; times are seconds from the start of its step, its deadline from sending.
 
-    Attributes:
-        kind: what kind of call it was.
-        client: number of its client.
-        at_s: when it was planned to be sent.
-        sent_s: when it was sent; later than planned if the generator is slow.
-        ended_s: when its caller received the outcome.
-        deadline_s: seconds from sending.
-        code: name of the gRPC status.
-        detail: outcome of an answer, or reason of an error; empty for an error of the client's own.
-        retry_after_s: seconds after which a refusal requests another attempt, or None.
+    It was sent later than planned (`at_s`) if the generator is slow. `detail` is the outcome of an answer, or the
+    reason of an error; empty for an error of the client's own. `retry_after_s` is what a refusal requests.
     """
 
     kind: Kind
@@ -105,16 +97,9 @@ class Latencies:
 class Account:
     """The figures of the calls of a step.
 
-    Attributes:
-        window_s: time that rates refer to: the step without its beginning.
-        sent: number of all calls, including those of the beginning; `fates` and `outcomes` add up to it.
-        offered_per_s: all calls; this and the next three by when they were to be sent.
-        goodput_per_s: queries answered before their deadline, which counts from then, too.
-        refused_per_s, overdue_per_s: calls that ended so.
-        completed_per_s: rate of answers received in the window, whenever they were requested.
-        answers: latencies of answered queries.
-        refusals: latencies of refused calls.
-        send_lag: delays of sending, caused by the generator. This and all before leave out the beginning.
+    All leave out its beginning, except `sent`, to which `fates` and `outcomes` add up. Rates are by when calls were to
+    be sent, from when deadlines count, too; only `completed_per_s` counts answers received in the window, whenever they
+    were requested. `send_lag` are delays of sending, caused by the generator.
     """
 
     window_s: float

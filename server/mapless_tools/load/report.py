@@ -21,14 +21,7 @@ from .step import TREND_CONFIDENCE, Step
 
 @dataclass(frozen=True)
 class Check:
-    """A figure and the bar that it has to meet.
-
-    Attributes:
-        figure: name of the figure.
-        value: the value as text.
-        bar: the bar as text.
-        met: whether the value meets the bar; None if it was not measured.
-    """
+    """A figure with its value and the bar that it has to meet; `met` is None if it was not measured."""
 
     figure: str
     value: str
@@ -96,10 +89,7 @@ def loop_lag_check(steps: Sequence[Step], bar_s: float = 0.02) -> Check:
 def machine_lines(checks: Sequence[Check], load: float, cores: int) -> list[str]:
     """A hint for missed bars if more threads were ready to run than there are cores.
 
-    Args:
-        checks: the bars.
-        load: average number of threads that ran or waited for a core (the system's load average of a minute).
-        cores: number of cores.
+    `load` is the system's load average.
     """
     if load <= cores or all(check.met is not False for check in checks):
         return []

@@ -40,12 +40,7 @@ def requests_for(client: Client, queries: Sequence[Photograph]) -> Requests:
 
 
 def mixed_requests(named: Requests, queries: Sequence[Photograph]) -> Requests:
-    """Makes all kinds of good requests: with names, without names, and some that the server can only reject.
-
-    Args:
-        named: requests with names, and bad ones.
-        queries: photographs for the others.
-    """
+    """Makes all kinds of good requests: with names, without names, and some that the server can only reject."""
     chosen = [photo_request(query.data, query.camera, ()) for query in queries]
     camera = queries[0].camera
     blank = np.full((camera.height_px, camera.width_px, 3), 127, np.uint8)

@@ -20,12 +20,9 @@ LOOP_LAG = "mapless_event_loop_lag_seconds"
 class Scrape:
     """Metrics at one time, or the difference of two.
 
-    Attributes:
-        started: calls of Localize that began.
-        handled: calls that ended, by status.
-        terminated: admitted jobs that ended, by outcome.
-        lag_buckets: cumulative number of the event loop's delays, by upper edge, seconds.
-        totals: sum of each metric over its labels.
+    `started` calls of Localize began, and `handled` ended, by status; admitted jobs ended by outcome. `lag_buckets` are
+    cumulative numbers of the event loop's delays, by upper edge, seconds; `totals` the sum of each metric over its
+    labels.
     """
 
     started: int
@@ -63,13 +60,10 @@ class Scrape:
 class Reconciliation:
     """Comparison of the client's and the server's counts.
 
-    Attributes:
-        sent: number of calls that the client made.
-        handled: calls that have ended by the server's count.
-        running: calls that have begun but not ended by the server's count, although all have ended for the client.
-        missing: calls, by a status that only a server can give, which the server did not count.
-        surplus: calls that the server counted beyond those that ended for the client and those it cancelled.
-        unseen: calls that the client gave up before the server began with them.
+    All calls have ended for the client, but some perhaps not by the server's count (`running`). `missing` are calls, by
+    a status that only a server can give, which the server did not count; `surplus` those that it counted beyond those
+    that ended for the client and those it cancelled; `unseen` those that the client gave up before the server began
+    with them.
     """
 
     sent: int

@@ -29,12 +29,9 @@ ReadAnswer = Callable[[bytes], str]
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """The method that is called.
+    """The method that is called, of each client on its own connection; `deadline_s` is that of calls without their own.
 
-    Attributes:
-        methods: the method of each client, on its own connection.
-        deadline_s: deadline of calls without their own.
-        read_answer: function that returns the outcome of an answer.
+    `read_answer` returns the outcome of an answer.
     """
 
     methods: Sequence[Any]
@@ -46,15 +43,7 @@ class Target:
 async def connected(
     address: str, method: str, clients: int, deadline_s: float, read_answer: ReadAnswer
 ) -> AsyncIterator[Target]:
-    """Makes connections of several clients until the end of the block.
-
-    Args:
-        address: host:port.
-        method: path of the RPC, "/package.Service/Method".
-        clients: number of clients.
-        deadline_s: deadline of calls without their own.
-        read_answer: function that returns the outcome of an answer.
-    """
+    """Connects several clients to a method, "/package.Service/Method", until the end of the block."""
     options = [
         # Channels to one address share a connection otherwise, and the server would see one client.
         ("grpc.use_local_subchannel_pool", 1),
@@ -76,13 +65,8 @@ async def connected(
 async def send_open_loop(target: Target, plan: Sequence[PlannedCall], start_s: float | None = None) -> list[CallRecord]:
     """Makes every call of a plan at its time, independent of the outcomes of earlier calls.
 
-    Args:
-        target: the method that is called.
-        plan: in order of time; its clients are those of the target, the last one's number modulo theirs.
-        start_s: when the plan begins, by the event loop's clock; None for now.
-
-    Returns:
-        One record per call, after all have ended; all end, since they have deadlines.
+    The plan, in order of time, begins at `start_s` by the event loop's clock, or now. Returns one record per call,
+    after all have ended; all end, since they have deadlines.
     """
     loop = asyncio.get_running_loop()
     begin_s = loop.time() if start_s is None else start_s

@@ -28,14 +28,9 @@ _UNCORRELATED = 0.05
 
 @dataclass(frozen=True)
 class Slope:
-    """The trend of a figure.
+    """The trend of a figure: its slope, with the confidence interval, and the median of the samples.
 
-    Attributes:
-        level: median of the samples.
-        per_hour: the slope.
-        low, high: confidence interval of the slope.
-        hours: time that the samples span.
-        block: number of samples in a block.
+    The samples span so many hours, in blocks of so many.
     """
 
     level: float
@@ -64,8 +59,7 @@ class Slope:
 def slope(times_s: Sequence[float], values: Sequence[float], confidence: float = CONFIDENCE) -> Slope:
     """The slope of samples in the order of time, with its interval.
 
-    Raises:
-        ValueError: fewer than `MIN_SAMPLES`, or times that do not ascend.
+    ValueError for fewer than `MIN_SAMPLES`, or times that do not ascend.
     """
     hours, y = np.asarray(times_s, float) / 3600, np.asarray(values, float)
     if len(hours) != len(y) or len(y) < MIN_SAMPLES or not (np.diff(hours) > 0).all():

@@ -54,18 +54,14 @@ class SoakOptions:
     """Options of the soak.
 
     Attributes:
-        minutes: duration.
         rate_per_s: rate of calls of Localize; None for `share` of saturation, which is then measured.
         share: share of saturation that is offered as good queries, including cancelled ones.
         cancelled_share, hurried_share, bad_share: shares of all calls; bad images are sent in addition to the good
             ones.
-        clients: number of independent clients.
-        deadline_s: deadline of every call.
         churn: speed of the other workers; 0 for none.
         ramp_s: time with each number of concurrent calls, to find saturation.
         settle_share: share of the time that slopes leave out, while caches fill.
         sample_every_s: time between samples of the server.
-        seed: seed of the arrivals.
     """
 
     minutes: float = 10.0
@@ -93,18 +89,10 @@ class SoakOptions:
 
 @dataclass(frozen=True, eq=False)
 class SoakResult:
-    """What was measured.
+    """What was measured: steps before the soak, its own step, and the server meanwhile.
 
-    Attributes:
-        scene: description of the scene.
-        options: options of the soak.
-        before: the step of sequential calls, then those up to saturation, if that was measured.
-        rate_per_s: requested rate of calls of Localize.
-        soak: the soak's own step.
-        states: states of the server meanwhile.
-        slopes: slopes of the states after the settling, by field; empty if there are too few.
-        outcomes: outcomes of the calls besides queries.
-        account: comparison of the client's and the server's counts; None if the server serves no metrics.
+    Slopes are those of the states after the settling, by field; empty if there are too few. The account compares the
+    client's and the server's counts; None if the server serves no metrics.
     """
 
     scene: str
@@ -121,10 +109,7 @@ class SoakResult:
 def measure_soak(place: Place, options: SoakOptions, progress: Progress, log: Path | None = None) -> SoakResult:
     """Starts a server, measures its saturation unless a rate is given, and keeps it busy; appends its log to `log`.
 
-    Raises:
-        ServerFailed: the server did not start.
-        MaplessError: a call before the measurement failed.
-        RuntimeError: the server answered no call, or ended.
+    RuntimeError if the server answered no call, or ended.
     """
     with server_with_scene(place, progress, {"MAPLESS_ALLOW_WATCHING": "true"}, log) as server:
         return asyncio.run(_measure(place, server, options, progress))

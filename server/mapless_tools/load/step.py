@@ -24,19 +24,11 @@ TREND_FIELDS = ("resident_mib", "threads", "descriptors")
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """The result of a step.
+    """The result of a step: figures of the client's calls, samples of the server's process, and its own counts.
 
-    Attributes:
-        name: name of the step.
-        asked_per_s: rate of the Poisson process; None for a closed loop.
-        duration_s: time in which calls were made.
-        account: figures of the client's calls.
-        codes: statuses of all calls, for comparing with the server's account.
-        samples: samples of the server's process, from before the first call until all had ended.
-        settle_s: the beginning that rates leave out; trends do, too.
-        scraped: the server's counts meanwhile; None if it serves no metrics.
-        own_cpu_s: processor time of the generator itself.
-        wall_s: time from the first sample to the last.
+    `asked_per_s` is the rate of the Poisson process, None for a closed loop. Rates and trends leave out the first
+    `settle_s`. Samples are from before the first call until all had ended; the generator itself used `own_cpu_s`
+    meanwhile.
     """
 
     name: str
@@ -122,17 +114,7 @@ async def run_step(
     settle_s: float = 0.0,
     sample_every_s: float = SAMPLE_EVERY_S,
 ) -> Step:
-    """Makes calls, and measures client, server and process meanwhile.
-
-    Args:
-        name: name of the step.
-        server: the server to measure.
-        send: function that makes the calls.
-        duration_s: time for which it makes them.
-        asked_per_s: the requested rate.
-        settle_s: beginning that rates and trends leave out.
-        sample_every_s: time between samples of the process.
-    """
+    """Makes calls for `duration_s` by the function `send`, and measures client, server and process meanwhile."""
     before = server.scrape()
     own_s, start_s = time.process_time(), time.monotonic()
     async with process_samples(server.process_id, sample_every_s) as samples:

@@ -20,13 +20,7 @@ NICENESS_STEP = 5
 
 @dataclass(frozen=True)
 class ServerUnderLoad:
-    """The server that is measured.
-
-    Attributes:
-        process_id: process of the server.
-        metrics_address: "host:port" of its metrics; empty if it serves none.
-        data_dir: its data folder, if that is observed.
-    """
+    """The process of the server that is measured, and its metrics and data folder, if they are observed."""
 
     process_id: int
     metrics_address: str = ""
@@ -39,14 +33,10 @@ class ServerUnderLoad:
 
 @dataclass(frozen=True)
 class ProcessSample:
-    """A process at one time.
+    """A process at one time, by the event loop's clock.
 
-    Attributes:
-        at_s: time by the event loop's clock.
-        resident_mib: memory, including that shared with other processes.
-        threads: number of threads.
-        descriptors: open files and sockets.
-        cpu_s: processor time of all its threads so far, in steps of 0.01 s.
+    Memory includes what is shared with other processes, descriptors are open files and sockets; processor time is that
+    of all its threads so far, in steps of 0.01 s.
     """
 
     at_s: float
@@ -60,13 +50,8 @@ class ProcessSample:
 class ServerState(ProcessSample):
     """The state of a server at one time: its process, and more.
 
-    Attributes:
-        unique_mib: memory that would be free without it.
-        python_blocks: number of memory blocks that Python's objects use.
-        sockets: number of descriptors that are sockets.
-        data_mib: size of the data folder on the disk.
-        waiting_jobs: number of jobs in the queue.
-        loop_lag_ms: mean delay of the event loop's timers since the previous state.
+    `unique_mib` would be free without it; `python_blocks` are memory blocks that Python's objects use; `loop_lag_ms` is
+    the mean delay of the event loop's timers since the previous state.
     """
 
     unique_mib: float
@@ -81,11 +66,7 @@ FIELDS = tuple(field.name for field in fields(ServerState) if field.name != "at_
 
 
 def read_process(process_id: int, at_s: float) -> ProcessSample:
-    """Samples the process now.
-
-    Raises:
-        OSError: the process has ended, or the system has no /proc.
-    """
+    """Samples the process now; OSError if it has ended, or the system has no /proc."""
     folder = Path(f"/proc/{process_id}")
     status = dict(line.split(":", 1) for line in (folder / "status").read_text().splitlines())
     # The name, in parentheses, may hold anything; user and system time are the 14th and 15th field of all.
@@ -102,8 +83,7 @@ def read_process(process_id: int, at_s: float) -> ProcessSample:
 def read_state(server: ServerUnderLoad, at_s: float, before: Scrape | None) -> tuple[ServerState, Scrape]:
     """Reads the present state, and the metrics for the next call.
 
-    Raises:
-        OSError: the process has ended, or its metrics do not answer.
+    OSError if the process has ended or does not answer.
     """
     process, folder = read_process(server.process_id, at_s), Path(f"/proc/{server.process_id}")
     scrape = server.scrape()
@@ -175,13 +155,10 @@ def column(samples: Sequence[ServerState], field: str) -> list[float]:
 
 @contextmanager
 def priority_over(process_id: int) -> Iterator[None]:
-    """Gives this process priority over another one until the end of the block.
+    """Gives this process priority over another one until the end of the block; OSError if that has ended.
 
     Real callers are on other machines; here, a generator that waits for a core would count its own waiting as the
     server's. If permitted, this process raises its own priority; else it lowers the other's, below that of all others.
-
-    Raises:
-        OSError: the process has ended, or the system has no /proc.
     """
     own_id, own = os.getpid(), os.getpriority(os.PRIO_PROCESS, 0)
     try:

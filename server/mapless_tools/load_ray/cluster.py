@@ -50,13 +50,7 @@ class ClusterFailed(Exception):
 
 @dataclass(frozen=True)
 class Replica:
-    """A replica that receives calls.
-
-    Attributes:
-        name: Serve's name of it.
-        process_id: of its process.
-        address: "host:port" of its own gRPC server, behind the ingress.
-    """
+    """A replica that receives calls: Serve's name, and the "host:port" of its own gRPC server, behind the ingress."""
 
     name: str
     process_id: int
@@ -65,12 +59,9 @@ class Replica:
 
 @dataclass
 class Cluster:
-    """A running cluster.
+    """A running cluster: the "host:port" of its ingress, and the folder of logs and configurations.
 
-    Attributes:
-        address: "host:port" of the ingress.
-        folder: of logs and configurations.
-        application: the last deployed one, as in a Serve config.
+    `application` is the last deployed one, as in a Serve config.
     """
 
     address: str
@@ -80,14 +71,9 @@ class Cluster:
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def deploy(self, application: Mapping[str, Any], limit_s: float = START_LIMIT_S) -> None:
-        """Returns when exactly the replicas of the config run.
+        """Deploys one of the `applications` of a Serve config, "mapless"; returns when exactly its replicas run.
 
-        Args:
-            application: one of the `applications` of a Serve config; its name is "mapless".
-            limit_s: time limit.
-
-        Raises:
-            ClusterFailed: they did not within the limit.
+        ClusterFailed if they did not within the limit.
         """
         self.application = dict(application)
         self._ask({"deploy": self.application, "limit_s": limit_s})
@@ -163,13 +149,9 @@ def application(
 
 @contextmanager
 def running_cluster(environment: Mapping[str, str] | None = None) -> Iterator[Cluster]:
-    """A cluster without an application, until the block is left.
+    """A cluster without an application, until the block is left; ClusterFailed if it did not start.
 
-    Args:
-        environment: variables of all its processes, such as settings that are not in the application's arguments.
-
-    Raises:
-        ClusterFailed: it did not start.
+    `environment` has variables of all its processes, such as settings that are not in the application's arguments.
     """
     # It holds sockets, whose paths are limited to 107 bytes.
     folder = Path(tempfile.mkdtemp(prefix="mr-", dir="/tmp"))

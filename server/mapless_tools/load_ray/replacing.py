@@ -24,13 +24,9 @@ END_LIMIT_S = 60.0
 
 @dataclass(frozen=True)
 class Call:
-    """A call that has ended; times of `time.monotonic`.
+    """A call that has ended; times of `time.monotonic`, before its first attempt and after its last.
 
-    Attributes:
-        caller: its caller's number.
-        begin_s: before its first attempt.
-        end_s: after its last one.
-        error: its final error; empty if it was answered.
+    `error` is the final one, empty if it was answered.
     """
 
     caller: int
@@ -41,11 +37,9 @@ class Call:
 
 @dataclass
 class Calls:
-    """All calls that were made.
+    """All calls that were made, in the order of their ends.
 
-    Attributes:
-        ended: in the order of their ends.
-        acknowledged: (scene, reference) of all that the server reported as stored.
+    Acknowledged are (scene, reference) of all that the server reported as stored.
     """
 
     ended: list[Call] = field(default_factory=list)
@@ -87,11 +81,7 @@ def calling(
 ) -> Iterator[Calls]:
     """A caller for each kind of call, each with a connection of its own, until the block is left.
 
-    Args:
-        address: "host:port".
-        kinds: of calls.
-        pause_s: between a caller's calls.
-        options: of the connections; None for the client's defaults, with retries.
+    They pause between their calls; without options, connections have the client's defaults, with retries.
     """
     calls, done, lock = Calls(), threading.Event(), threading.Lock()
 
@@ -125,10 +115,7 @@ def calling(
 class Scenes:
     """Scenes whose calls cost no computing, and the kinds of calls on them.
 
-    Attributes:
-        count: how many; calls of different scenes go to different replicas.
-        photo: of all references and queries.
-        camera: of the photo.
+    Calls of different scenes go to different replicas. All references and queries have the same photograph.
     """
 
     count: int = 16
@@ -191,13 +178,9 @@ REDEPLOY_LIMIT_S = 300.0
 class Replacement:
     """One replacement, with the calls in progress from its beginning until a while after its end.
 
-    Attributes:
-        duration_s: until the new replicas served.
-        calls: number of the calls.
-        errors: of those that failed in spite of their retries.
-        usual_s: duration of the slowest call in the seconds before.
-        slowest_s: duration of the slowest of the calls, retries included.
-        gap_s: the longest time that one caller was without an answer.
+    It lasts until the new replicas served. Errors are of calls that failed in spite of their retries. Durations are
+    those of the slowest call in the seconds before, of the slowest of the calls, and the longest time that one caller
+    was without an answer.
     """
 
     duration_s: float

@@ -31,10 +31,8 @@ MIN_GAIN = 1.7
 class ThroughputOptions:
     """Options of the comparison.
 
-    Attributes:
-        rounds: number of turns of one replica and two, so that other load of the machine affects both alike.
-        step_s: time of parallel calls, a round and way; the first fifth does not count.
-        concurrency: parallel calls a replica: one computes, the next is decoded, one is in transit.
+    One replica and two take turns in rounds, so that other load of the machine affects both alike; the first fifth of a
+    step does not count. Of three parallel calls a replica computes one, the next is decoded, one is in transit.
     """
 
     rounds: int = 4
@@ -46,10 +44,8 @@ class ThroughputOptions:
 class Round:
     """Both ways, one after the other.
 
-    Attributes:
-        one: one replica on one core, called at its own port; the other core is idle. two: two replicas on a core each,
-        called through the ingress, which shares the cores with them and the generator. balancer_share: share of one
-        core that HAProxy used meanwhile.
+    One replica on one core is called at its own port; the other core is idle. Two replicas on a core each are called
+    through the ingress, which shares the cores with them and the generator; HAProxy used `balancer_share` of one core.
     """
 
     one: Step
@@ -65,8 +61,7 @@ class Round:
 def measure_throughput(place: Place, options: ThroughputOptions, progress: Progress) -> list[Round]:
     """Starts two replicas, each with one computing thread on its own core.
 
-    Raises:
-        RuntimeError: a call did not end with an answer, or there are fewer than two cores.
+    RuntimeError if a call did not end with an answer, or there are fewer than two cores.
     """
     cores = sorted(os.sched_getaffinity(0))[:2]
     if len(cores) < 2:

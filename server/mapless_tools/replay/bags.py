@@ -42,15 +42,11 @@ MAX_FAILURES = 5
 
 @dataclass
 class BagReport:
-    """The results of a recording's images.
+    """The results of a recording's images, as far as it was read.
 
-    Attributes:
-        images: number of images of the recording, as far as it was read.
-        counts: localized images, and the others by the reason that their diagnostics begin with.
-        apart_cm, apart_deg: distance of each localized pose from the recording's own in the same map frame.
-        radii_cm: 95 % radii of the positions.
-        server_s: times in the server.
-        stopped: why it ended early; empty if it did not.
+    Images are counted as localized, or by the reason that their diagnostics begin with. Distances are of localized
+    poses from the recording's own in the same map frame, radii the 95 % ones of the positions. `stopped` says why it
+    ended early.
     """
 
     images: int = 0
@@ -93,22 +89,11 @@ def replay_bag(
     progress: Progress,
     sequence_length: int = 0,
 ) -> BagReport:
-    """Localizes a recording; `out` is a valid recording in any case, with what was computed so far.
+    """Localizes a recording; `out`, a new folder, is a valid recording in any case, with what was computed so far.
 
-    Args:
-        path: the recording.
-        out: folder to write, which must not exist.
-        client: client of the server.
-        bag: which topics and frames of the recording are used.
-        options: options of the localizer. An empty `odom_frame` or `base_frame` is that of the recording's poses. The
-            rate 0 takes every image.
-        camera: camera of a recording without CameraInfo.
-        progress: reports the progress.
-        sequence_length: see LocalizerOptions; only for recordings with odometry.
-
-    Raises:
-        ValueError: the recording or the options cannot be used; nothing is written then.
-        MaplessError: there is no such server or scene.
+    An empty `odom_frame` or `base_frame` of the options is that of the recording's poses; the rate 0 takes every image.
+    The camera is for a recording without CameraInfo; `sequence_length` only for one with odometry. ValueError if the
+    recording or the options cannot be used, MaplessError if there is no such server or scene; nothing is written then.
     """
     if out.exists():
         raise ValueError(f"{out} exists already")

@@ -41,13 +41,9 @@ class Change:
 
 @dataclass(frozen=True)
 class Comparison:
-    """An answer beside the same one computed again.
+    """An answer beside the same one computed again: whether they are equal to the last bit, and the first differences.
 
-    Attributes:
-        is_identical: whether they are equal to the last bit.
-        changes: the first differences, in the order of the fields.
-        apart_cm: distance of the poses; None unless both have one.
-        apart_deg: angle between their rotations; None unless both have one.
+    Distance and angle of the poses are None unless both have one.
     """
 
     is_identical: bool

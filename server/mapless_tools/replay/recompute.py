@@ -54,17 +54,10 @@ def response_of(call: CapturedCall) -> Response:
 
 
 def recompute(call: CapturedCall, blobs: Blobs, tiers: Sequence[Tier], options: EngineOptions) -> Response:
-    """Computes the answer to a captured call again.
+    """Computes the answer to a captured call again, by present tiers, limits and defaults.
 
-    Args:
-        call: the captured call.
-        blobs: blobs of the references.
-        tiers: tiers that compute now.
-        options: present limits and defaults.
-
-    Raises:
-        CaptureError: a part of the capture is missing, or its method is not known.
-        RequestError, FieldError: the call is refused now.
+    CaptureError if a part of the capture is missing, or its method is not known; RequestError or FieldError if the call
+    is refused now.
     """
     then = response_of(call)
     request = MESSAGES[call.method][0].FromString(call.request)

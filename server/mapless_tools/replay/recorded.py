@@ -34,8 +34,7 @@ _CACHE_BYTES = 512 * 2**20
 class Blobs:
     """Photographs and features of references in a capture folder, cached for the next call.
 
-    Attributes:
-        found_anew: keys of the references whose captured features this program cannot read.
+    `found_anew` are the keys of references whose captured features this program cannot read.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -47,10 +46,8 @@ class Blobs:
         """The features of a reference: the captured ones, or else extracted again.
 
         They are extracted again if this extractor's features were not captured, or if another version wrote them in a
-        form that this one cannot read; the latter is added to `found_anew`.
-
-        Raises:
-            DamagedCapture: the photograph or its features are missing or damaged.
+        form that this one cannot read; the latter is added to `found_anew`. DamagedCapture if they are missing or
+        damaged.
         """
         known = (reference.key, extractor.name)
         view = self._views.get(known)
@@ -84,14 +81,9 @@ class Blobs:
 
 @dataclass(frozen=True, eq=False)
 class RecordedSource:
-    """References and their choice from a captured call; see `ReferenceSource`.
+    """References of one photograph of a captured call and their choice; see `ReferenceSource`.
 
-    Attributes:
-        call: the captured call.
-        part: one of its photographs.
-        blobs: blobs of the references.
-        extractor: extractor of the features by which photographs are compared.
-        is_described: whether the photograph was described for the choice, which takes a reference to compare it with.
+    `is_described` says whether the photograph was described for the choice, which takes a reference to compare it with.
     """
 
     call: CapturedCall

@@ -27,14 +27,7 @@ IDENTICAL, CHANGED, NOT_COMPUTED = "identical", "changed", "not computed"
 
 @dataclass(frozen=True)
 class Selection:
-    """Which calls; empty values and None select all.
-
-    Attributes:
-        request_ids: calls of these ids.
-        last: number of the latest calls.
-        tenant: calls of this tenant.
-        scene_id: calls in scenes of this id.
-    """
+    """Which calls: of these ids, the latest ones, of a tenant, in a scene; empty values and None select all."""
 
     request_ids: frozenset[str] = frozenset()
     last: int | None = None
@@ -55,18 +48,11 @@ class Selection:
 
 @dataclass(frozen=True)
 class Replayed:
-    """A captured call and its answer computed again.
+    """A captured call and its answer computed again; the time is UTC, the verdict one of `IDENTICAL` and so on.
 
-    Attributes:
-        request_id, time, method, tenant, scene_id: properties of the call; the time is UTC.
-        verdict: the result of the comparison, see `IDENTICAL`.
-        outcome_then, outcome_now: "localized", or the reason of the rejection; empty without an answer.
-        seconds_then, seconds_now: computing time of its stages.
-        stages_then, stages_now: computing time of each stage.
-        apart_cm, apart_deg: distance of the poses; None unless there are two, or if the answers are identical.
-        changes: the first differences.
-        error: why there is no answer now.
-        found_anew: references whose captured features this version cannot read, so that it extracted them again.
+    Outcomes are "localized" or the reason of the rejection, empty without an answer, for which `error` has the reason.
+    Seconds are the computing time of all stages. Distances are None unless there are two poses, or if the answers are
+    identical. This version cannot read the captured features of `found_anew` references, and extracted them again.
     """
 
     request_id: str
@@ -90,13 +76,7 @@ class Replayed:
 
 @dataclass(frozen=True)
 class Report:
-    """The replayed calls, the oldest first.
-
-    Attributes:
-        calls: the calls.
-        circumstances: differences of versions, settings and weights, of any of the calls.
-        unreadable: files that are damaged, and why.
-    """
+    """The replayed calls, the oldest first, differences of circumstances of any of them, and damaged files."""
 
     calls: tuple[Replayed, ...]
     circumstances: tuple[Change, ...]
@@ -109,16 +89,10 @@ class Report:
 
 
 def replay(folder: Path, selection: Selection, settings: Settings) -> Report:
-    """Computes captured answers again.
+    """Computes captured answers of a folder again, whether a server uses it or not; nothing in it is changed.
 
-    Args:
-        folder: a capture folder, whether a server uses it or not; nothing in it is changed.
-        selection: which calls.
-        settings: settings of features, backend and so on; those of listening and storing have no effect.
-
-    Raises:
-        CaptureError: the folder is not a capture folder or has no such calls, or the settings name what is not
-            available.
+    Settings of listening and storing have no effect. CaptureError if the folder is not a capture folder or has no such
+    calls, or the settings name what is not available.
     """
     check_format(folder)
     unreadable: list[str] = []

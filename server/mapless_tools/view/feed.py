@@ -39,14 +39,9 @@ class Feed:
         show: Callable[[Query], None],
         report: Callable[[str, bool], None],
     ) -> None:
-        """Begins to watch at once.
+        """Begins to watch a scene at once; `show` is called with each query, in the feed's thread.
 
-        Args:
-            address: address of the server.
-            options: how to connect.
-            scene: id of the scene.
-            show: called with each query, in the feed's thread.
-            report: called with the state of the watching, in a few words, and whether there will be queries.
+        `report` is called with the state of the watching, in a few words, and whether there will be queries.
         """
         self._channel = options.channel(address)
         self._metadata = options.metadata()
@@ -62,11 +57,7 @@ class Feed:
         self._thread.start()
 
     def localize(self, image: bytes, camera: Camera, references: Sequence[str]) -> LocalizationResult | Rejected:
-        """Localizes a photograph against some references, with the matches; it is not shown.
-
-        Raises:
-            MaplessError: the call failed.
-        """
+        """Localizes a photograph against some references, with the matches; it is not shown."""
         scene = self._request.scene
         request = pb.LocalizeRequest(
             scene=scene,

@@ -27,8 +27,7 @@ class GuardedViser(viser.ViserServer):
     def __init__(self, host: str, port: int, label: str) -> None:
         """Listens on a loopback address; port 0 takes any free one.
 
-        Raises:
-            RuntimeError: the port is taken; or viser does not serve as it used to, so that it could not be guarded.
+        RuntimeError if the port is taken; or viser does not serve as it used to, so that it could not be guarded.
         """
         # It prints its address, which the command prints, too.
         with _guarded_connections() as guarded, redirect_stdout(io.StringIO()):
@@ -50,9 +49,8 @@ class GuardedViser(viser.ViserServer):
 def is_own(host: str | None, origin: str | None) -> bool:
     """Whether a request comes from a page of the server that it is made to, or from no page at all.
 
-    Args:
-        host: its header `Host`, "127.0.0.1:8080".
-        origin: its header `Origin`, "http://127.0.0.1:8080"; None from other programs than browsers.
+    The headers are `Host`, "127.0.0.1:8080", and `Origin`, "http://127.0.0.1:8080", None from other programs than
+    browsers.
     """
     name = (host or "").rpartition(":")[0] or (host or "")
     return name in _LOOPBACK_NAMES and origin in (None, f"http://{host}")

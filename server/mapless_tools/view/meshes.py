@@ -15,9 +15,8 @@ _FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 def ellipsoid(covariance: Array, steps: int = 18) -> tuple[Array, NDArray[np.uint32]]:
     """Vertices (V, 3) around the origin and faces (F, 3) of the ellipsoid that contains 95 % of positions.
 
-    Args:
-        covariance: (3, 3) or more, of which the first three are the position; square metres.
-        steps: number of meridians; there are half as many parallels.
+    The covariance is (3, 3) or more, of which the first three are the position, square metres. There are half as many
+    parallels as meridians.
     """
     values, axes = np.linalg.eigh(covariance[:3, :3])
     radii = np.sqrt(np.maximum(values, 0.0) * CHI2_95_IN_SPACE)

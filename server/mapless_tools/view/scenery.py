@@ -21,13 +21,9 @@ _ALIKE = 0.5
 class Scenery:
     """References as they are laid out.
 
-    Attributes:
-        references: all references of the scene.
-        pictured: indices of the references that are drawn as frustums; each is far from the previous ones.
-        origin: (3,) world position that is drawn at zero, since browsers compute in single precision.
-        down: (3,) unit vector of gravity.
-        size_m: length of a frustum that does not hide its neighbours.
-        extent_m: extent of the references.
+    Those drawn as frustums (`pictured`, indices) are each far from the previous ones, and their length `size_m` does
+    not hide their neighbours. The world position `origin` (3,) is drawn at zero, since browsers compute in single
+    precision; `down` (3,) is a unit vector of gravity.
     """
 
     references: tuple[Reference, ...]
@@ -48,11 +44,7 @@ class Scenery:
 
 
 def lay_out(scene: Scene, references: Sequence[Reference], max_pictured: int) -> Scenery:
-    """The scenery of a scene.
-
-    Raises:
-        ValueError: there are no references.
-    """
+    """The scenery of a scene; ValueError if there are no references."""
     if not references:
         raise ValueError(f"scene {scene.scene_id} has no references to show")
     centres = np.stack([it.world_from_camera.translation for it in references])

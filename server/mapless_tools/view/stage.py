@@ -48,14 +48,7 @@ class Stage:
     """The drawn scene; its methods may be called from any thread."""
 
     def __init__(self, server: GuardedViser, scenery: Scenery, title: str, open_photo: Callable[[str], bytes]) -> None:
-        """Draws the references, at first without their photographs.
-
-        Args:
-            server: viser's server.
-            scenery: the references.
-            title: id of the scene.
-            open_photo: function that returns the photograph of a reference by its id.
-        """
+        """Draws the references, at first without their photographs, which `open_photo` returns by their ids."""
         self._server, self._scenery, self._open_photo = server, scenery, open_photo
         self._drawing = Drawing(server, scenery)
         self._lock = threading.Lock()

@@ -34,15 +34,11 @@ SEED_NEIGHBOURS = 8
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """What the viewer shows, and where.
+    """What the viewer shows, and where: a loopback address, since there is no authentication, and a port, 0 for any.
 
-    Attributes:
-        host: a loopback address: there is no authentication.
-        port: port of the page; 0 for any free one.
-        max_pictured: largest number of references drawn with their photographs, spread over the scene; more make
-            browsers slow. The others are dots.
-        seeds: number of references that are localized against their neighbours for the first points; half a second of
-            the server's computing each.
+    References drawn with their photographs are spread over the scene; more make browsers slow. The others are dots. So
+    many `seeds` are localized against their neighbours for the first points; half a second of the server's computing
+    each.
     """
 
     host: str = "127.0.0.1"
@@ -58,18 +54,9 @@ class ViewOptions:
 
 @contextmanager
 def viewer(address: str, connect: ConnectOptions, scene: str, options: ViewOptions) -> Iterator[str]:
-    """Shows a scene until the end of the block; yields the page's address.
+    """Shows a scene of a server until the end of the block; yields the page's address.
 
-    Args:
-        address: address of the server, "host:port".
-        connect: how to connect to it.
-        scene: id of the scene.
-        options: options of the viewer.
-
-    Raises:
-        MaplessError: the server cannot be reached, or rejects a call.
-        ValueError: the scene has no references.
-        RuntimeError: viser cannot be guarded.
+    ValueError if the scene has no references, RuntimeError if viser cannot be guarded.
     """
     with ExitStack() as stack:
         client = stack.enter_context(Client(address, connect))

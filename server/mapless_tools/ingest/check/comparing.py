@@ -31,14 +31,9 @@ LIMITS = ImageLimits(max_bytes=2**28, max_pixels=200_000_000)
 
 
 def check_frames(frames: Sequence[Frame], progress: Progress, extractor: FeatureExtractor | None = None) -> Verdict:
-    """Judges frames; pairs and suspects are indices of frames.
+    """Judges frames by SIFT or other features; pairs and suspects are indices of frames.
 
     Photographs that cannot be read are left out: the upload reports them.
-
-    Args:
-        frames: frames with the poses to check.
-        progress: reports the progress.
-        extractor: SIFT if none.
     """
     poses = [frame.world_from_camera for frame in frames]
     if len(frames) < 2:

@@ -80,12 +80,9 @@ CONVENTIONS: Mapping[str, Correction] = {
 
 @dataclass(frozen=True)
 class Explanation:
-    """A likely mistake.
+    """A likely mistake, and the photographs that it concerns, if not all; without text there is none.
 
-    Attributes:
-        text: for the report; empty if there is none.
-        error_px: median error of the pairs after the correction.
-        photographs: the photographs it concerns, if not all.
+    `error_px` is the median error of the pairs after its correction.
     """
 
     text: str = ""
@@ -96,10 +93,7 @@ class Explanation:
 def explain(views: Views, matched: Sequence[MatchedPair], given_px: float) -> Explanation:
     """Finds the mistake whose correction makes the poses fit best.
 
-    Args:
-        views: the views as given.
-        matched: matched pairs of them.
-        given_px: their median error without correction.
+    `given_px` is the median error without correction.
     """
     matched = [MatchedPair(item.pair, item.matches[:: 1 + len(item.matches) // _ENOUGH_MATCHES]) for item in matched]
     candidates = []

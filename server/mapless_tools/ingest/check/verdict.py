@@ -62,20 +62,12 @@ _SUSPECT_PAIRS = 2
 
 @dataclass(frozen=True)
 class Verdict:
-    """The verdict on all pairs.
+    """The verdict on all pairs; medians and shares are NaN without pairs.
 
-    Attributes:
-        pairs: pairs with matches.
-        unmatched_count: number of pairs with too few matches.
-        median_px: median of the pairs' errors; NaN without pairs.
-        bad_share: share of bad pairs; NaN without pairs.
-        threshold_px: median of the pairs' thresholds.
-        suspects: photographs that do not fit their neighbours although the scene as a whole does, or those that the
-            explanation concerns, if not all.
-        explanation: the likely mistake if the scene as a whole is wrong; empty if none was found.
-        explained_px: the median error after correcting that mistake.
-        median_depth: median depth of the photographed points, in the unit of the poses; None if unknown, or the scene
-            is wrong.
+    Suspects do not fit their neighbours although the scene as a whole does; or they are what the explanation concerns,
+    if not all. The explanation is the likely mistake if the scene as a whole is wrong, `explained_px` the median error
+    after its correction. The median depth of photographed points is in the unit of the poses; None if unknown, or the
+    scene is wrong.
     """
 
     pairs: tuple[PairError, ...]
@@ -100,13 +92,7 @@ class Verdict:
 
 
 def judge(views: Views, matched: Sequence[MatchedPair], unmatched_count: int = 0) -> Verdict:
-    """Judges the matched pairs.
-
-    Args:
-        views: views by the index that pairs use.
-        matched: pairs that have matches.
-        unmatched_count: number of pairs with too few matches.
-    """
+    """Judges the matched pairs; `unmatched_count` pairs have too few matches."""
     errors = errors_of(views, matched)
     if not errors:
         return Verdict((), unmatched_count, math.nan, math.nan, THRESHOLD_PX)

@@ -21,11 +21,7 @@ __all__ = ["Intrinsics", "KeyframeOptions", "ReadOptions", "fits", "read_dataset
 
 
 def recognize(path: Path) -> str:
-    """Recognizes the layout of a folder.
-
-    Raises:
-        ValueError: the folder has no known layout, or several; the message names them.
-    """
+    """Recognizes the layout of a folder; ValueError names the known or the found ones if it has none, or several."""
     _check_there(path)
     found = [name for name in FORMATS if fits(path, name)]
     if not found:
@@ -41,16 +37,13 @@ def fits(path: Path, format: str) -> bool:
 
 
 def read_dataset(path: Path, format: str = "auto", options: ReadOptions | None = None) -> Dataset:
-    """Reads the posed photographs of a folder.
+    """Reads the posed photographs of a folder; at least one frame, and those that cannot be used in `refused`.
 
     Args:
         path: the folder (`7scenes`: a scene; `12scenes`: a room; `colmap`: a model or a folder of one), or a file of
             `rosbag`.
         format: one of FORMATS, or "auto" to recognize it; `Dataset.format` is then its name.
         options: see ReadOptions.
-
-    Returns:
-        The dataset, with at least one frame. Frames that cannot be used are in `refused`, with the reason.
 
     Raises:
         ValueError: the folder as a whole cannot be read; the message, which can be printed, names file and field.

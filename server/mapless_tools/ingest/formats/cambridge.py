@@ -55,12 +55,9 @@ def read(path: Path, options: ReadOptions) -> Dataset:
 
 @dataclass(frozen=True)
 class Lens:
-    """VisualSFM's lens of an image.
+    """VisualSFM's lens of an image: its focal length, and its radial distortion k.
 
-    Attributes:
-        focal_px: focal length.
-        k: its radial distortion: a pixel at distance r from the centre, in focal lengths, is seen where an ideal camera
-            sees it at r (1 + k r^2).
+    A pixel at distance r from the centre, in focal lengths, is seen where an ideal camera sees it at r (1 + k r^2).
     """
 
     focal_px: float

@@ -59,17 +59,10 @@ class Collector:
     def add(
         self, image: str, camera: Camera, world_from_camera: RigidTransform, split: str = "", name: str = ""
     ) -> None:
-        """Adds a frame.
+        """Adds a frame; ValueError names what is wrong.
 
-        Args:
-            image: path from the folder, with slashes.
-            camera: its camera, in the file's pixels.
-            world_from_camera: its pose.
-            split: see Frame.
-            name: text from which the frame's id is made; if empty, the image's path without its ending.
-
-        Raises:
-            ValueError: one of them is wrong; the message names it.
+        The image is a path from the folder, with slashes. The frame's id is made from `name`, or else from that path
+        without its ending.
         """
         file = self.image(image)
         check_camera(camera)

@@ -33,9 +33,8 @@ class Intrinsics:
 class KeyframeOptions:
     """Options of choosing keyframes: the sharpest of a few images, each time the camera has moved or turned.
 
-    Attributes:
-        distance_m: distance from the last keyframe. A tenth of the depth of a room, so that neighbours overlap.
-        angle_deg: angle from the last keyframe; a third of a narrow lens's field of view.
+    The distance is a tenth of the depth of a room, so that neighbours overlap; the angle a third of a narrow lens's
+    field of view.
     """
 
     distance_m: float = 0.3
@@ -63,8 +62,7 @@ class ReadOptions:
         ground_truth: poses that replace the layout's own: a file or folder of SfM pseudo ground truth, for `7scenes`
             and `12scenes`.
         intrinsics: for layouts without them (`7scenes`, `tum`, recordings); None for the layout's usual ones.
-        bag: which topics and frames of a recording are used; only for `rosbag`.
-        keyframes: which images of a recording are used; only for `rosbag`.
+        bag, keyframes: which topics, frames and images of a recording are used; only for `rosbag`.
     """
 
     images: Path | None = None

@@ -25,13 +25,7 @@ GROUND_TRUTH = "SfM pseudo ground truth (COLMAP)"
 
 @dataclass(frozen=True, eq=False)
 class PosesBySplit:
-    """Poses by image path; one of the two is empty.
-
-    Attributes:
-        source: the file or folder, for messages.
-        lines: words of the text files' lines.
-        model: a COLMAP model, its images by name.
-    """
+    """Poses by image path, from a COLMAP model or from text files, whose words they are; `source` is for messages."""
 
     source: Path
     lines: Mapping[str, tuple[str, ...]]
@@ -61,15 +55,10 @@ class PosesBySplit:
 
 
 def find_ground_truth(path: Path, scene: str) -> PosesBySplit:
-    """Finds the poses of a scene.
+    """Finds the poses of a scene, "redkitchen" or "apt1_kitchen"; ValueError if there are none, or a file is malformed.
 
-    Args:
-        path: a text file; a folder with the scene's text files, at any depth of the original repository; a COLMAP
-            model; or a folder with a model of the scene.
-        scene: "redkitchen", or "apt1_kitchen".
-
-    Raises:
-        ValueError: there are no poses, or a file is malformed.
+    The path is a text file; a folder with the scene's text files, at any depth of the original repository; a COLMAP
+    model; or a folder with a model of the scene.
     """
     if path.is_file():
         return PosesBySplit(path, _read_lines([path]), None)

@@ -39,14 +39,7 @@ _PERSPECTIVE = frozenset({"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL"
 
 @dataclass(frozen=True)
 class ColmapCamera:
-    """A camera in a model's form.
-
-    Attributes:
-        camera_id: its id in COLMAP, or in a layout that uses COLMAP's cameras.
-        model: one of MODEL_NAMES, or a model that mapless does not have.
-        width_px, height_px: size of its images.
-        parameters: the parameters of the model.
-    """
+    """A camera in a model's form, of COLMAP or of a layout that uses its cameras; mapless may not have the model."""
 
     camera_id: int | str
     model: str

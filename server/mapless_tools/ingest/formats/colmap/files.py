@@ -21,14 +21,7 @@ _MAX_NAME_BYTES = 4096
 
 @dataclass(frozen=True)
 class ImageRecord:
-    """An image.
-
-    Attributes:
-        image_id: its id in COLMAP.
-        pose: qw qx qy qz tx ty tz of camera_from_world.
-        camera_id: id of its camera.
-        name: its path from the images' folder.
-    """
+    """An image: its pose is qw qx qy qz tx ty tz of camera_from_world, its name the path from the images' folder."""
 
     image_id: int
     pose: Sequence[float]

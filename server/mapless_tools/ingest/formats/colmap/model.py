@@ -16,14 +16,7 @@ from .files import ImageRecord, read_cameras, read_images
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Cameras and images.
-
-    Attributes:
-        file: file of the images, for messages.
-        cameras: cameras by COLMAP's id.
-        images: images by name.
-        refused: names that occur twice, each with the reason.
-    """
+    """Cameras by COLMAP's id, images by name, and names that occur twice, each with the reason."""
 
     file: Path
     cameras: Mapping[int | str, ColmapCamera]
