@@ -7,18 +7,19 @@ import importlib.metadata
 import inspect
 import os
 import subprocess
-import sys
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
+import grpc
 import pytest
+from grpc_reflection.v1alpha import reflection_pb2
 from support.programs import printed
-from support.servers import CAMERA, PHOTO, pose, serving
+from support.servers import serving
 
 import mapless
 import mapless_server
-from mapless import Client, NewReference, wire
+from mapless import wire
 from mapless.axes import Axes
 from mapless.v1 import localization_service_pb2, reference_service_pb2
 from mapless_server.method.options import ScaleStrategy, Variant
@@ -86,100 +87,28 @@ def test_the_public_names() -> None:
     assert importlib.metadata.version("mapless") == mapless_server.__version__
 
 
-REFLECTING_CALLER = '''
-"""Calls a server as grpcurl does: all it knows of the interface comes from the server."""
-import atexit, json, sys
-import grpc
-from google.protobuf import descriptor_pb2, descriptor_pool, json_format, message_factory
-from grpc_reflection.v1alpha import reflection_pb2
-
-address, version, request = sys.argv[1:]
-channel = grpc.insecure_channel(address)
-atexit.register(channel.close)  # an open one may keep the interpreter from ending
-reflect = channel.stream_stream(
-    f"/grpc.reflection.{version}.ServerReflection/ServerReflectionInfo",
-    request_serializer=reflection_pb2.ServerReflectionRequest.SerializeToString,
-    response_deserializer=reflection_pb2.ServerReflectionResponse.FromString,
-)
-
-def ask(**question):
-    return next(reflect(iter([reflection_pb2.ServerReflectionRequest(**question)]), timeout=20))
-
-services = [service.name for service in ask(list_services="").list_services_response.service]
-files = {}
-
-def collect(response):
-    for data in response.file_descriptor_response.file_descriptor_proto:
-        file = descriptor_pb2.FileDescriptorProto.FromString(data)
-        if file.name not in files:
-            files[file.name] = file
-            for dependency in file.dependency:
-                collect(ask(file_by_filename=dependency))
-
-collect(ask(file_containing_symbol="mapless.v1.LocalizationService"))
-pool = descriptor_pool.DescriptorPool()
-
-def add(name):
-    file = files.pop(name, None)
-    if file is not None:
-        for dependency in file.dependency:
-            add(dependency)
-        pool.Add(file)
-
-for name in list(files):
-    add(name)
-method = pool.FindServiceByName("mapless.v1.LocalizationService").methods_by_name["Localize"]
-message = json_format.ParseDict(json.loads(request), message_factory.GetMessageClass(method.input_type)())
-call = channel.unary_unary(
-    "/mapless.v1.LocalizationService/Localize",
-    request_serializer=lambda message: message.SerializeToString(),
-    response_deserializer=message_factory.GetMessageClass(method.output_type).FromString,
-)
-response = json_format.MessageToDict(call(message, timeout=20), preserving_proto_field_name=True)
-assert not [name for name in sys.modules if name.startswith("mapless")]
-print(json.dumps({"services": services, "response": response}))
-'''
+def reflected(address: str, version: str) -> set[str]:
+    """The services that a server names by one version of reflection; it describes the first of ours, too."""
+    questions: list[dict[str, Any]] = [
+        {"list_services": ""},
+        {"file_containing_symbol": "mapless.v1.LocalizationService"},
+    ]
+    with grpc.insecure_channel(address) as channel:
+        ask = channel.stream_stream(
+            f"/grpc.reflection.{version}.ServerReflection/ServerReflectionInfo",
+            reflection_pb2.ServerReflectionRequest.SerializeToString,
+            reflection_pb2.ServerReflectionResponse.FromString,
+        )
+        requests = iter([reflection_pb2.ServerReflectionRequest(**it) for it in questions])
+        listed, described = ask(requests, timeout=20)
+    assert described.file_descriptor_response.file_descriptor_proto
+    return {it.name for it in listed.list_services_response.service}
 
 
 @pytest.mark.parametrize("version", ["v1", "v1alpha"])
-def test_a_caller_with_nothing_but_reflection_localizes(tmp_path: Path, version: str) -> None:
-    import base64
-    import json
-
-    from google.protobuf import json_format
-
-    with serving(tmp_path) as server, Client(server.address) as client:
-        client.create_scene("s")
-        client.add_reference("s", NewReference("r", PHOTO, CAMERA, pose(1.5)))
-        request = {
-            "scene": "scenes/s",
-            "image": base64.b64encode(PHOTO).decode(),
-            "intrinsics": json_format.MessageToDict(wire.camera_to_message(CAMERA)),
-            "options": {"variant": "VARIANT_FULL"},
-        }
-        done = subprocess.run(
-            [sys.executable, "-c", REFLECTING_CALLER, server.address, version, json.dumps(request)],
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
-        )
-    assert done.returncode == 0, done.stderr
-    answer = json.loads(done.stdout)
-    assert {"mapless.v1.LocalizationService", "mapless.v1.ReferenceService", "grpc.health.v1.Health"} <= set(
-        answer["services"]
-    )
-    assert answer["response"]["localization"]["world_from_camera"]["translation_m"]["x"] == 1.5
-    assert answer["response"]["diagnostics"]["variant"] == "VARIANT_FULL"
-
-
-def test_reflection_can_be_turned_off(tmp_path: Path) -> None:
-    with serving(tmp_path, reflection=False) as server:
-        done = subprocess.run(
-            [sys.executable, "-c", REFLECTING_CALLER, server.address, "v1alpha", "{}"],
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
-        )
-    assert "UNIMPLEMENTED" in done.stderr
+def test_reflection_describes_the_services_unless_turned_off(tmp_path: Path, version: str) -> None:
+    with serving(tmp_path / "open") as server:
+        ours = {"mapless.v1.LocalizationService", "mapless.v1.ReferenceService", "grpc.health.v1.Health"}
+        assert ours <= reflected(server.address, version)
+    with serving(tmp_path / "closed", reflection=False) as server, pytest.raises(grpc.RpcError, match="UNIMPLEMENTED"):
+        reflected(server.address, version)

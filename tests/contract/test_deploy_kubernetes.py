@@ -20,7 +20,7 @@ from urllib.request import urlopen
 import kubernetes_validate  # type: ignore[import-untyped]
 import pytest
 import yaml  # type: ignore[import-untyped]
-from support.manifests import OLDEST, VERSIONS, Json, built, check_confined, check_valid, needs_kubectl
+from support.manifests import OLDEST, Json, built, check_confined, check_valid, needs_kubectl
 
 from mapless_server.networks.weights.catalogue import CATALOGUE
 from mapless_server.observability.exporter import MetricsServer
@@ -122,22 +122,6 @@ def test_kustomizations_name_every_file_and_no_other() -> None:
         assert {name for name in named if not name.startswith("..")} == here
         for folder in [name for name in named if name.startswith("..")] + document.get("components", []):
             assert (kustomization.parent / folder / "kustomization.yaml").is_file()
-
-
-@pytest.mark.parametrize("version", VERSIONS)
-@pytest.mark.parametrize("folder", ["base", "weights", "components/autoscaling"])
-def test_every_resource_is_valid(folder: str, version: str) -> None:
-    (kustomization,) = read(KUBERNETES / folder / "kustomization.yaml")
-    for name in kustomization["resources"]:
-        for document in read(KUBERNETES / folder / name):
-            kubernetes_validate.validate(document, version, strict=True)
-
-
-def test_no_secret_is_in_the_files() -> None:
-    documents = [document for path in KUBERNETES.rglob("*.yaml") for document in read(path)]
-    kinds = {document["kind"] for document in documents if isinstance(document, dict)}  # a list is a patch
-    assert set(WORKLOADS) <= kinds
-    assert "Secret" not in kinds
 
 
 # What kustomize makes of them
@@ -371,6 +355,7 @@ def test_the_database_is_let_through_when_there_is_one() -> None:
 def test_scaling_joins_any_of_them_that_shares_a_database(folder: str, tmp_path: Path) -> None:
     """As many as there is work for; no other field sets the number."""
     documents = built(extended(folder, ["postgres", "autoscaling"], tmp_path))
+    check_valid(documents)
     scaled = the(documents, "Deployment")
     scaler = the(documents, "HorizontalPodAutoscaler")["spec"]
     assert "replicas" not in scaled["spec"]

@@ -7,8 +7,6 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from mapless.v1 import geometry_pb2, localization_service_pb2, reference_service_pb2
 
 ROOT = Path(__file__).parents[2]
@@ -25,10 +23,6 @@ def in_csharp(name: str) -> str:
 
 def fields(message: Any) -> dict[str, Any]:
     return {in_csharp(it.name): it for it in message.fields}
-
-
-def test_the_names_of_fields_in_csharp() -> None:
-    assert (in_csharp("position_95_m"), in_csharp("in_axes"), in_csharp("x")) == ("Position95M", "InAxes", "X")
 
 
 def test_what_is_set_exists() -> None:
@@ -84,8 +78,3 @@ def test_the_recipe_names_all_protos_and_they_are_there() -> None:
     (line,) = re.findall(r"^ {4}(protoc .*)$", recipe, re.MULTILINE)
     named = {part for part in shlex.split(line) if part.endswith(".proto")}
     assert named == {str(path.relative_to(ROOT)) for path in (ROOT / "proto").rglob("*.proto")}
-
-
-@pytest.mark.parametrize("name", ["MaplessClient.cs"])
-def test_the_copied_file_is_there(name: str) -> None:
-    assert f"cp client/unity/{name} " in (UNITY / "README.md").read_text()
