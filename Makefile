@@ -91,7 +91,7 @@ load: setup  ## Measure the server under load; DATA=folder for real photographs,
 	$(BIN)/mapless-server load all $(if $(DATA),--data '$(DATA)') $(ARGS)
 
 RUNS ?= 1000000
-fuzz: setup  ## Fuzz what reads untrusted input; TARGET="images names" for some, RUNS=1000 for few, ARGS="--parallel 2"
+fuzz: setup  ## Fuzz what reads untrusted input; TARGET="images colmap" for some, RUNS=1000 for few, ARGS="--parallel 2"
 	PYTHONPATH=tests $(BIN)/python -m fuzz.campaign --output fuzz-output --runs $(RUNS) --targets $(TARGET) $(ARGS)
 
 load-ray: setup  ## Measure replicas on Ray Serve, on this machine: half an hour; PART=overhead, throughput, failover or redeploys

@@ -22,9 +22,7 @@ TARGETS = {
     "colmap": "importers",
     "captures": "importers",
     "benchmarks": "importers",
-    "names": "store text",
-    "stored": "store text",
-    "configuration": "store text",
+    "configuration": "text of operators",
 }
 """The area of each target by its name, which is its module's too."""
 

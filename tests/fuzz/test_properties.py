@@ -7,6 +7,7 @@ import io
 import json
 import math
 import struct
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ from mapless_server.services.messages.answers import answer_frames_of
 from mapless_server.services.messages.queries import query_from_message
 from mapless_server.services.messages.references import Page
 from mapless_server.store import SceneAttributes, codec
-from mapless_tools.dataset import Dataset, Refusal, printable
+from mapless_tools.dataset import Dataset, Refusal, legal_id, printable
 from mapless_tools.ingest.formats import read_dataset
 from mapless_tools.ingest.formats.writing import LAYOUTS, PosedImage
 from mapless_tools.ingest.report import ImportReport, print_report
@@ -41,6 +42,8 @@ from mapless_tools.ingest.report import ImportReport, print_report
 LIMITS = ImageLimits()
 RGB = textured(40, 32)
 PNG = encode(".png", RGB)
+
+STORED_FIELDS = ("camera", "world_from_camera", "distortion", "model", "count", "datum", "down_in_world", "calibration")
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 identifiers = st.from_regex(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,20}[A-Za-z0-9_])?", fullmatch=True).filter(str.isascii)
@@ -211,6 +214,9 @@ def test_the_report_can_be_printed_for_any_frame_file(text: str) -> None:
     json.dumps(vars(dataset.refused[0])).encode()
 
 
+OTHER_LISTS = (("others", "scenes"), ("acme", "scenes/hall"), ("acme", "scenes/hall audit"), ("acm", "e\nscenes"))
+
+
 @given(st.lists(identifiers, max_size=12, unique=True).map(sorted), st.integers(1, 5))
 def test_pages_have_each_of_a_list_once_and_in_order(ids: list[str], size: int) -> None:
     listed: list[str] = []
@@ -222,8 +228,9 @@ def test_pages_have_each_of_a_list_once_and_in_order(ids: list[str], size: int) 
         listed += records
         if not token:
             break
-        with pytest.raises(FieldError, match="page_token"):
-            Page(reference_pb.ListScenesRequest(page_token=token), "others", "scenes")
+        for tenant, collection in OTHER_LISTS:
+            with pytest.raises(FieldError, match="page_token"):
+                Page(reference_pb.ListScenesRequest(page_token=token), tenant, collection)
     assert listed == ids
 
 
@@ -247,6 +254,29 @@ def test_an_id_is_ascii_fit_for_names_and_files_or_refused(text: str) -> None:
     assert wire.scene_id_from_name(names.scene_name(text), "name") == text
     assert wire.reference_ids_from_name(names.reference_name(text, text), "name") == (text, text)
     assert Path(text).name == text
+    assert legal_id(text, ()) == text
+
+
+@given(st.text(max_size=140))
+def test_any_file_name_gives_a_legal_id_that_is_not_taken(text: str) -> None:
+    made = legal_id(text, ())
+    assert names.check_id(made) == made
+    assert legal_id(text, {made}) != made
+
+
+anything = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(STORED_FIELDS), inner, max_size=4),
+)
+
+
+@given(anything.map(lambda it: json.dumps(it).encode()) | st.binary(max_size=99))
+def test_bytes_of_another_form_are_damaged_or_read(data: bytes) -> None:
+    """Although their checksum is right."""
+    sha256 = codec.sha256_for("owner", data)
+    for read_stored in (codec.decode_geometry, codec.decode_view, codec.decode_attributes):
+        with suppress(codec.Damaged):
+            read_stored("owner", data, sha256)
 
 
 @given(st.tuples(*[finite] * 9), st.tuples(*[finite] * 12), st.integers(0, 10_000), st.integers(1, 255))

@@ -55,15 +55,15 @@ def test_a_finding_ends_the_campaign_and_is_kept(tmp_path: Path, monkeypatch: py
     folder.mkdir()
     for file in Path(campaign.__file__).parent.glob("*.py"):
         (folder / file.name).write_bytes(file.read_bytes())
-    (folder / "names.py").write_text(
+    (folder / "images.py").write_text(
         "from .target import Target\n"
         "def check(data):\n    assert b'bad' not in data, 'a law'\n    return True\n"
         "TARGET = Target(lambda: [b'good', b'this is bad'], check, lambda data, random, mutate: mutate(data))\n"
     )
     monkeypatch.setattr(campaign, "TESTS", tmp_path)
-    outcome = campaign.fuzz("names", tmp_path / "output", RUNS, SEED, LIMIT_S)
+    outcome = campaign.fuzz("images", tmp_path / "output", RUNS, SEED, LIMIT_S)
     (finding,) = outcome.findings
     assert Path(finding).read_bytes() == b"this is bad"
     assert outcome.exit_code != 0
-    assert "AssertionError: a law" in (tmp_path / "output" / "names" / "log").read_text()
-    assert "| store text | names |" in campaign.table([outcome])
+    assert "AssertionError: a law" in (tmp_path / "output" / "images" / "log").read_text()
+    assert "| image decoding | images |" in campaign.table([outcome])
