@@ -12,7 +12,6 @@ from pathlib import Path
 import grpc
 import pytest
 from support.messages import essence
-from support.planted_damage import damage
 from support.servers import listening
 from support.stores import Folder
 from support.waiting import wait_until
@@ -23,7 +22,7 @@ from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scenes.background import BackgroundMatching
-from mapless_server.security import RateLimiter, SceneKey
+from mapless_server.security import RateLimiter
 from mapless_server.serve.assembly import make_engine
 from mapless_server.settings import Settings
 from mapless_server.store import Store, calibrations, pairs
@@ -145,25 +144,6 @@ def test_switched_off_damaged_pairs_are_deleted(matched: Path, expected: list[by
         assert served.value("mapless_background_pairs_total") == 0
 
 
-def test_damaged_pairs_change_no_answer_and_are_made_again(matched: Path, expected: list[bytes]) -> None:
-    Folder(matched).execute("UPDATE reference_pair SET data = zeroblob(16)")
-    with serving(matched) as served:
-        assert served.answers() == expected
-        damaged = served.value("mapless_stored_pairs_total", result="damaged")
-        assert damaged > 0
-        wait_until(lambda: served.value("mapless_background_pairs_total") == damaged)
-
-
-def test_background_work_that_fails_fails_no_query(data_dir: Path, expected: list[bytes]) -> None:
-    with Store.open(data_dir) as store:
-        damage(store, SceneKey("room"), room().references[0].name, "features")
-    with serving(data_dir) as served:
-        wait_until(lambda: served.value("mapless_background_failures_total") == 2)  # strict and wide
-        wait_until(lambda: served.value("mapless_background_pairs_total") == (REFERENCES - 1) * (REFERENCES - 2))
-        assert len(served.answers()) == len(expected)
-        assert served.value("mapless_background_waiting") == 1
-
-
 def test_what_a_killed_server_began_is_finished(
     data_dir: Path, expected: list[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -181,6 +161,7 @@ def test_what_a_killed_server_began_is_finished(
         assert served.answers() == expected
 
 
+@pytest.mark.nightly
 def test_a_killed_servers_scene_is_calibrated_by_the_next(
     matched: Path, expected: list[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -20,13 +20,11 @@ from mapless import (
     AlreadyExists,
     Client,
     ConnectOptions,
-    DeadlineExceeded,
     InvalidArgument,
     LocalizationResult,
     NewReference,
     NotFound,
     Rejected,
-    ResourceExhausted,
     Unavailable,
     aio,
 )
@@ -126,19 +124,6 @@ def test_a_server_that_is_busy_twice_answers_the_third_time(connect: Connect, co
 
 
 @both
-@pytest.mark.parametrize("retry_after_s", [None, 60.0])
-def test_a_permanent_refusal_is_not_retried(connect: Connect, retry_after_s: float | None) -> None:
-    with (
-        failing([status("RESOURCE_EXHAUSTED", retry_after_s)] * 9) as (address, server),
-        connect(address, FAST) as client,
-        pytest.raises(ResourceExhausted) as caught,
-    ):
-        client.localize(PHOTO, CAMERA, "s", timeout_s=20.0)
-    assert caught.value.retry_after_s == retry_after_s
-    assert len(server.tries) == 1
-
-
-@both
 def test_a_change_whose_answer_was_lost_is_made_once(server: RunningServer, connect: Connect) -> None:
     scene = f"lost-{time.monotonic_ns()}"
     references = [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(2)]
@@ -211,12 +196,6 @@ def test_calls_go_on_when_a_server_restarts(tmp_path: Path, connect: Connect) ->
         finally:
             leave.set()
             thread.join(60)
-
-
-@both
-def test_a_deadline_ends_a_call(server: RunningServer, connect: Connect, scene: str) -> None:
-    with connect(server.address) as client, server.method.held(), pytest.raises(DeadlineExceeded):
-        client.localize(PHOTO, CAMERA, scene, timeout_s=0.5)
 
 
 def test_closing_a_client_ends_its_pauses() -> None:

@@ -152,12 +152,12 @@ def test_a_wrong_name_gets_a_suggestion(run: Run, client: Client, arguments: tup
     assert "did you mean" not in run("scene", "get", "something-else")[2]
 
 
-@pytest.mark.parametrize(("typed", "meant"), [("reference sh", "show"), ("scene g", "get"), ("scene de", "delete")])
-def test_the_shell_completes_commands(typed: str, meant: str) -> None:
+def test_the_shell_completes_commands() -> None:
+    meant = {"reference sh": "show", "scene g": "get", "scene de": "delete"}
     script = subprocess.run([sys.executable, "-m", "mapless", "completion", "bash"], capture_output=True, text=True)
-    asked = f'COMP_WORDS=(mapless {typed}); COMP_CWORD=2; _shtab_mapless; echo "${{COMPREPLY[@]}}"'
-    done = subprocess.run(["bash", "-c", f"{script.stdout}\n{asked}"], capture_output=True, text=True)
-    assert (done.stdout, script.stderr + done.stderr) == (f"{meant}\n", "")
+    asked = [f'COMP_WORDS=(mapless {it}); COMP_CWORD=2; _shtab_mapless; echo "${{COMPREPLY[@]}}"' for it in meant]
+    done = subprocess.run(["bash", "-c", "\n".join([script.stdout, *asked])], capture_output=True, text=True)
+    assert (done.stdout.split(), script.stderr + done.stderr) == ([*meant.values()], "")
 
 
 @pytest.mark.parametrize(

@@ -53,14 +53,6 @@ def test_what_is_missing_or_taken_is_named_as_a_resource(client: Client, stubs: 
         assert found.description
 
 
-def test_every_error_has_the_request_id_in_its_details(stubs: Stubs) -> None:
-    for call, request in (
-        (stubs.references.GetScene, pb.GetSceneRequest(name="no name")),
-        (stubs.localization.Localize, localize_request("nowhere")),
-    ):
-        assert details_of(call, request, "my-id-7")["RequestInfo"].request_id == "my-id-7"
-
-
 def test_health_lists_all_services(server: RunningServer) -> None:
     with grpc.insecure_channel(server.address) as channel:
         call = channel.unary_unary(

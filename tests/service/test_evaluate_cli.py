@@ -45,6 +45,7 @@ def test_leaves_one_out(folder: Path, tmp_path: Path) -> None:
         assert len(query["references"]) == 8
 
 
+@pytest.mark.nightly
 def test_chosen_references(folder: Path, tmp_path: Path) -> None:
     done = run("evaluate", folder, "--references", 4, "--queries", 3, "--k", 3, "--json", tmp_path / "figures.json")
     assert done.exit_code == 0, done.output

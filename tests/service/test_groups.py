@@ -9,7 +9,6 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-import grpc
 import numpy as np
 import pytest
 from support.compare import assert_pose_close
@@ -40,8 +39,6 @@ from mapless.axes import Axes, pose_to
 from mapless.geometry import rotation_from_vector
 from mapless.v1 import geometry_pb2 as geometry_pb
 from mapless.v1 import localization_service_pb2 as pb
-from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
-from mapless_server.services.capture.files import calls_of
 
 CORNER = Camera(320, 240, 280.0, 280.0, 160.3, 118.9)
 STANDPOINTS = [corner_pose(-15.0 + 6 * i, height_m=-1.6 + 0.05 * (i % 2)) for i in range(6)]
@@ -283,24 +280,6 @@ def test_a_group_with_too_many_bytes_is_refused(tmp_path: Path) -> None:
             client.localize_rig([image] * 2, "hall")
         assert (refused.value.code, refused.value.reason) == ("RESOURCE_EXHAUSTED", "TOO_LARGE")
         assert isinstance(client.localize_rig([image], "hall"), GroupRejected)
-
-
-def test_each_captured_photograph_is_announced(tmp_path: Path) -> None:
-    captured = tmp_path / "captured"
-    with serving(tmp_path / "data", capture_dir=captured) as server, Client(server.address) as client:
-        client.create_scene("hall")
-        with grpc.insecure_channel(server.address) as channel:
-            stub = LocalizationServiceStub(channel)
-            rig = stub.LocalizeRig(rig_request("hall"), timeout=30)
-            sequence = stub.LocalizeSequence(sequence_request("hall"), timeout=30)
-            secret_rig, secret_walk = rig_request("hall"), sequence_request("hall")
-            secret_rig.options.confidential = secret_walk.options.confidential = True
-            secrets = [stub.LocalizeRig(secret_rig, timeout=30), stub.LocalizeSequence(secret_walk, timeout=30)]
-    for answer in (rig, sequence):
-        assert [report.diagnostics.captured for report in answer.images] == [True] * 3
-    for answer in secrets:
-        assert [report.diagnostics.captured for report in answer.images] == [False] * 3
-    assert len(list(calls_of(captured))) == 2
 
 
 def test_an_unknown_scene_is_not_found(stubs: Stubs) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.images import cmyk_jpeg, encode, png_claiming, textured, with_exif_orientation
+from support.images import encode, png_claiming, textured, with_exif_orientation
 from support.messages import set_field
 from support.servers import CAMERA, COVARIANCE, PHOTO, RunningServer, Stubs, failure_of, localize_request, pose
 
@@ -27,11 +27,9 @@ from mapless import (
 from mapless.geometry import Camera
 from mapless.v1 import geometry_pb2 as geometry_pb
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_server.images import ImageLimits, decode_image
 from mapless_server.security import SceneKey
 from mapless_server.store import Store
 
-DEEP = np.random.default_rng(3).integers(0, 65536, (64, 96, 3)).astype(np.uint16)
 JPEG = encode(".jpg", textured())
 
 
@@ -79,12 +77,6 @@ def test_an_answer_in_full(client: Client, scene: str) -> None:
     assert len(used.request_id) == 32
 
 
-def test_without_references_the_server_chooses(client: Client, scene: str) -> None:
-    answer = localized(client.localize(PHOTO, CAMERA, scene, reference_count=2))
-    assert len(answer.diagnostics.references) == 2
-    assert "retrieval" in answer.diagnostics.stage_s
-
-
 @pytest.mark.parametrize("deletions", [1, 2, 3])
 def test_references_that_go_while_the_server_chooses(
     server: RunningServer, client: Client, scene: str, monkeypatch: pytest.MonkeyPatch, deletions: int
@@ -127,26 +119,6 @@ def test_a_pose_outside_the_prior_is_rejected(client: Client, scene: str) -> Non
     answer = rejected(client.localize(PHOTO, CAMERA, scene, ["r1"], priors=Priors(far)))
     assert answer.reason == "PRIOR_CONFLICT"
     assert "0.10 m outside" in answer.message
-
-
-@pytest.mark.parametrize(
-    ("image", "same_as"),
-    [
-        (encode(".png", DEEP), None),
-        (cmyk_jpeg(np.full((8, 12, 4), 200, np.uint8)), None),
-        (encode(".png", textured(channels=4)), None),
-        (encode(".png", textured()[..., 0].copy()), None),
-        (encode(".webp", textured()), None),
-        (with_exif_orientation(JPEG, 6), JPEG),
-    ],
-    ids=["16 bit", "CMYK", "alpha", "grey", "webp", "EXIF"],
-)
-def test_unusual_images_are_read_as_stored(
-    server: RunningServer, client: Client, scene: str, image: bytes, same_as: bytes | None
-) -> None:
-    localized(client.localize(image, CAMERA, scene))
-    expected = decode_image(same_as or image, ImageLimits())
-    np.testing.assert_array_equal(server.extractors[0].seen[-1], expected)
 
 
 def test_exif_orientation_does_not_turn_the_intrinsics(client: Client, scene: str) -> None:

@@ -38,6 +38,10 @@ from mapless_server.networks.runner import NetworkRunner
 
 CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
 DISTANCE_M = 3.0
+by_one = pytest.mark.parametrize(
+    "name", [it if it == "pi3x" else pytest.param(it, marks=pytest.mark.nightly) for it in NETWORKS]
+)
+"""What no network decides; nightly with the others."""
 WALL = textured(800, 240, seed=8)
 """Wallpaper: it moves by 100 px when the camera moves by a metre along it."""
 NAMES = ["r0", "r1", "r2", "r3"]
@@ -110,7 +114,7 @@ def test_a_network_of_nans_gives_no_coarse_pose(tmp_path: Path, name: str, caplo
     assert f"{name}: the network's output is not finite" in [record.message for record in caplog.records]
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@by_one
 def test_calls_waiting_for_a_network_become_one_batch(tmp_path: Path, name: str) -> None:
     sizes: list[int] = []
     entered, gate = threading.Semaphore(0), threading.Event()
@@ -146,7 +150,7 @@ def test_calls_waiting_for_a_network_become_one_batch(tmp_path: Path, name: str)
         assert backend.cache.counters.misses == 4
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@by_one
 def test_a_call_whose_deadline_passes_in_the_network_fails_alone(tmp_path: Path, name: str) -> None:
     entered, gate = threading.Semaphore(0), threading.Event()
 
@@ -169,7 +173,7 @@ def test_a_call_whose_deadline_passes_in_the_network_fails_alone(tmp_path: Path,
         assert isinstance(client.localize(photograph, CAMERA, "wall", NAMES), LocalizationResult | Rejected)
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@by_one
 def test_too_little_memory_fails_the_call_alone(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A query that does not fit alone is UNAVAILABLE; a batch that does not fit is split, and answered."""
     photograph, most = encode(".png", photograph_at(0.7)), [0]

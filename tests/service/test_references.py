@@ -51,15 +51,6 @@ def test_the_life_of_a_scene(client: Client) -> None:
             operation("life")
 
 
-def test_a_deleted_scene_takes_no_memory(client: Client, server: RunningServer) -> None:
-    before = server.engine.references.index_bytes
-    make_scene(client, "chosen")
-    client.localize(PHOTO, CAMERA, "chosen")
-    assert server.engine.references.index_bytes > before
-    client.delete_scene("chosen")
-    assert server.engine.references.index_bytes == before
-
-
 @pytest.mark.parametrize("ends", ["late", "full"])
 def test_a_scene_whose_deletion_is_slow_takes_no_memory(tmp_path: Path, ends: str) -> None:
     """The scene is gone by then."""
@@ -240,13 +231,3 @@ def test_a_page_is_made_off_the_event_loop(client: Client, scene: str, monkeypat
     client.add_references(scene, [NewReference(f"new{i}", PHOTO, CAMERA, pose(i)) for i in range(3)])
     assert threads
     assert all(name.startswith("asyncio_") for name in threads)  # the loop's default executor
-
-
-def test_the_metrics_count_store_reads_of_a_localization(tmp_path: Path) -> None:
-    with serving(tmp_path) as server, Client(server.address) as client:
-        make_scene(client)
-        for _ in range(3):
-            client.localize(PHOTO, CAMERA, "s", ["r0"])
-        assert server.value("mapless_store_op_seconds_count", op="load_references") == 3
-        assert server.value("mapless_store_op_seconds_count", op="add_references") == 1
-        assert server.value("mapless_store_errors_total") == 0

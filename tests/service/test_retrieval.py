@@ -96,22 +96,6 @@ def test_a_name_that_is_wrong_is_found_out_when_reranking_too(client: Client) ->
     assert caught.value.field == "references[1]"
 
 
-def test_a_position_prior_narrows_to_its_radius_and_ten_metres(client: Client) -> None:
-    prior = PositionPrior(pose(0.0).translation, 1.0)
-    found = client.retrieve_references(PHOTOS[9], CAMERA, "hall", 1000, priors=Priors(prior))
-    assert sorted(ids([it.name for it in found])) == ["r00", "r01", "r02"]
-
-
-def test_a_heading_prior_narrows_to_its_angle_and_sixty_degrees(client: Client) -> None:
-    axis = pose(0.0).rotation[:, 2]
-    near = client.retrieve_references(
-        PHOTOS[0], CAMERA, "hall", 1000, priors=Priors(heading=HeadingPrior(3 * axis, 1.0))
-    )
-    expected = [i for i in range(COUNT) if axis @ pose(SPACING_M * i).rotation[:, 2] >= np.cos(np.radians(61))]
-    assert sorted(ids([it.name for it in near])) == [f"r{i:02}" for i in expected]
-    assert 0 < len(expected) < COUNT
-
-
 def test_a_pose_against_the_heading_prior_is_rejected(client: Client) -> None:
     axis = pose(0.0).rotation[:, 2]
     ahead, behind = (Priors(heading=HeadingPrior(sign * axis, 5.0)) for sign in (1, -1))

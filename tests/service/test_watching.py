@@ -125,11 +125,6 @@ def test_watchers_above_the_limit_are_refused(stub: LocalizationServiceStub) -> 
         call.cancel()
 
 
-def test_a_deadline_of_the_callers_own_ends_it(stub: LocalizationServiceStub) -> None:
-    failure = ending(stub.WatchQueries(REQUEST, timeout=0.3))
-    assert failure.code == "DEADLINE_EXCEEDED"
-
-
 def test_the_end_of_the_server_ends_it_at_once(tmp_path: Path) -> None:
     with serving(tmp_path, allow_watching=True, drain_grace_s=60) as leaving:
         with Client(leaving.address) as client:

@@ -113,6 +113,12 @@ def test_each_photograph_of_a_captured_group_is_marked(served: tuple[Client, Loc
         stub.LocalizeRig(pb.LocalizeRigRequest(scene="scenes/s", images=images), timeout=30),
         stub.LocalizeSequence(pb.LocalizeSequenceRequest(scene="scenes/s", frames=frames), timeout=30),
     )
+    secret = pb.LocalizeOptions(confidential=True)
+    for kept_out in (
+        stub.LocalizeRig(pb.LocalizeRigRequest(scene="scenes/s", images=images, options=secret), timeout=30),
+        stub.LocalizeSequence(pb.LocalizeSequenceRequest(scene="scenes/s", frames=frames, options=secret), timeout=30),
+    ):
+        assert [it.diagnostics.captured for it in kept_out.images] == [False, False]
     assert [[it.diagnostics.captured for it in answer.images] for answer in answers] == [[True, True]] * 2
     wait_until(lambda: len(captured_in(folder)) == 2)
     assert [decode_call(it.read_bytes()).response for it in captured_in(folder)] == [
