@@ -59,9 +59,7 @@ def read_camera(source: str | Path, photo: str | Path | None = None) -> Camera:
 def read_pose(source: str | Path) -> RigidTransform:
     """Reads a pose: JSON (a file or text) in the form of RigidTransform, or a 4x4 or 3x4 matrix.
 
-    Raises:
-        OSError: the file cannot be read.
-        ValueError: the source is not a valid pose; the message names the file and the field.
+    ValueError, for what is no valid pose, names the file and the field; OSError, if the file cannot be read.
     """
     text = str(source)
     is_inline = text.lstrip().startswith(("{", "["))
@@ -106,10 +104,9 @@ def read_cameras(file: str | Path) -> dict[Path, Camera]:
 
 
 def camera_of_frame(frame: Mapping[str, Any]) -> Camera:
-    """Camera of a frame of a cameras.json. Its numbers are finite, but the interface's bounds are not checked.
+    """Camera of a frame of a cameras.json; ValueError names a field that is missing or wrong.
 
-    Raises:
-        ValueError: a field is missing or wrong; the message names it.
+    Its numbers are finite, but the interface's bounds are not checked.
     """
     if missing := [it for it in ("width", "height", "K") if it not in frame]:
         raise ValueError(f"{', '.join(missing)} {'is' if len(missing) == 1 else 'are'} missing")

@@ -92,10 +92,7 @@ class Client:
     def acting_for(self, token: str | None, client_id: str = "") -> Client:
         """A client on the same connection with another token and client id, for programs that serve several users.
 
-        Closing this client also ends the returned one.
-
-        Raises:
-            ValueError: see `ConnectOptions`.
+        Closing this client also ends the returned one. ValueError as of `ConnectOptions`.
         """
         other = copy(self)
         other.options = replace(self.options, token=token, client_id=client_id)

@@ -39,12 +39,9 @@ _LATENESS = 0.25  # relative, added to the server's RetryInfo at random: many re
 
 @dataclass(frozen=True)
 class Call:
-    """One call, of one request and one answer.
+    """One call, of one request and one answer, "package.Service/Method".
 
     Attributes:
-        method: "package.Service/Method".
-        request: the message.
-        response_type: type of the answer.
         timeout_s: deadline in seconds, above 0, for all attempts, pauses and calls of `on_repeat`; None for the
             default.
         is_upload: whether the default is `upload_timeout_s`.
@@ -133,16 +130,8 @@ def attempts(
 
     A call is retried if the server is UNAVAILABLE or lost, or RESOURCE_EXHAUSTED with RetryInfo; never if the pause
     would exceed the deadline. Attempts are counted, except those that the server's RetryInfo requests. An answer that
-    the exchange cannot read is an error of the server, `Internal`.
-
-    Args:
-        exchange: the calls.
-        options: limits of attempts and time.
-        clock: replaces the computer's clock.
-        deadline_s: deadline of all calls together, in the clock's time, in addition to each call's own.
-
-    Raises:
-        ValueError: a call's `timeout_s` is not above 0.
+    the exchange cannot read is an error of the server, `Internal`. `deadline_s` is that of all calls together, in the
+    clock's time, in addition to each call's own; ValueError if a call's `timeout_s` is not above 0.
     """
     clock = clock or _Clock()
     try:
@@ -177,9 +166,6 @@ class Reader:
     """Reads the messages of a call's attempts: a stream's early answer, once, and the outcome of each attempt.
 
     An attempt that fails after its early answer is retried like any other; the retry yields the final answer only.
-
-    Attributes:
-        outcome: outcome of the current attempt, for `attempts`.
     """
 
     outcome: Message | MaplessError

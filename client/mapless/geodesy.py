@@ -116,8 +116,7 @@ class Datum:
     def from_json(content: object) -> Datum:
         """Reads it from a JSON object; enu_from_world is optional.
 
-        Raises:
-            ValueError: a member is missing, is no number or out of bounds.
+        ValueError if a member is missing, is no number or out of bounds.
         """
         latitude_deg, longitude_deg, height_m = (_number(content, name) for name in _DATUM_NUMBERS)
         turned = content.get("enu_from_world") if isinstance(content, dict) else None
@@ -170,8 +169,7 @@ class GeoPose:
     def from_json(content: object) -> GeoPose:
         """Reads it from a JSON object; members that the standard does not define are ignored.
 
-        Raises:
-            ValueError: a member is missing, is no number or out of bounds.
+        ValueError if a member is missing, is no number or out of bounds.
         """
         position, quaternion = (
             content.get(it) if isinstance(content, dict) else None for it in ("position", "quaternion")

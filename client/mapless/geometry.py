@@ -42,8 +42,7 @@ class Quaternion:
     def matrix(self) -> Array:
         """The rotation matrix, (3, 3).
 
-        Raises:
-            ValueError: not finite, or the norm is further than ROTATION_TOLERANCE from one.
+        ValueError if not finite, or the norm is further than ROTATION_TOLERANCE from one.
         """
         q = np.array([self.x, self.y, self.z, self.w])
         norm = float(np.linalg.norm(q))
@@ -59,11 +58,7 @@ class Quaternion:
         )
 
     def normalized(self) -> Quaternion:
-        """The same rotation with norm 1 and w >= 0; one that has both keeps its bits.
-
-        Raises:
-            ValueError: as `matrix`.
-        """
+        """The same rotation with norm 1 and w >= 0; one that has both keeps its bits. ValueError as of `matrix`."""
         self.matrix()
         norm = math.hypot(self.x, self.y, self.z, self.w)
         factor = math.copysign(1.0, self.w) / (1.0 if abs(norm - 1) < 1e-12 else norm)
@@ -92,8 +87,7 @@ class Quaternion:
 def nearest_rotation(matrix: ArrayLike) -> Array:
     """The rotation nearest to a matrix that is almost one, (3, 3).
 
-    Raises:
-        ValueError: not finite, further than ROTATION_TOLERANCE from orthonormal, or a reflection.
+    ValueError if it is not finite, further than ROTATION_TOLERANCE from orthonormal, or a reflection.
     """
     m = np.asarray(matrix, float)
     if m.shape != (3, 3):
@@ -153,8 +147,7 @@ class RigidTransform:
     def from_matrix(matrix: ArrayLike) -> RigidTransform:
         """From a homogeneous matrix, (4, 4) or (3, 4); its rotation is re-orthonormalized.
 
-        Raises:
-            ValueError: wrong shape, not finite, or the rotation part is not a rotation.
+        ValueError if its shape is another, it is not finite, or the rotation part is not a rotation.
         """
         m = np.asarray(matrix, float)
         if m.shape not in ((4, 4), (3, 4)):
@@ -294,10 +287,8 @@ def unknown_lens(lens: object, field: str = "camera.distortion") -> TypeError:
 def lens_from_coefficients(model: object, coefficients: Sequence[float] | None) -> Distortion | None:
     """The lens of a model's name and its coefficients in their order, as a cameras.json has both.
 
-    None for the coefficients stands for zeros, of which the default model is a pinhole: no lens.
-
-    Raises:
-        ValueError: no such model, or not as many coefficients as it has.
+    None for the coefficients stands for zeros, of which the default model is a pinhole: no lens. ValueError for an
+    unknown model, or another number of coefficients than it has.
     """
     if not isinstance(model, str) or model not in LENS_MODELS:
         raise ValueError(f"lens must be one of {', '.join(LENS_MODELS)}, is {model!r}")

@@ -21,18 +21,11 @@ _WHOLE = (FieldDescriptor.TYPE_INT32, FieldDescriptor.TYPE_INT64)
 
 
 def read_message(source: str, message: M, required: Sequence[str], convert: Callable[[M, str], T], what: str) -> T:
-    """Reads what a JSON file, or JSON text, describes.
+    """Reads what a JSON file, or JSON text, describes, into a message with the same fields.
 
-    Args:
-        source: the file, or the text.
-        message: filled with what it holds; its fields are those of the JSON, all of them numbers or messages.
-        required: fields that must be given.
-        convert: makes the result of the message at a path, and checks its bounds.
-        what: a name for the text in error messages; a file has its own.
-
-    Raises:
-        OSError: the file cannot be read.
-        ValueError: it is not JSON, or a field is unknown, missing or wrong; names the file and the field.
+    `convert` makes the result of the message at a path, and checks its bounds; `what` is a name for the text in error
+    messages. ValueError, if it is not JSON, or a field is unknown, missing or wrong, names the file and the field;
+    OSError if the file cannot be read.
     """
     is_text = source.lstrip().startswith(("{", "["))
     name = what if is_text else source
@@ -52,11 +45,7 @@ def read_message(source: str, message: M, required: Sequence[str], convert: Call
 
 
 def read_json(text: str | bytes) -> Any:
-    """Parses JSON that names no field twice.
-
-    Raises:
-        ValueError: it is something else; says what.
-    """
+    """Parses JSON that names no field twice; ValueError if it is something else."""
     try:
         decoded = text.decode("utf-8-sig") if isinstance(text, bytes) else text
         if not decoded.strip():

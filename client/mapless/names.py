@@ -10,11 +10,7 @@ _SHOWN_CHARACTERS = 60  # of a wrong value in an error message: ids of 10,000 ha
 
 
 def check_id(value: str) -> str:
-    """The id of a scene or a reference, unchanged.
-
-    Raises:
-        ValueError: the value is not an id.
-    """
+    """The id of a scene or a reference, unchanged; ValueError if the value is not an id."""
     if not _ID.fullmatch(value) or ".." in value:
         raise ValueError(
             "an id is 1 to 128 characters of A-Z a-z 0-9 . _ -, begins and ends with a letter, digit or underscore and "
@@ -41,11 +37,7 @@ def reference_names(scene: str, references: Sequence[str]) -> list[str]:
 
 
 def parse_scene_name(name: str) -> str:
-    """The scene's id.
-
-    Raises:
-        ValueError: not "scenes/{scene}".
-    """
+    """The scene's id; ValueError if the name is not "scenes/{scene}"."""
     collection, _, scene_id = name.partition("/")
     if collection != "scenes" or not scene_id:
         raise ValueError(f"must be scenes/{{scene}}, got {shown(name)}")
@@ -53,11 +45,7 @@ def parse_scene_name(name: str) -> str:
 
 
 def parse_reference_name(name: str) -> tuple[str, str]:
-    """The ids of the scene and of the reference.
-
-    Raises:
-        ValueError: not "scenes/{scene}/references/{reference}".
-    """
+    """The ids of scene and reference; ValueError if the name is not "scenes/{scene}/references/{reference}"."""
     parts = name.split("/", 3)
     if len(parts) != 4 or parts[0] != "scenes" or parts[2] != "references":
         raise ValueError(f"must be scenes/{{scene}}/references/{{reference}}, got {shown(name)}")

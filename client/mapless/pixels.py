@@ -10,8 +10,7 @@ _JPEG_ALONE = frozenset({0x01, *range(0xD0, 0xD9)})  # markers that no segment f
 def size_of_image(data: bytes) -> tuple[int, int]:
     """Width and height of the raster as it is stored, pixels; EXIF orientation is not applied.
 
-    Raises:
-        ValueError: neither a JPEG nor a PNG nor a WebP file, or one without its header.
+    ValueError for neither a JPEG nor a PNG nor a WebP file, or one without its header.
     """
     try:
         if data.startswith(b"\xff\xd8"):

@@ -107,9 +107,7 @@ class Priors:
 def set_priors(request: Any, priors: Priors) -> None:
     """Sets the priors of a request; the fields of a prior and of its message have the same names.
 
-    Raises:
-        TypeError: a single prior was given.
-        ValueError: the request has no field for a prior.
+    TypeError if a single prior was given, ValueError if the request has no field for a prior.
     """
     if not isinstance(priors, Priors):
         raise TypeError(f"priors must be a Priors, such as Priors(position=...), is a {type(priors).__name__}")

@@ -43,10 +43,7 @@ class IntrinsicsUncertainty:
 def create_request(scene_name: str, reference: NewReference) -> reference_pb.CreateReferenceRequest:
     """The request that stores a reference; reads the photograph's file.
 
-    Raises:
-        OSError: the file cannot be read.
-        TypeError: a value has another type; names it.
-        ValueError: the pose's rotation is not a rotation.
+    TypeError names a value of another type; ValueError if the pose's rotation is not a rotation.
     """
     if not isinstance(reference.reference_id, str):
         raise TypeError(f"reference_id must be a text, is {reference.reference_id!r}")

@@ -86,11 +86,7 @@ class Calibration:
 
 
 def unit_vector(x: float, y: float, z: float) -> Vector:
-    """The direction of a vector.
-
-    Raises:
-        ValueError: its length is 0 or not finite.
-    """
+    """The direction of a vector; ValueError if its length is 0 or not finite."""
     longest = max(abs(x), abs(y), abs(z))
     if not 0 < longest < math.inf or not all(map(math.isfinite, (x, y, z))):
         raise ValueError("must be finite and not zero")
@@ -111,11 +107,7 @@ def datum_to_message(datum: Datum) -> pb.Datum:
 
 
 def datum_from_message(message: pb.Datum, field: str) -> Datum:
-    """Datum of a message, its quaternion normalized.
-
-    Raises:
-        FieldError: a number is out of range, or the quaternion's norm is not one.
-    """
+    """Datum of a message, its quaternion normalized; FieldError if a number is out of range, or its norm is not one."""
     ranges = (
         ("latitude_deg", -90.0, 90.0),
         ("longitude_deg", -180.0, 180.0),
@@ -165,8 +157,7 @@ def calibration_to_message(calibration: Calibration) -> pb.SceneCalibration:
 def calibration_from_message(message: pb.SceneCalibration, field: str) -> Calibration:
     """Calibration of a message, with its time; an unknown variant, from a newer program, is its number as text.
 
-    Raises:
-        FieldError: a number is out of range, or a text too long.
+    FieldError if a number is out of range, or a text too long.
     """
     for name in FACTORS:
         factor = getattr(message, name)

@@ -31,11 +31,7 @@ MIN_FOCAL_PER_SIDE, MAX_FOCAL_PER_SIDE = 0.01, 100.0
 
 
 class FieldError(ValueError):
-    """A field of a message violates its contract.
-
-    Attributes:
-        field: its path in the request.
-    """
+    """A field of a message, by its path in the request, violates its contract."""
 
     def __init__(self, field: str, message: str) -> None:
         super().__init__(f"{field}: {message}")
@@ -116,8 +112,7 @@ def camera_to_message(camera: Camera) -> pb.CameraIntrinsics:
 def camera_from_message(message: pb.CameraIntrinsics, field: str) -> Camera:
     """Camera of a message.
 
-    Raises:
-        FieldError: a number is not finite or out of the range that geometry.proto states.
+    FieldError if a number is not finite or out of the range that geometry.proto states.
     """
     for side in ("width_px", "height_px"):
         value = getattr(message, side)
@@ -167,8 +162,8 @@ def transform_from_message(
 ) -> RigidTransform:
     """Rigid transform of a message, its rotation normalized.
 
-    Raises:
-        FieldError: a part is missing or not finite, the quaternion's norm is not one, a coordinate exceeds the maximum.
+    FieldError if a part is missing or not finite, the quaternion's norm is not one, or a coordinate exceeds the
+    maximum.
     """
     for part in ("rotation", "translation_m"):
         if not message.HasField(part):
@@ -218,8 +213,7 @@ def value_name(enum: ProtoEnum, number: int) -> str:
 def enum_value(enum: ProtoEnum, value: str | Enum) -> Any:
     """The number of a value of an enum, given without prefix in small or capital letters; 0 for "".
 
-    Raises:
-        ValueError: the enum has no such value; the message lists those it has.
+    ValueError lists the values that the enum has.
     """
     prefix = enum_prefix(enum)
     written = str(value.value if isinstance(value, Enum) else value)

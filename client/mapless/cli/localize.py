@@ -109,8 +109,7 @@ def _print_paths(arguments: argparse.Namespace) -> None:
 def photos_of(folder: Path, camera: str | None) -> list[Photo]:
     """Lists the photographs of a folder: those of its cameras.json, or all of them if one camera is given.
 
-    Raises:
-        ValueError: there are no photographs, or there is no camera.
+    ValueError without photographs or without a camera.
     """
     if camera is None:
         if not (folder / FOLDER_FILE).is_file():

@@ -30,11 +30,9 @@ _ALIKE = 0.7
 class Plan:
     """A view along the vertical.
 
-    Attributes:
-        basis: (2, 3) world directions to the right and up on the page.
-        low: (2,) coordinates of the page's lower left corner along these, metres.
-        scale: units of the page per metre.
-        is_guessed: whether the direction of gravity was estimated from the cameras.
+    The basis (2, 3) is the world directions to the right and up on the page, `low` (2,) the coordinates of its lower
+    left corner along these, metres; the scale is units of the page per metre. `is_guessed` says whether the direction
+    of gravity was estimated from the cameras.
     """
 
     basis: Array
@@ -57,16 +55,10 @@ def plan_view(
     points: Array,
     down_in_world: ArrayLike | None,
 ) -> str:
-    """Draws the plan; empty without poses.
+    """Draws references, the used ones among them, and poses of the photograph; empty without poses.
 
-    Args:
-        references: by name.
-        used: names of the references used.
-        poses: poses of the photograph, with names; several if they contradict each other.
-        camera: camera of the photograph.
-        covariance: covariance of the first pose.
-        points: (N, 3) points of its inliers.
-        down_in_world: direction of gravity; None to estimate it from the cameras.
+    There are several poses, with names, if they contradict each other. The covariance and the points (N, 3), which are
+    its inliers, are of the first one.
     """
     cameras = [it.world_from_camera for it in references.values()] + [pose for _, pose in poses]
     if not cameras:

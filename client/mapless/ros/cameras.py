@@ -19,12 +19,7 @@ RATIONAL_COUNTS = (8, 12, 14)
 
 @dataclass(frozen=True, eq=False)
 class RosCamera:
-    """A camera in mapless's form, and how its images become photographs of it.
-
-    Attributes:
-        camera: camera of the photographs that `photo` returns.
-        undistortion: OpenCV's maps from the images to a pinhole; None where mapless has the lens.
-    """
+    """A camera in mapless's form, and OpenCV's maps from its images to a pinhole; none where mapless has the lens."""
 
     camera: Camera
     undistortion: tuple[NDArray[Any], NDArray[Any]] | None = None
@@ -32,8 +27,7 @@ class RosCamera:
     def photo(self, message: Any, lossless: bool = False) -> bytes:
         """Makes the file to send for a sensor_msgs/Image or CompressedImage.
 
-        Raises:
-            ValueError: the image cannot be read, or has another size than the camera.
+        ValueError if the image cannot be read, or has another size than the camera.
         """
         size = (self.camera.width_px, self.camera.height_px)
         if hasattr(message, "encoding") and (message.width, message.height) != size:
@@ -47,17 +41,11 @@ class RosCamera:
 
 
 def camera_from_info(message: Any, rectified: bool = False) -> RosCamera:
-    """The camera of a sensor_msgs/CameraInfo.
+    """The camera of a sensor_msgs/CameraInfo; of rectified images it is P instead of K and D.
 
     The lenses `plumb_bob` and `equidistant` exist in mapless. A `rational_polynomial` with zeros after the fifth
     coefficient is a `plumb_bob`; images of other ones are undistorted to a pinhole, cropped to the lens's field.
-
-    Args:
-        message: the CameraInfo.
-        rectified: whether the images are rectified already; then their camera is P instead of K and D.
-
-    Raises:
-        ValueError: the camera is not calibrated, its lens is unknown, or its image is binned or cropped.
+    ValueError if the camera is not calibrated, its lens is unknown, or its image is binned or cropped.
     """
     name, matrix, columns = ("p", list(message.p), 4) if rectified else ("k", list(message.k), 3)
     focal_x, focal_y, principal_x, principal_y = (float(matrix[i]) for i in (0, columns + 1, 2, columns + 2))

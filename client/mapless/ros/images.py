@@ -66,10 +66,8 @@ ENCODINGS: Mapping[str, _Encoding] = _encodings()
 def pixels_from_image(message: Any) -> NDArray[np.uint8]:
     """Pixels of a sensor_msgs/Image or CompressedImage: (H, W) grey, or (H, W, 3) BGR.
 
-    Values of 16 bits are stretched to 8: cameras use 10, 12 or all of them, and no message says how many.
-
-    Raises:
-        ValueError: an unsupported encoding, fewer bytes than the size needs, or a file that cannot be decoded.
+    Values of 16 bits are stretched to 8: cameras use 10, 12 or all of them, and no message says how many. ValueError
+    for an unsupported encoding, fewer bytes than the size needs, or a file that cannot be decoded.
     """
     if not hasattr(message, "encoding"):
         return _decoded(message)

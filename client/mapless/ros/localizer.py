@@ -145,8 +145,7 @@ class Localizer:
     def guess(self, message: Any, now_ns: int) -> None:
         """Uses a geometry_msgs/PoseWithCovarianceStamped of the base in the map, as of /initialpose, as a prior.
 
-        Raises:
-            ValueError: it is given in another frame, or its numbers are not a pose.
+        ValueError if it is given in another frame, or its numbers are not a pose.
         """
         frame = message.header.frame_id.lstrip("/")
         if frame != self._options.map_frame:

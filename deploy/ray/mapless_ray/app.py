@@ -16,8 +16,7 @@ DRAIN_GRACE_S = 60.0
 def build(settings: dict[str, Any]) -> Application:
     """Makes the application of one deployment; the config's `deployments` sets the replicas and their devices.
 
-    Args:
-        settings: the config's `args`: settings of mapless by name. Secrets belong into the environment instead.
+    The config's `args` are settings of mapless by name. Secrets belong into the environment instead.
     """
     return deployed(MaplessReplica, settings)
 

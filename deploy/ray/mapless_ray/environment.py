@@ -36,14 +36,10 @@ _LOST = """\
 
 
 def variables(max_message_mib: int = 32, leaving_s: float = LEAVING_S) -> dict[str, str]:
-    """Returns the variables.
+    """Returns the variables, for a setting `max_message_mib`, which Serve's gRPC servers do not read.
 
     Serve's template of HAProxy's configuration ends its section for all proxies with the balancing algorithm, so that
     further lines in that variable are further lines of the section.
-
-    Args:
-        max_message_mib: the setting of this name, which Serve's gRPC servers do not read.
-        leaving_s: see `LEAVING_S`.
     """
     lost = _LOST.format(502, "the replica ended") + _LOST.format(503, "no replica took the call")
     lost += _LOST.format(504, "the replica does not answer")
@@ -60,11 +56,7 @@ def variables(max_message_mib: int = 32, leaving_s: float = LEAVING_S) -> dict[s
 
 
 def check_environment(settings: Settings, environment: Mapping[str, str] = os.environ) -> None:
-    """Checks the variables without which calls fail.
-
-    Raises:
-        StartupError: a variable is missing or contradicts the settings.
-    """
+    """StartupError if a variable without which calls fail is missing or contradicts the settings."""
     wanted = variables(settings.max_message_mib)
     for name in (
         "RAY_SERVE_ENABLE_HA_PROXY",

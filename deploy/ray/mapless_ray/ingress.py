@@ -53,8 +53,7 @@ _LAST_BYTES_S = 5.0
 class Ingress:
     """Receives the calls of a replica; one a process. Implements `mapless_server.serve.running.Listener`.
 
-    Attributes:
-        address: unknown, since Serve chooses and opens the port when the replica is ready.
+    The address is unknown, since Serve chooses and opens the port when the replica is ready.
     """
 
     address = "ray"

@@ -36,8 +36,7 @@ HEARTBEAT_LIMIT_S = 5.0
 class MaplessReplica:
     """Serve's deployment class; calls come through `ingress`, not through its methods.
 
-    Attributes:
-        make: makes the engine; tests and measurements replace it.
+    `make` makes the engine; tests and measurements replace it.
     """
 
     make: MakeEngine = staticmethod(make_engine)
@@ -45,11 +44,8 @@ class MaplessReplica:
     async def __init__(self, settings: dict[str, Any]) -> None:  # type: ignore[misc]  # Serve awaits it
         """Returns when the first localization has succeeded; then Serve sends calls.
 
-        Args:
-            settings: settings of mapless by name; the others come from the environment (MAPLESS_...).
-
-        Raises:
-            StartupError: the replica cannot serve; Serve tries again a few times, and then reports it to the operator.
+        Settings that are not given come from the environment (MAPLESS_...). StartupError if the replica cannot serve;
+        Serve tries again a few times, and then reports it to the operator.
         """
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         loaded = load_settings({**settings, "host": SERVE_HOST})

@@ -53,9 +53,8 @@ class Reporter:
 def replicas_for(queued_s: Iterable[float], busy: Iterable[float]) -> float:
     """The number of replicas that meet both targets with an evenly shared load.
 
-    Args:
-        queued_s: queued computing time of each replica; a new one that has not reported is idle.
-        busy: used share of each replica, 0 to 1.
+    The queued computing time is that of each replica, a new one that has not reported being idle; `busy` its used
+    share, 0 to 1.
     """
     return max(sum(queued_s) / TARGET_QUEUED_S, sum(busy) / TARGET_BUSY)
 
