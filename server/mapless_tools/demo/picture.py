@@ -1,7 +1,7 @@
 """A picture that shows whether a pose is right.
 
-Left: the photograph with known structure projected by the found pose. Right: the nearest reference with the same
-structure. Below: the numbers and a plan of the place.
+Left: the photograph with the matched points of the references projected by the found pose. Right: the reference that
+shows most of them. Below: the numbers and a plan of the place.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, RigidTransform
+from mapless.geometry import Array, Camera, RigidTransform, resized_pixel
 
-from .structure import Shot, SparsePoints, find_in
+from .photographs import Outline, Photograph
 
 Canvas = NDArray[np.uint8]
 
@@ -28,20 +28,46 @@ SIZE_PX = (1600, 840)
 STRIP = 240 / 840
 """Share of the height below the photographs."""
 MAGNIFICATION = 10
-MAX_OFFSET_PX = 20.0
-"""Observations farther from a drawn point than this are taken for wrong matches, not for a wrong pose."""
 
 INK, DIM, FAINT, BACKGROUND = "#ebebeb", "#cdcdcd", "#969696", "#181a1e"
 GREEN, RED, AMBER = "#46dc78", "#ff5046", "#ffbe3c"
 
 
 @dataclass(frozen=True, eq=False)
-class Scenery:
-    """What is known of the place, for drawing: triangulated points, (E, 2, 3) edges, and the visible parts of edges."""
+class Shot:
+    """A decoded photograph (H, W, 3) uint8 RGB with its pose, its camera in the image's pixels, and matched points.
 
-    points: SparsePoints
-    outline: Array = field(default_factory=lambda: np.empty((0, 2, 3)))
-    visible_outline: Array = field(default_factory=lambda: np.empty((0, 2, 3)))
+    The points (N, 3), world, are those that the answer rests on, at the keypoints (N, 2) of `image`.
+    """
+
+    name: str
+    image: Canvas
+    camera: Camera
+    world_from_camera: RigidTransform
+    points: Array = field(default_factory=lambda: np.empty((0, 3)))
+    keypoints: Array = field(default_factory=lambda: np.empty((0, 2)))
+
+    @staticmethod
+    def of(photograph: Photograph, max_side_px: int) -> Shot:
+        """Decodes a photograph, reduced if it is large, without EXIF orientation; ValueError if it cannot be read."""
+        flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+        image = cv2.imdecode(np.frombuffer(photograph.data, np.uint8), flags)
+        if image is None:
+            raise ValueError(f"{photograph.name} is not an image that can be read")
+        scale = min(1.0, max_side_px / max(image.shape[:2]))
+        size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
+        drawn = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        return Shot(photograph.name, drawn, photograph.camera.resized(*size), photograph.world_from_camera)
+
+    def with_points(self, points: Array, pixels: Array, camera: Camera) -> Shot:
+        """The same with points (N, 3), world, at pixels (N, 2) of the photograph as `camera` has it."""
+        scale = self.camera.width_px / camera.width_px, self.camera.height_px / camera.height_px
+        keypoints = np.stack([resized_pixel(pixels[:, i], scale[i]) for i in (0, 1)], axis=-1)
+        return replace(self, points=points, keypoints=keypoints)
+
+    def project(self, x_in_world: Array) -> Array:
+        """Pixels (N, 2) of points (N, 3); NaN behind the camera."""
+        return self.camera.project(self.world_from_camera.inverse().apply(x_in_world))
 
 
 def draw(
@@ -49,7 +75,7 @@ def draw(
     world_from_query: RigidTransform | None,
     nearest: Shot,
     references: Sequence[Shot],
-    scenery: Scenery,
+    outline: Outline | None,
     caption: Sequence[str],
 ) -> Canvas:
     """Draws the picture (H, W, 3) uint8 RGB of one answer; the first line of the caption is its heading.
@@ -65,12 +91,14 @@ def draw(
     else:
         found = replace(query, world_from_camera=world_from_query)
         _show(left, (query.image * 0.72).astype(np.uint8), f"{query.name}: drawn with the found pose")
-        _add_lines(left, found.project(scenery.visible_outline), color=AMBER, linewidth=2.2)
-        lines.append(_add_points(left, found, scenery.points))
+        if outline is not None:
+            _add_lines(left, found.project(outline.visible_edges[query.name]), color=AMBER, linewidth=2.2)
+        lines.append(_add_points(left, found))
     _show(right, (nearest.image * 0.72).astype(np.uint8), f"{nearest.name}: the reference that agrees most")
-    _add_points(right, nearest, scenery.points)
+    _add_points(right, nearest)
     plan = figure.add_axes((0.6, 0.01, 0.28, STRIP - 0.02))
-    _draw_plan(plan, query.world_from_camera, world_from_query, references, scenery)
+    edges = np.empty((0, 2, 3)) if outline is None else outline.edges
+    _draw_plan(plan, query, world_from_query, references, edges)
     figure.legend(*plan.get_legend_handles_labels(), loc=(0.885, 0.1), frameon=False, labelcolor=INK, fontsize=10)
     for i, line in enumerate(lines):
         y = STRIP - (0.06 + 0.042 * i)
@@ -107,39 +135,33 @@ def _add_lines(axes: Axes, ends: Array, **style: Any) -> None:
     axes.add_collection(LineCollection(list(ends[np.isfinite(ends).all(axis=(1, 2))]), **style))
 
 
-def _add_points(axes: Axes, shot: Shot, points: SparsePoints) -> str:
+def _add_points(axes: Axes, shot: Shot) -> str:
     """Draws the points projected by the shot's pose, near red, far blue; returns a text on how well they fit."""
-    pixels = shot.project(points.x_in_world)
-    last_px = [shot.camera.width_px - 1, shot.camera.height_px - 1]
-    inside = ((pixels >= 0) & (pixels <= last_px)).all(axis=-1)
-    depth = shot.world_from_camera.inverse().apply(points.x_in_world[inside])[:, 2]
+    if not len(shot.points):
+        return "no points were matched"
+    pixels = shot.project(shot.points)
+    depth = shot.world_from_camera.inverse().apply(shot.points)[:, 2]
     rank = np.argsort(np.argsort(-depth))  # not the depth itself: every step of it shall be seen
-    x, y = pixels[inside].T
+    x, y = pixels.T
     axes.scatter(x, y, c=rank, cmap="turbo", vmin=-0.18 * len(x), vmax=1.05 * len(x), s=20, linewidths=0)
-    indices, observed = find_in(points, shot, MAX_OFFSET_PX)
-    if len(indices) == 0:
-        return "no drawn point was recognized in the photograph"
-    offsets = observed - pixels[indices]
-    ends = np.stack([pixels[indices], pixels[indices] + MAGNIFICATION * offsets], axis=1)
-    _add_lines(axes, ends, color="white", linewidth=0.8)
+    offsets = shot.keypoints - pixels
+    _add_lines(axes, np.stack([pixels, pixels + MAGNIFICATION * offsets], axis=1), color="white", linewidth=0.8)
     middle = float(np.median(np.linalg.norm(offsets, axis=-1)))
     return (
-        f"{len(indices)} drawn points recognized, {middle:.2f} px (median) from where the pose puts them; "
+        f"{len(offsets)} matched points, {middle:.2f} px (median) from where the pose puts them; "
         f"white: that offset x {MAGNIFICATION}"
     )
 
 
-def _draw_plan(
-    axes: Axes, true: RigidTransform, found: RigidTransform | None, references: Sequence[Shot], scenery: Scenery
-) -> None:
-    """Draws the place from above: structure, references, the true position and the found one."""
-    poses = [reference.world_from_camera for reference in references]
+def _draw_plan(axes: Axes, query: Shot, found: RigidTransform | None, references: Sequence[Shot], edges: Array) -> None:
+    """Draws the place from above: matched points, edges, references, the true position and the found one."""
+    poses, true = [reference.world_from_camera for reference in references], query.world_from_camera
     ground = _ground_axes(poses)
-    points = scenery.points.x_in_world @ ground.T
-    _add_lines(axes, scenery.outline @ ground.T, color="#50545c", linewidth=0.8)
+    points = query.points @ ground.T
+    _add_lines(axes, edges @ ground.T, color="#50545c", linewidth=0.8)
     axes.scatter(points[:, 0], points[:, 1], color="#6e7887", s=0.4)
-    around = np.concatenate([scenery.outline.reshape(-1, 3), [pose.translation for pose in [*poses, true]]]) @ ground.T
-    if len(points) and not len(scenery.outline):
+    around = np.concatenate([edges.reshape(-1, 3), [pose.translation for pose in [*poses, true]]]) @ ground.T
+    if len(points) and not len(edges):
         around = np.concatenate([around, np.quantile(points, [0.03, 0.97], axis=0)])
     low, high = around.min(axis=0), around.max(axis=0)
     length = 0.07 * float((high - low).max())

@@ -19,13 +19,10 @@ from mapless_tools.child import child_server
 
 from . import picture
 from .photographs import Photograph, Place, place_of
-from .structure import Shot, points_to_draw
 
 SCENE = "demo"
 DRAWN_PX = 960
 """Longer side of the photographs that are drawn."""
-DRAWN_REFERENCES = 3
-"""So many, those with the most inliers, give the points that are drawn: more would add points that are hidden."""
 MAX_MEDIAN_ERROR_M = 0.03
 MAX_MEDIAN_ERROR_DEG = 1.0
 """What the rendered room must reach for the demo to succeed."""
@@ -67,7 +64,8 @@ def run_demo(data: Path | None, output: Path, console: Console | None = None) ->
         outcomes = []
         for query in place.queries:
             with console.status(f"localizing {query.name}"):
-                outcomes.append(judge(query, client.localize(query.data, query.camera, SCENE)))
+                answer = client.localize(query.data, query.camera, SCENE, include_debug=True)
+                outcomes.append(judge(query, answer))
     console.print("server: stopped")
 
     console.print(table_of(outcomes, place.metric))
@@ -137,7 +135,7 @@ def summarize(console: Console, place: Place, outcomes: Sequence[Outcome]) -> bo
 def write_pictures(place: Place, outcomes: Sequence[Outcome], output: Path) -> list[Path]:
     """Writes one picture for each query, and first a sheet of all."""
     output.mkdir(parents=True, exist_ok=True)
-    shots = {photo.name: Shot.of(photo, DRAWN_PX) for photo in place.references}
+    shots = {photo.name: picture.Shot.of(photo, DRAWN_PX) for photo in place.references}
     pictures = [_picture(place, outcome, shots) for outcome in outcomes]
     paths = [output / "all.png", *(output / f"{outcome.query.name}.png" for outcome in outcomes)]
     for path, image in zip(paths, [picture.contact_sheet(pictures), *pictures], strict=True):
@@ -145,17 +143,22 @@ def write_pictures(place: Place, outcomes: Sequence[Outcome], output: Path) -> l
     return paths
 
 
-def _picture(place: Place, outcome: Outcome, shots: Mapping[str, Shot]) -> picture.Canvas:
-    answer = outcome.answer
-    uses = sorted(answer.diagnostics.references, key=lambda use: (-use.inlier_count, -use.match_count))
-    used = [shots[use.name.rsplit("/", 1)[-1]] for use in uses] or list(shots.values())
-    scenery = picture.Scenery(points_to_draw(used[:DRAWN_REFERENCES]))
-    if place.outline is not None:
-        visible = place.outline.visible_edges[outcome.query.name]
-        scenery = picture.Scenery(scenery.points, place.outline.edges, visible)
-    query = Shot.of(outcome.query, DRAWN_PX)
-    found = answer.world_from_camera if isinstance(answer, LocalizationResult) else None
-    return picture.draw(query, found, used[0], list(shots.values()), scenery, _caption(outcome, place.metric))
+def _picture(place: Place, outcome: Outcome, shots: Mapping[str, picture.Shot]) -> picture.Canvas:
+    answer, references = outcome.answer, outcome.answer.diagnostics.references
+    best = max(range(len(references)), key=lambda i: references[i].inlier_count, default=None)
+    nearest = next(iter(shots.values())) if best is None else shots[references[best].name.rpartition("/")[2]]
+    query = picture.Shot.of(outcome.query, DRAWN_PX)
+    found = None
+    if isinstance(answer, LocalizationResult):
+        found = answer.world_from_camera
+        if debug := answer.debug:
+            query = query.with_points(
+                debug.x_in_world[debug.is_inlier], debug.query_px[debug.is_inlier], outcome.query.camera
+            )
+            shown = debug.is_inlier & (debug.reference == best)
+            camera = next(it.camera for it in place.references if it.name == nearest.name)
+            nearest = nearest.with_points(debug.x_in_world[shown], debug.reference_px[shown], camera)
+    return picture.draw(query, found, nearest, [*shots.values()], place.outline, _caption(outcome, place.metric))
 
 
 def _caption(outcome: Outcome, metric: bool) -> list[str]:
