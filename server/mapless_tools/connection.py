@@ -10,7 +10,7 @@ import inspect
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -57,22 +57,27 @@ class Connection:
         )
 
 
-def with_connection_flags(command: Callable[..., None]) -> Callable[..., None]:
-    """Gives a command the flags of a Connection in place of its keyword parameter `connection`."""
-    own = inspect.signature(command, eval_str=True).parameters.values()
-    hints = get_type_hints(Connection, include_extras=True)
-    flags = [
-        inspect.Parameter(it.name, inspect.Parameter.KEYWORD_ONLY, default=it.default, annotation=hints[it.name])
-        for it in fields(Connection)
-    ]
+def with_flags(command: Callable[..., None]) -> Callable[..., None]:
+    """Gives a command the fields of its parameters that are dataclasses as flags, in place of these parameters."""
+    own = inspect.signature(command, eval_str=True).parameters
+    groups: dict[str, Any] = {it.name: it.annotation for it in own.values() if is_dataclass(it.annotation)}
+    flags = []
+    for group in groups.values():
+        hints = get_type_hints(group, include_extras=True)
+        flags += [
+            inspect.Parameter(it.name, inspect.Parameter.KEYWORD_ONLY, default=it.default, annotation=hints[it.name])
+            for it in fields(group)
+        ]
 
     @functools.wraps(command)
-    def connecting(**arguments: Any) -> None:
-        connection = Connection(**{flag.name: arguments.pop(flag.name) for flag in flags})
-        command(**arguments, connection=connection)
+    def grouped(**arguments: Any) -> None:
+        for name, group in groups.items():
+            arguments[name] = group(**{it.name: arguments.pop(it.name) for it in fields(group)})
+        command(**arguments)
 
-    vars(connecting)["__signature__"] = inspect.Signature([*(it for it in own if it.name != "connection"), *flags])
-    return connecting
+    rest = [it for it in own.values() if it.name not in groups]
+    vars(grouped)["__signature__"] = inspect.Signature([*rest, *flags])
+    return grouped
 
 
 @contextmanager

@@ -28,14 +28,15 @@ def usage_errors() -> Iterator[None]:
 
 
 @contextmanager
-def failures_end_command(interrupted: str = "interrupted") -> Iterator[None]:
+def failures_end_command(usage: type[ValueError] = UsageError, interrupted: str = "interrupted") -> Iterator[None]:
     """Ends the command after a failure: exit code 2 for wrong usage, 1 for a server or a file, 130 after Ctrl-C."""
     from mapless import MaplessError
+    from mapless_server.settings import ConfigError
     from mapless_tools.child import ServerFailed
 
     try:
         yield
-    except UsageError as error:
+    except (usage, ConfigError) as error:
         fail(str(error))
     except (ServerFailed, MaplessError, OSError) as error:
         fail(str(error), code=1)

@@ -7,13 +7,13 @@ from typing import Annotated
 
 import typer
 
-from mapless_tools.connection import Connection, with_connection_flags
+from mapless_tools.connection import Connection, with_flags
 from mapless_tools.ingest.command import FORMAT_NAMES
 
 OUTPUT = Path("calibration-output")
 
 
-@with_connection_flags
+@with_flags
 def calibrate_command(
     folder: Annotated[
         Path | None, typer.Argument(help="Folder with photographs and their poses; not needed with --clear.")
@@ -60,7 +60,7 @@ def calibrate_command(
     from .findings import RightRule
     from .run import CalibrateOptions, calibrate, clear_calibration
 
-    with failures_end_command("interrupted; nothing is stored"):
+    with failures_end_command(interrupted="interrupted; nothing is stored"):
         if clear:
             clear_calibration(folder, scene, connection)
             print(f"answers in scene {scene} are uncalibrated now")

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mapless_server.serve.command import fail
-from mapless_tools.connection import Connection, Scene, with_connection_flags
+from mapless_tools.connection import Connection, Scene, with_flags
 
 from .printing import AsJson, printed_as_json
 
@@ -38,7 +38,7 @@ MAX_TIMEOUT_S = 600.0
 _ORDER = (*ALARMS, "DUPLICATE", "UNVERIFIABLE", "CONSISTENT")
 
 
-@with_connection_flags
+@with_flags
 def audit_command(
     scene: Scene,
     report: Annotated[Path | None, typer.Option(help="JSON file for the whole report.")] = None,

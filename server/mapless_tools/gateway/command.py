@@ -9,10 +9,10 @@ from typing import Annotated
 import typer
 
 from mapless_server.serve.command import fail
-from mapless_tools.connection import Connection, with_connection_flags
+from mapless_tools.connection import Connection, with_flags
 
 
-@with_connection_flags
+@with_flags
 def gateway_command(
     scene: Annotated[str, typer.Option(help="Id of the scene of requests that name none.")] = "",
     host: Annotated[str, typer.Option(help="Address that it listens on.")] = "127.0.0.1",

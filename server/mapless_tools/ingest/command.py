@@ -11,17 +11,8 @@ import typer
 from typer.core import TyperCommand
 
 from mapless_server.serve.command import fail
-from mapless_tools.bags.flags import (
-    BodyFrame,
-    BodyFromCamera,
-    CameraTopic,
-    ImageTopic,
-    MaxPoseGap,
-    PoseTopic,
-    WorldFrame,
-    bag_options,
-)
-from mapless_tools.connection import Connection, Scene, with_connection_flags
+from mapless_tools.bags.flags import BagFlags
+from mapless_tools.connection import Connection, Scene, with_flags
 
 from . import FORMATS
 
@@ -58,7 +49,7 @@ class ImportCommand(TyperCommand):
         return super().parse_args(ctx, joined)
 
 
-@with_connection_flags
+@with_flags
 def import_command(
     folder: Annotated[Path, typer.Argument(help="Folder with photographs and their poses, or a robot's recording.")],
     scene: Scene,
@@ -70,13 +61,6 @@ def import_command(
     intrinsics: Annotated[
         str, typer.Option(help="fx,fy,cx,cy in pixels, for layouts without; (0, 0) is the first pixel's centre.")
     ] = "",
-    image_topic: ImageTopic = "",
-    camera_topic: CameraTopic = "",
-    pose_topic: PoseTopic = "",
-    world_frame: WorldFrame = "",
-    body_frame: BodyFrame = "",
-    body_from_camera: BodyFromCamera = "",
-    max_pose_gap: MaxPoseGap = 0.15,
     keyframe_distance: Annotated[
         float, typer.Option(help="Of a recording: metres from one keyframe to the next; 0: all images.")
     ] = 0.3,
@@ -103,6 +87,7 @@ def import_command(
     report: Annotated[Path | None, typer.Option(help="JSON file for the whole report.")] = None,
     data_dir: DataDir = None,
     *,
+    bag: BagFlags,
     connection: Connection,
 ) -> None:
     """Store the posed photographs of a folder, or keyframes of a recording, as references of a scene.
@@ -116,13 +101,12 @@ def import_command(
     from .metres import MetreOptions
     from .upload import UploadOptions
 
-    bag = (image_topic, camera_topic, pose_topic, world_frame, body_frame, body_from_camera, max_pose_gap)
     try:
         read = ReadOptions(
             images=images,
             ground_truth=ground_truth,
             intrinsics=_intrinsics(intrinsics),
-            bag=bag_options(*bag),
+            bag=bag.options(),
             keyframes=KeyframeOptions(keyframe_distance, keyframe_angle),
         )
         options = ImportOptions(
@@ -143,7 +127,7 @@ def import_command(
     raise typer.Exit(0 if went_well else 1)
 
 
-@with_connection_flags
+@with_flags
 def export_command(
     scene: Scene,
     folder: Annotated[Path, typer.Argument(help="Folder to write to; must be empty or not be there.")],
@@ -156,24 +140,18 @@ def export_command(
 
     One that is damaged in the store is named and left out; the exit code is then 1, and the folder whole without it.
     """
-    from mapless import MaplessError
     from mapless_server.serve.signals import terminable
-    from mapless_server.settings import ConfigError
-    from mapless_tools.child import ServerFailed
     from mapless_tools.connection import connected
     from mapless_tools.progress import progress_bars
+    from mapless_tools.usage import failures_end_command
 
     from .exporting import check_target, export_scene
 
-    try:
+    with failures_end_command(ValueError):
         check_target(folder, format)
         settings = _settings(data_dir, connection)
         with terminable(), connected(connection, settings) as client, progress_bars() as progress:
             export = export_scene(client, scene, folder, format, progress)
-    except (ValueError, ConfigError) as error:
-        fail(str(error))
-    except (MaplessError, ServerFailed, OSError) as error:
-        fail(str(error), code=1)
     for reason in export.damaged.values():
         print(f"skipped: {reason}", file=sys.stderr)
     where = f"references of scene {scene} are in {folder}"

@@ -7,21 +7,11 @@ from typing import Annotated
 
 import typer
 
-from mapless_server.serve.command import fail
-from mapless_tools.bags.flags import (
-    BodyFrame,
-    BodyFromCamera,
-    CameraTopic,
-    ImageTopic,
-    MaxPoseGap,
-    PoseTopic,
-    WorldFrame,
-    bag_options,
-)
-from mapless_tools.connection import Connection, with_connection_flags
+from mapless_tools.bags.flags import BagFlags
+from mapless_tools.connection import Connection, with_flags
 
 
-@with_connection_flags
+@with_flags
 def replay_bag_command(
     recording: Annotated[Path, typer.Argument(help="Folder of rosbag2, or an .mcap or .db3 file.")],
     scene: Annotated[str, typer.Argument(help="Id of the scene to localize in.")],
@@ -38,36 +28,28 @@ def replay_bag_command(
     odom_frame: Annotated[str, typer.Option(help="Frame of the odometry; default: that of the poses.")] = "",
     base_frame: Annotated[str, typer.Option(help="Frame whose pose is written; default: that of the poses.")] = "",
     camera: Annotated[str, typer.Option(help="Intrinsics, JSON or a file, for a recording without CameraInfo.")] = "",
-    image_topic: ImageTopic = "",
-    camera_topic: CameraTopic = "",
-    pose_topic: PoseTopic = "",
-    world_frame: WorldFrame = "",
-    body_frame: BodyFrame = "",
-    body_from_camera: BodyFromCamera = "",
-    max_pose_gap: MaxPoseGap = 0.15,
     data_dir: Annotated[
         Path | None, typer.Option(help="Folder of the store, where no --address is given; default: the settings'.")
     ] = None,
     *,
+    bag: BagFlags,
     connection: Connection,
 ) -> None:
     """Localize the images of a robot's recording, and write poses, map > odom and diagnostics as a recording.
 
     As the ROS 2 package does on a robot. Exit code 1 if it ended early; what was computed until then is written.
     """
-    from mapless import MaplessError
     from mapless.cameras import read_camera
     from mapless.ros import LocalizerOptions
     from mapless_server.serve.signals import terminable
-    from mapless_server.settings import ConfigError, load_settings
-    from mapless_tools.child import ServerFailed
+    from mapless_server.settings import load_settings
     from mapless_tools.connection import connected
     from mapless_tools.progress import progress_bars
+    from mapless_tools.usage import failures_end_command
 
     from .bags import replay_bag
 
-    bag = (image_topic, camera_topic, pose_topic, world_frame, body_frame, body_from_camera, max_pose_gap)
-    try:
+    with failures_end_command(ValueError):
         if data_dir is not None and connection.address:
             raise ValueError("--data-dir is a store, --address a server: give one of them")
         options = LocalizerOptions(
@@ -82,12 +64,8 @@ def replay_bag_command(
         )
         settings = load_settings({"data_dir": data_dir}).settings
         given = read_camera(camera) if camera else None
-        found = bag_options(*bag)
+        found = bag.options()
         with terminable(), connected(connection, settings) as client, progress_bars() as progress:
             report = replay_bag(recording, out, client, found, options, given, progress, sequence_length)
-    except (ValueError, ConfigError) as error:
-        fail(str(error))
-    except (MaplessError, ServerFailed, OSError) as error:
-        fail(str(error), code=1)
     print(*report.lines(), f"written to {out}", sep="\n")
     raise typer.Exit(1 if report.stopped else 0)

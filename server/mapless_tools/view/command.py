@@ -9,12 +9,12 @@ from typing import Annotated
 import typer
 
 from mapless_server.serve.command import fail
-from mapless_tools.connection import Connection, Scene, with_connection_flags
+from mapless_tools.connection import Connection, Scene, with_flags
 
 _ALLOW_WATCHING = {"MAPLESS_ALLOW_WATCHING": "true"}
 
 
-@with_connection_flags
+@with_flags
 def view_command(
     scene: Scene,
     host: Annotated[str, typer.Option(help="Loopback address that the page is served on.")] = "127.0.0.1",
