@@ -1,4 +1,4 @@
-"""A scene in a real browser: references, points and a query are drawn, and a click on it opens its photograph."""
+"""A scene in a real browser: references, points and a query are drawn, and a click on it opens its report."""
 
 from __future__ import annotations
 
@@ -94,9 +94,9 @@ def look(page: Page, client: Client, folder: Path) -> None:
     page.until(lambda: like(canvas(page), (110, 200, 170), within=40).sum() < 200)
     rows, columns = np.nonzero(like(canvas(page), YELLOW))
     page.until(lambda: opened(page, float(np.median(columns)), TOP_PX + float(np.median(rows))))
-    page.until(lambda: "agree with the pose" in page.text)
+    assert "agree with the pose" in page.evaluate("document.querySelector('.mantine-Modal-content iframe').srcdoc")
     size = page.evaluate(
-        "(() => { const it = document.querySelector('.mantine-Modal-content img').getBoundingClientRect();"
+        "(() => { const it = document.querySelector('.mantine-Modal-content iframe').getBoundingClientRect();"
         "return [it.x, it.y, it.width, it.height]; })()"
     )
     x, y, width, height = (round(value) for value in size)
@@ -104,13 +104,13 @@ def look(page: Page, client: Client, folder: Path) -> None:
     page.until(lambda: like(page.screenshot()[y : y + height, x : x + width], GREEN).sum() > 500)
     save(page, folder / "query.png")
     page.evaluate("[...document.querySelectorAll('button')].find(it => it.innerText === 'Close').click()")
-    page.until(lambda: "agree with the pose" not in page.text)
+    page.until(lambda: not page.evaluate("!!document.querySelector('.mantine-Modal-content iframe')"))
 
 
 def opened(page: Page, x: float, y: float) -> bool:
-    """Clicks until the picture is open: the first click may come before the frustum is ready for it."""
+    """Clicks until the report is open: the first click may come before the frustum is ready for it."""
     page.click(x, y)
-    return any(page.evaluate("!!document.querySelector('.mantine-Modal-content img')?.complete") for _ in range(20))
+    return any(page.evaluate("!!document.querySelector('.mantine-Modal-content iframe')") for _ in range(20))
 
 
 def save(page: Page, file: Path) -> None:

@@ -22,13 +22,12 @@ from mapless.answers import Accuracy, Debug, Diagnostics, Hint, Hypothesis, Loca
 from mapless.geometry import Array, Camera, RigidTransform, rotation_from_vector
 from mapless_tools.cli.app import app
 from mapless_tools.view.meshes import ellipsoid, enlargement, rays
-from mapless_tools.view.queries import INLIER, OVERLAY_PX, Query, colours_at, overlay, read_picture
+from mapless_tools.view.queries import Query, colours_at, read_picture
 from mapless_tools.view.scenery import lay_out, spread_out
 
 CAMERA = Camera(1800, 1350, 1500.0, 1500.0, 899.5, 674.5)
 NOW = datetime(2026, 11, 21, tzinfo=timezone.utc)
 SCENE = Scene("hall", 1, 3, NOW)
-HOSTILE = "`</script><img src=x onerror=alert(1)> {process.exit()} **bold**\n# head"
 
 
 def reference(number: int, pose: RigidTransform) -> Reference:
@@ -41,7 +40,8 @@ def upright(x_m: float, y_m: float = 0.0, turn: float = 0.0) -> RigidTransform:
     return RigidTransform(rotation_from_vector([0, 0, turn]) @ level, np.array([4e5 + x_m, 5e6 + y_m, 30.0]))
 
 
-def query(pose: RigidTransform | None, debug: Debug | None = None, image: bytes = b"", text: str = "why") -> Query:
+def query(pose: RigidTransform | None, debug: Debug | None = None, image: bytes = b"") -> Query:
+    text = "why"
     uses = (ReferenceUse(f"scenes/hall/references/{text}", 9, 7),)
     used = Diagnostics(text, "geometric", "", "sift", "BEST", 1, uses, None, {}, 0.0, 0.2, 96, 64, "0.1.0")
     if pose is None:
@@ -148,34 +148,6 @@ class TestScenery:
 
 
 class TestPictures:
-    def matched(self) -> tuple[bytes, Debug]:
-        """A grey photograph and points planted in it, of which every fifth is matched wrongly."""
-        random = np.random.default_rng(6)
-        x = upright(0).apply(random.uniform((-2, -1.5, 4), (2, 1.5, 6), (40, 3)))
-        pixels = CAMERA.project(upright(0).inverse().apply(x))
-        is_inlier = np.arange(40) % 5 != 0
-        image = encode(".png", np.full((1350, 1800, 3), 90, np.uint8))
-        return image, Debug(pixels, x, is_inlier, np.zeros(40), np.zeros(40, int), pixels)
-
-    def test_dots_lie_where_points_are_seen(self) -> None:
-        image, debug = self.matched()
-        drawn = overlay(query(upright(0), debug, image))
-        assert drawn.shape == (round(OVERLAY_PX * 0.75), OVERLAY_PX, 3)
-        scale = OVERLAY_PX / 1800
-        for (x, y), is_inlier in zip(debug.query_px, debug.is_inlier, strict=True):
-            column, row = round(scale * (x + 0.5) - 0.5), round(scale * (y + 0.5) - 0.5)
-            if is_inlier and 2 < row < drawn.shape[0] - 3 and 2 < column < OVERLAY_PX - 3:
-                assert np.abs(drawn[row, column].astype(int) - INLIER).max() < 40
-
-    def test_a_photograph_without_matches_or_pose_is_shown_as_it_is(self) -> None:
-        image, debug = self.matched()
-        assert (overlay(query(None, None, image)) == 90).all()
-        assert not (overlay(query(None, debug, image)) == 90).all()
-
-    def test_a_small_one_is_enlarged(self) -> None:
-        small = encode(".png", np.full((48, 64, 3), 90, np.uint8))
-        assert OVERLAY_PX / 2 < overlay(query(None, None, small)).shape[1] <= OVERLAY_PX
-
     def test_colours_are_those_of_the_pixels(self) -> None:
         random = np.random.default_rng(1)
         coarse = random.integers(0, 256, (27, 36, 3)).astype(np.uint8)
@@ -189,22 +161,10 @@ class TestPictures:
 
 
 class TestWords:
-    def test_a_query_is_shown_in_a_line_and_in_full(self) -> None:
+    def test_a_query_is_shown_in_a_line(self) -> None:
         found, lost = query(upright(0)), query(None)
         assert found.label == "#4 localized to 2.0 cm"
-        assert "**95 % within** 2.0 cm and 0.20°" in found.details()
-        assert "7 of 9" in found.details()
         assert lost.label == "#4 not localized: low overlap"
-        assert "**Not localized**: `why`" in lost.details()
-
-    @pytest.mark.parametrize("pose", [upright(0), None])
-    def test_what_came_from_elsewhere_stands_in_code(self, pose: RigidTransform | None) -> None:
-        details = query(pose, text=HOSTILE).details()
-        outside = "".join(details.split("`")[0::2])
-        assert "<" not in outside
-        assert "{" not in outside
-        assert "bold" not in outside
-        assert "\n#" not in details
 
 
 @pytest.fixture(scope="module")
@@ -308,7 +268,11 @@ def test_queries_of_every_outcome_come_and_go() -> None:
     from mapless_tools.view.guarded import GuardedViser
     from mapless_tools.view.stage import MAX_QUERIES, Stage
 
-    image, debug = TestPictures().matched()
+    random = np.random.default_rng(6)
+    x = upright(0).apply(random.uniform((-2, -1.5, 4), (2, 1.5, 6), (40, 3)))
+    pixels = CAMERA.project(upright(0).inverse().apply(x))
+    image = encode(".png", np.full((1350, 1800, 3), 90, np.uint8))
+    debug = Debug(pixels, x, np.arange(40) % 5 != 0, np.zeros(40), np.zeros(40, int), pixels)
     hypotheses = (Hypothesis(upright(0), 9, ()), Hypothesis(upright(3), 8, ()))
     lost = query(None, debug, image)
     assert isinstance(lost.answer, Rejected)

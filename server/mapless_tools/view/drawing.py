@@ -12,7 +12,7 @@ from mapless.geometry import Array, Camera, RigidTransform
 
 from .guarded import GuardedViser
 from .meshes import ellipsoid, enlargement, rays
-from .queries import INLIER, OUTLIER, Picture
+from .queries import Picture
 from .scenery import Scenery
 
 Colour = tuple[int, int, int]
@@ -25,6 +25,8 @@ REFERENCE, OTHER, QUERY, SELECTED, DOUBT = (
     (230, 90, 40),
 )
 """Of references, of those drawn as dots, of queries, of the selected one, and of poses that contradict each other."""
+INLIER, OUTLIER = (46, 230, 166), (255, 107, 43)
+"""Of matches that agree with the pose, and of those that do not."""
 MAX_RAYS = 90
 """Lines from a query to its points; more hide what they lead to."""
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -14,15 +16,18 @@ from numpy.typing import NDArray
 from mapless import Reference
 from mapless.answers import Rejected
 from mapless.geometry import Array
+from mapless.report import report_html
 
 from .drawing import DOUBT, OTHER, QUERY, REFERENCE, SELECTED, Drawing
 from .guarded import GuardedViser
-from .queries import OVERLAY_PX, THUMBNAIL_PX, Picture, Query, overlay, read_picture
+from .queries import THUMBNAIL_PX, Picture, Query, read_picture
 from .scenery import Scenery
 
 MAX_QUERIES = 12
 """Queries that are kept; each has its photograph in memory."""
 MAX_POINTS = 150_000
+REFERENCE_PX = 1200
+"""Longer side of a reference's photograph in its dialogue, at most."""
 _QUERY_SIZE = 1.5
 """Of a query's frustum beside those of references."""
 _VOXEL_SHARE, _POINT_SHARE = 0.002, 0.004
@@ -116,20 +121,30 @@ class Stage:
                     handle.color = SELECTED if it is shown else DOUBT if it.query.pose is None else QUERY
 
     def _open(self, shown: _Shown, client: Any) -> None:
-        """Selects a query, and shows its photograph with its matches."""
+        """Selects a query, and shows the client's report of its answer."""
         self._select(shown)
-        picture, details = overlay(shown.query), shown.query.details()
-        if shown.query.answer.debug is not None:
-            details = (
-                f"Green agrees with the pose, orange does not; lines lead to where it puts the points.\n\n{details}"
+        if client is None:  # it was closed meanwhile
+            return
+        query = shown.query
+        used = {it.name for it in query.answer.diagnostics.references}
+        references = [
+            it for it in self._scenery.references if f"scenes/{it.scene_id}/references/{it.reference_id}" in used
+        ]
+        page = report_html(query.answer, query.image, query.camera, references, "", self._scenery.down)
+        with _dialogue(client, query.label) as gui:
+            gui.add_html(
+                f'<iframe sandbox srcdoc="{escape(page)}" style="width: 100%; height: 70vh; border: 0"></iframe>'
             )
-        _dialogue(client, shown.query.label, picture, details)
 
     def _open_reference(self, reference: Reference, client: Any) -> None:
-        picture = read_picture(self._open_photo(reference.reference_id), OVERLAY_PX)
+        if client is None:
+            return
+        picture = read_picture(self._open_photo(reference.reference_id), REFERENCE_PX)
         x, y, z = reference.world_from_camera.translation
         details = f"**Position** {x:.3f}, {y:.3f}, {z:.3f} m; {reference.feature_count} features"
-        _dialogue(client, f"Reference {reference.reference_id}", picture, details)
+        with _dialogue(client, f"Reference {reference.reference_id}") as gui:
+            gui.add_image(picture, format="jpeg", jpeg_quality=88)
+            gui.add_markdown(details)
 
     def _pictured(self) -> list[tuple[int, Reference]]:
         return [(int(i), self._scenery.references[i]) for i in self._scenery.pictured]
@@ -203,12 +218,10 @@ class Stage:
                     handle.scale = _QUERY_SIZE * size
 
 
-def _dialogue(client: Any, title: str, picture: Picture, details: str) -> None:
-    """Shows a picture with its details in the browser that requested it."""
-    if client is None:  # it was closed meanwhile
-        return
+@contextmanager
+def _dialogue(client: Any, title: str) -> Iterator[Any]:
+    """A dialogue in the browser that requested it, to be filled in the block."""
     with client.gui.add_modal(title) as modal:
         client.gui.add_html(_WIDE)
-        client.gui.add_image(picture, format="jpeg", jpeg_quality=88)
-        client.gui.add_markdown(details)
+        yield client.gui
         client.gui.add_button("Close").on_click(lambda _: modal.close())
