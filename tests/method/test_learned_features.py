@@ -190,7 +190,8 @@ def test_edgepoint2_features_are_read_at_the_peaks_of_the_maps(
     column, row = np.meshgrid(np.arange(80) * 4 + 1.5, np.arange(64) * 4 + 1.5)
     feature_map = np.stack([column, row, np.full(column.shape, 200.0)])[None]
     maps = tuple(torch.from_numpy(it.astype(np.float32)) for it in (logits[None, None], feature_map))
-    monkeypatch.setattr(edgepoint2, "_network", lambda _: maps)
+    monkeypatch.setattr(edgepoint2._network, "forward", lambda _: maps)
+    monkeypatch.setattr(edgepoint2._network, "describe", lambda samples: samples)
     camera = replace(CAMERA, height_px=250)
     view = edgepoint2.extract(np.zeros((250, 320, 3), np.uint8), camera)
     assert view.camera == camera

@@ -1,7 +1,8 @@
 """EdgePoint2 (Yao et al. 2025): a small convolutional network of keypoints and descriptors, made for edge devices.
 
 Written from a description of it; the modules' names are those of the official checkpoints' entries. `EdgePoint2` is the
-network as described; `fuse` makes it compute the same in two thirds of the time.
+network as described, but for the last layer of the descriptors, which is applied to samples of a map rather than to all
+of it; `fuse` makes it compute the same in less time.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ MULTIPLE_PX = 32
 """Sides of the images that the layers take; `EdgePoint2` pads others."""
 
 DESCRIPTOR_STEP_PX = 4
-"""Side of the pixels of the descriptor map."""
+"""Side of the pixels of the map that descriptors are computed from."""
 
 GROUP = 16
 """Channels of a group of the descriptors' 3x3 convolution."""
@@ -81,7 +82,7 @@ class Residual(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, width_in, H, W) to (B, width, H, W)."""
-        return F.relu(self.layer(x) + self.skip(x), inplace=True)
+        return F.relu(self.layer(x).add_(self.skip(x)), inplace=True)
 
 
 class EdgePoint2(nn.Module):
@@ -105,33 +106,54 @@ class EdgePoint2(nn.Module):
         self.score_head = nn.Sequential(
             *(nn.Conv2d(score, score, 3, padding=1), _relu()),
             *(nn.Conv2d(score, score, 3, padding=1), _relu()),
-            *(nn.Conv2d(score, 4, 3, padding=1), nn.PixelShuffle(2)),
+            nn.Conv2d(score, 4, 3, padding=1),
         )
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Logits (1, 1, H, W) and descriptors (1, D, H', W') of a grey image (1, 1, H, W).
+        """Logits (1, 1, H, W) and the map (1, C, H', W') for `describe` of a grey image (1, 1, H, W).
 
-        H' and W' are quarters of H and W rounded up to multiples of 32. Descriptors are not normalized.
+        H' and W' are quarters of H and W rounded up to multiples of 32.
         """
-        padded = pad(normalize(image))
-        half, eighth, last = self.maps(padded)
-        logits = self.score_head(self.conv1(half) + _enlarge(self.conv2(eighth), 4) + _enlarge(self.conv3(last), 16))
-        joint = torch.cat([F.avg_pool2d(half, 2), _enlarge(eighth, 2), _enlarge(last, 8)], dim=1)
-        return logits[..., : image.shape[2], : image.shape[3]], self.desc_head(joint)
+        half = self.block1(pad(normalize(image)))
+        quarter = F.avg_pool2d(half, 2)
+        eighth = self.block2(F.avg_pool2d(quarter, 2))
+        last = self.block3(F.avg_pool2d(eighth, 4))
+        score = self.conv1(half)
+        score += _enlarge(self.conv2(eighth), 4)
+        score += _enlarge(self.conv3(last), 16)
+        logits = _squares_of_channels(self.score_head(score))
+        return logits[..., : image.shape[2], : image.shape[3]], self.desc_head[1](self._joined(quarter, eighth, last))
 
-    def maps(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Maps at 1/2, 1/8 and 1/32 of the resolution."""
-        half = self.block1(image)
-        eighth = self.block2(F.avg_pool2d(F.avg_pool2d(half, 2), 2))
-        return half, eighth, self.block3(F.avg_pool2d(eighth, 4))
+    def describe(self, samples: Tensor) -> Tensor:
+        """Descriptors (N, D), not normalized, of samples (N, C) of the map.
+
+        This layer commutes with sampling, and there are fewer keypoints than pixels of the map.
+        """
+        layer = self.desc_head[2]
+        assert isinstance(layer, nn.Conv2d)
+        return F.linear(samples, layer.weight.flatten(1), layer.bias)
+
+    def _joined(self, quarter: Tensor, eighth: Tensor, last: Tensor) -> Tensor:
+        """The descriptors' first layer, applied to each map before it is enlarged, which commutes."""
+        layer = self.desc_head[0]
+        assert isinstance(layer, nn.Conv2d)
+        first, second, third = layer.weight.split([x.shape[1] for x in (quarter, eighth, last)], dim=1)
+        joined = F.conv2d(quarter, first, layer.bias, dilation=layer.dilation)
+        joined += _enlarge(F.conv2d(eighth, second, dilation=layer.dilation), 2)
+        joined += _enlarge(F.conv2d(last, third, dilation=layer.dilation), 8)
+        return joined
 
 
 def fuse(network: EdgePoint2) -> EdgePoint2:
     """Moves each batch normalization into the convolution before it, and puts channels last in memory; in place.
 
-    L64 at 640x480 on one core of a CPU: 51 ms unfused, 46 ms fused, 34 ms with channels last too.
+    L64 at 640x480 on one core of a CPU: 38 ms unfused, 24 ms fused.
     """
     for block in network.modules():
+        if isinstance(block, nn.Conv2d) and block.kernel_size == (1, 1):
+            # Dilation does not change a 1x1 convolution. Without it, PyTorch does not compute it by oneDNN on one
+            # thread, but by a matrix product that takes twice the time.
+            block.dilation = (2, 2)
         if isinstance(block, (Convolution, Residual)):
             layers: list[nn.Module] = []
             for layer in block.layer:
@@ -147,13 +169,21 @@ def fuse(network: EdgePoint2) -> EdgePoint2:
 
 def normalize(image: Tensor) -> Tensor:
     """Normalizes an image (1, 1, H, W) to mean 0 and standard deviation 1."""
-    return F.instance_norm(image)
+    centred = image - image.mean()  # a fifth of the time of instance_norm
+    return centred / (centred.square().mean() + 1e-5).sqrt()
 
 
 def pad(image: Tensor) -> Tensor:
     """Pads an image to sides that are multiples of 32, right and below, by zeros, the mean of a normalized image."""
     height, width = image.shape[2:]
     return F.pad(image, (0, -width % MULTIPLE_PX, 0, -height % MULTIPLE_PX))
+
+
+def _squares_of_channels(x: Tensor) -> Tensor:
+    """(1, 4, H, W) to (1, 1, 2 H, 2 W); with channels last a quarter of the time of pixel_shuffle."""
+    _, _, height, width = x.shape
+    squares = x.permute(0, 2, 3, 1).reshape(height, width, 2, 2)
+    return squares.permute(0, 2, 1, 3).reshape(1, 1, 2 * height, 2 * width)
 
 
 def _enlarge(x: Tensor, factor: int) -> Tensor:

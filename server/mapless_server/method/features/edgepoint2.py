@@ -73,7 +73,7 @@ class EdgePoint2Extractor:
         return view_of(
             reduced_camera,
             array_of(keypoints).astype(np.float64),
-            array_of(normalize(_sampled(feature_map, keypoints), dim=1)),
+            array_of(normalize(self._network.describe(_sampled(feature_map, keypoints)), dim=1)),
             array_of(SIZE_OF_WIDTH / (-curvatures.amax(dim=1)).sqrt()),
         )
 
