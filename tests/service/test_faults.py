@@ -59,7 +59,7 @@ from mapless_server.method.answer import Answer, Localization
 from mapless_server.rpc import receiving
 from mapless_server.serve import listening as grpc_server
 from mapless_tools.load.driving import free_port
-from mapless_tools.load.scrape import Scrape, read_metrics
+from mapless_tools.load.watch import Scrape, read_metrics
 
 ONCE = ConnectOptions(max_attempts=1)
 PATIENT = ConnectOptions(max_attempts=5, initial_backoff_s=1.0, max_backoff_s=5.0)

@@ -26,17 +26,34 @@ from hypothesis import strategies as st
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.images import ImageLimits, decode_image
 from mapless_tools.charts import write_figure
-from mapless_tools.load.arrivals import Kind, Mix, PlannedCall, Requests, plan_calls, poisson_times
+from mapless_tools.load.calls import (
+    CallRecord,
+    Fate,
+    Kind,
+    Mix,
+    PlannedCall,
+    Requests,
+    account_of,
+    latencies,
+    plan_calls,
+    poisson_times,
+)
 from mapless_tools.load.charts import LATENCIES, RATES, draw_load
 from mapless_tools.load.no_op import CAMERA, padded_photo
 from mapless_tools.load.pipeline import PipelineOptions, PipelineResult, pipeline_checks, pipeline_json
-from mapless_tools.load.records import CallRecord, Fate, account_of, latencies
 from mapless_tools.load.report import Check, check_lines, machine_lines, step_lines, update_json
 from mapless_tools.load.requests import photo_request, read_answer
-from mapless_tools.load.scrape import Scrape, parse_metrics, reconcile
 from mapless_tools.load.sender import Target, connected, send_closed_loop, send_open_loop
 from mapless_tools.load.step import Step, run_step
-from mapless_tools.load.watch import ProcessSample, ServerUnderLoad, priority_over, read_process
+from mapless_tools.load.watch import (
+    ProcessSample,
+    Scrape,
+    ServerUnderLoad,
+    parse_metrics,
+    priority_over,
+    read_process,
+    reconcile,
+)
 
 METHOD = "/toy.Toy/Call"
 GOOD, BAD = b"good", b"bad"

@@ -13,13 +13,11 @@ import numpy as np
 import pytest
 
 from mapless.geometry import Array
-from mapless_tools.load.arrivals import Kind, Mix, Requests, plan_calls
+from mapless_tools.load.calls import CallRecord, Fate, Kind, Mix, Requests, plan_calls
 from mapless_tools.load.charts import draw_soak
-from mapless_tools.load.records import CallRecord, Fate
-from mapless_tools.load.scrape import Scrape
 from mapless_tools.load.slopes import MIN_SAMPLES, Slope, slope
 from mapless_tools.load.soak import MIN_SETTLED_S, UNITS, SoakOptions, least_minutes, slopes_of
-from mapless_tools.load.watch import ServerState, ServerUnderLoad, read_state
+from mapless_tools.load.watch import Scrape, ServerState, ServerUnderLoad, read_state
 
 EVERY_S = 10.0
 TIMES_S = np.arange(0.0, 2400.0, EVERY_S)

@@ -15,8 +15,7 @@ from mapless_tools.progress import Progress, progress_bars
 from mapless_tools.usage import UsageError, usage_errors
 
 from .latency import measure_latency
-from .report import BenchResult, as_json, markdown
-from .scenes import KITCHEN, OTHER_FOLDERS, SCENES
+from .report import KITCHEN, OTHER_FOLDERS, SCENES, BenchResult, as_json, markdown
 
 OUTPUT = Path("bench-output/bench.json")
 QUICK_QUERIES = 6

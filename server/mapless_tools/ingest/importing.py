@@ -25,10 +25,9 @@ from mapless_tools.output_files import check_writable, write_json
 from mapless_tools.progress import progress_bars
 
 from .check import check_frames, implausible_depth
-from .existing import KnownReferences
+from .existing import NO_METRES, KnownReferences, WrongUnit, open_scene
 from .formats import ReadOptions, read_dataset
 from .metres import MetreOptions, in_metres
-from .opening import NO_METRES, WrongUnit, open_scene
 from .report import ImportReport, print_report, to_json, verdict_lines
 from .upload import Uploader, UploadOptions
 

@@ -15,8 +15,7 @@ from mapless_tools.child import CONNECT, child_server
 from mapless_tools.demo import Place
 from mapless_tools.progress import Progress
 
-from .arrivals import Mix, Requests, plan_calls
-from .records import CallRecord, Fate
+from .calls import CallRecord, Fate, Mix, Requests, plan_calls
 from .requests import requests_for, store_references
 from .sender import Target, send_open_loop
 from .step import Step, closed_loop_step, run_step

@@ -13,8 +13,8 @@ from mapless_server.settings import available_cores
 from mapless_tools.demo import Place
 from mapless_tools.progress import Progress
 
+from .calls import Fate
 from .driving import LoadedServer, find_saturation, open_step, server_with_scene
-from .records import Fate
 from .report import Check, loop_lag_check, trend_check
 from .requests import METHOD, read_answer
 from .sender import connected

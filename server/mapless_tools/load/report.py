@@ -14,7 +14,7 @@ from mapless_server.observability.provenance import cpu_model
 from mapless_server.settings import available_cores
 from mapless_tools.output_files import write_json
 
-from .records import Fate
+from .calls import Fate
 from .slopes import Slope
 from .step import TREND_CONFIDENCE, Step
 

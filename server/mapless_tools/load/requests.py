@@ -13,7 +13,7 @@ from mapless.names import reference_name, scene_name
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_tools.demo import Photograph
 
-from .arrivals import Requests
+from .calls import Requests
 
 SCENE = "load"
 METHOD = "/mapless.v1.LocalizationService/Localize"

@@ -16,8 +16,7 @@ import grpc
 
 from mapless.errors import MaplessError, from_rpc_error
 
-from .arrivals import Kind, PlannedCall
-from .records import CallRecord, Fate
+from .calls import CallRecord, Fate, Kind, PlannedCall
 
 MAX_MESSAGE_BYTES = 64 * 2**20
 REFUSED_PAUSE_S = 0.1

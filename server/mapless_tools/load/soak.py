@@ -18,17 +18,15 @@ from mapless_server.method.options import check_bounds
 from mapless_tools.demo import Place
 from mapless_tools.progress import Progress
 
-from .arrivals import Mix
+from .calls import Fate, Mix
 from .churn import WORK, Outcomes, Workers, churning
 from .driving import LoadedServer, find_saturation, open_step, server_with_scene
-from .records import Fate
 from .report import Check, loop_lag_check
 from .requests import METHOD, mixed_requests, read_answer
-from .scrape import Reconciliation, reconcile
 from .sender import connected
 from .slopes import CONFIDENCE, MIN_SAMPLES, Slope, slope
 from .step import Step, closed_loop_step
-from .watch import FIELDS, ServerState, column, server_states
+from .watch import FIELDS, Reconciliation, ServerState, column, reconcile, server_states
 
 UNITS: Mapping[str, str] = {
     "resident_mib": "MiB",

@@ -9,11 +9,10 @@ from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
 
-from .records import Account, CallRecord, Fate, account_of
-from .scrape import Scrape
+from .calls import Account, CallRecord, Fate, account_of
 from .sender import Target, send_closed_loop
 from .slopes import MIN_SAMPLES, Slope, slope
-from .watch import SAMPLE_EVERY_S, ProcessSample, ServerUnderLoad, process_samples
+from .watch import SAMPLE_EVERY_S, ProcessSample, Scrape, ServerUnderLoad, process_samples
 
 Send = Callable[[], Awaitable[list[CallRecord]]]
 CLOSED_SETTLE_SHARE = 0.2

@@ -13,7 +13,7 @@ from typing import Any
 
 from mapless import Client
 from mapless_tools.demo import Place
-from mapless_tools.load.records import Fate
+from mapless_tools.load.calls import Fate
 from mapless_tools.load.report import Check
 from mapless_tools.load.requests import METHOD, read_answer, requests_for, store_references
 from mapless_tools.load.sender import Target, connected
