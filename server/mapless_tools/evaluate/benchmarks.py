@@ -8,7 +8,7 @@ from pathlib import Path
 from mapless_tools.ingest.formats import fits
 from mapless_tools.usage import UsageError
 
-from .paper import CAMBRIDGE, SEVEN_SCENES, TWELVE_SCENES, PaperTables
+from .paper import PAPER, PaperTables
 
 MAX_DEPTH = 2
 """12-Scenes keeps its rooms in folders of buildings."""
@@ -49,7 +49,7 @@ BENCHMARKS = {
             },
             (30, 20, 10, 5),
             "SfM pseudo ground truth (Brachmann et al., ICCV 2021)",
-            SEVEN_SCENES,
+            PAPER["7scenes"],
         ),
         Benchmark(
             "12scenes",
@@ -57,7 +57,7 @@ BENCHMARKS = {
             {f"{house}/{room}": f"{house.capitalize()}_{room}" for house, rooms in _ROOMS.items() for room in rooms},
             (30, 20, 10, 5),
             "SfM pseudo ground truth (Brachmann et al., ICCV 2021)",
-            TWELVE_SCENES,
+            PAPER["12scenes"],
         ),
         Benchmark(
             "cambridge",
@@ -70,7 +70,7 @@ BENCHMARKS = {
             },
             (60, 50, 40, 30),
             "the benchmark's own SfM poses",
-            CAMBRIDGE,
+            PAPER["cambridge"],
         ),
     )
 }
