@@ -1,12 +1,4 @@
-"""A folder of photographs with known poses: ``images/`` and ``cameras.json``.
-
-`cameras.json` holds ``frames``, a list of objects with ``image`` (path from the folder), ``width`` and ``height``,
-``K`` (3x3, pixels, (0, 0) the centre of the top-left one), ``dist`` (OpenCV's k1 k2 p1 p2 [k3], or null) and
-``world_from_camera`` (4x4, camera axes x right, y down, z forward), perhaps also ``split`` ("train" or "test") and
-``lens`` ("fisheye": dist is then OpenCV's fisheye k1 k2 k3 k4); and beside them ``metric`` (false: the unit of length
-is arbitrary), ``source``, ``ground_truth``, ``datum`` (where the world is on the Earth, `mapless.geodesy.Datum`:
-``latitude_deg``, ``longitude_deg``, ``height_m``, perhaps ``enu_from_world`` with ``x y z w``) and ``down_in_world``.
-"""
+"""Photographs of one place with known poses, whatever the layout on the disk; `ingest.formats` reads them."""
 
 from __future__ import annotations
 
@@ -19,12 +11,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from mapless.cameras import FOLDER_FILE, camera_of_frame
 from mapless.geodesy import Datum
-from mapless.geometry import MAX_COORDINATE_M, Array, Camera, RigidTransform
+from mapless.geometry import Array, Camera, RigidTransform
 from mapless.scenes import Vector, unit_vector
 
-FILE_NAME = FOLDER_FILE
 MAX_NAME_LENGTH = 128
 SPLITS = ("", "train", "test")
 _MAX_QUOTED = 1000
@@ -90,52 +80,6 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
-def read_folder(path: Path, skips_unusable: bool = False) -> Dataset:
-    """Reads the frames of a folder; images are not opened. ValueError names the frame and the field that is wrong.
-
-    With `skips_unusable`, malformed frames are only listed in `refused`, if at least one frame is usable.
-    """
-    file = path / FILE_NAME
-    content = read_json(file)
-    if not isinstance(content, dict) or not isinstance(content.get("frames"), list) or not content["frames"]:
-        raise ValueError(f"{file}: frames must be a list with at least one frame")
-    if not isinstance(content.get("metric", True), bool):
-        raise ValueError(f"{file}: metric must be true or false")
-    frames: list[Frame] = []
-    refused: list[Refusal] = []
-    names: set[str] = set()
-    images: set[Path] = set()
-    for index, entry in enumerate(content["frames"]):
-        image = entry.get("image", "?") if isinstance(entry, dict) else "?"
-        label = f"frames[{index}] ({image})"
-        try:
-            frame = read_frame(path, entry, names)
-            if frame.image_path in images:
-                raise ValueError(f"image: {image!r} is named twice")
-        except ValueError as error:
-            if not skips_unusable:
-                raise ValueError(f"{file}: {label}: {error}") from error
-            refused.append(Refusal(f"{FILE_NAME}: {label}", str(error)))
-            continue
-        names.add(frame.name)
-        images.add(frame.image_path)
-        frames.append(frame)
-    if not frames:
-        first = refused[0]
-        raise ValueError(f"{path}: none of {len(refused)} frames can be used; {first.frame}: {first.reason}")
-    datum, down_in_world = read_place(file, content)
-    return Dataset(
-        path.resolve().name,
-        tuple(frames),
-        content.get("metric", True),
-        _text(content, "source"),
-        _text(content, "ground_truth"),
-        refused=tuple(refused),
-        datum=datum,
-        down_in_world=down_in_world,
-    )
-
-
 def read_place(file: Path, content: Mapping[str, Any]) -> tuple[Datum | None, Vector | None]:
     """Reads datum and direction of gravity, each None if it is missing; ValueError names the field."""
     return _parsed(file, content, "datum", Datum.from_json), _parsed(file, content, "down_in_world", _direction)
@@ -151,11 +95,6 @@ def read_json(file: Path) -> Any:
         raise ValueError(f"{file} is not JSON: {error}") from error
 
 
-def _text(content: Mapping[str, Any], field: str) -> str:
-    text = content.get(field, "")
-    return printable(text) if isinstance(text, str) else ""
-
-
 def _parsed(file: Path, content: Mapping[str, Any], field: str, read: Callable[[object], Parsed]) -> Parsed | None:
     if content.get(field) is None:
         return None
@@ -166,13 +105,8 @@ def _parsed(file: Path, content: Mapping[str, Any], field: str, read: Callable[[
 
 
 def _direction(content: object) -> Vector:
-    x, y, z = _numbers({"it": content}, "it", (3,)).tolist()
+    x, y, z = finite_numbers(content, "it", (3,)).tolist()
     return unit_vector(x, y, z)
-
-
-def reference_id(image: str, taken: Container[str]) -> str:
-    """The image path's stem as a legal reference id that is not `taken` yet."""
-    return legal_id(PurePosixPath(image).stem, taken)
 
 
 def legal_id(stem: str, taken: Container[str]) -> str:
@@ -197,36 +131,6 @@ def image_file(folder: Path, image: str) -> Path:
     if not found:
         raise ValueError(f"image: there is no file {file}")
     return file
-
-
-def read_frame(folder: Path, entry: object, taken: Container[str]) -> Frame:
-    """Reads an entry of `frames`, with an id that is not `taken`; ValueError names the wrong field."""
-    if not isinstance(entry, dict):
-        raise ValueError("must be an object")
-    image = entry.get("image")
-    if not isinstance(image, str) or not image:
-        raise ValueError("image must be a path")
-    file = image_file(folder, image)
-    try:
-        pose = RigidTransform.from_matrix(_numbers(entry, "world_from_camera", (4, 4)))
-        if not np.abs(pose.translation).max() <= MAX_COORDINATE_M:
-            raise ValueError(f"lies more than {MAX_COORDINATE_M:g} m from the origin")
-    except ValueError as error:
-        raise ValueError(f"world_from_camera: {error}") from error
-    return Frame(reference_id(image, taken), file, _camera(entry), pose, entry.get("split", ""))
-
-
-def _camera(entry: Mapping[str, Any]) -> Camera:
-    camera = camera_of_frame(entry)
-    if not (camera.focal_x_px > 0 and camera.focal_y_px > 0):
-        raise ValueError(f"K: focal lengths must be above 0, are {camera.focal_x_px:g} and {camera.focal_y_px:g}")
-    return camera
-
-
-def _numbers(entry: Mapping[str, Any], field: str, shape: tuple[int, ...] | None) -> Array:
-    if field not in entry:
-        raise ValueError(f"{field} is missing")
-    return finite_numbers(entry[field], field, shape)
 
 
 def finite_numbers(value: object, what: str, shape: tuple[int, ...] | None = None) -> Array:

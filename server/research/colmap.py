@@ -25,11 +25,12 @@ import numpy as np
 import pycolmap
 
 from mapless.geometry import Array, RigidTransform
-from mapless_tools.dataset import Dataset, Frame, read_folder
+from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.evaluate.metrics import QueryResult, pose_error, trajectory_radius
 from mapless_tools.evaluate.plan import MAX_K, EvaluationOptions, split_frames
 from mapless_tools.evaluate.report import SCALE_FREE, format_length, format_rotation, to_json
 from mapless_tools.evaluate.run import Evaluation
+from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.ingest.formats.colmap.cameras import from_camera
 from mapless_tools.output_files import whole_file, write_json
 

@@ -28,9 +28,10 @@ from mapless_server.method.pipeline import Pipeline, StageOptions
 from mapless_server.method.priors.known import NO_PRIORS, Priors
 from mapless_server.method.results import Support
 from mapless_server.method.views import PosedView, View
-from mapless_tools.dataset import Frame, read_folder
+from mapless_tools.dataset import Frame
 from mapless_tools.evaluate.metrics import pose_error
 from mapless_tools.evaluate.references import choose_references
+from mapless_tools.ingest.formats.cameras import read_folder
 
 S = TypeVar("S")
 

@@ -27,9 +27,9 @@ from mapless_server.scenes import RankOptions, Selection, rank_references
 from mapless_server.scenes.retrieval.index import Entries, SceneIndex
 from mapless_server.scenes.retrieval.vlad import DIMENSION, VladDescriptor
 from mapless_server.store import IndexedReference, SceneChanges
-from mapless_tools.dataset import read_folder
 from mapless_tools.evaluate.metrics import pose_error
 from mapless_tools.evaluate.plan import EvaluationOptions, split_frames
+from mapless_tools.ingest.formats.cameras import read_folder
 
 from .places import KITCHEN, Pair, Place, answered, read_place
 

@@ -32,7 +32,7 @@ from mapless_server.method.rejection import RejectionReason
 from mapless_server.method.trust.evidence import AgreementOptions, Evidence, evidence_of, votes_of
 from mapless_server.method.trust.judge import LEVELS
 from mapless_server.method.views import Features
-from mapless_tools.dataset import read_folder
+from mapless_tools.ingest.formats.cameras import read_folder
 
 from .places import (
     ALL,

@@ -20,9 +20,10 @@ from support.layouts import truth
 
 from mapless.geometry import Camera
 from mapless.names import check_id
-from mapless_tools.dataset import SPLITS, Dataset, read_frame
+from mapless_tools.dataset import SPLITS, Dataset
 from mapless_tools.ingest.formats import ReadOptions, read_dataset, recognize
-from mapless_tools.ingest.formats.collecting import check_camera
+from mapless_tools.ingest.formats.cameras import add_frame
+from mapless_tools.ingest.formats.collecting import Collector, check_camera
 from mapless_tools.ingest.formats.colmap.cameras import from_camera
 from mapless_tools.ingest.formats.writing import PosedImage, cameras_files
 
@@ -150,7 +151,9 @@ def _check_written(dataset: Dataset, folder: Path) -> None:
     name = frame.image_path.relative_to(folder).as_posix()
     (text,) = cameras_files([PosedImage(name, frame.camera, frame.world_from_camera)], "").values()
     (entry,) = json.loads(text)["frames"]
-    again = read_frame(folder, entry | {"image": name, "split": frame.split}, ())
+    collector = Collector(folder)
+    add_frame(collector, entry | {"image": name, "split": frame.split})
+    (again,) = collector.frames
     assert again.camera == frame.camera, (again.camera, frame.camera)
     assert np.abs(again.world_from_camera.matrix() - frame.world_from_camera.matrix()).max() < 1e-9
     colmap = from_camera(1, frame.camera).camera()

@@ -12,9 +12,9 @@ import pytest
 from support.layouts import CAMERA, Truth, assert_reads, reasons, truth, write_image, write_layout
 
 from mapless.geometry import Fisheye, RadialTangential
-from mapless_tools.dataset import read_folder
 from mapless_tools.ingest import FORMATS
 from mapless_tools.ingest.formats import read_dataset, recognize
+from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.ingest.formats.writing import LAYOUTS, PosedImage, image_name, write_file
 
 TRUTH = truth()

@@ -20,7 +20,7 @@ from mapless.report.sections import provenance_section
 from mapless.v1 import geometry_pb2 as pb
 from mapless_server.method.features import undistort_pixels
 from mapless_server.store.codec import decode_geometry, encode_geometry, sha256_for
-from mapless_tools.dataset import read_folder
+from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.ingest.formats.colmap.cameras import from_camera
 from mapless_tools.ingest.formats.writing import PosedImage, cameras_files
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from mapless_tools.dataset import read_folder
+from mapless_tools.ingest.formats.cameras import read_folder
 
 pytest.importorskip("pycolmap")
 

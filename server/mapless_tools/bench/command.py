@@ -7,9 +7,9 @@ from pathlib import Path
 from mapless_server.observability.provenance import cpu_model
 from mapless_server.serve.signals import terminable
 from mapless_server.settings import available_cores, load_settings
-from mapless_tools.dataset import read_folder
 from mapless_tools.evaluate.plan import EvaluationOptions
 from mapless_tools.evaluate.run import Evaluation, evaluate
+from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.output_files import write_json
 from mapless_tools.progress import Progress, progress_bars
 from mapless_tools.usage import UsageError, usage_errors

@@ -24,9 +24,10 @@ from mapless import Client, LocalizationResult
 from mapless.geometry import Array
 from mapless_server.serve.signals import terminable
 from mapless_tools.child import CONNECT, ChildServer, child_server
-from mapless_tools.dataset import Dataset, Frame, read_folder
+from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.evaluate.plan import EvaluationOptions, split_frames
 from mapless_tools.evaluate.run import SCENE, store_references
+from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.usage import UsageError, failures_end_command, usage_errors
 
 TURNS = (0, 1, 1, 0)

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from mapless import Camera, RigidTransform
 from mapless.geometry import Array
-from mapless_tools.dataset import Frame, read_folder
+from mapless_tools.dataset import Frame
+from mapless_tools.ingest.formats.cameras import read_folder
 
 ROOM = Path(__file__).with_name("room")
 MAX_FRAMES = 60

@@ -10,8 +10,8 @@ from rich.console import Console
 
 from mapless_server.serve.signals import terminable
 from mapless_server.settings import load_settings
-from mapless_tools.dataset import read_folder
 from mapless_tools.ingest.formats import ReadOptions, read_dataset
+from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.output_files import check_writable, write_json
 from mapless_tools.progress import progress_bars
 from mapless_tools.usage import UsageError, usage_errors

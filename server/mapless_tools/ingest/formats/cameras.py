@@ -1,19 +1,74 @@
-"""`cameras.json` and images: our own layout, described in `dataset`."""
+"""Our own layout: ``images/`` and ``cameras.json``.
+
+`cameras.json` holds ``frames``, a list of objects with ``image`` (path from the folder), ``width`` and ``height``,
+``K`` (3x3, pixels, (0, 0) the centre of the top-left one), ``dist`` (OpenCV's k1 k2 p1 p2 [k3], or null) and
+``world_from_camera`` (4x4, camera axes x right, y down, z forward), perhaps also ``split`` ("train" or "test") and
+``lens`` ("fisheye": dist is then OpenCV's fisheye k1 k2 k3 k4); and beside them ``metric`` (false: the unit of length
+is arbitrary), ``source``, ``ground_truth``, ``datum`` (where the world is on the Earth, `mapless.geodesy.Datum`:
+``latitude_deg``, ``longitude_deg``, ``height_m``, perhaps ``enu_from_world`` with ``x y z w``) and ``down_in_world``.
+"""
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import Any
 
-from mapless_tools.dataset import FILE_NAME, Dataset, read_folder
+from mapless.cameras import FOLDER_FILE, camera_of_frame
+from mapless.geometry import RigidTransform
+from mapless_tools.dataset import Dataset, finite_numbers, printable, read_json, read_place
 
+from .collecting import Collector
 from .options import ReadOptions
 
 
 def fits(path: Path) -> bool:
     """Whether a folder has this layout."""
-    return (path / FILE_NAME).is_file()
+    return (path / FOLDER_FILE).is_file()
 
 
 def read(path: Path, options: ReadOptions) -> Dataset:
-    """Reads the folder; see `read_dataset`."""
-    return read_folder(path, skips_unusable=True)
+    """Reads the folder; see `read_dataset`. Images are not opened."""
+    file = path / FOLDER_FILE
+    content = read_json(file)
+    if not isinstance(content, dict) or not isinstance(content.get("frames"), list) or not content["frames"]:
+        raise ValueError(f"{file}: frames must be a list with at least one frame")
+    metric = content.get("metric", True)
+    if not isinstance(metric, bool):
+        raise ValueError(f"{file}: metric must be true or false")
+    collector = Collector(path)
+    for index, entry in enumerate(content["frames"]):
+        image = entry.get("image", "?") if isinstance(entry, dict) else "?"
+        with collector.attempt(f"{FOLDER_FILE}: frames[{index}] ({image})"):
+            add_frame(collector, entry)
+    texts = {it: printable(str(content[it])) for it in ("source", "ground_truth") if isinstance(content.get(it), str)}
+    dataset = collector.dataset(path.resolve().name, "cameras", metric=metric, **texts)
+    datum, down_in_world = read_place(file, content)
+    return replace(dataset, datum=datum, down_in_world=down_in_world)
+
+
+def read_folder(path: Path) -> Dataset:
+    """Reads the frames of a folder, all of which must be right; ValueError names the frame and the wrong field."""
+    dataset = read(path, ReadOptions())
+    if dataset.refused:
+        raise ValueError(f"{path}: {dataset.refused[0].frame}: {dataset.refused[0].reason}")
+    return dataset
+
+
+def add_frame(collector: Collector, entry: Any) -> None:
+    """Adds an entry of `frames`; ValueError names the wrong field."""
+    if not isinstance(entry, dict):
+        raise ValueError("must be an object")
+    image = entry.get("image")
+    if not isinstance(image, str) or not image:
+        raise ValueError("image must be a path")
+    if "world_from_camera" not in entry:
+        raise ValueError("world_from_camera is missing")
+    try:
+        pose = RigidTransform.from_matrix(finite_numbers(entry["world_from_camera"], "it", (4, 4)))
+    except ValueError as error:
+        raise ValueError(f"world_from_camera: {error}") from error
+    camera = camera_of_frame(entry)
+    if not (camera.focal_x_px > 0 and camera.focal_y_px > 0):
+        raise ValueError(f"K: focal lengths must be above 0, are {camera.focal_x_px:g} and {camera.focal_y_px:g}")
+    collector.add(image, camera, pose, entry.get("split", ""), PurePosixPath(image).stem)

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from mapless import Scene
+from mapless.cameras import FOLDER_FILE
 from mapless.geometry import DEFAULT_LENS_MODEL, Camera, RigidTransform, lens_model_of
-from mapless_tools.dataset import FILE_NAME
 
 from .colmap.cameras import from_camera
 from .kapture import PROPERTIES
@@ -60,7 +60,7 @@ def cameras_files(images: Sequence[PosedImage], source: str, scene: Scene | None
     unit = "metre" if properties["metric"] else "arbitrary"
     content: dict[str, Any] = {"source": source, "units": unit, **properties}
     content["frames"] = [_entry(image) for image in images]
-    return {FILE_NAME: json.dumps(content, indent=1, allow_nan=False) + "\n"}
+    return {FOLDER_FILE: json.dumps(content, indent=1, allow_nan=False) + "\n"}
 
 
 def colmap_files(images: Sequence[PosedImage], source: str, scene: Scene | None = None) -> dict[str, str]:
