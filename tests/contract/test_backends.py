@@ -45,7 +45,7 @@ def view_at(x_m: float) -> View:
     start = round(x_m * CAMERA.focal_x_px / DISTANCE_M)
     pixels = np.ascontiguousarray(WALL[:, start : start + CAMERA.width_px])
     view = SiftExtractor().extract(pixels, CAMERA)
-    return View(view.camera, view.features, Photograph(f"at {x_m}", CAMERA, lambda: pixels))
+    return View(view.camera, view.features, Photograph(lambda: f"at {x_m}", CAMERA, lambda: pixels))
 
 
 def references() -> tuple[PosedView, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import re
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
@@ -19,11 +20,12 @@ from support.waiting import until
 from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
-from mapless_server.errors import NotFound, Overloaded, PermissionDenied, Unauthenticated
+from mapless_server.errors import NotFound, Overloaded, PermissionDenied, RequestError, Unauthenticated, Unavailable
 from mapless_server.observability.tracing import MAX_STEPS, TracedStep
-from mapless_server.rpc import CallGuard, receiving
+from mapless_server.rpc import CallGuard, pace, receiving
 from mapless_server.rpc.call import ANSWER_MARGIN_SHARE, Call
 from mapless_server.rpc.receiving import OpenMethods, Receiver
+from mapless_server.scheduling import Flow
 from mapless_server.security import Principal, Role
 
 CHECK, WATCH = "/grpc.health.v1.Health/Check", "/grpc.health.v1.Health/Watch"
@@ -313,6 +315,23 @@ class TestCallsWithHeadersOnly:
         async with listening(echo, counted, authenticate=authenticate) as port:
             await self.ended(port, raw_http2.begin(1, METHOD))
         assert counted.codes == ["UNAUTHENTICATED"]
+
+    @pytest.mark.parametrize(("error", "is_paced"), [(Overloaded("full"), True), (Unavailable("stopping"), False)])
+    async def test_refusals_beyond_a_rate_wait_for_their_turn(
+        self, counted: Counted, monkeypatch: pytest.MonkeyPatch, error: RequestError, is_paced: bool
+    ) -> None:
+        monkeypatch.setattr(pace, "PER_S", 20)
+        monkeypatch.setattr(pace, "BURST", 2)
+
+        def refuse(method: str, flow: Flow) -> None:
+            raise error
+
+        start_s = time.monotonic()
+        async with serving(echo, counted, check_admission=refuse) as channel:
+            failures = await asyncio.gather(*(failure(channel) for _ in range(10)))
+        took_s = time.monotonic() - start_s
+        assert {it.code for it in failures} == {error.code}
+        assert (took_s > 7 / 20) is is_paced
 
     async def test_the_message_has_to_come_before_the_deadline(
         self, counted: Counted, caplog: pytest.LogCaptureFixture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import math
 import weakref
 from collections import Counter
@@ -144,6 +145,9 @@ class TestAdmission:
         assert refused.retry_after_s is not None
         assert refused.retry_after_s > 0
         # The device is what there is least of: 0.3 s each, and three quarters of 2 s.
+        toy.scheduler.check_room(Flow("t", "another"), toy.jobs[0].step)
+        with pytest.raises(Refused, match="as much is admitted already"):
+            toy.scheduler.check_room(toy.jobs[0].flow, toy.jobs[0].step)
         toy.admit(client="another")
 
     def test_a_job_is_booked_for_no_more_than_it_was_admitted_for(self) -> None:
@@ -235,12 +239,22 @@ class TestOrder:
         assert sizes == [3, 3, 1, 1]
         assert toy.observer.inflight["coarse"] == toy.observer.waiting["coarse"] == 0
 
-    def test_a_batch_that_did_not_fit_is_not_tried_again(self) -> None:
-        toy = Toy(WorkQueueOptions(max_queued_s=1000))
+    def test_a_larger_batch_is_tried_again_ever_more_rarely(self) -> None:
+        toy = Toy(WorkQueueOptions(max_queued_s=1e9))
         toy.scheduler.limit_batch("coarse", "b", 1)
-        for _ in range(3):
-            toy.admit(stage="coarse")
-        assert len(toy.take("device").jobs) == 1
+        sizes: list[int] = []
+        for _ in range(300):
+            for _ in range(4):
+                toy.admit(stage="coarse", deadline_s=1e9)
+            while (batch := toy.scheduler.take("device", toy.now_s)) is not None:
+                sizes.append(len(batch.jobs))
+                if len(batch.jobs) > 1:  # it does not fit, and its halves do
+                    toy.scheduler.limit_batch("coarse", "b", 1)
+                toy.finish(batch, *[Done("result")] * len(batch.jobs))
+        large = [i for i, size in enumerate(sizes) if size > 1]
+        between = [later - earlier - 1 for earlier, later in itertools.pairwise([-1, *large])]
+        assert between == [64, 128, 256, 512]
+        assert set(sizes) == {1, 2}
 
     def test_a_lane_computes_as_much_at_a_time_as_it_has_threads(self) -> None:
         toy = Toy(WorkQueueOptions(max_queued_s=1000))

@@ -35,7 +35,7 @@ def sent(view: View, camera: Camera) -> View:
     def read() -> np.ndarray:
         raise AssertionError("the pixels are not needed")
 
-    return replace(view, photograph=Photograph("", camera, read))
+    return replace(view, photograph=Photograph(str, camera, read))
 
 
 def support_of(

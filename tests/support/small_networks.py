@@ -70,7 +70,7 @@ def photograph(image: NDArray[np.uint8], camera: Camera | None = None, reads: li
         return image
 
     camera = camera or Camera(width, height, 0.8 * width, 0.8 * width, width / 2 - 0.5, height / 2 - 0.5)
-    return Photograph(sha256, camera, read)
+    return Photograph(lambda: sha256, camera, read)
 
 
 def view_of(photo: Photograph) -> View:

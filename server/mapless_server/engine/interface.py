@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from mapless_server.images import ImageLimits
 from mapless_server.method.options import check_bounds
-from mapless_server.scheduling import Job, WorkQueueOptions
+from mapless_server.scheduling import Flow, Job, WorkQueueOptions
 
 from .tiers import EscalationOptions
 
@@ -107,8 +107,8 @@ class Engine(Protocol):
         """Reserves the memory of a group's photographs for the duration of its call."""
         ...
 
-    def check_room(self) -> None:
-        """Raises RequestError if no query of any kind would be admitted now."""
+    def check_room(self, flow: Flow, is_query: bool = True) -> None:
+        """Raises RequestError if no query of a caller would be admitted now, or no upload of references."""
         ...
 
     async def describe(self, photos: Sequence[Photo], caller: Caller) -> list[Description]:

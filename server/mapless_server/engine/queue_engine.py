@@ -23,6 +23,7 @@ from mapless_server.scheduling import (
     Expired,
     Failure,
     Fatal,
+    Flow,
     ItemList,
     Job,
     Observer,
@@ -56,6 +57,8 @@ DESCRIBE, RETRIEVE, AUDIT, COVERAGE = "describe", "retrieve", "audit", "coverage
 
 JOIN = "join"
 """Poses several photographs together that were localized each by itself."""
+
+_QUERY, _UPLOAD = Step(PREPARE, "", "", None), Step(DESCRIBE, DESCRIBE, DESCRIBE, None)
 
 
 class QueueEngine:
@@ -162,10 +165,15 @@ class QueueEngine:
                 stack.enter_context(self.queue.hold(caller.flow, size_bytes))
             yield
 
-    def check_room(self) -> None:
-        """Raises RequestError if no query of any kind would be admitted now, so that its message need not be read."""
-        with _as_request_errors():
-            self.queue.check_room(Step(PREPARE, "", "", None))
+    def check_room(self, flow: Flow, is_query: bool = True) -> None:
+        """Raises RequestError if no query of a caller would be admitted now, or no upload of references.
+
+        Of what is refused here the message need not be read.
+        """
+        try:
+            self.queue.check_room(flow, _QUERY if is_query else _UPLOAD)
+        except Refused as refused:
+            raise _refusal(refused) from None
 
     async def describe(self, photos: Sequence[Photo], caller: Caller) -> list[Description]:
         """Computes features and descriptors of photographs, in order.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,14 +74,19 @@ class Photograph:
     """The image of a view, for stages that use pixels. Reading it may involve a database and a decoder.
 
     Attributes:
-        sha256: hash of the encoded image, hexadecimal; key for caches of anything computed from the pixels.
+        identify: function that returns `sha256`; called only where something is cached by it.
         camera: camera in pixels of the image, with its lens distortion.
         read: function that returns the pixels, (H, W, 3) uint8 RGB, of the camera's size.
     """
 
-    sha256: str
+    identify: Callable[[], str]
     camera: Camera
     read: Callable[[], NDArray[np.uint8]]
+
+    @cached_property
+    def sha256(self) -> str:
+        """Hash of the encoded image, hexadecimal; key for caches of anything computed from the pixels."""
+        return self.identify()
 
 
 @dataclass(frozen=True, eq=False)

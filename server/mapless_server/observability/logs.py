@@ -139,6 +139,8 @@ def plain(value: object) -> object:
 
     Bytes become their count, other values their `repr`. Never raises.
     """
+    if value.__class__ is str and len(value) <= _MAX_FIELD_TEXT:  # the usual case first
+        return value
     try:
         return _plain(value, 0)
     except Exception as error:  # the rest of the line is still of use
@@ -146,14 +148,14 @@ def plain(value: object) -> object:
 
 
 def _plain(value: object, depth: int) -> object:
+    if type(value) is float and math.isfinite(value):  # the usual case first
+        return value
     if isinstance(value, Enum):
         return _plain(value.value, depth)
     if value is None or isinstance(value, bool):
         return value
     if isinstance(value, str):
         return _cut(value, _MAX_FIELD_TEXT)
-    if type(value) is float and math.isfinite(value):  # the usual case first
-        return value
     if isinstance(value, Integral):  # NumPy's too
         number = int(value)
         return number if abs(number) < _MAX_INTEGER else _cut(hex(number), _MAX_FIELD_TEXT)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
+import random
 import re
 import time
-import uuid
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from urllib.parse import unquote
@@ -103,7 +103,7 @@ def begin_call(context: Context, deadlines: Deadlines, is_endless: bool) -> Call
     if math.isfinite(given_s):
         margin_s = min(max(ANSWER_MARGIN_S, ANSWER_MARGIN_SHARE * given_s), _MAX_MARGIN_SHARE * given_s)
     metadata = metadata_of(context)
-    request_id = _well_formed(metadata, REQUEST_ID_KEY) or uuid.uuid4().hex
+    request_id = _well_formed(metadata, REQUEST_ID_KEY) or f"{random.getrandbits(128):032x}"
     client = _well_formed(metadata, CLIENT_ID_KEY) or unquote(context.peer())
     call = Call(request_id, now_s, now_s + given_s - margin_s, client=client)
     if math.isfinite(given_s):

@@ -18,9 +18,11 @@ from mapless.wire import FieldError
 from mapless_server.errors import DeadlineExceeded, InvalidArgument, RequestError, Unavailable
 from mapless_server.observability.logs import as_extra
 from mapless_server.observability.tracing import CallSpan, Metadata, NoTracer, Tracer
+from mapless_server.scheduling import Flow
 from mapless_server.security import ENDLESS_METHODS, OPEN_METHODS, Principal
 
 from .call import Call, Deadlines, begin_call, metadata_of
+from .pace import PACED_CODES, Pace
 from .receiving import Context, OpenMethods, Receiver, quiet_ended_calls
 from .sending import ENDLESS_SEND_LIMIT_S, SEND_LIMIT_S, Sender
 
@@ -68,7 +70,7 @@ class CallGuard:
         max_deadline_s: float = 600.0,
         *,
         authenticate: Authenticate | None = None,
-        check_admission: Callable[[str], None] = lambda method: None,
+        check_admission: Callable[[str, Flow], None] = lambda method, flow: None,
         observer: CallObserver | None = None,
         tracer: Tracer | None = None,
     ) -> None:
@@ -78,8 +80,8 @@ class CallGuard:
             default_deadline_s: deadline of calls without one.
             max_deadline_s: largest deadline; later ones are reduced to it.
             authenticate: function that authenticates the caller of a method.
-            check_admission: raises RequestError if no call of this method can be served now; called on the event loop,
-                before the message is read.
+            check_admission: raises RequestError if no call of this method and caller can be served now; called on the
+                event loop, before the message is read.
             observer: counts calls.
             tracer: traces calls; its owner closes it.
         """
@@ -94,6 +96,7 @@ class CallGuard:
         self._abandoned: set[asyncio.Task[Any]] = set()  # the loop holds only weak references
         self._receiver = Receiver()
         self._sender = Sender()
+        self._pace = Pace()
         self._open = OpenMethods(self._receiver)
         quiet_ended_calls()
 
@@ -108,8 +111,8 @@ class CallGuard:
             call = begin_call(context, self._deadlines, method in ENDLESS_METHODS)
             with self._recorded(method, call, context) as result:
                 try:
-                    self._principal(method, context)
-                    self._check_admission(method)
+                    principal = self._principal(method, context)
+                    self._check_admission(method, Flow(principal.tenant, call.client))
                     response = await reply(handler, method, call, context)
                     context.set_trailing_metadata(call.trailers)
                     result.code = "OK"
@@ -117,7 +120,10 @@ class CallGuard:
                 except RequestError as error:
                     result.code = error.code
                     call.note(reason=error.reason, error=str(error))
-                    await self._sender.error(context, call, error)
+                    if error.code in PACED_CODES:
+                        error.__traceback__ = error.__context__ = None  # they hold the message
+                        await self._pace.turn(call.deadline_s)
+                    await self._sender.error(context, call, error, streams)
                     raise  # not reached: sending it raises
                 except asyncio.CancelledError:
                     # When the caller's deadline passes, grpc may notice it first.
@@ -128,7 +134,9 @@ class CallGuard:
                     call.note(reason=type(error).__name__)
                     ids = {"request_id": call.request_id, "trace_id": result.span.trace_id}
                     log.exception("%s failed", method, extra=ids)
-                    await self._sender.error(context, call, RequestError(f"internal error, id={call.request_id}"))
+                    await self._sender.error(
+                        context, call, RequestError(f"internal error, id={call.request_id}"), streams
+                    )
                     raise
 
         # Not as a unary method, whose message grpc receives first: a rejected call must cost nothing, and one without a
@@ -154,7 +162,11 @@ class CallGuard:
             self._active -= is_awaited
             if not self._active:
                 self._idle.set()
-            self._log_end(method, call, result)
+            seconds = time.monotonic() - call.arrived_s
+            if self._observer is not None:
+                self._observer.call_handled(method, result.code, seconds, result.span.trace_id)
+            # Behind the answer, which grpc sends when this handler returns.
+            asyncio.get_running_loop().call_soon(self._log_end, method, call, result, seconds)
 
     async def wait_until_idle(self, limit_s: float) -> None:
         """Returns when no call is being answered, or after the limit."""
@@ -289,10 +301,8 @@ class CallGuard:
         if error is not None and not isinstance(error, RequestError | FieldError):
             log.error("a call failed after it was abandoned", exc_info=error)
 
-    def _log_end(self, method: str, call: Call, result: _Result) -> None:
-        seconds, span, record = time.monotonic() - call.arrived_s, result.span, call.history
-        if self._observer is not None:
-            self._observer.call_handled(method, result.code, seconds, span.trace_id)
+    def _log_end(self, method: str, call: Call, result: _Result, seconds: float) -> None:
+        span, record = result.span, call.history
         fields: dict[str, object] = {**record.notes, "request_id": call.request_id, "client": call.client}
         span.end(result.code, record.steps, fields)
         if span.trace_id:

@@ -53,14 +53,22 @@ class Sender:
         """
         await self._in_time(context.write(data), limit_s)
 
-    async def error(self, context: Context, call: Call, error: RequestError) -> None:
+    async def error(self, context: Context, call: Call, error: RequestError, is_stream: bool) -> None:
         """Ends a call with an error: always raises, and the handler must not catch that exception.
 
-        It does not wait for a caller that does not read, which gets the status after the earlier messages.
+        It does not wait for a caller that does not read a stream, which gets the status after the earlier messages.
         """
         status = rpc_status.to_status(to_status(error, call.request_id))
         metadata = (*status.trailing_metadata, (REQUEST_ID_KEY, call.request_id))
-        aborting = self._begin(context.abort(status.code, status.details, metadata))
+        abort = context.abort(status.code, status.details, metadata)
+        if not is_stream:  # nothing is before it
+            try:
+                await abort
+            except grpc.aio.BaseError as failure:
+                if has_ended(failure):
+                    raise asyncio.CancelledError("the call has ended") from None
+                raise
+        aborting = self._begin(abort)
         await asyncio.wait({aborting}, timeout=_STATUS_LIMIT_S)
         if not aborting.done():
             raise asyncio.CancelledError("the caller does not read")

@@ -177,7 +177,7 @@ class ReferenceLibrary:
 
     def _posed_view(self, reference: DescribedReference) -> PosedView:
         record = reference.record
-        photograph = Photograph(record.image_sha256, record.camera, partial(self._pixels, record))
+        photograph = Photograph(lambda: record.image_sha256, record.camera, partial(self._pixels, record))
         return PosedView(
             record.key,
             reference_name(record.scene_id, record.reference_id),

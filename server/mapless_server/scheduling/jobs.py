@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -174,12 +173,12 @@ class _Life:
         checked_s: see `Job.checked_s`.
     """
 
-    over: threading.Event = field(default_factory=threading.Event)
+    over: bool = False
     checked_s: float = -math.inf
 
     def check(self) -> None:
         self.checked_s = time.monotonic()
-        if self.over.is_set():
+        if self.over:
             raise Abandoned
 
 
@@ -226,7 +225,7 @@ class Job:
     @property
     def is_over(self) -> bool:
         """Whether it has ended; a thread may still be computing it."""
-        return self._life.over.is_set()
+        return self._life.over
 
     @property
     def checked_s(self) -> float:
@@ -246,7 +245,7 @@ class Job:
     def end(self, ending: Ending, value: Any) -> None:
         """Ends the job; called by the scheduler only."""
         assert not self.is_over
-        self._life.over.set()
+        self._life.over = True
         self.on_end(ending, value)
 
 

@@ -38,9 +38,6 @@ from .options import WorkQueueOptions
 
 _TRY_ONE_IN = 8
 
-_NEW_CALLER = Flow("", "")
-"""A caller without jobs."""
-
 _ENDED_TIMERS = 16
 """Timers of ended jobs that are kept in any case, so that they are not swept out too often."""
 
@@ -74,6 +71,31 @@ class _Lane:
     free: int
     passed_over: int = 0
     busy_s: float = 0.0
+
+
+_TRY_LARGER_AFTER = 64
+"""Batches of the size that a bucket is limited to, before a larger one is tried; twice as many after each trial."""
+
+
+@dataclass
+class _BatchLimit:
+    """The number of jobs of a bucket that fit in memory together.
+
+    Attributes:
+        size: the number.
+        batches: batches of this size that have fitted since it changed.
+        trials: how often a larger size was tried.
+    """
+
+    size: int
+    batches: int = 0
+    trials: int = 0
+
+    def fitted(self, size: int) -> None:
+        """Counts a batch; raises the limit by one when it has been kept for long enough."""
+        self.batches += size == self.size
+        if self.batches >= _TRY_LARGER_AFTER << min(self.trials, 10):
+            self.size, self.batches, self.trials = self.size + 1, 0, self.trials + 1
 
 
 class Scheduler:
@@ -110,7 +132,7 @@ class Scheduler:
             name: _Lane(count, [stage for stage in stages if stage.lane == name], count)
             for name, count in lanes.items()
         }
-        self._max_batch: dict[tuple[str, str], int] = {}
+        self._limits: dict[tuple[str, str], _BatchLimit] = {}
         self._declined: Counter[tuple[str, str]] = Counter()
         self._ledger = Ledger()
         self._admission = Admission(options, lanes, self._ledger)
@@ -170,10 +192,18 @@ class Scheduler:
         """Undoes `hold`."""
         self._ledger.release(flow, size_bytes)
 
-    def check_room(self, step: Step) -> None:
-        """Raises Refused if a job with this first step would not be admitted even for a caller without other jobs."""
-        with self._refusals_reported():
-            self._admission.check_queue(_NEW_CALLER, self._predict(step))
+    def check_room(self, flow: Flow, step: Step) -> None:
+        """Raises Refused if a caller's job with this first step would not be admitted, whatever its deadline."""
+        try:
+            self._admission.check_queue(flow, self._predict(step))
+        except Refused as refused:
+            self._observer.refused(refused.reason)
+            raise
+
+    def has_work(self, lane_name: str) -> bool:
+        """Whether a job waits for an idle thread of a lane."""
+        lane = self._lanes[lane_name]
+        return lane.free > 0 and any(self._queues[stage.name] for stage in lane.stages)
 
     def take(self, lane_name: str, now_s: float) -> Batch | None:
         """Selects what a thread of a lane computes now; None if all threads are busy or no job waits."""
@@ -202,7 +232,10 @@ class Scheduler:
         lane.free += 1
         lane.busy_s += seconds
         self._running[stage.name] -= len(batch.jobs)
-        self._observer.computed(stage.name, batch.jobs[0].step.bucket, len(batch.jobs), seconds)
+        bucket = batch.jobs[0].step.bucket
+        self._observer.computed(stage.name, bucket, len(batch.jobs), seconds)
+        if (limit := self._limits.get((stage.name, bucket))) is not None:
+            limit.fitted(len(batch.jobs))
         unusual_s = max(job.unusual_s for job in batch.jobs)
         share_s = seconds / len(batch.jobs)
         for job, result in zip(batch.jobs, results, strict=True):
@@ -243,8 +276,13 @@ class Scheduler:
                 self._give_fallback(job, job.fallback, now_s)
 
     def limit_batch(self, stage: str, bucket: str, size: int) -> None:
-        """Limits the number of jobs of a bucket that are computed together, because more did not fit in memory."""
-        self._max_batch[stage, bucket] = max(1, min(size, self._max_batch.get((stage, bucket), size)))
+        """Limits the number of jobs of a bucket that are computed together, because more did not fit in memory.
+
+        After some batches that fit one more is tried, since another program may have had the memory.
+        """
+        limit = self._limits.setdefault((stage, bucket), _BatchLimit(size))
+        limit.size = max(1, min(size, limit.size))
+        limit.batches = 0
 
     def drain(self) -> None:
         """Admits nothing from now on."""
@@ -337,7 +375,8 @@ class Scheduler:
         queue = self._queues[stage.name]
         first = queue.pop()
         bucket = first.step.bucket
-        at_most = min(stage.max_batch, self._max_batch.get((stage.name, bucket), stage.max_batch))
+        limit = self._limits.get((stage.name, bucket))
+        at_most = stage.max_batch if limit is None else min(stage.max_batch, limit.size)
         return (first, *queue.pop_alike(lambda job: job.step.bucket == bucket, at_most - 1))
 
     def _end(self, job: Job, ending: Ending, value: Any, now_s: float) -> None:

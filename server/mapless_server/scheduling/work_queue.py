@@ -183,10 +183,10 @@ class WorkQueue:
             with self._lock:
                 self._scheduler.release(flow, size_bytes)
 
-    def check_room(self, step: Step) -> None:
-        """Raises Refused if no caller would be admitted with this first step."""
+    def check_room(self, flow: Flow, step: Step) -> None:
+        """Raises Refused if no job of a caller would be admitted with this first step, whatever its deadline."""
         with self._lock:
-            self._scheduler.check_room(step)
+            self._scheduler.check_room(flow, step)
 
     def forget_costs(self) -> None:
         """Forgets the observed computing times, because those of later jobs will differ."""
@@ -241,10 +241,15 @@ class WorkQueue:
         except Exception as error:
             self._fail(error)
 
-    def _notify(self) -> None:
-        """Wakes threads and timer after a change of the scheduler; the caller has the lock."""
-        for condition in self._wakes_threads.values():
-            condition.notify()
+    def _notify(self, own_lane: str = "") -> None:
+        """Wakes threads that have work, and the timer, after a change of the scheduler; the caller has the lock.
+
+        The calling thread's own lane is left out: that thread is about to take the next batch, and then wakes another
+        one if there is more. A thread woken in vain costs two switches between threads.
+        """
+        for lane, condition in self._wakes_threads.items():
+            if lane != own_lane and self._scheduler.has_work(lane):
+                condition.notify()
         due_s = self._scheduler.next_due_s
         if due_s is not None and due_s < self._timer_at_s and self._loop is not None:
             self._timer_at_s = due_s
@@ -277,7 +282,7 @@ class WorkQueue:
                 with self._lock:
                     self._computing.discard(batch)
                     self._scheduler.finish(batch, results, time.monotonic())
-                    self._notify()
+                    self._notify(lane)
                 # An idle thread must not keep photographs and tensors alive.
                 del batch, results
         except BaseException as error:  # SystemExit too: the queue must not go on without this thread
@@ -290,7 +295,8 @@ class WorkQueue:
                 batch = self._scheduler.take(lane, time.monotonic())
                 if batch is not None:
                     self._computing.add(batch)
-                    self._wakes_threads[lane].notify()  # there may be work for another thread
+                    if self._scheduler.has_work(lane):
+                        self._wakes_threads[lane].notify()
                     return batch
                 self._wakes_threads[lane].wait()
         return None

@@ -133,7 +133,7 @@ def _photograph(world_from_camera: RigidTransform) -> bytes:
 
 def _posed_view(name: str, world_from_camera: RigidTransform, extractor: FeatureExtractor) -> PosedView:
     pixels = _render(world_from_camera)
-    photograph = Photograph(hashlib.sha256(pixels.tobytes()).hexdigest(), _CAMERA, lambda: pixels)
+    photograph = Photograph(lambda: hashlib.sha256(pixels.tobytes()).hexdigest(), _CAMERA, lambda: pixels)
     view = replace(extractor.extract(pixels, _CAMERA), photograph=photograph)
     return PosedView(name, name, view, world_from_camera)
 

@@ -22,6 +22,7 @@ from mapless_server.errors import Unavailable
 from mapless_server.observability.metrics import Metrics
 from mapless_server.observability.tracing import Tracer
 from mapless_server.rpc import Authenticate, CallGuard
+from mapless_server.scheduling import Flow
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 
@@ -35,9 +36,14 @@ SERVICE_NAMES = (
     reference_service_pb2.DESCRIPTOR.services_by_name["ReferenceService"].full_name,
 )
 
-LOCALIZE_METHODS = frozenset(
-    f"/{SERVICE_NAMES[0]}/{name}" for name in ("Localize", "LocalizeProgressively", "LocalizeRig", "LocalizeSequence")
-)
+_NEEDS_ROOM = {
+    **{
+        f"/{SERVICE_NAMES[0]}/{name}": True
+        for name in ("Localize", "LocalizeProgressively", "LocalizeRig", "LocalizeSequence")
+    },
+    **{f"/{SERVICE_NAMES[1]}/{name}": False for name in ("CreateReference", "BatchCreateReferences")},
+}
+"""The methods whose messages are large and whose work waits in the queue, and whether they are queries."""
 
 
 class _Health(health.aio.HealthServicer):  # type: ignore[name-defined,misc]
@@ -163,13 +169,13 @@ class Services:
         if self._is_serving:
             await self.set_serving(True)
 
-    def _check_admission(self, method: str) -> None:
-        """Raises Unavailable while the server starts or stops, and Overloaded while it has no room for any query."""
+    def _check_admission(self, method: str, flow: Flow) -> None:
+        """Raises Unavailable while the server starts or stops, and Overloaded while it has no room for the caller."""
         if self._is_draining:
             raise Unavailable("the server is stopping", reason="DRAINING", retry_after_s=1.0)
         engine = self._ready_engine()
-        if method in LOCALIZE_METHODS:
-            engine.check_room()
+        if (is_query := _NEEDS_ROOM.get(method)) is not None:
+            engine.check_room(flow, is_query)
 
     def _ready_engine(self) -> Engine:
         if self._engine is None:

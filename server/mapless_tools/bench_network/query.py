@@ -93,7 +93,7 @@ class Bench:
     def _store(self, key: str, photo: Picture, extractor: FeatureExtractor) -> PosedView:
         pixels = decode_image(photo.data, ImageLimits())
         view = replace(
-            extractor.extract(pixels, photo.camera), photograph=Photograph(key, photo.camera, lambda: pixels)
+            extractor.extract(pixels, photo.camera), photograph=Photograph(lambda: key, photo.camera, lambda: pixels)
         )
         return PosedView(key, photo.name, view, photo.world_from_camera)
 
@@ -114,7 +114,7 @@ class Bench:
         stages["decode"] = time.perf_counter() - start_s
         view = self.tier.extractor.extract(pixels, photo.camera)
         stages["features"] = time.perf_counter() - start_s - stages["decode"]
-        view = replace(view, photograph=Photograph(key, photo.camera, lambda: pixels))
+        view = replace(view, photograph=Photograph(lambda: key, photo.camera, lambda: pixels))
         answer = localize(view, self.nearest(photo), pipeline, LocalizeOptions())
         return answer, {**stages, **answer.stage_seconds, "total": time.perf_counter() - start_s}
 

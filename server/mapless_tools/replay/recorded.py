@@ -135,6 +135,6 @@ class RecordedSource:
         tenant = self.call.tenant
         view = self.blobs.view(tenant, reference, extractor)
         read = partial(self.blobs.pixels, tenant, reference)
-        photograph = Photograph(reference.image_sha256, reference.camera, read)
+        photograph = Photograph(lambda: reference.image_sha256, reference.camera, read)
         name = reference_name(scene_id_of(scene_key), reference.reference_id)
         return PosedView(reference.key, name, replace(view, photograph=photograph), reference.world_from_camera)

@@ -96,7 +96,8 @@ def photo_from_message(message: Any, path: str, limits: ImageLimits) -> Photo:
     if not message.HasField("intrinsics"):
         raise FieldError(joined(path, "intrinsics"), "is required")
     camera = camera_from_message(message.intrinsics, joined(path, "intrinsics"))
-    width_px, height_px = image_size(message.image, limits, joined(path, "image"))
+    image = message.image  # every access copies the bytes
+    width_px, height_px = image_size(image, limits, joined(path, "image"))
     if (camera.width_px, camera.height_px) != (width_px, height_px):
         raise FieldError(
             joined(path, "intrinsics.width_px"),
@@ -111,7 +112,7 @@ def photo_from_message(message: Any, path: str, limits: ImageLimits) -> Photo:
             f"must show the image: with {coefficients} only {100 * share:.0f} % of its pixels have a ray "
             f"({100 * MIN_SEEN_SHARE:.0f} are needed)",
         )
-    return Photo(message.image, camera, joined(path, "image"))
+    return Photo(image, camera, joined(path, "image"))
 
 
 MIN_SEEN_SHARE = 0.1
