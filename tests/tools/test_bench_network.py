@@ -33,6 +33,7 @@ GRID = (3, 4)
 SIZES = PI3
 
 
+@pytest.mark.nightly
 def test_the_full_network_has_the_published_operation_count() -> None:
     """11 views of 392x294: the count of the official modules, 16.506794665636 TFLOP, 4.0 of them attention's own."""
     operations = operations_of("pi3", Work(11, 11, grid=(21, 28)))

@@ -18,6 +18,7 @@ from research.colmap import Case, SceneDatabase, cases_of, measure, table
 ROOM = Path(__file__).parents[2] / "server/mapless_tools/demo/room"
 
 
+@pytest.mark.nightly
 def test_colmap_places_a_rendered_photograph(tmp_path: Path) -> None:
     room = read_folder(ROOM)
     few = replace(room, frames=room.frames[5:9])
