@@ -60,6 +60,20 @@ def test_many_matches_are_thinned_not_cut() -> None:
     assert_pose_close(solve(problem).world_from_camera, POSE, metres=0.005, degrees=0.05)
 
 
+@pytest.mark.parametrize("outlier_share", [0.1, 0.5, 0.8])
+def test_a_sample_gives_the_pose_of_all_matches(outlier_share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where too few of the sample agree, RANSAC sees all matches: the same bits."""
+    _, structure, _ = problem = planted(random_for("sample", outlier_share), 400, 0.5, outlier_share)
+    pixels = problem[0].features.keypoints.astype(float)
+    fast = ransac(CAMERA, structure.x_in_world, pixels, None, PnpOptions())
+    monkeypatch.setattr(pnp, "SAMPLE", 10**9)
+    plain = ransac(CAMERA, structure.x_in_world, pixels, None, PnpOptions())
+    assert fast is not None
+    assert plain is not None
+    assert_pose_close(fast, plain, metres=1e-3, degrees=0.01)
+    assert (fast.matrix() == plain.matrix()).all() == (outlier_share == 0.8)
+
+
 def test_the_same_matches_give_the_same_bits() -> None:
     problem = planted(random_for("bits"), 300, 0.5, 0.5)
     first, second = solve(problem), solve(problem)
