@@ -22,6 +22,7 @@ from mapless_server.method.trust.evidence import (
     Evidence,
     epipolar_share,
     evidence_of,
+    expected_share,
     findable_count,
     hull_share,
     votes_of,
@@ -161,6 +162,17 @@ def test_evidence_has_the_planted_counts() -> None:
     assert found.found_share == pytest.approx(expected)
     assert 0.5 < found.expected_share <= 1.0  # of what is inside a reference it sees nine tenths
     assert found.disagreement < 0.01
+
+
+def test_expected_share_is_the_median_of_each_references_own() -> None:
+    """In plain rows, one reference at a time."""
+    support, shares = support_of(0.25), []
+    for i, it in enumerate(support.references):
+        projected = it.view.camera.project(it.world_from_camera.inverse().apply(support.structure.x_in_world))
+        size = [it.view.camera.width_px, it.view.camera.height_px]
+        inside = ((projected >= -0.5) & (projected < np.array(size) - 0.5)).all(axis=1).sum()
+        shares.append((support.structure.tracks.view == i).sum() / min(inside, len(it.view.features)))
+    assert expected_share(support.structure, support.references) == pytest.approx(np.median(shares))
 
 
 def test_epipolar_share_is_the_planted_share_of_two_references() -> None:

@@ -158,12 +158,16 @@ def _median_disagreement(
 ) -> float:
     """Median over the splits of the distance of the two halves' cameras, as a share of `distance_m`; at most 1."""
     random, apart = np.random.default_rng(0), []
+    in_order = None if keypoint is None else np.argsort(keypoint, kind="stable")
     for _ in range(options.splits):
         in_first = draw_half(random)
         centres = []
-        for rows in (np.flatnonzero(in_first), np.flatnonzero(~in_first)):
-            if keypoint is not None:
-                rows = rows[np.unique(keypoint[rows], return_index=True)[1]]
+        for half in (in_first, ~in_first):
+            if keypoint is None or in_order is None:
+                rows = np.flatnonzero(half)
+            else:
+                rows = in_order[half[in_order]]
+                rows = rows[np.diff(keypoint[rows], prepend=-1) > 0]
             pose = ransac(camera, x_in_world[rows], pixels[rows], None, options.pnp) if len(rows) >= 4 else None
             centres.append(None if pose is None else pose.translation)
         first, second = centres
@@ -253,7 +257,7 @@ def evidence_of(
 
 def findable_count(view: View, x_in_world: Array, world_from_camera: RigidTransform) -> int:
     """Number of points (P, 3) that project into the image, occluded or not; at most the number of its features."""
-    return min(int(_inside(view, x_in_world, world_from_camera).sum()), len(view.features))
+    return min(int(_inside([view], [world_from_camera], x_in_world).sum()), len(view.features))
 
 
 def hull_share(query: View, matches: PointMatches, inliers: NDArray[np.bool_]) -> float:
@@ -284,19 +288,24 @@ def epipolar_share(
     return float(np.prod([agreeing[matches.reference == i].mean() for i in (0, 1)]))
 
 
-def _inside(view: View, x_in_world: Array, world_from_camera: RigidTransform) -> NDArray[np.bool_]:
-    """Which of the points (P, 3) project into the image."""
-    size = np.array([view.camera.width_px, view.camera.height_px])
-    projected = view.camera.project(world_from_camera.inverse().apply(x_in_world))
-    return np.asarray(((projected >= -0.5) & (projected < size - 0.5)).all(axis=1))
+def _inside(views: Sequence[View], world_from_camera: Sequence[RigidTransform], x_in_world: Array) -> NDArray[np.bool_]:
+    """Which of the points (P, 3) project into each of V photographs, (V, P)."""
+    poses = [it.inverse() for it in world_from_camera]
+    rotations, translations = np.stack([it.rotation for it in poses]), np.stack([it.translation for it in poses])
+    x, y, z = np.moveaxis(rotations @ x_in_world.T + translations[:, :, None], 1, 0)
+    cameras = [it.camera for it in views]
+    size = np.array([(it.width_px, it.height_px) for it in cameras], float).T[:, :, None]
+    focal = np.array([(it.focal_x_px, it.focal_y_px) for it in cameras]).T[:, :, None]
+    edge = np.array([(it.principal_x_px, it.principal_y_px) for it in cameras]).T[:, :, None] + 0.5
+    right, below = focal[0] * x + edge[0] * z, focal[1] * y + edge[1] * z
+    return np.asarray((z > 0) & (right >= 0) & (right < size[0] * z) & (below >= 0) & (below < size[1] * z))
 
 
 def expected_share(structure: Structure, references: Sequence[PosedView]) -> float:
     """Median over the references of the share that each observes of the points that it should see."""
-    shares = []
     observed = np.bincount(structure.tracks.view, minlength=len(references))
     step = max(1, -(-len(structure.x_in_world) // MOST_POINTS))
-    for reference, count in zip(references, observed, strict=True):
-        inside = step * _inside(reference.view, structure.x_in_world[::step], reference.world_from_camera).sum()
-        shares.append(count / max(1, min(inside, len(reference.view.features))))
+    views, poses = [it.view for it in references], [it.world_from_camera for it in references]
+    inside = step * _inside(views, poses, structure.x_in_world[::step]).sum(axis=1)
+    shares = observed / np.maximum(1, np.minimum(inside, [len(it.features) for it in views]))
     return min(1.0, float(np.median(shares)))
