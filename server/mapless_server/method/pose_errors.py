@@ -25,7 +25,6 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from mapless.geometry import Array
@@ -133,9 +132,14 @@ def most_probable(errors: PoseErrors, matrix: Array, gradient: Array, options: P
     own, drift = project @ errors.own @ project.T, project @ errors.drift @ project.T
     sizes = np.array([(a, b) for a in options.own for b in options.drift])
     squares = sizes[:, :, None, None] ** 2
-    factor = np.linalg.cholesky(np.eye(len(data)) + squares[:, 0] * own + squares[:, 1] * drift)
-    error = np.array([scipy.linalg.solve_triangular(it, data, lower=True, check_finite=False) for it in factor])
-    log_determinant = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
+    # The last row of a Cholesky factor [L 0; (L^-1 d)^T .] of the matrix bordered by d.
+    bordered = np.empty((len(sizes), len(data) + 1, len(data) + 1))
+    bordered[:, :-1, :-1] = np.eye(len(data)) + squares[:, 0] * own + squares[:, 1] * drift
+    bordered[:, -1, :-1] = bordered[:, :-1, -1] = data
+    bordered[:, -1, -1] = 1 + data @ data
+    factor = np.linalg.cholesky(bordered)
+    error = factor[:, -1, :-1]
+    log_determinant = np.log(np.diagonal(factor, axis1=1, axis2=2)[:, :-1]).sum(axis=1)
     usual = np.array([options.usual_own, options.usual_drift])
     unusual = (np.log(sizes / usual) / options.prior_log) ** 2
     best = np.argmax(-0.5 * (error**2).sum(axis=1) - log_determinant - 0.5 * unusual.sum(axis=1))
