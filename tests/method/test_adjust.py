@@ -16,8 +16,9 @@ from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.adjust import adjust_pose
 from mapless_server.method.bundle import Bundle, BundleProblem, Poses
+from mapless_server.method.optimize import MinimizeOptions, minimize
 from mapless_server.method.pnp import PnpOptions, solve_pose
-from mapless_server.method.pose_problem import AdjustOptions, pose_problem
+from mapless_server.method.pose_problem import AdjustOptions, optimum, pose_problem
 from mapless_server.method.results import PointMatches, PoseEstimate
 
 
@@ -62,6 +63,26 @@ def test_gradient_equals_finite_differences_of_the_cost(moved: float, tolerance:
     assert_jacobian(
         2 * gradient, lambda v: problem.cost(from_vector(state, v)), np.zeros(len(gradient)), tolerance=tolerance
     )
+
+
+def test_a_lower_curvature_changes_neither_gradient_nor_minimum() -> None:
+    problem, state = problem_of("curvature", 1e-3)
+    curved = problem.replaced(least_curvature=0.5)
+    plain, longer = problem.linearize(state), curved.linearize(state)
+    for name in ("pose_gradient", "point_gradient"):
+        np.testing.assert_allclose(getattr(longer, name), getattr(plain, name), rtol=1e-9, atol=1e-9)
+    assert np.linalg.eigvalsh(plain.pose_block - longer.pose_block).min() > -1e-6 * plain.pose_block.max()
+    ends = [minimize(it, state, MinimizeOptions(100, 1e-14)).world_from_query for it in (problem, curved)]
+    assert_pose_close(ends[1], ends[0], metres=1e-6, degrees=1e-5)
+
+
+def test_the_optimum_is_near_that_of_many_steps() -> None:
+    """By less than a standard deviation of the residuals."""
+    for case in range(3):
+        problem, state = problem_of(f"near {case}", 1e-3)
+        far = minimize(problem, state, MinimizeOptions(60, 1e-14))
+        near = optimum(problem, state, AdjustOptions())
+        assert problem.query_motion_sigma(far, near, problem.linearize(far)) < 1
 
 
 def test_cameras_turn_together_as_each_alone_to_the_last_bit() -> None:

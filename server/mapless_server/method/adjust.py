@@ -19,9 +19,8 @@ import numpy as np
 
 from mapless.geometry import Array
 
-from .optimize import MinimizeOptions, minimize
 from .options import IntrinsicsSigma
-from .pose_problem import AdjustOptions, adjusted_estimate, errors_of_pose, pose_problem, shares_camera
+from .pose_problem import AdjustOptions, adjusted_estimate, errors_of_pose, optimum, pose_problem, shares_camera
 from .priors.known import NO_PRIORS, Priors
 from .recalibrate import recalibrated
 from .results import MetricScale, PointMatches, PoseEstimate, PoseStage, Structure, Support
@@ -91,7 +90,7 @@ def _adjusted(
         return None
     problem, start = pose_problem(query, references, structure, matches, used, estimate.world_from_camera, options)
     with_priors = problem.replaced(priors=priors, prior_weight=options.error_inflation**2)
-    bundle = minimize(with_priors, start, MinimizeOptions(options.iterations, options.min_decrease))
+    bundle = optimum(with_priors, start, options)
     terms = intrinsics_terms(query, references, intrinsics)
     found = adjusted_estimate(query, structure, matches, used, estimate, problem, bundle, options, terms)
     if found and found.intrinsics:

@@ -113,6 +113,9 @@ class BundleProblem:
         intrinsics_offset: (I,) errors of the intrinsics that are removed already; the prior's mean is minus these.
         planes: planes near which the points lie by stored depths, at the references' given poses: motions of these by
             millimetres do not matter for depths known to centimetres.
+        least_curvature: least curvature of the loss along a residual, as a share of its weight. Along a residual
+            Cauchy's loss curves less than its weight says, so below 1 steps are longer and fewer (Triggs et al.,
+            Bundle adjustment: a modern synthesis, 2000); the minimum is the same.
     """
 
     observations: Observations
@@ -126,6 +129,7 @@ class BundleProblem:
     intrinsics_information: Array = field(default_factory=lambda: np.zeros(0))
     intrinsics_offset: Array = field(default_factory=lambda: np.zeros(0))
     planes: DepthPlanes | None = None
+    least_curvature: float = 1.0
 
     @cached_property
     def by_view(self) -> ViewColumns:
@@ -165,7 +169,7 @@ class BundleProblem:
 
     def linearize(self, bundle: Bundle) -> NormalEquations:
         """See `optimize.Problem`."""
-        equations = self.by_view.equations(bundle, self.loss_scale_sigma)
+        equations = self.by_view.equations(bundle, self.loss_scale_sigma, self.least_curvature)
         query = self.query_rows
         references, intrinsics = slice(query.start), slice(query.stop, None)
         equations.pose_block[references, references] += self.information
@@ -188,6 +192,16 @@ class BundleProblem:
             return None
         cameras = self.query_rows.stop
         return bundle.moved(motion[:cameras].reshape(-1, 6), points.steps(motion), motion[cameras:])
+
+    def query_motion_sigma(self, before: Bundle, after: Bundle, equations: NormalEquations) -> float:
+        """Length of the query's motion, intrinsics included, in standard deviations by the residuals.
+
+        These are as if points and references were known, so the motion is no longer than this.
+        """
+        motion = after.poses[-1:].motion_from(before.poses[-1:]).ravel()
+        step = np.concatenate([motion, after.intrinsics - before.intrinsics])
+        unknowns = slice(self.query_rows.start, None)
+        return math.sqrt(step @ equations.pose_block[unknowns, unknowns] @ step)
 
     def _query_terms(self, world_from_query: RigidTransform) -> tuple[Array, Array]:
         """Gradient (6,) and information (6, 6) of the query's priors, by a left perturbation of camera_from_world.
@@ -304,18 +318,32 @@ class ViewColumns:
         residual = self._with_intrinsics(ideal * self.focal + self.offset, bundle.intrinsics)
         return residual, by_point, by_pose
 
-    def equations(self, bundle: Bundle, loss_scale_sigma: float) -> NormalEquations:
-        """The normal equations of the observations alone, weighted by a Cauchy loss of this scale."""
+    def equations(self, bundle: Bundle, loss_scale_sigma: float, least_curvature: float = 1.0) -> NormalEquations:
+        """The normal equations of the observations alone, for a Cauchy loss of this scale.
+
+        With `least_curvature` below 1 derivatives J become (I - (1 - c) r r^T / |r|^2) J and residuals r become r / c,
+        which leaves the gradient as it is. For a weight w the loss curves by w (2 w - 1) along r. But c^2 is least at
+        w = 1/2 and 1 far away, where the curvature is negative.
+        """
         residual, by_point, by_pose = self.linearized(bundle)
-        weight = cauchy_weight((residual**2).sum(axis=0), loss_scale_sigma)
+        squared, last, by_intrinsics = (residual**2).sum(axis=0), self.parts[-1], self.by_intrinsics
+        weight = cauchy_weight(squared, loss_scale_sigma)
+        if least_curvature < 1:
+            shrink = np.sqrt(1 - 4 * (1 - least_curvature) * weight * (1 - weight))
+            along = residual * ((1 - shrink) / np.maximum(squared, 1e-12))
+            by_point = by_point - residual[:, None] * (along[:, None] * by_point).sum(axis=0)
+            by_pose = by_pose - residual[:, None] * (along[:, None] * by_pose).sum(axis=0)
+            if by_intrinsics.size:
+                its_part = (along[:, None, last] * by_intrinsics).sum(axis=0)
+                by_intrinsics = by_intrinsics - residual[:, None, last] * its_part
+            residual = residual / shrink
         weighted_point, weighted_pose = by_point * weight, by_pose * weight
-        last = self.parts[-1]
-        weighted_intrinsics = self.by_intrinsics * weight[last] if self.by_intrinsics.size else self.by_intrinsics
+        weighted_intrinsics = by_intrinsics * weight[last] if by_intrinsics.size else by_intrinsics
         blocks, gradients = [], []
         for part in self.parts:
             (x, y), (weighted_x, weighted_y) = by_pose[:, :, part], weighted_pose[:, :, part]
-            if part is last and self.by_intrinsics.size:
-                x, y = np.concatenate([by_pose[:, :, part], self.by_intrinsics], axis=1)
+            if part is last and by_intrinsics.size:
+                x, y = np.concatenate([by_pose[:, :, part], by_intrinsics], axis=1)
                 weighted_x, weighted_y = np.concatenate([weighted_pose[:, :, part], weighted_intrinsics], axis=1)
             blocks.append(weighted_x @ x.T + weighted_y @ y.T)
             gradients.append(weighted_x @ residual[0, part] + weighted_y @ residual[1, part])

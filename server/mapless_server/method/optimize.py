@@ -85,8 +85,16 @@ class MinimizeOptions:
         check_bounds(self, "raised_by", above=1)
 
 
-def minimize(problem: Problem[X, E], start: X, options: MinimizeOptions) -> X:
-    """Finds the minimum near a start; returns the last point if the iterations do not suffice."""
+def minimize(
+    problem: Problem[X, E],
+    start: X,
+    options: MinimizeOptions,
+    is_near: Callable[[X, X, E], bool] = lambda before, after, equations: False,
+) -> X:
+    """Finds the minimum near a start; returns the last point if the iterations do not suffice.
+
+    `is_near` is whether an accepted step, by the equations at its start, is so short that it may be the last one.
+    """
     x, cost, damping = start, problem.cost(start), options.damping
     if math.isnan(cost):
         return start
@@ -101,7 +109,7 @@ def minimize(problem: Problem[X, E], start: X, options: MinimizeOptions) -> X:
             if damping > options.max_damping:
                 break
             continue
-        converged = cost - candidate_cost < options.min_decrease * cost
+        converged = cost - candidate_cost < options.min_decrease * cost or is_near(x, candidate, equations)
         x, cost, damping, equations = candidate, candidate_cost, damping * LOWERED, None
         if converged:
             break

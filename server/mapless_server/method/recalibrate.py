@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from mapless.geometry import Array
 
 from .intrinsics import PRINCIPAL, ContradictionOptions, IntrinsicsEvidence, corrected_view
-from .optimize import MinimizeOptions, minimize
 from .perturbation import reprojection_errors_px
-from .pose_problem import AdjustOptions, adjusted_estimate, pose_problem, shares_camera, with_intrinsics
+from .pose_problem import AdjustOptions, adjusted_estimate, optimum, pose_problem, shares_camera, with_intrinsics
 from .priors.known import Priors
 from .results import PointMatches, PoseEstimate, Structure
 from .views import PosedView, View
@@ -26,6 +25,8 @@ WIDE_SIGMA = np.array([0.3, 0.3, 0.3, 1.0])
 """Of an estimated parameter: focal length and k1, and principal point as a share of the width."""
 MAX_HELD = 3.0
 """An estimate that leaves the prior by more standard deviations has diverged."""
+LINEAR_CHANGE = np.array([0.01, 0.01, 0.01, 0.02])
+"""Changes in the same units below which keypoints move in proportion to them, to a tenth of a pixel."""
 LEAST_MATCHES = 20
 """For a pose and intrinsics."""
 
@@ -107,28 +108,31 @@ def _with_errors(
     """The estimate with intrinsics as unknowns of prior standard deviations `held`; None if it fails."""
     assert found.intrinsics is not None
     errors, pose, view = found.intrinsics.removed, found.world_from_camera, found.view or query
-    steps = MinimizeOptions(options.iterations, options.min_decrease)
-    change: Array | None = None
+    small = LINEAR_CHANGE * np.array([1, query.camera.width_px, query.camera.width_px, 1])
+    moved, bundle, change, information = structure, None, None, None
     for left in reversed(range(options.rounds)):
         pixels = view.features.keypoints[matches.keypoint].astype(np.float64)
         errors_px = reprojection_errors_px(view.camera, pose, structure.x_in_world[matches.point], pixels)
         used = np.flatnonzero(errors_px < options.max_error_px)
         if len(used) < LEAST_MATCHES:
             return None
-        problem, start = pose_problem(view, references, structure, matches, used, pose, options)
+        problem, start = pose_problem(view, references, moved, matches, used, pose, options, information)
         problem = problem.replaced(priors=priors, prior_weight=options.error_inflation**2)
-        if not left or (change is not None and (np.abs(change) < usual / 10).all()):
+        start = start if bundle is None else replace(start, poses=bundle.poses)
+        if not left or (change is not None and (np.abs(change) < small).all()):
             break
         wider, there = with_intrinsics(problem, start, view)
         wider = wider.replaced(intrinsics_information=held**-2.0, intrinsics_offset=errors)
-        bundle = minimize(wider, there, steps)
-        pose, change = bundle.world_from_query, bundle.intrinsics
+        bundle = optimum(wider, there, options)
+        pose, change, information = bundle.world_from_query, bundle.intrinsics, problem.information
         errors = errors + change
         if np.abs(errors / held).max() > MAX_HELD:
             return None
-        view = corrected_view(query, errors)
+        view, points = corrected_view(query, errors), moved.x_in_world.copy()
+        points[np.unique(matches.point[used])] = bundle.points
+        moved = replace(structure, x_in_world=points)
     terms = (query, errors, usual, held)
     before = replace(found, inliers=errors_px < options.inlier_px)
-    bundle = minimize(problem, start, steps)
+    bundle = optimum(problem, start, options)
     better = adjusted_estimate(view, structure, matches, used, before, problem, bundle, options, terms)
     return better and replace(better, view=view)
