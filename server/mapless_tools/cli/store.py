@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapless_server.serve.command import fail
+from mapless_tools.progress import progress_bars
 
 from .printing import AsJson, printed_as_json
 
 if TYPE_CHECKING:
     from mapless_server.store.database import Database
-    from mapless_server.store.verification import Progress, Verification
+    from mapless_server.store.verification import Verification
 
 store_app = typer.Typer(help="The store: bring it up to date, check it, back it up, restore it.", no_args_is_help=True)
 
@@ -48,7 +49,7 @@ def verify_command(
 
     with (
         _store_errors(),
-        _progress() as on_progress,
+        progress_bars() as on_progress,
         closing(SqliteDatabase.open_as_is(file) if file else _look(config, data_dir)) as database,
         database.read() as connection,
     ):
@@ -68,7 +69,7 @@ def backup_command(
     """Copy the store to one file, whether it is served or not; exit code 1 if something in the store is damaged."""
     from mapless_server.store.backup import back_up
 
-    with _store_errors(), _progress() as on_progress, closing(_look(config, data_dir)) as database:
+    with _store_errors(), progress_bars() as on_progress, closing(_look(config, data_dir)) as database:
         found = back_up(database, file, on_progress)
     _report(found, f"written to {file}, read again and found whole")
 
@@ -83,7 +84,7 @@ def restore_command(
     from mapless_server.store.backup import restore
     from mapless_server.store.sqlite import SqliteDatabase
 
-    with _store_errors(), _progress() as on_progress:
+    with _store_errors(), progress_bars() as on_progress:
         SqliteDatabase.open_as_is(file).close()  # before a store is made for it
         with closing(_open(config, data_dir)) as database:
             found = restore(file, database, on_progress)
@@ -130,23 +131,6 @@ def _store_errors() -> Iterator[None]:
         fail(str(error), code=2)
     except (StoreError, RequestError, ValueError) as error:
         fail(str(error), code=1)
-
-
-@contextmanager
-def _progress() -> Iterator[Progress]:
-    from rich.console import Console
-    from rich.progress import Progress as Bars
-    from rich.progress import TaskID
-
-    tasks: dict[str, TaskID] = {}
-    with Bars(console=Console(stderr=True)) as bars:
-
-        def on_progress(what: str, done: int, total: int) -> None:
-            if what not in tasks:
-                tasks[what] = bars.add_task(what)
-            bars.update(tasks[what], completed=done, total=total)
-
-        yield on_progress
 
 
 def _report(found: Verification, verdict: str) -> None:
