@@ -343,17 +343,17 @@ class TestAverages:
         (group,) = groups_of(suite({"chess": 0.01, "fire": 0.03}))
         average = group.average(DENSE, Method("best", "two_stage"))
         assert average is not None
-        assert average.median_translation_m == pytest.approx(0.02)
+        assert average.median_translation == pytest.approx(0.02)
         assert (average.scenes, average.complete) == (("chess", "fire"), False)
         assert average.recall["5cm_5deg"] == pytest.approx((1 + 1) / 2)
-        assert (average.localized, average.queries) == (18, 18)
+        assert (average.localized_count, average.query_count) == (18, 18)
 
     def test_one_lost_scene_loses_the_average(self) -> None:
         (group,) = groups_of(suite({"chess": 0.01, "fire": math.inf}))
         average = group.average(DENSE, Method("best", "two_stage"))
         assert average is not None
-        assert math.isinf(average.median_translation_m)
-        assert average.localized == 9
+        assert math.isinf(average.median_translation)
+        assert average.localized_count == 9
 
     def test_scenes_left_out_by_the_paper_are_not_averaged(self) -> None:
         names = dict.fromkeys(BENCHMARKS["cambridge"].scenes, 0.1)
@@ -361,7 +361,7 @@ class TestAverages:
         average = group.average(DENSE, Method("best", "two_stage"))
         assert average is not None
         assert average.complete
-        assert average.median_translation_m == pytest.approx(0.1)
+        assert average.median_translation == pytest.approx(0.1)
 
     def test_benchmarks_are_kept_apart(self) -> None:
         indoors, outdoors = suite({"chess": 0.01}), suite({"ShopFacade": 0.1}, layout="cambridge")

@@ -17,7 +17,7 @@ Key = tuple[str, int, Method]
 
 @dataclass(frozen=True)
 class Average:
-    """Figures of one method in one setting over scenes: means of the scenes' medians, shares and times.
+    """Figures of one method in one setting over scenes: means of the scenes' medians and shares.
 
     Infinite if one is. `complete` says whether these are all scenes that the paper averages over; True without figures
     of the paper.
@@ -25,13 +25,11 @@ class Average:
 
     scenes: tuple[str, ...]
     complete: bool
-    median_translation_m: float
+    median_translation: float
     median_rotation_deg: float
     recall: dict[str, float]
-    localized: int
-    queries: int
-    latency_p50_ms: float
-    latency_p95_ms: float
+    localized_count: int
+    query_count: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +71,11 @@ class Group:
         return Average(
             scenes=scenes,
             complete=set(scenes) == set(papers or self.scenes),
-            median_translation_m=_mean([s.median_translation for s in summaries]),
+            median_translation=_mean([s.median_translation for s in summaries]),
             median_rotation_deg=_mean([s.median_rotation_deg for s in summaries]),
             recall={name: _mean([s.recall[name] for s in summaries]) for name in RECALL_BARS},
-            localized=sum(s.localized_count for s in summaries),
-            queries=sum(s.query_count for s in summaries),
-            latency_p50_ms=_mean([s.latency_p50_ms for s in summaries]),
-            latency_p95_ms=_mean([s.latency_p95_ms for s in summaries]),
+            localized_count=sum(s.localized_count for s in summaries),
+            query_count=sum(s.query_count for s in summaries),
         )
 
 

@@ -99,11 +99,11 @@ def _averages(group: Group) -> Iterable[dict[str, Any]]:
                     **asdict(method),
                     "scenes": list(average.scenes),
                     "all_of_the_papers_scenes": average.complete if group.benchmark else None,
-                    "median_translation_cm": finite(100 * average.median_translation_m),
+                    "median_translation_cm": finite(100 * average.median_translation),
                     "median_rotation_deg": finite(average.median_rotation_deg),
                     **{f"recall_{name}": average.recall[name] for name in RECALL_BARS},
-                    "localized": average.localized,
-                    "queries": average.queries,
+                    "localized": average.localized_count,
+                    "queries": average.query_count,
                 }
 
 

@@ -148,7 +148,7 @@ MEASURES = (
         "translation error",
         "cm",
         lambda it: 100 * it.translation_error,
-        lambda it: 100 * it.median_translation_m,
+        lambda it: 100 * it.median_translation,
         0.01,
         0,
     ),

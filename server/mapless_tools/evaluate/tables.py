@@ -82,7 +82,7 @@ def _dense(group: Group) -> Table:
     rows = []
     for m in group.methods:
         medians = (_median(group.summaries.get((scene, DENSE, m))) for scene in scenes)
-        rows.append(Row((_ours(m), *medians, _average(group.average(DENSE, m))), OURS))
+        rows.append(Row((_ours(m), *medians, _median(group.average(DENSE, m))), OURS))
     for method in _paper_methods(group):
         medians = (_papers(method.scenes.get(scene)) for scene in scenes)
         rows.append(_paper_row(method, *medians, _papers(method.average.get(DENSE))))
@@ -112,7 +112,7 @@ def _recall(group: Group) -> Table:
             average = group.average(setting, method)
             if average is not None:
                 shares = (f"{100 * share:.1f}" for share in average.recall.values())
-                localized = f"{average.localized} of {average.queries}"
+                localized = f"{average.localized_count} of {average.query_count}"
                 rows.append(Row((f"{_ours(method)}, {setting_name(setting)}", *shares, localized), OURS))
     for paper in _paper_methods(group):
         if paper.recall_percent:
@@ -184,7 +184,7 @@ def _ours(method: Method) -> str:
 
 
 def _average_row(group: Group, name: str, method: Method) -> Row:
-    return Row((name, *(_average(group.average(setting, method)) for setting in group.settings)), OURS)
+    return Row((name, *(_median(group.average(setting, method)) for setting in group.settings)), OURS)
 
 
 def _paper_methods(group: Group) -> Sequence[PaperMethod]:
@@ -196,16 +196,10 @@ def _paper_row(method: PaperMethod, *cells: str, setting: str = "") -> Row:
     return Row((f"{method.name} (paper){setting}", *cells), PAPERS if method.variant else RIVAL)
 
 
-def _median(summary: Summary | None) -> str:
+def _median(summary: Summary | Average | None) -> str:
     if summary is None:
         return NO_FIGURE
     return format_median(100 * summary.median_translation, summary.median_rotation_deg)
-
-
-def _average(average: Average | None) -> str:
-    if average is None:
-        return NO_FIGURE
-    return format_median(100 * average.median_translation_m, average.median_rotation_deg)
 
 
 def _papers(median: Median | None, absent: str = NO_FIGURE) -> str:
