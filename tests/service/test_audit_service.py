@@ -66,7 +66,9 @@ def test_what_is_wrong_with_an_audit_is_named(client: Client) -> None:
     assert twice.value.field == "references[1]"
 
 
-@pytest.mark.parametrize("what", ["features", "descriptor", "pose"])
+@pytest.mark.parametrize(
+    "what", ["features", *(pytest.param(it, marks=pytest.mark.nightly) for it in ("descriptor", "pose"))]
+)
 def test_a_damaged_reference_is_reported_by_page_and_by_name(tmp_path: Path, what: str) -> None:
     store = Store.open(tmp_path)
     with serving_really(tmp_path, store) as address, Client(address) as client:

@@ -144,6 +144,7 @@ def test_switched_off_damaged_pairs_are_deleted(matched: Path, expected: list[by
         assert served.value("mapless_background_pairs_total") == 0
 
 
+@pytest.mark.nightly
 def test_what_a_killed_server_began_is_finished(
     data_dir: Path, expected: list[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -85,7 +85,8 @@ def test_wrong_folders_are_one_line(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds the server through /proc")
-@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.nightly)])
+@pytest.mark.nightly
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_it_takes_its_server_along(folder: Path, number: signal.Signals) -> None:
     process = subprocess.Popen(
         command("evaluate", folder), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True

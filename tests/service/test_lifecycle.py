@@ -7,16 +7,20 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import grpc
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
+from support.commands import run
 from support.programs import real
 from support.servers import CAMERA, PHOTO, RunningServer, pose, serving
 
 from mapless import Client, ConnectOptions, NewReference
+from mapless_server.observability import logs
+from mapless_server.serve import command
 
 SERVICES = ["", "mapless.v1.LocalizationService", "mapless.v1.ReferenceService"]
 SERVING, NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
@@ -55,23 +59,32 @@ def test_settings_are_shown_at_the_start(tmp_path: Path) -> None:
             assert re.search(f"^ +{shown}$", server.log, re.MULTILINE), shown
 
 
-def refusal(tmp_path: Path, **settings: object) -> str:
-    """The one line with which a server says why it does not start."""
-    with real(tmp_path / "server", log_level="error", **settings) as server:
-        assert (server.wait(), server.output) == (2, ""), server.log
-        (line,) = server.log.strip().splitlines()
-    assert line.startswith("mapless-server: ")
-    return line
+@pytest.fixture
+def refusal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
+    """The one line with which the command says why it does not start; it runs in this process, whose logs stay."""
+    for module, name in ((logs, "configure_logging"), (command, "configure_libraries")):
+        monkeypatch.setattr(module, name, lambda *_: None)
+
+    def refusal(**settings: object) -> str:
+        given = {"port": 0, "metrics_port": 0, "data_dir": tmp_path / "data", "features": "sift"} | settings
+        flags = [part for name, it in given.items() for part in (f"--{name.replace('_', '-')}", str(it))]
+        done = run("serve", *flags)
+        assert (done.exit_code, done.stdout) == (2, ""), done.output
+        (line,) = done.stderr.strip().splitlines()
+        assert line.startswith("mapless-server: ")
+        return line
+
+    return refusal
 
 
 @pytest.mark.parametrize(("setting", "value"), [("data_dir", "/dev/null/x"), ("features", "nonesuch")])
-def test_a_server_that_cannot_start_reports_why_in_one_line(tmp_path: Path, setting: str, value: str) -> None:
-    assert value in refusal(tmp_path, **{setting: value})
+def test_a_server_that_cannot_start_reports_why(refusal: Callable[..., str], setting: str, value: str) -> None:
+    assert value in refusal(**{setting: value})
 
 
-def test_a_taken_port_is_not_shared(server: RunningServer, tmp_path: Path) -> None:
+def test_a_taken_port_is_not_shared(server: RunningServer, refusal: Callable[..., str]) -> None:
     port = server.address.rpartition(":")[2]
-    assert f"cannot listen on 127.0.0.1:{port}" in refusal(tmp_path, port=port)
+    assert f"cannot listen on 127.0.0.1:{port}" in refusal(port=port)
 
 
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_info"), reason="needs glibc")
