@@ -70,8 +70,9 @@ def suite(medians_m: dict[str, float], options: SuiteOptions | None = None, layo
             for method in options.methods():
                 worse = (1 if split.setting == DENSE else 2) * (1 if method.scale == "two_stage" else 3)
                 errors = [worse * median_m * (0.5 + i / 8) for i in range(len(split.queries))]
-                results = tuple(result(q.name, e) for q, e in zip(split.queries, errors, strict=True))
-                runs.append(Run(scenes[-1], split, method, results, Path("/out/runs/x.jsonl")))
+                journal = Journal(Path("/out/runs"), "x", {})
+                journal.results |= {q.name: result(q.name, e) for q, e in zip(split.queries, errors, strict=True)}
+                runs.append(Run(scenes[-1], split, method, journal))
     made = Provenance("0.1.0", "abc1234", {"pi3": "f" * 64}, {"backend": "geometric"}, "a <CPU>", "2026-11-21T00:00:00")
     return Suite(options, made, tuple(scenes), tuple(runs), ())
 
@@ -423,8 +424,10 @@ class TestCharts:
     def test_a_long_sequence_keeps_its_worst(self) -> None:
         (group,) = groups_of(suite({"chess": 0.01}))
         (key,) = (key for key in group.runs if key[1] == DENSE)
-        many = tuple(result(f"q{i}", 5.0 if i == 777 else 0.01) for i in range(2000))
-        group.runs[key] = replace(group.runs[key], results=many)
+        run = group.runs[key]
+        many = tuple(replace(run.split.queries[0], name=f"q{i}") for i in range(2000))
+        run.journal.results |= {it.name: result(it.name, 5.0 if it.name == "q777" else 0.01) for it in many}
+        group.runs[key] = replace(run, split=replace(run.split, queries=many))
         errors_cm = np.asarray(along_sequence(group, "chess")[0].axes[0].lines[0].get_ydata(), float)
         assert len(errors_cm) <= 400
         assert errors_cm.max() == 500.0

@@ -52,7 +52,8 @@ def as_json(suite: Suite, groups: Sequence[Group]) -> dict[str, Any]:
             for scene in suite.scenes
         ],
         "runs": [
-            {**run_figures(run), "queries_file": f"{run.journal.parent.name}/{run.journal.name}"} for run in suite.runs
+            {**run_figures(run), "queries_file": f"{run.journal.path.parent.name}/{run.journal.path.name}"}
+            for run in suite.runs
         ],
         "averages": [average for group in groups for average in _averages(group)],
         "paper": {group.layout: _paper(group.benchmark.paper) for group in groups if group.benchmark},

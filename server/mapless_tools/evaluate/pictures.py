@@ -22,7 +22,6 @@ from mapless_tools.dataset import Frame
 from mapless_tools.progress import Progress
 
 from .metrics import QueryResult
-from .plan import setting_name
 from .references import Matcher
 from .suite import Run, Suite
 
@@ -50,7 +49,7 @@ class WorstQuery:
     def caption(self) -> str:
         """The scene, the query, its errors or its rejection, and how many matches fit."""
         run, result = self.run, self.result
-        name = f"{run.scene.place.name}, {setting_name(run.split.setting)}, {run.method.label}: {result.name}"
+        name = f"{run.scene.place.name}, {run.label}: {result.name}"
         if result.localized:
             outcome = (
                 f"{100 * result.translation_error:.1f} cm, {result.rotation_error_deg:.2f}° off; "

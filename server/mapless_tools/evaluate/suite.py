@@ -41,13 +41,27 @@ class SceneWork:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """The results of one method in one setting of one scene, in the order of its queries."""
+    """One method in one setting of one scene, and its results so far."""
 
     scene: SceneWork
     split: SceneSplit
     method: Method
-    results: tuple[QueryResult, ...]
-    journal: Path
+    journal: Journal
+
+    @property
+    def label(self) -> str:
+        """The setting and the method."""
+        return f"{setting_name(self.split.setting)}, {self.method.label}"
+
+    @property
+    def complete(self) -> bool:
+        """Whether all queries have results."""
+        return all(query.name in self.journal.results for query in self.split.queries)
+
+    @property
+    def results(self) -> tuple[QueryResult, ...]:
+        """The results of a complete run, in the order of its queries."""
+        return tuple(self.journal.results[query.name] for query in self.split.queries)
 
 
 @dataclass(frozen=True)
@@ -96,14 +110,14 @@ def measure(
     failures: list[Failure] = []
     suite = Suite(setup.options, setup.provenance, tuple(scenes), (), (), pairs)
     for scene in scenes:
-        pending = _pending_runs(scene, setup)
+        runs_of_scene = _runs_of(scene, setup)
         try:
-            _measure_scene(scene, pending, setup)
+            _measure_scene(scene, runs_of_scene, setup)
         except (MaplessError, ServerFailed, UsageError, OSError) as error:
             failures.append(Failure(scene.place.name, str(error)))
-        for run in pending:
+        for run in runs_of_scene:
             if run.complete:
-                runs.append(run.finished())
+                runs.append(run)
             elif not failures or failures[-1].scene != scene.place.name:
                 failures.append(Failure(scene.place.name, f"{run.label} is incomplete"))
         suite = Suite(setup.options, setup.provenance, tuple(scenes), tuple(runs), tuple(failures), pairs)
@@ -168,29 +182,7 @@ def _result(line: dict[str, Any]) -> QueryResult:
     return QueryResult(**line | {"references": tuple(line["references"]), "pose": pose})
 
 
-@dataclass(frozen=True, eq=False)
-class _PendingRun:
-    """A run and its results so far."""
-
-    scene: SceneWork
-    split: SceneSplit
-    method: Method
-    journal: Journal
-
-    @property
-    def label(self) -> str:
-        return f"{setting_name(self.split.setting)}, {self.method.label}"
-
-    @property
-    def complete(self) -> bool:
-        return all(query.name in self.journal.results for query in self.split.queries)
-
-    def finished(self) -> Run:
-        results = tuple(self.journal.results[query.name] for query in self.split.queries)
-        return Run(self.scene, self.split, self.method, results, self.journal.path)
-
-
-def _pending_runs(scene: SceneWork, setup: RunSetup) -> list[_PendingRun]:
+def _runs_of(scene: SceneWork, setup: RunSetup) -> list[Run]:
     runs = []
     queries = _digest(map(_description, (frame for frame in scene.dataset.frames if frame.split != "train")))
     for split in scene.splits:
@@ -199,7 +191,7 @@ def _pending_runs(scene: SceneWork, setup: RunSetup) -> list[_PendingRun]:
             name = ".".join((scene.place.name.replace("/", "_"), setting_name(split.setting), *asdict(method).values()))
             data = {"scene": scene.place.name, "references": references, "queries": queries, **asdict(method)}
             journal = Journal(setup.journals, name, {**data, **_identity(scene, setup)})
-            runs.append(_PendingRun(scene, split, method, journal))
+            runs.append(Run(scene, split, method, journal))
     return runs
 
 
@@ -229,7 +221,7 @@ def _digest(lines: Iterable[str]) -> str:
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
 
 
-def _measure_scene(scene: SceneWork, runs: Sequence[_PendingRun], setup: RunSetup) -> None:
+def _measure_scene(scene: SceneWork, runs: Sequence[Run], setup: RunSetup) -> None:
     incomplete = [run for run in runs if not run.complete]
     if incomplete:
         with temporary_server() as client:
@@ -239,7 +231,7 @@ def _measure_scene(scene: SceneWork, runs: Sequence[_PendingRun], setup: RunSetu
                     _measure_setting(client, split, of_split, setup)
 
 
-def _measure_setting(client: Client, split: SceneSplit, runs: Sequence[_PendingRun], setup: RunSetup) -> None:
+def _measure_setting(client: Client, split: SceneSplit, runs: Sequence[Run], setup: RunSetup) -> None:
     scene, scene_id = runs[0].scene, setting_name(split.setting).replace("=", "-")
 
     def labelled(label: str) -> Progress:
