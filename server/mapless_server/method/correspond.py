@@ -15,15 +15,15 @@ from __future__ import annotations
 
 import sys
 import time
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import combinations
 from pathlib import Path
 from threading import Lock
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,8 @@ from .choices import EDGEPOINT2
 from .options import check_bounds
 from .tracks import Tracks, build_tracks
 from .views import Features, Matches, PosedView, View
+
+ItemT = TypeVar("ItemT")
 
 _ROWS_AT_ONCE = 128
 """With 2,000 columns a block of cosines has 1 MB, as the second-level cache of a core."""
@@ -167,12 +169,51 @@ class StoredPairs(Protocol):
         ...
 
 
+class SharedThreads:
+    """Helps queries to match: each computes in its own thread, and threads that are free take over a part.
+
+    So a query alone uses all cores, and as many queries as there are cores use a thread each.
+    """
+
+    def __init__(self, threads: int) -> None:
+        """Uses so many threads for one query, its own among them."""
+        self._helpers = threads - 1
+        self._pool = ThreadPoolExecutor(max(1, self._helpers), "match")
+
+    def map(self, compute: Callable[[ItemT], Matches], items: Sequence[ItemT]) -> list[Matches]:
+        """The results for all items, in order; raises what a computation raises, when no other one is running."""
+        results: dict[int, Matches] = {}
+        rest = iter(list(enumerate(items)))  # the next item is taken under the interpreter's lock
+
+        def work() -> None:
+            try:
+                for i, item in rest:
+                    results[i] = compute(item)
+            except BaseException:
+                deque(rest, 0)
+                raise
+
+        helpers = [self._pool.submit(work) for _ in range(min(self._helpers, len(items) - 1))]
+        try:
+            work()
+        finally:
+            running = [it for it in helpers if not it.cancel()]
+            wait(running)
+        for helper in running:
+            helper.result()
+        return [results[i] for i in range(len(items))]
+
+    def close(self) -> None:
+        """Ends the threads."""
+        self._pool.shutdown()
+
+
 class NearestNeighbours:
     """Matches mutual nearest neighbours that pass the ratio test, for any descriptor."""
 
-    def __init__(self, ratio: float, pool: ThreadPoolExecutor) -> None:
+    def __init__(self, ratio: float, threads: SharedThreads) -> None:
         self.ratio = ratio
-        self._pool = pool
+        self._threads = threads
 
     def match(self, query: View, references: Sequence[PosedView], check: Callable[[], None]) -> Sequence[Matches]:
         """See QueryMatching.match."""
@@ -184,7 +225,7 @@ class NearestNeighbours:
             check()
             return mutual_matches(ours, reference.view.features, self.ratio)
 
-        return tuple(self._pool.map(with_one, references))
+        return tuple(self._threads.map(with_one, references))
 
 
 class Matcher:
@@ -213,8 +254,8 @@ class Matcher:
         self.pair_matching = pair_matching
         self.pair_s: float | None = None
         self.stored: StoredPairs | None = None
-        self._pool = ThreadPoolExecutor(threads, "match")
-        self._query_matching = query_matching or NearestNeighbours(self.options.query_ratio, self._pool)
+        self._threads = SharedThreads(threads)
+        self._query_matching = query_matching or NearestNeighbours(self.options.query_ratio, self._threads)
         self._remembered: OrderedDict[_Key, Matches] = OrderedDict()
         self._lock = Lock()
 
@@ -238,7 +279,7 @@ class Matcher:
 
         pairs = list(combinations(range(len(references)), 2))
         self._look_up([in_order(references[i], references[j]) for i, j in pairs], wide)
-        pair_matches = self._pool.map(of_pair, pairs)
+        pair_matches = self._threads.map(of_pair, pairs)
         if query_matches is None:
             query_matches = self.match_query(query, references, check)
         return Correspondences(dict(zip(pairs, pair_matches, strict=True)), tuple(query_matches))
@@ -277,7 +318,7 @@ class Matcher:
 
     def close(self) -> None:
         """Ends the threads."""
-        self._pool.shutdown()
+        self._threads.close()
 
     def matching(self, wide: bool = False, strong: bool = False) -> str:
         """Returns a name for everything that determines a pair's matches, except for the two references."""
