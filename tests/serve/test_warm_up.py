@@ -228,7 +228,9 @@ def test_a_starting_server_rejects_calls_and_then_serves(tmp_path: Path, phase: 
 def test_sigterm_during_the_start_ends_it(tmp_path: Path) -> None:
     with gated(tmp_path / "server", warm_up=True) as server:
         wait_until(lambda: server.began)
+        sent_s = time.monotonic()
         server.process.send_signal(signal.SIGTERM)
         assert server.wait() == 0
+        assert time.monotonic() - sent_s < 5, "it waited for the thread that computes"
         assert "stopping before the start was over" in server.log
         assert not server.output

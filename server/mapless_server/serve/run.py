@@ -28,6 +28,10 @@ CLOSING_LIMIT_S = 15.0
 """Time after the drain for threads to end their step, for traces and for the store; then the process hangs. Together
 with the drain's times it must be less than the supervisor's limit, see deploy/kubernetes."""
 
+STOP_STARTING_S = 0.5
+"""Time for what has been opened to be closed, if a signal comes before the start is over; killing the process loses
+nothing that is stored."""
+
 SWITCH_INTERVAL_S = 0.001
 """Longest time that a computing thread blocks the event loop; Python's default of 5 ms adds up to late answers."""
 
@@ -50,8 +54,9 @@ async def serve(settings: Settings, make: MakeEngine = make_engine) -> None:
         if not starting.done():
             log.info("stopping before the start was over")
             starting.cancel()
-            await asyncio.wait({starting})
-            return
+            await asyncio.wait({starting}, timeout=STOP_STARTING_S)
+            logging.shutdown()
+            os._exit(0)  # the thread that loads networks cannot be ended
         running = starting.result()
         # Present objects stay; scanning them again would only block the event loop.
         gc.collect()
