@@ -24,6 +24,9 @@ MIN_SHARE_OF_IDEAL = 0.9
 MAX_P99_OVER_UNLOADED_P50 = 3.0
 MIN_SHARE_OF_PEAK = 0.9
 MAX_REFUSAL_MS = 50.0
+HAMMERING = 32
+"""Callers that call again at once when they are refused; the queue has room for some of them."""
+MIN_SHARE_BESIDE_HAMMERING = 0.8
 COMFORTABLE, EXCESSIVE = 0.7, 3.0
 """Shares of saturation that have bars of their own."""
 COMFORTABLE_STEPS = 3
@@ -65,7 +68,7 @@ class PipelineOptions:
 class PipelineResult:
     """What was measured: sequential calls, 2, 4 and more concurrent ones, and the options' shares of saturation.
 
-    Saturation is the largest rate of answers of the ramp.
+    Saturation is the largest rate of answers of the ramp. At the end all callers hammer.
     """
 
     scene: str
@@ -74,11 +77,12 @@ class PipelineResult:
     ramp: Sequence[Step]
     saturation_per_s: float
     steps: Sequence[Step]
+    hammered: Step
 
     @property
     def all_steps(self) -> list[Step]:
         """All steps in order."""
-        return [self.unloaded, *self.ramp, *self.steps]
+        return [self.unloaded, *self.ramp, *self.steps, self.hammered]
 
     def at(self, share: float) -> Step | None:
         """The step at a share of saturation; None if it was not measured."""
@@ -105,6 +109,7 @@ def pipeline_checks(result: PipelineResult) -> list[Check]:
         _ideal_check("at saturation", result.saturation_per_s, best.cpu_s_per_answer, cores),
         _comfort_check(result),
         *_overload_checks(result),
+        _hammering_check(result),
     ]
     overdue = sum(step.account.count(Fate.OVERDUE) for step in result.all_steps)
     failed = sum(step.account.count(Fate.FAILED) for step in result.all_steps)
@@ -128,6 +133,7 @@ def pipeline_json(result: PipelineResult) -> dict[str, Any]:
             {"share_of_saturation": share, **step.as_json()}
             for share, step in zip(result.options.shares, result.steps, strict=True)
         ],
+        "hammered": result.hammered.as_json(),
     }
 
 
@@ -152,7 +158,11 @@ async def _measure(place: Place, server: LoadedServer, options: PipelineOptions,
                     seed=options.seed + number,
                 )
             )
-    return PipelineResult(place.title, options, unloaded, ramp, saturation_per_s, steps)
+        progress("hammering", 0, 1)
+        hammered = await closed_loop_step(
+            "hammering", server.under_load, target, server.requests.good, HAMMERING, options.step_s, False
+        )
+    return PipelineResult(place.title, options, unloaded, ramp, saturation_per_s, steps, hammered)
 
 
 def _ideal_check(where: str, saturation_per_s: float, cpu_s: float, cores: int) -> Check:
@@ -174,6 +184,17 @@ def _comfort_check(result: PipelineResult) -> Check:
     p99_ms, count = step.account.answers.p99_ms, step.account.answers.count
     value = f"{p99_ms:.0f} ms of {count} answers, {p99_ms / p50_ms:.1f} times {p50_ms:.0f} ms"
     return Check(figure, value, bar, p99_ms <= MAX_P99_OVER_UNLOADED_P50 * p50_ms)
+
+
+def _hammering_check(result: PipelineResult) -> Check:
+    account = result.hammered.account
+    share = account.goodput_per_s / result.saturation_per_s
+    return Check(
+        f"goodput beside {HAMMERING} callers that call again at once",
+        f"{account.goodput_per_s:.2f}/s, {100 * share:.0f} % of saturation; {account.refused_per_s:.0f} refusals/s",
+        f"at least {100 * MIN_SHARE_BESIDE_HAMMERING:.0f} %",
+        share >= MIN_SHARE_BESIDE_HAMMERING,
+    )
 
 
 def _overload_checks(result: PipelineResult) -> list[Check]:

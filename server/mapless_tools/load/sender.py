@@ -79,12 +79,12 @@ async def send_open_loop(target: Target, plan: Sequence[PlannedCall], start_s: f
 
 
 async def send_closed_loop(
-    target: Target, requests: Sequence[bytes], concurrency: int, duration_s: float
+    target: Target, requests: Sequence[bytes], concurrency: int, duration_s: float, waits_if_refused: bool = True
 ) -> list[CallRecord]:
     """Keeps this many calls in progress, to measure the largest rate or, with one call, the unloaded latency.
 
     It does not measure latency under load, since the callers wait for the server. A refused caller calls again when the
-    server requests it; otherwise cheap refusals would dominate the measurement.
+    server requests it, or else at once, as badly written callers do.
     """
     loop = asyncio.get_running_loop()
     begin_s = loop.time()
@@ -97,7 +97,7 @@ async def send_closed_loop(
             planned = PlannedCall(at_s, number, Kind.QUERY, requests[number % len(requests)])
             record = await _call(target, planned, begin_s)
             records.append(record)
-            if record.fate is Fate.REFUSED:
+            if record.fate is Fate.REFUSED and waits_if_refused:
                 left_s = max(0.0, begin_s + duration_s - loop.time())
                 await asyncio.sleep(min(record.retry_after_s or REFUSED_PAUSE_S, left_s))
 

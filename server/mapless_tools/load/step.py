@@ -135,13 +135,19 @@ async def run_step(
 
 
 async def closed_loop_step(
-    name: str, server: ServerUnderLoad, target: Target, requests: Sequence[bytes], concurrency: int, seconds: float
+    name: str,
+    server: ServerUnderLoad,
+    target: Target,
+    requests: Sequence[bytes],
+    concurrency: int,
+    seconds: float,
+    waits_if_refused: bool = True,
 ) -> Step:
     """Runs a step of this many concurrent calls; rates leave out its first fifth."""
     return await run_step(
         name,
         server,
-        lambda: send_closed_loop(target, requests, concurrency, seconds),
+        lambda: send_closed_loop(target, requests, concurrency, seconds, waits_if_refused),
         seconds,
         settle_s=CLOSED_SETTLE_SHARE * seconds,
     )

@@ -49,10 +49,14 @@ class Scrape:
     @property
     def longest_lag_s(self) -> float | None:
         """Upper bound of the event loop's delays; infinite beyond the last edge, None without the metric."""
+        return self.lag_s(1.0)
+
+    def lag_s(self, share: float) -> float | None:
+        """Upper bound of this share of the delays, the shortest ones; as `longest_lag_s`."""
         total = self.lag_buckets.get(math.inf, 0)
         if total == 0:
             return None
-        return min(edge for edge, number in self.lag_buckets.items() if number == total)
+        return min(edge for edge, number in self.lag_buckets.items() if number >= share * total)
 
     @property
     def mean_lag_ms(self) -> float:
