@@ -199,38 +199,6 @@ def test_queries_use_what_is_kept_without_the_network(kept: Path) -> None:
     assert network.runs == 0
 
 
-def test_depths_are_found_once_they_are_made(data_dir: Path) -> None:
-    with serving(data_dir, **STORED) as server:
-        assert poses(server)
-        assert server.value("mapless_stored_depths_total", result="stored") == 0
-        assert server.value("mapless_stored_depths_total", result="absent") > 0
-    with serving(data_dir, PlantedNetwork(), **MAKING) as server:
-        wait_for_depths(server)
-        assert poses(server)
-        assert server.value("mapless_stored_depths_total", result="stored") > 0
-
-
-@pytest.mark.parametrize(
-    "damage", ["data = zeroblob(40)", "sha256 = 'no'", "kind = replace(kind, 'depth-1/', 'depth-0/')"]
-)
-def test_damaged_depths_and_other_versions_change_no_answer_and_are_made_again(kept: Path, damage: str) -> None:
-    with serving(kept, **OFF) as server:
-        without = poses(server)
-    Folder(kept).execute(f"UPDATE reference_depth SET {damage}")
-    if "kind" in damage:
-        Folder(kept).execute("DELETE FROM reference_matching WHERE matching LIKE 'depth-%'")
-    with serving(kept, PlantedNetwork(), **STORED) as server:
-        assert poses(server) == without
-        assert server.value("mapless_stored_depths_total", result="stored") == 0
-    with serving(kept, PlantedNetwork(), **MAKING) as server:
-        assert poses(server)
-
-        def is_made() -> bool:
-            return server.value("mapless_depths_total", result="kept") >= REFERENCES - 1
-
-        wait_until(is_made)
-
-
 @pytest.mark.parametrize("factor", [1.6, float("nan")], ids=["another scale", "NaN"])
 def test_a_network_that_is_wrong_keeps_nothing(data_dir: Path, factor: float) -> None:
     """All depths 1.6 times as large as its own poses say: triangulated points contradict them."""
