@@ -1,0 +1,265 @@
+"""Many queries at a time have the answers they have alone: kept tokens, batches, memory that does not suffice."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+pytest.importorskip("torch", reason="the networks' extra is not installed")
+pytest.importorskip("PIL", reason="the networks' extra is not installed")
+
+import torch
+from support.grey_network import (
+    OPTIONS,
+    UNCACHED,
+    GreyRunner,
+    assert_close,
+    assert_same_bits,
+    grey_backend,
+    grey_request,
+    greys_of,
+)
+from support.small_networks import small_request, small_runner
+
+from mapless_server.engine.failures import failure_of
+from mapless_server.method.choices import NETWORKS
+from mapless_server.method.coarse import Bucket, Request, reconstruct_one
+from mapless_server.method.coarse.network import NetworkReconstructor
+from mapless_server.method.coarse.token_cache import TokenCacheOptions
+from mapless_server.scheduling import Done, Flow, Job, Observer, Stage, StageResult, Step, WorkQueue, WorkQueueOptions
+
+# Kept tokens
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_cached_tokens_give_the_same_bits(name: str) -> None:
+    reads: list[str] = []
+    query, references = small_request(4, reads=reads)
+    runner = small_runner(name)
+    backend = NetworkReconstructor(runner, OPTIONS)
+    reconstruct_one(backend, query, references[:3])
+    reconstruct_one(backend, query, references[2:])
+    reads.clear()
+    kept = reconstruct_one(backend, query, references)
+    assert query.photograph is not None
+    assert reads == [query.photograph.sha256]
+    assert backend.cache.counters.device_hits == 5
+    assert_same_bits(kept, reconstruct_one(NetworkReconstructor(runner, UNCACHED), query, references))
+    assert len(reads) == 6
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_tokens_from_the_host_give_the_same_bits(name: str) -> None:
+    request = small_request(4)
+    runner = small_runner(name)
+    backend = NetworkReconstructor(runner, OPTIONS)
+    reconstruct_one(backend, *request)
+    one_view_bytes = backend.cache.counters.device_bytes // 4
+    # On a device of its own memory; here both levels are the host's.
+    backend.cache = type(backend.cache)(runner.device, TokenCacheOptions(one_view_bytes, 4 * one_view_bytes))
+    first, second = reconstruct_one(backend, *request), reconstruct_one(backend, *request)
+    assert backend.cache.counters.host_hits == 3 + 1
+    assert_same_bits(first, second)
+    assert_same_bits(second, reconstruct_one(NetworkReconstructor(runner, UNCACHED), *request))
+
+
+def test_another_photograph_of_the_same_name_misses_the_cache() -> None:
+    query, references = grey_request(7, 50, 100)
+    backend = grey_backend(GreyRunner())
+    reconstruct_one(backend, query, references)
+    changed = replace(references[1], view=grey_request(200)[0])
+    assert greys_of(reconstruct_one(backend, query, [references[0], changed])) == [7, 50, 200]
+
+
+def test_another_grid_misses_the_cache() -> None:
+    query, references = grey_request(7, 50, 100)
+    portraits = grey_request(7, 60, 70, 80, size=(72, 96))[1]
+    backend = grey_backend(GreyRunner())
+    reconstruct_one(backend, query, references)
+    assert greys_of(reconstruct_one(backend, query, [references[0], *portraits])) == [7, 50, 60, 70, 80]
+    assert backend.cache.counters.device_hits == 0
+    assert greys_of(reconstruct_one(backend, query, references)) == [7, 50, 100]
+    assert backend.cache.counters.device_hits == 2
+
+
+# Many queries at a time
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_queries_of_a_batch_equal_single_ones(name: str) -> None:
+    requests = [
+        small_request(3, 1),
+        small_request(2, 2),
+        small_request(3, 3),
+        small_request(3, 4, size=(72, 96)),
+        small_request(3, 5),
+    ]
+    runner = small_runner(name)
+    together = NetworkReconstructor(runner, OPTIONS).reconstruct_many([Request(*request) for request in requests])
+    for request, outcome in zip(requests, together, strict=True):
+        alone = reconstruct_one(NetworkReconstructor(runner, OPTIONS), *request)
+        assert_close(outcome, alone)
+
+
+@pytest.mark.parametrize("cache", [OPTIONS.cache, TokenCacheOptions(0, 0)], ids=["kept", "not kept"])
+def test_each_view_of_a_batch_is_encoded_once(cache: TokenCacheOptions) -> None:
+    runner = GreyRunner()
+    _, references = grey_request(0, 50, 100, 150)
+    requests = [Request(grey_request(i)[0], references) for i in (1, 2, 3, 4)]
+    outcomes = grey_backend(runner, replace(OPTIONS, cache=cache)).reconstruct_many(requests)
+    assert [greys_of(outcome) for outcome in outcomes] == [[i, 50, 100, 150] for i in (1, 2, 3, 4)]
+    assert sum(runner.encoded) == 3 + 4
+    assert runner.batches == [4]
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_queries_with_common_references_equal_single_ones(name: str) -> None:
+    _, references = small_request(3)
+    queries = [small_request(1, seed)[0] for seed in (1, 2, 3, 4)]
+    runner = small_runner(name)
+    together = NetworkReconstructor(runner, UNCACHED).reconstruct_many([Request(q, references) for q in queries])
+    for query, outcome in zip(queries, together, strict=True):
+        alone = reconstruct_one(NetworkReconstructor(runner, UNCACHED), query, references)
+        assert_close(outcome, alone)
+
+
+def test_queries_of_one_bucket_are_one_batch_of_the_network() -> None:
+    backend = grey_backend(GreyRunner())
+    assert backend.bucket(*grey_request(1, 50, 60)) == Bucket("grey", 2, (4, 5))
+    assert str(backend.bucket(*grey_request(1, 50, 60))) == "grey-4x5-2"
+    assert str(backend.bucket(*grey_request(1, 50, size=(72, 96)))) == "grey-5x4-1"
+    query, _ = grey_request(1, 50)
+    with pytest.raises(ValueError, match="the query has no photograph"):
+        backend.bucket(replace(query, photograph=None), grey_request(1, 50)[1])
+
+
+def test_one_requests_error_does_not_fail_the_others() -> None:
+    requests = [grey_request(1, 50), grey_request(2, 60), grey_request(3, 70)]
+    query, (reference,) = requests[1]
+    requests[1] = (query, (replace(reference, view=replace(reference.view, photograph=None)),))
+    outcomes = grey_backend(GreyRunner()).reconstruct_many([Request(*request) for request in requests])
+    assert isinstance(outcomes[1], ValueError)
+    assert [greys_of(outcomes[i]) for i in (0, 2)] == [[1, 50], [3, 70]]
+
+
+# Out of memory
+
+
+def test_out_of_memory_is_retried_after_tokens_are_released() -> None:
+    runner = GreyRunner(failing_batches=1)
+    backend = grey_backend(runner)
+    outcomes = backend.reconstruct_many([Request(*grey_request(i, 50, 100)) for i in range(4)])
+    assert [greys_of(outcome) for outcome in outcomes] == [[i, 50, 100] for i in range(4)]
+    assert runner.batches == [4, 4]
+    assert sum(runner.encoded) == 2 + 4, "the batch's own tokens stay"
+    assert backend.cache.counters.device_bytes == 0
+
+
+def test_a_batch_that_still_does_not_fit_raises() -> None:
+    runner = GreyRunner(most_scenes=2)
+    with pytest.raises(torch.OutOfMemoryError):
+        grey_backend(runner).reconstruct_many([Request(*grey_request(i, 50, 100)) for i in range(4)])
+    assert runner.batches == [4, 4]
+
+
+def test_the_queue_splits_a_batch_that_does_not_fit() -> None:
+    """Else each full batch would fail anew, and empty the cache each time."""
+    runner = GreyRunner(most_scenes=2)
+    backend, observer, gate = grey_backend(runner), CountingObserver(), threading.Event()
+
+    def compute(jobs: Sequence[Job]) -> list[StageResult]:
+        if jobs[0].step.bucket == "plug":
+            assert gate.wait(20)
+            return [Done(None)]
+        made = backend.reconstruct_many([job.step.payload for job in jobs])
+        return [it if isinstance(it, Exception) else Done(it) for it in made]
+
+    async def test() -> None:
+        options = WorkQueueOptions(max_queued_s=1e6)
+        stages = {Stage("coarse", "toy-device", max_batch=4): compute}
+        queue = WorkQueue(stages, {"toy-device": 1}, options, observer, failure_of)
+
+        def submit(bucket: str, payload: Request | None = None) -> asyncio.Task[Any]:
+            step = Step("coarse", "toy", bucket, payload)
+            return asyncio.ensure_future(queue.run(Job(Flow("t", "c"), step, time.monotonic() + 600, 1)))
+
+        try:
+            for expected in ([4, 4, 2, 2], [2, 2]):
+                runner.batches.clear()
+                gate.clear()
+                plug = submit("plug")
+                calls = [submit("b", Request(*grey_request(i, 50))) for i in range(4)]
+                while queue.job_count < 5:
+                    await asyncio.sleep(0.002)
+                gate.set()
+                results = await asyncio.wait_for(asyncio.gather(*calls, plug), 20)
+                assert [greys_of(outcome) for outcome in results[:4]] == [[i, 50] for i in range(4)]
+                assert runner.batches == expected
+                assert observer.out_of_memory == 1
+        finally:
+            gate.set()
+            await queue.close()
+
+    asyncio.run(test())
+
+
+def test_a_single_query_is_retried_once() -> None:
+    runner = GreyRunner(most_scenes=0)
+    with pytest.raises(torch.OutOfMemoryError):
+        reconstruct_one(grey_backend(runner), *grey_request(1, 50))
+    assert runner.batches == [1, 1]
+
+
+@pytest.mark.parametrize("failing", [1, 2])
+@pytest.mark.parametrize("queries", [1, 2])
+def test_encoding_is_retried_once(failing: int, queries: int) -> None:
+    backend = grey_backend(GreyRunner(failing_encodings=failing))
+    requests = [Request(*grey_request(i, 50)) for i in range(queries)]
+    if failing == 1:
+        assert [greys_of(outcome) for outcome in backend.reconstruct_many(requests)] == [
+            [i, 50] for i in range(queries)
+        ]
+    elif queries == 1:
+        assert isinstance(backend.reconstruct_many(requests)[0], torch.OutOfMemoryError)
+    else:  # it may be the others that have taken the room
+        with pytest.raises(torch.OutOfMemoryError):
+            backend.reconstruct_many(requests)
+
+
+class CountingObserver(Observer):
+    """Counts how often memory did not suffice."""
+
+    def __init__(self) -> None:
+        self.out_of_memory = 0
+
+    def ran_out_of_memory(self) -> None:
+        self.out_of_memory += 1
+
+
+class LostDevice(RuntimeError):
+    """As torch raises it when the context is poisoned."""
+
+
+def test_errors_of_the_device_are_passed_on_unchanged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether it is lost while one view is encoded or in the middle of the batch, the error comes out unchanged."""
+    lost = LostDevice("CUDA error: an illegal memory access was encountered")
+
+    def fail(*_: Any) -> None:
+        raise lost
+
+    runner = GreyRunner()
+    backend = grey_backend(runner)
+    requests = [Request(*grey_request(i, 50)) for i in (1, 2)]
+    with monkeypatch.context() as patch:
+        patch.setattr(runner, "reconstruct", fail)
+        with pytest.raises(LostDevice) as raised:
+            backend.reconstruct_many(requests)
+        assert raised.value is lost
+    monkeypatch.setattr(runner, "encode", fail)
+    assert all(outcome is lost for outcome in grey_backend(runner).reconstruct_many(requests))
