@@ -30,12 +30,13 @@ from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.method.results import PoseStage
+from mapless_server.method.trust.judge import LEVELS, JudgeOptions
 from mapless_server.method.views import Features, Matches, PosedView, View
 from mapless_server.scenes import Narrowing, Sphere
 from mapless_server.scheduling import Abandoned, CostModel, Ending, Flow, Job, Next
 from mapless_server.security import SceneKey
 from mapless_server.serve.assembly import engine_over
-from mapless_server.store import NewReference, Store
+from mapless_server.store import NewReference, SelfCalibration, Store, calibrations
 
 SURE_INLIERS, DOUBTFUL_INLIERS = 500, 5
 ESCALATION = EscalationOptions(doubtful_trust=0.1, doubtful_radius_m=0.2)
@@ -70,6 +71,7 @@ class Setting:
     replies: dict[str, Reply] = field(default_factory=dict)
     asked: list[str] = field(default_factory=list)
     seen: list[tuple[View, Sequence[PosedView]]] = field(default_factory=list)
+    judges: list[JudgeOptions] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.extractors = {name: StandInExtractor(name) for name in ("cheap", "strong")}
@@ -78,15 +80,16 @@ class Setting:
         def method(
             query: View, references: Sequence[PosedView], pipeline: Pipeline, _: Any, check: Callable[[], None]
         ) -> Answer:
-            (name,) = (name for name, it in pipelines.items() if it is pipeline)
+            (name,) = (name for name, it in pipelines.items() if it.reconstructor is pipeline.reconstructor)
+            self.judges.append(pipeline.options.judge)
             self.asked.append(name)
             self.seen.append((query, references))
             reply = self.replies[name]
             return reply(query, references, check) if callable(reply) else reply
 
-        tiers = [Tier(extractor, pipelines[name]) for name, extractor in self.extractors.items()]
+        self.tiers = [Tier(extractor, pipelines[name]) for name, extractor in self.extractors.items()]
         self.engine = engine_over(
-            self.store, tiers, EngineOptions(escalation=ESCALATION), None, None, whole(method), DESCRIPTOR
+            self.store, self.tiers, EngineOptions(escalation=ESCALATION), None, None, whole(method), DESCRIPTOR
         )
         self.loop = asyncio.new_event_loop()
 
@@ -176,6 +179,21 @@ class TestTiers:
         assert setting.asked == ["cheap", "strong"]
         assert result.tier.extractor.name == answered
         assert is_outcome(result, {"cheap": first, "strong": second}[answered])
+
+    def test_a_scenes_own_quantiles_replace_the_usual_trust(self, setting: Setting) -> None:
+        """In the judge and for doubt; unless the query ignores calibrations."""
+        setting.replies = dict.fromkeys(("cheap", "strong"), localized(DOUBTFUL_INLIERS))
+        quantiles = tuple(np.asarray(LEVELS) ** 0.1)
+        kind = setting.tiers[0].kind
+        claim = calibrations.claim_scene(setting.store.database, kind)
+        assert claim is not None
+        assert calibrations.add(setting.store, claim, SelfCalibration(kind, 1, 9, trust_quantiles=quantiles), 60.0)
+        setting.localize()
+        assert setting.asked == ["cheap"]
+        setting.localize(is_generic=True)
+        assert setting.asked == ["cheap", "cheap", "strong"]
+        usual = JudgeOptions()
+        assert setting.judges == [usual.with_trust(quantiles), usual, usual]
 
     def test_the_times_of_both_tiers_are_separate(self, setting: Setting) -> None:
         setting.replies = {"cheap": rejected(), "strong": localized(SURE_INLIERS)}
