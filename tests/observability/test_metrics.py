@@ -189,6 +189,14 @@ def test_metrics_without_events_are_described(metrics: Metrics) -> None:
             for it in Ending
         ),
         *(("answers", {"outcome": it}, partial(Metrics.answered, outcome=it)) for it in OUTCOMES),
+        ("background_failures", {}, Metrics.matching_failed),
+        ("calibration_failures", {}, Metrics.calibration_failed),
+        ("depth_failures", {}, Metrics.depth_failed),
+        ("depth_failures", {}, Metrics.depth_lookup_failed),
+        ("fatal", {}, Metrics.failed_fatally),
+        ("gpu_oom", {}, Metrics.ran_out_of_memory),
+        ("store_errors", {}, Metrics.store_failed),
+        ("stored_pairs_failures", {}, Metrics.pair_lookup_failed),
     ],
 )
 def test_an_event_is_counted_once_and_was_zero_before(
