@@ -91,7 +91,9 @@ class TwoViewMatches:
     def sampson_px(self, world_from_query: RigidTransform) -> Array:
         """Sampson distances (T,) of the matches, pixels; NaN without a baseline."""
         rotation, centre = world_from_query.rotation, world_from_query.translation
-        return np.asarray(self.sampson_along_px(rotation, centre, np.zeros(3), np.zeros(1))[0])
+        error, gradient = self._constraint(rotation, self.ray @ rotation.T, self.reference_centre - centre)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray(np.abs(error) / np.linalg.norm(gradient, axis=1))
 
     def sampson_along_px(self, rotation: Array, centre: Array, direction: Array, distance: Array) -> Array:
         """Sampson distances (S, T) of queries at centre + distance * direction, for S distances."""
