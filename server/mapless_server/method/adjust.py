@@ -94,7 +94,8 @@ def _adjusted(
     terms = intrinsics_terms(query, references, intrinsics)
     found = adjusted_estimate(query, structure, matches, used, estimate, problem, bundle, options, terms)
     if found and found.intrinsics:
-        found = recalibrated(query, references, structure, matches, found, options, priors, terms[2])
+        solved = problem, bundle, used
+        found = recalibrated(query, references, structure, matches, found, options, priors, terms[2], solved)
     return found and replace(found, covariance=priors.sharpened(found.covariance, found.world_from_camera))
 
 
@@ -153,7 +154,8 @@ def with_covariance(
         return found
     # The pose stays as it is; but an error is not seen in full before it is estimated.
     given = support.query, references, support.structure, matches
-    estimated = recalibrated(*given, found, options, NO_PRIORS, terms[2]).intrinsics
+    solved = problem, bundle, used
+    estimated = recalibrated(*given, found, options, NO_PRIORS, terms[2], solved).intrinsics
     if estimated is not None and estimated.contradicted(options.contradiction, terms[2]).any():
         found = replace(found, intrinsics=estimated)
     return found

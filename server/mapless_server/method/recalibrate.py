@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array
 
+from .bundle import Bundle, BundleProblem
 from .intrinsics import PRINCIPAL, ContradictionOptions, IntrinsicsEvidence, corrected_view
 from .perturbation import reprojection_errors_px
 from .pose_problem import AdjustOptions, adjusted_estimate, optimum, pose_problem, shares_camera, with_intrinsics
@@ -29,6 +30,11 @@ LINEAR_CHANGE = np.array([0.01, 0.01, 0.01, 0.02])
 """Changes in the same units below which keypoints move in proportion to them, to a tenth of a pixel."""
 LEAST_MATCHES = 20
 """For a pose and intrinsics."""
+ROUGHLY = 2.0
+"""Factor on `AdjustOptions.min_motion_sigma` before the photograph is read again."""
+
+Solved = tuple[BundleProblem, Bundle, NDArray[np.intp]]
+"""A problem, its solution, and the indices of the matches that it uses."""
 
 
 def recalibrated(
@@ -40,15 +46,19 @@ def recalibrated(
     options: AdjustOptions,
     priors: Priors,
     usual: Array,
+    solved: Solved,
 ) -> PoseEstimate:
-    """The estimate with the parameters that the photograph contradicts; the one found if it contradicts none."""
+    """The estimate with the parameters that the photograph contradicts; the one found if it contradicts none.
+
+    `solved` is where the estimate was found.
+    """
     held, untried = usual, np.ones(4, bool)
     wide = np.maximum(usual, WIDE_SIGMA * np.array([1, query.camera.width_px, query.camera.width_px, 1]))
     if _contradicted(found, options.suspicion, untried) is None and found.inliers.mean() >= options.agreeing_share:
         return found
     # With all estimated, the wrong ones stand out: an error that is held looks like errors of the others.
     given = query, references, structure, matches
-    guide = _with_errors(*given, found, options, priors, usual, wide) or found
+    guide = _with_errors(*given, found, options, priors, usual, wide, solved) or found
     while (worst := _contradicted(guide, options.suspicion, untried)) is not None:
         untried[list(worst)] = False
         freed = held.copy()
@@ -104,26 +114,32 @@ def _with_errors(
     priors: Priors,
     usual: Array,
     held: Array,
+    solved: Solved | None = None,
 ) -> PoseEstimate | None:
     """The estimate with intrinsics as unknowns of prior standard deviations `held`; None if it fails."""
     assert found.intrinsics is not None
     errors, pose, view = found.intrinsics.removed, found.world_from_camera, found.view or query
     small = LINEAR_CHANGE * np.array([1, query.camera.width_px, query.camera.width_px, 1])
+    rough = replace(options, min_motion_sigma=ROUGHLY * options.min_motion_sigma)
     moved, bundle, change, information = structure, None, None, None
     for left in reversed(range(options.rounds)):
-        pixels = view.features.keypoints[matches.keypoint].astype(np.float64)
-        errors_px = reprojection_errors_px(view.camera, pose, structure.x_in_world[matches.point], pixels)
-        used = np.flatnonzero(errors_px < options.max_error_px)
+        if solved is None:
+            pixels = view.features.keypoints[matches.keypoint].astype(np.float64)
+            errors_px = reprojection_errors_px(view.camera, pose, structure.x_in_world[matches.point], pixels)
+            used = np.flatnonzero(errors_px < options.max_error_px)
+            problem, start = pose_problem(view, references, moved, matches, used, pose, options, information)
+            start = start if bundle is None else replace(start, poses=bundle.poses)
+        else:
+            problem, start, used = solved
+            solved = None
         if len(used) < LEAST_MATCHES:
             return None
-        problem, start = pose_problem(view, references, moved, matches, used, pose, options, information)
         problem = problem.replaced(priors=priors, prior_weight=options.error_inflation**2)
-        start = start if bundle is None else replace(start, poses=bundle.poses)
         if not left or (change is not None and (np.abs(change) < small).all()):
             break
         wider, there = with_intrinsics(problem, start, view)
         wider = wider.replaced(intrinsics_information=held**-2.0, intrinsics_offset=errors)
-        bundle = optimum(wider, there, options)
+        bundle = optimum(wider, there, rough)
         pose, change, information = bundle.world_from_query, bundle.intrinsics, problem.information
         errors = errors + change
         if np.abs(errors / held).max() > MAX_HELD:
