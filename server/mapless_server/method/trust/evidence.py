@@ -32,6 +32,9 @@ MOST_POINTS = 2000
 LEAST_SHARE, LEAST_HULL_SHARE, LEAST_EPIPOLAR_SHARE, LEAST_DISAGREEMENT = 0.01, 0.002, 0.0004, 0.001
 """Below these evidence is not better or worse. A right pose's halves are apart by a thousandth of the distance."""
 
+AGREED = LEAST_DISAGREEMENT / math.sqrt(2)
+"""Halves of matches and of references that are apart by less are together not better evidence than any nearer ones."""
+
 EPIPOLAR_PX = 2.0
 """Largest Sampson distance of a match that agrees with a pose; keypoints are accurate to about a pixel."""
 
@@ -94,8 +97,8 @@ class AgreementOptions:
     """Options of the comparison.
 
     Attributes:
-        splits: number of splits into halves, of which the median counts; one split may put all good matches into one
-            half.
+        splits: largest number of splits into halves, of which the median counts; one split may put all good matches
+            into one half.
         shuffling: references are assigned to halves in the order of their numbers of matches, each raised by up to this
             share at random, so that the splits differ and the halves remain balanced.
         pnp: options of the halves' poses. With good matches, 30 iterations give the same poses as 100; 1000 find a pose
@@ -158,20 +161,24 @@ def _median_disagreement(
 ) -> float:
     """Median over the splits of the distance of the two halves' cameras, as a share of `distance_m`; at most 1."""
     random, apart = np.random.default_rng(0), []
-    in_order = None if keypoint is None else np.argsort(keypoint, kind="stable")
+    order = slice(None) if keypoint is None else np.argsort(keypoint, kind="stable")
+    x_in_world, pixels = x_in_world[order], pixels[order]
+    keypoint = None if keypoint is None else keypoint[order]
     for _ in range(options.splits):
-        in_first = draw_half(random)
+        in_first = draw_half(random)[order]
         centres = []
         for half in (in_first, ~in_first):
-            if keypoint is None or in_order is None:
-                rows = np.flatnonzero(half)
-            else:
-                rows = in_order[half[in_order]]
-                rows = rows[np.diff(keypoint[rows], prepend=-1) > 0]
+            rows = np.flatnonzero(half)
+            if keypoint is not None:
+                is_first, its = np.ones(len(rows), bool), keypoint[rows]
+                is_first[1:] = its[1:] != its[:-1]
+                rows = rows[is_first]
             pose = ransac(camera, x_in_world[rows], pixels[rows], None, options.pnp) if len(rows) >= 4 else None
             centres.append(None if pose is None else pose.translation)
         first, second = centres
         apart.append(NO_AGREEMENT if first is None or second is None else math.dist(first, second) / distance_m)
+        if 2 * len(apart) > options.splits and max(apart) < AGREED:
+            break  # so is the median of all
     return min(NO_AGREEMENT, float(np.median(apart)))
 
 
