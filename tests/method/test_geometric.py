@@ -11,8 +11,8 @@ from support.planted import moved_references, true_correspondences
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
-from mapless_server.method.coarse import Request, reconstruct_one
-from mapless_server.method.coarse.geometric import GeometricReconstructor
+from mapless_server.method.coarse import Request, Triangulation, reconstruct_one
+from mapless_server.method.coarse.geometric import GeometricReconstructor, point_maps
 from mapless_server.method.correspond import Correspondences, Matcher
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.views import PosedView, ReconstructedView, Reconstruction, View
@@ -21,11 +21,10 @@ EXACT = SceneOptions(noise_px=0.0, point_count=300, reference_count=4)
 
 
 def reconstruct(scene: SyntheticScene, references: tuple[PosedView, ...] | None = None) -> Reconstruction:
-    outcome = reconstruct_one(
-        GeometricReconstructor(), scene.query, references or scene.references, true_correspondences(scene)
-    )
-    assert isinstance(outcome, Reconstruction), outcome
-    return outcome
+    references = references or scene.references
+    outcome = reconstruct_one(GeometricReconstructor(), scene.query, references, true_correspondences(scene))
+    assert isinstance(outcome, Triangulation), outcome
+    return point_maps(outcome, scene.query, references)
 
 
 def rejection_of(query: View, references: tuple[PosedView, ...], correspondences: Correspondences) -> Rejection:
@@ -103,12 +102,11 @@ def test_the_local_frame_does_not_depend_on_the_world() -> None:
 
 def test_wrong_matches_do_not_change_the_pose() -> None:
     scene = make_scene(random_for("outliers"), SceneOptions(outlier_share=0.4))
-    reconstruction = reconstruct_one(
+    outcome = reconstruct_one(
         GeometricReconstructor(), scene.query, scene.references, Matcher().correspond(scene.query, scene.references)
     )
-    assert isinstance(reconstruction, Reconstruction)
-    pose = world_from_local(scene, reconstruction).transform_pose(reconstruction.query.local_from_camera)
-    assert_pose_close(pose, scene.world_from_query, metres=0.02, degrees=0.2)
+    assert isinstance(outcome, Triangulation)
+    assert_pose_close(outcome.world_from_query, scene.world_from_query, metres=0.02, degrees=0.2)
 
 
 def test_queries_in_a_batch_equal_single_ones_and_fail_alone() -> None:
@@ -118,8 +116,9 @@ def test_queries_in_a_batch_equal_single_ones_and_fail_alone() -> None:
     first, failed, second = GeometricReconstructor().reconstruct_many([requests[0], without, requests[1]])
     assert isinstance(failed, ValueError)
     for outcome, scene in ((first, scenes[0]), (second, scenes[1])):
-        assert isinstance(outcome, Reconstruction)
-        np.testing.assert_array_equal(outcome.query.point_map, reconstruct(scene).query.point_map)
+        assert isinstance(outcome, Triangulation)
+        again = point_maps(outcome, scene.query, scene.references)
+        np.testing.assert_array_equal(again.query.point_map, reconstruct(scene).query.point_map)
 
 
 def test_each_number_of_references_is_a_bucket() -> None:

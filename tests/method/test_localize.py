@@ -137,9 +137,10 @@ def test_refinement_makes_a_rough_pose_accurate() -> None:
     assert max(errors[Variant.FULL][1], errors[Variant.BEST][1]) < 0.5 * errors[Variant.COARSE][1]
 
 
+@pytest.mark.nightly
 def test_best_beats_full_under_noisy_reference_poses() -> None:
     errors: dict[Variant, list[float]] = {Variant.FULL: [], Variant.BEST: []}
-    for seed in range(6):
+    for seed in range(24):
         scene = make_scene(random_for("average", seed), SceneOptions(point_count=300))
         random = random_for("reference noise", seed)
         references = [

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +16,9 @@ from support.planted import metric_scale, true_correspondences, true_tracks
 from support.scenes import CAMERA, SceneOptions, SyntheticScene, arc_poses, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform
+from mapless_server.method import structure as stage
 from mapless_server.method.arrays import SYMMETRIC, columns, invert_symmetric, rows, solve_columns
-from mapless_server.method.correspond import Correspondences
+from mapless_server.method.correspond import Correspondences, CorrespondOptions, Matcher
 from mapless_server.method.observations import (
     MIN_NOISE_LEVEL_PX,
     ONE_PIXEL,
@@ -33,6 +36,7 @@ from mapless_server.method.structure import (
     build_structure,
     observe,
     predicted_points,
+    triangulated_structure,
     trustworthy,
 )
 from mapless_server.method.tracks import Tracks
@@ -454,3 +458,80 @@ def test_without_matches_there_is_no_structure(options: StructureOptions) -> Non
         )
         assert structure.x_in_world.shape == (0, 3)
         assert structure.tracks.point_count == 0
+
+
+# Structures of a set of references
+
+
+@pytest.fixture
+def triangulations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """An entry for each structure that is computed."""
+    computed: list[int] = []
+    real = stage._triangulated
+
+    def counted(*arguments: Any) -> Structure:
+        computed.append(1)
+        return real(*arguments)
+
+    monkeypatch.setattr(stage, "_triangulated", counted)
+    return computed
+
+
+def triangulated_by(
+    matcher: Matcher, scene: SyntheticScene, references: Sequence[PosedView], shift: float = 0.0, wide: bool = False
+) -> Structure:
+    """As `localize` does: matched in the world, triangulated around an origin."""
+    nearby = [replace(r, world_from_camera=r.world_from_camera.shifted(np.full(3, -shift))) for r in references]
+    return triangulated_structure(nearby, matcher.correspond(scene.query, references, wide), StructureOptions())
+
+
+def test_a_set_of_references_is_triangulated_once_in_any_order(triangulations: list[int]) -> None:
+    scene = make_scene(random_for("once"), SceneOptions(point_count=150, reference_count=4))
+    matcher, uncached = Matcher(), Matcher(CorrespondOptions(structure_bytes=0))
+    for chosen, shift in (([0, 1, 2, 3], 0.0), ([2, 0, 3, 1], 7.0), ([3, 2, 1, 0], 0.0)):
+        references = [scene.references[i] for i in chosen]
+        found = triangulated_by(matcher, scene, references, shift)
+        assert len(triangulations) == 1
+        plain = triangulated_by(uncached, scene, references, shift)
+        triangulations.pop()
+        for a, b in zip(parts(found), parts(plain), strict=True):
+            np.testing.assert_array_equal(a, b)
+        tracks, shown = found.tracks, [scene.reference_points[i] for i in chosen]
+        point = np.array([shown[v][k] for v, k in zip(tracks.view, tracks.keypoint, strict=True)])
+        off_m = np.linalg.norm(found.x_in_world[tracks.point] + shift - scene.x_in_world[point], axis=1)
+        assert np.median(off_m) < 0.01
+        first = tracks.view[tracks.starts] * 10_000 + tracks.keypoint[tracks.starts]
+        assert (np.diff(first) > 0).all()
+        assert (np.diff(tracks.point * 4 + tracks.view) > 0).all()
+
+
+def parts(structure: Structure) -> tuple[NDArray[Any], ...]:
+    tracks = structure.tracks
+    return structure.x_in_world, tracks.point, tracks.view, tracks.keypoint, np.array(structure.noise.level_px)
+
+
+def test_other_references_and_wide_matches_have_a_structure_of_their_own(triangulations: list[int]) -> None:
+    scene = make_scene(random_for("sets"), SceneOptions(point_count=100, reference_count=4))
+    matcher = Matcher()
+    for references, wide in ((scene.references, False), (scene.references, True), (scene.references[:3], False)) * 2:
+        triangulated_by(matcher, scene, references, wide=wide)
+    assert len(triangulations) == 3
+
+
+def test_structures_are_bounded_and_leave_with_their_references(triangulations: list[int]) -> None:
+    scene = make_scene(random_for("bounded sets"), SceneOptions(point_count=100, reference_count=4))
+    a, b, c, d = scene.references
+    size = triangulated_by(Matcher(), scene, [a, b, c]).size_bytes
+    matcher = Matcher(CorrespondOptions(structure_bytes=2 * size + size // 2))
+    triangulations.clear()
+    for references in ([a, b, c], [a, b, d], [a, b, c]):
+        triangulated_by(matcher, scene, references)
+    assert len(triangulations) == 2
+    triangulated_by(matcher, scene, [b, c, d])
+    triangulated_by(matcher, scene, [a, b, d])
+    assert len(triangulations) == 4, "the least recently used one was dropped"
+    matcher.forget({c.key})
+    triangulated_by(matcher, scene, [a, b, d])
+    assert len(triangulations) == 4
+    triangulated_by(matcher, scene, [b, c, d])
+    assert len(triangulations) == 5

@@ -19,6 +19,7 @@ import pytest
 from prometheus_client import generate_latest
 from prometheus_client.parser import text_string_to_metric_families
 
+from mapless_server.method.cache import LruCache
 from mapless_server.method.coarse.token_cache import TokenCacheCounters
 from mapless_server.method.rejection import RejectionReason
 from mapless_server.observability import exporter
@@ -26,7 +27,6 @@ from mapless_server.observability.event_loop import watch_event_loop
 from mapless_server.observability.exporter import MAX_CONNECTIONS, MetricsServer
 from mapless_server.observability.metrics import LOCALIZED, STAGES, Metrics
 from mapless_server.scheduling import Ending, Refusal
-from mapless_server.store.cache import LruCache
 
 LOCALIZE = "/mapless.v1.LocalizationService/Localize"
 

@@ -69,7 +69,8 @@ def metric_scale(world_from_local: Similarity, world_from_query: RigidTransform)
 
 def moved_references(references: tuple[PosedView, ...], world: RigidTransform) -> tuple[PosedView, ...]:
     """The same references in another world frame, with keys of their own."""
-    return tuple(PosedView(f"{r.key}-moved", r.name, r.view, world.compose(r.world_from_camera)) for r in references)
+    moved = f"moved {hash(world.matrix().tobytes())}"
+    return tuple(PosedView(f"{r.key} {moved}", r.name, r.view, world.compose(r.world_from_camera)) for r in references)
 
 
 def stages(scene: SyntheticScene, references: tuple[PosedView, ...]) -> tuple[Structure, PointMatches, PoseEstimate]:

@@ -9,6 +9,7 @@ optimize                     robust losses; Levenberg-Marquardt, the only one
 views                        photographs with features and poses; the result of the coarse stage
 rejection                    "no pose" is a result
 features/                    local features of a photograph
+cache                        results that are kept within a bound, here and by the server
 tracks                       observations of the same point
 lightglue, correspond        matches among references, and of the query with them (lightglue: by a network)
 priors/                      what is known of the query's pose beforehand

@@ -15,14 +15,13 @@ from __future__ import annotations
 
 import sys
 import time
-from collections import OrderedDict, deque
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import combinations
 from pathlib import Path
-from threading import Lock
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -30,6 +29,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, cross_matrix
 
+from .cache import LruCache
 from .choices import EDGEPOINT2
 from .options import check_bounds
 from .tracks import Tracks, build_tracks
@@ -65,6 +65,7 @@ class CorrespondOptions:
             250 on LightGlue finds fewer, of fewer keypoints. In the kitchen with 3 references (433, 267 and 179
             matches) 300 instead of 500 costs one of 40 photographs; in meeting-room with 5 (141 at most) 50 costs none.
         remembered_pairs: number of cached pairs of references, about 8 KiB each.
+        structure_bytes: memory of the cached structures of sets of references, about 0.25 MB for ten at 640x480.
     """
 
     reference_ratio: float = 0.9
@@ -76,12 +77,13 @@ class CorrespondOptions:
     rematched_references: int = 5
     enough_matches: int = 500
     remembered_pairs: int = 20_000
+    structure_bytes: int = 32 * 2**20
 
     def __post_init__(self) -> None:
         check_bounds(self, "reference_ratio query_ratio wide_ratio", above=0, at_most=1)
         check_bounds(self, "wide_similarity guided_similarity", at_least=-1)
         check_bounds(self, "epipolar_px", above=0)
-        check_bounds(self, "rematched_references enough_matches remembered_pairs", at_least=0)
+        check_bounds(self, "rematched_references enough_matches remembered_pairs structure_bytes", at_least=0)
 
 
 _ALIKED = CorrespondOptions(
@@ -110,16 +112,37 @@ instead of 0.41 from 5 references) and costs as much on the drive; both let a wr
 
 
 @dataclass(frozen=True, eq=False)
+class MatchedReferences:
+    """References whose matches with one another are determined by their keys and a rule.
+
+    Attributes:
+        references: with their poses in the caller's world, in the order of the query.
+        rule: name of everything else that determines the matches.
+        cache: results of sets of references, whatever their order; its keys begin with the references' keys.
+    """
+
+    references: tuple[PosedView, ...]
+    rule: str
+    cache: LruCache[Any]
+
+    def key(self, *further: Hashable) -> Hashable:
+        """Key for a result that depends on the references, their matches and `further` values alone."""
+        return tuple(sorted(reference.key for reference in self.references)), self.rule, *further
+
+
+@dataclass(frozen=True, eq=False)
 class Correspondences:
     """Matches of one query and its references.
 
     Attributes:
         reference_pairs: for each i < j, matches between references i and j.
         query_matches: for each reference, matches (query keypoint, reference keypoint).
+        source: the references as they were matched, and where results from these alone are cached; None caches none.
     """
 
     reference_pairs: Mapping[tuple[int, int], Matches]
     query_matches: tuple[Matches, ...]
+    source: MatchedReferences | None = None
     _tracks: dict[int | None, Tracks] = field(default_factory=dict, init=False, repr=False)
 
     def tracks(self, references: Sequence[PosedView], anchor: int | None = None) -> Tracks:
@@ -256,8 +279,8 @@ class Matcher:
         self.stored: StoredPairs | None = None
         self._threads = SharedThreads(threads)
         self._query_matching = query_matching or NearestNeighbours(self.options.query_ratio, self._threads)
-        self._remembered: OrderedDict[_Key, Matches] = OrderedDict()
-        self._lock = Lock()
+        self._remembered: LruCache[Matches] = LruCache(self.options.remembered_pairs)
+        self._structures: LruCache[Any] = LruCache(self.options.structure_bytes)
 
     def correspond(
         self,
@@ -282,7 +305,10 @@ class Matcher:
         pair_matches = self._threads.map(of_pair, pairs)
         if query_matches is None:
             query_matches = self.match_query(query, references, check)
-        return Correspondences(dict(zip(pairs, pair_matches, strict=True)), tuple(query_matches))
+        # Strong matches of a pair may be stored at any time, so that its matches are not determined.
+        source = MatchedReferences(tuple(references), self.matching(wide), self._structures)
+        known = source if self.pair_matching is None else None
+        return Correspondences(dict(zip(pairs, pair_matches, strict=True)), tuple(query_matches), known)
 
     def match_query(
         self, query: View, references: Sequence[PosedView], check: Callable[[], None] = lambda: None
@@ -335,12 +361,12 @@ class Matcher:
         They are strong ones if the strict matches have been looked up as such; otherwise from nearest neighbours.
         """
         pair = in_order(first, second)
-        strong = self._recall(_Key.of(pair, False, True)) is not None
+        strong = self._remembered.get(_Key.of(pair, False, True)) is not None
         key = _Key.of(pair, wide, strong)
-        matches = self._recall(key)
+        matches = self._remembered.get(key)
         if matches is None:
             matches = self._widened(*pair, self.match_references(*pair)) if wide else self._match_strictly(*pair)
-            self._remember(key, matches)
+            self._remembered.put(key, matches)
         return matches if pair[0] is first else np.ascontiguousarray(matches[:, ::-1])
 
     def match_pair(
@@ -383,35 +409,21 @@ class Matcher:
     def _found(self, pairs: Sequence[tuple[PosedView, PosedView]], wide: bool, strong: bool) -> list[bool]:
         """Caches these pairs' stored matches; returns which of the pairs are cached then."""
         keys = [_Key.of(pair, wide, strong) for pair in pairs]
-        with self._lock:
-            found = [key in self._remembered for key in keys]
+        found = [self._remembered.get(key) is not None for key in keys]
         missing = [i for i, is_cached in enumerate(found) if not is_cached]
         if missing and self.stored is not None:
             stored = self.stored.find(self.matching(wide, strong), [pairs[i] for i in missing])
             for i, matches in zip(missing, stored, strict=True):
                 if matches is not None:
-                    self._remember(keys[i], matches)
+                    self._remembered.put(keys[i], matches)
                     found[i] = True
         return found
 
-    def _recall(self, key: _Key) -> Matches | None:
-        with self._lock:
-            matches = self._remembered.get(key)
-            if matches is not None:
-                self._remembered.move_to_end(key)
-        return matches
-
-    def _remember(self, key: _Key, matches: Matches) -> None:
-        with self._lock:
-            self._remembered[key] = matches
-            while len(self._remembered) > self.options.remembered_pairs:
-                self._remembered.popitem(last=False)
-
     def forget(self, keys: Collection[str]) -> None:
-        """Removes the pairs of deleted references from the cache, in time linear in its size."""
-        with self._lock:
-            for pair in [it for it in self._remembered if it.first in keys or it.second in keys]:
-                del self._remembered[pair]
+        """Removes what was computed from deleted references from the caches, in time linear in their size."""
+        gone = frozenset(keys)
+        self._remembered.forget(lambda pair, _: pair.first in gone or pair.second in gone)
+        self._structures.forget(lambda key, _: not gone.isdisjoint(key[0]))
 
     def _match_strictly(self, first: PosedView, second: PosedView) -> Matches:
         return self._filtered(

@@ -15,8 +15,8 @@ from typing import Any, TypeVar
 from mapless.geometry import Array
 
 from .answer import Answer, Localization, shifted
-from .coarse import Bucket, Outcome, Reconstructor, Request, reconstruct_one
-from .coarse.geometric import GeometricReconstructor
+from .coarse import Bucket, Outcome, Reconstructor, Request, Triangulation, reconstruct_one
+from .coarse.geometric import GeometricReconstructor, point_maps
 from .correspond import Correspondences, Matcher
 from .kept_depth import with_kept_depths
 from .match import PAPER_MATCH, MatchOptions, match_points
@@ -27,7 +27,7 @@ from .pose_problem import AdjustOptions
 from .priors.known import NO_PRIORS, Priors
 from .rejection import Rejection, RejectionReason
 from .results import MetricScale, PointMatches, PoseStage, Structure, Support
-from .scale import estimate_scale, network_scale
+from .scale import estimate_scale, known_scale, network_scale
 from .scale_equations import ScaleOptions
 from .structure import PAPER_STRUCTURE, StructureOptions, build_structure
 from .trust.gate import GateOptions
@@ -178,7 +178,8 @@ class Coarse:
         reconstruction: up to scale, or a rejection.
         scale: the metric scale with the initial pose, in the world of `prepared`; or a rejection, if wide
             correspondences are still to be tried.
-        structure, matches: None unless they were computed on a device together with the scale.
+        structure, matches: None unless they were computed on a device together with the scale; the structure alone, if
+            the coarse stage triangulated it.
     """
 
     prepared: Prepared
@@ -268,6 +269,14 @@ def _each(work: Callable[..., T], *columns: Sequence[Any]) -> list[T | Exception
 def _launch_scale(prepared: Prepared, reconstruction: Outcome) -> Callable[[], Coarse]:
     """Launches the metric scale on the device of the reconstruction; the returned function waits for the result."""
     references, correspondences, context = prepared.references, prepared.correspondences, prepared.context
+    options = ScaleOptions(prepared.options.scale_strategy)
+    if isinstance(reconstruction, Triangulation):
+        if prepared.options.variant in (Variant.BEST, Variant.COARSE):
+            with context.stage("scale"):
+                scale = known_scale(reconstruction.structure, reconstruction.world_from_query, references, options)
+            return partial(Coarse, prepared, reconstruction, scale, reconstruction.structure)
+        with context.stage("scale"):
+            reconstruction = point_maps(reconstruction, prepared.query, references)
     coarse = partial(Coarse, prepared, reconstruction)
     if isinstance(reconstruction, Rejection):
         return partial(coarse, reconstruction)
@@ -275,7 +284,7 @@ def _launch_scale(prepared: Prepared, reconstruction: Outcome) -> Callable[[], C
         with context.stage("scale"):
             fetched = reconstruction if isinstance(reconstruction, Reconstruction) else reconstruction.fetch()
             return partial(Coarse, prepared, fetched, network_scale(fetched, references[0]))
-    options = ScaleOptions(prepared.options.scale_strategy, metre_sigma=reconstruction.metre_sigma)
+    options = replace(options, metre_sigma=reconstruction.metre_sigma)
     if isinstance(reconstruction, Reconstruction):
         with context.stage("scale"):
             return partial(coarse, estimate_scale(reconstruction, references, correspondences, options))
@@ -312,16 +321,17 @@ def _unverified(scale: MetricScale, stage: PoseStage) -> Localization:
 
 
 def structure_and_matches(coarse: Coarse, scale: MetricScale) -> tuple[Structure, PointMatches]:
-    """Structure and matches: from the device, if they were computed there with the scale, else computed here."""
+    """Structure and matches: those that were computed together with the coarse stage or the scale, else new ones."""
     if coarse.structure is not None and coarse.matches is not None:
         return coarse.structure, coarse.matches
-    prepared, reconstruction = coarse.prepared, coarse.reconstruction
-    assert isinstance(reconstruction, Reconstruction)
+    prepared, reconstruction, structure = coarse.prepared, coarse.reconstruction, coarse.structure
     references, correspondences = prepared.references, prepared.correspondences
     with prepared.context.stage("structure"):
-        structure = build_structure(reconstruction, scale, references, correspondences, prepared.structure_options)
-        if prepared.options.variant is Variant.BEST:
-            structure = with_kept_depths(structure, references, correspondences)
+        if structure is None:
+            assert isinstance(reconstruction, Reconstruction)
+            structure = build_structure(reconstruction, scale, references, correspondences, prepared.structure_options)
+            if prepared.options.variant is Variant.BEST:
+                structure = with_kept_depths(structure, references, correspondences)
     with prepared.context.stage("match"):
         initial, options = scale.world_from_query, prepared.match_options
         prior_pose = prepared.priors.pose.world_from_camera if prepared.priors.pose else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -138,6 +139,27 @@ class Structure:
         if self.planes is None:
             return np.ones(len(self.x_in_world), bool)
         return np.bincount(self.tracks.point, minlength=len(self.x_in_world)) > 1
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory of points and tracks, bytes."""
+        tracks = self.tracks
+        return self.x_in_world.nbytes + tracks.point.nbytes + tracks.view.nbytes + tracks.keypoint.nbytes
+
+    def moved(self, order: Sequence[int], offset: Array) -> Structure:
+        """The triangulated structure with view v renumbered order[v], and an offset (3,) added to the points.
+
+        Points are in the order of their first keypoints, as in `build_tracks`.
+        """
+        if not len(self.x_in_world):
+            return self
+        tracks, view = self.tracks, np.asarray(order, np.intp)[self.tracks.view]
+        keypoint = view * (tracks.keypoint.max() + 1) + tracks.keypoint  # counted through all references
+        points = np.argsort(np.minimum.reduceat(keypoint, tracks.starts))
+        point = np.argsort(points)[tracks.point]
+        rows = np.argsort(point * len(order) + view)
+        moved = Tracks(point[rows], view[rows], tracks.keypoint[rows])
+        return Structure(self.x_in_world[points] + offset, moved, self.noise)
 
 
 @dataclass(frozen=True, eq=False)

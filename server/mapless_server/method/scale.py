@@ -15,11 +15,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mapless.geometry import RigidTransform, Similarity
+from mapless.geometry import Array, RigidTransform, Similarity
 
 from .correspond import Correspondences
 from .rejection import Rejection, RejectionReason
-from .results import MetricScale, ScaleStage
+from .results import MetricScale, ScaleStage, Structure
 from .scale_equations import ScaleCandidates, ScaleOptions, gather, predict, scale_candidates, trajectory_radius
 from .views import PosedView, Reconstruction
 
@@ -84,6 +84,59 @@ def network_scale(reconstruction: Reconstruction, reference: PosedView) -> Metri
         world_from_local.compose(of_query),
         reconstruction.metre_sigma,
     )
+
+
+def known_scale(
+    structure: Structure,
+    world_from_query: RigidTransform,
+    references: Sequence[PosedView],
+    options: ScaleOptions | None = None,
+) -> MetricScale | Rejection:
+    """The scale of a reconstruction that was triangulated from the known poses, so that it is metric already.
+
+    Args:
+        structure: the points, at least one.
+        world_from_query: the query's initial pose.
+        references: the references, in the order of the structure's tracks.
+        options: options of the scale. The references' places must be within its bounds; any strategy finds this scale.
+
+    Returns:
+        The scale of the frame `unit_frame`; or a rejection: NO_USABLE_REFERENCES for fewer than two references,
+        DEGENERATE_REFERENCES for references too close to one another.
+    """
+    options = options or ScaleOptions()
+    rejection = check_references(references, options)
+    if rejection is not None:
+        return rejection
+    centres, axes = (np.stack(it) for it in zip(*(_centre_and_axis(r) for r in references), strict=True))
+    tracks, frame = structure.tracks, unit_frame(references[0].world_from_camera, structure.x_in_world)
+    depth_m = ((structure.x_in_world[tracks.point] - centres[tracks.view]) * axes[tracks.view]).sum(axis=1)
+    candidates = ScaleCandidates(
+        broken_poses=0,
+        known_depths=len(depth_m),
+        radius_per_depth=trajectory_radius(centres) / np.median(depth_m),
+        ratio_count=len(depth_m),
+        metres_per_unit=frame.scale,
+        by_triangulation=options.by_triangulation,
+        deviation=0.0,
+        anchor=np.bincount(tracks.view).argmax(),
+        local_rotation=frame.rotation,
+        local_centre=frame.translation,
+        query_rotation=world_from_query.rotation,
+        query_centre=world_from_query.translation,
+    )
+    return judge(candidates, len(references), options)
+
+
+def _centre_and_axis(reference: PosedView) -> tuple[Array, Array]:
+    """Camera centre and viewing direction (3,), world."""
+    return reference.world_from_camera.translation, reference.world_from_camera.rotation[:, 2]
+
+
+def unit_frame(world_from_camera: RigidTransform, x_in_world: Array) -> Similarity:
+    """The frame of a camera, scaled so that the median of the points (P, 3) is one unit away: world_from_local."""
+    distance_m = float(np.median(np.linalg.norm(x_in_world - world_from_camera.translation, axis=1)))
+    return Similarity(distance_m, world_from_camera.rotation, world_from_camera.translation)
 
 
 def check_references(references: Sequence[PosedView], options: ScaleOptions) -> Rejection | None:

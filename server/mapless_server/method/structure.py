@@ -12,8 +12,9 @@ The equations are in `observations`, for NumPy arrays and torch tensors.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +35,8 @@ from .observations import (
 )
 from .options import check_bounds
 from .results import KeypointNoise, MetricScale, Structure
-from .tracks import Tracks, keypoint_depths, keypoint_offsets, keypoint_rays
-from .views import PosedView, Reconstruction
+from .tracks import Tracks, build_tracks, keypoint_depths, keypoint_offsets, keypoint_rays
+from .views import Matches, PosedView, Reconstruction
 
 
 @dataclass(frozen=True)
@@ -104,15 +105,48 @@ def build_structure(
         The structure. Every point is finite and in front of the references that observe it.
     """
     tracks = tracks_of(references, correspondences, options)
+    observations = observe(tracks, references, options.first_noise)
     start = predicted_points(reconstruction, scale, references, tracks)
-    return _refined(observe(tracks, references, options.first_noise), start, options)
+    return _refined(observations, first_points(observations, start, options), options)
 
 
 def triangulated_structure(
     references: Sequence[PosedView], correspondences: Correspondences, options: StructureOptions
 ) -> Structure:
-    """Triangulates the structure from the references' poses alone."""
-    observations = observe(tracks_of(references, correspondences, options), references, options.first_noise)
+    """Triangulates the structure of one reference or more from their poses alone, over all their pairs.
+
+    It depends neither on the query nor on the references' order, so it is computed once for a set of references: in
+    the order of their names, in the caller's world around the first of these.
+    """
+    source = correspondences.source
+    given = references if source is None else source.references
+    order = sorted(range(len(given)), key=lambda i: (given[i].name, given[i].key))
+    structure = None if source is None else source.cache.get(source.key(options))
+    if structure is None:
+        structure = _triangulated(given, order, correspondences.reference_pairs, options)
+        if source is not None:
+            source.cache.put(source.key(options), structure, structure.size_bytes)
+    return structure.moved(order, references[order[0]].world_from_camera.translation)
+
+
+def _triangulated(
+    references: Sequence[PosedView],
+    order: Sequence[int],
+    pairs: Mapping[tuple[int, int], Matches],
+    options: StructureOptions,
+) -> Structure:
+    """Triangulates references in an order, relative to the camera centre of the first of these."""
+    origin = references[order[0]].world_from_camera.translation
+    ordered = [
+        replace(references[i], world_from_camera=references[i].world_from_camera.shifted(-origin)) for i in order
+    ]
+    matches = {
+        (a, b): pairs[i, j] if i < j else pairs[j, i][:, ::-1]
+        for (a, i), (b, j) in combinations(enumerate(order), 2)
+        if (min(i, j), max(i, j)) in pairs
+    }
+    tracks = build_tracks(matches, [len(reference.view.features) for reference in ordered])
+    observations = observe(tracks, ordered, options.first_noise)
     return _refined(observations, triangulate(observations), options)
 
 
@@ -146,12 +180,17 @@ class RefinedPoints:
     noise: KeypointNoise
 
 
+def first_points(observations: Observations, predicted: AnyArray, options: StructureOptions) -> AnyArray:
+    """Initial values (P, 3) of the points: the predicted ones, or the triangulated ones where these are better."""
+    if not (options.optimize and options.all_references):
+        return predicted
+    return better_start(observations, predicted, triangulate(observations), options.loss_scale_sigma)
+
+
 def refine_points(observations: Observations, x_in_world: AnyArray, options: StructureOptions) -> RefinedPoints:
-    """Adjusts predicted points (P, 3); `observations` must have the noise `options.first_noise`."""
+    """Adjusts points from their initial values (P, 3); `observations` must have the noise `options.first_noise`."""
     points, noise = x_in_world, options.first_noise
     if options.optimize:
-        if options.all_references:
-            points = better_start(observations, points, triangulate(observations), options.loss_scale_sigma)
         points = adjust_points(observations, points, options.loss_scale_sigma, options.iterations)
         if options.model_noise:
             noise = estimate_noise(observations, points, noise)

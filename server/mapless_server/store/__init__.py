@@ -6,7 +6,8 @@ become values in `rows` and `codec`, which check every byte. `sqlite` and `postg
 `verify` are what the `store` commands do.
 """
 
-from .cache import LruCache
+from mapless_server.method.cache import LruCache
+
 from .database import StoreError
 from .records import (
     ContradictingDown,

@@ -12,10 +12,10 @@ from typing import Any, Concatenate, NamedTuple, NoReturn, ParamSpec, Protocol, 
 from sqlalchemy import Connection, Row, Select, select
 
 from mapless_server.errors import AlreadyExists, NotFound, RequestError
+from mapless_server.method.cache import LruCache
 from mapless_server.security import SceneKey
 
 from . import queries, rows, tables
-from .cache import LruCache
 from .database import Database
 from .faults import DamagedPages, unless_damaged
 from .queries import read_changes

@@ -17,11 +17,11 @@ from mapless.geodesy import Datum
 from mapless.names import scene_name
 from mapless.scenes import UNCHANGED, Calibration, UnchangedType, Vector
 from mapless_server.errors import AlreadyExists, DataLoss, NotFound
+from mapless_server.method.cache import LruCache
 from mapless_server.method.views import View
 from mapless_server.security import SceneKey, scene_id_of
 
 from . import deletion, queries, rows, tables
-from .cache import LruCache
 from .database import Database
 from .deletion import PendingDeletions
 from .faults import DamagedPages

@@ -77,6 +77,7 @@ class PlantedReconstructor:
         poses = np.stack([self._local_pose(key, keys[0]) for key in keys])
         if isinstance(outcome, DeviceReconstruction):
             return self._on_device(outcome, keys[:-1], poses)
+        assert isinstance(outcome, Reconstruction)
         views = [
             replace(view, point_map=self._maps[key].numpy(), confidence=np.ones_like(view.confidence))
             for view, key in zip(outcome.references, keys, strict=False)

@@ -10,16 +10,38 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, TypeAlias
 
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import RigidTransform
+
 from ..correspond import Correspondences
 from ..priors.known import NO_PRIORS, Priors
 from ..rejection import Rejection
+from ..results import Structure
 from ..views import PosedView, Reconstruction, View
 
 if TYPE_CHECKING:  # it needs torch
     from .device import DeviceReconstruction
 
 
-Outcome: TypeAlias = "Reconstruction | DeviceReconstruction | Rejection"
+@dataclass(frozen=True, eq=False)
+class Triangulation:
+    """A reconstruction that is metric already: points of the references' known poses, and the query posed by them.
+
+    Attributes:
+        structure: the points, in the world of the references.
+        world_from_query: the query's initial pose.
+        point, keypoint: (M,) points that agree with this pose, and the query's keypoints that match them.
+    """
+
+    structure: Structure
+    world_from_query: RigidTransform
+    point: NDArray[np.intp]
+    keypoint: NDArray[np.intp]
+
+
+Outcome: TypeAlias = "Reconstruction | DeviceReconstruction | Triangulation | Rejection"
 """The result of a backend for one query: its reconstruction, or a rejection."""
 
 

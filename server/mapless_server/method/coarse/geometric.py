@@ -1,8 +1,8 @@
 """The coarse stage without a network: the default on a machine without a GPU or weights.
 
 Features matched among the references are triangulated from the references' known poses, and the query is posed by PnP
-on its matches with these points. The sparse points are scattered into point maps, in a local frame with a scale of its
-own, like a network's: the following stages do not depend on the backend.
+on its matches with these points. That is metric: `Variant.BEST` needs no further scale and structure. For the paper's
+variants the sparse points are scattered into point maps, in a local frame with a scale of its own, like a network's.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from mapless.geometry import Array, RigidTransform, Similarity
 from ..correspond import Correspondences
 from ..kept_depth import with_kept_depths
 from ..match import vote
-from ..observations import FIRST_GUESS, adjust_points, triangulate
 from ..options import check_bounds
 from ..perturbation import reprojection_errors_px
 from ..pnp import PnpOptions, ransac
@@ -26,10 +25,14 @@ from ..priors.informed import informed_pose
 from ..priors.known import NO_PRIORS, Priors
 from ..rejection import Rejection, RejectionReason
 from ..results import PointMatches, Structure
-from ..structure import StructureOptions, observe, trustworthy
+from ..scale import unit_frame
+from ..structure import StructureOptions, triangulated_structure
 from ..trust.gate import GateOptions, format_false_alarms, log10_false_alarms
 from ..views import PosedView, ReconstructedView, Reconstruction, View
-from . import Bucket, Outcome, Request
+from . import Bucket, Outcome, Request, Triangulation
+
+CELL_PX = 2
+"""Side of a cell of the point maps, pixels of the view; so small that two keypoints seldom share a cell."""
 
 
 @dataclass(frozen=True)
@@ -37,23 +40,20 @@ class GeometricOptions:
     """Options of the geometric backend.
 
     Attributes:
-        structure: options of the triangulation, with few iterations, since the structure stage follows.
+        structure: options of the triangulation, those of the structure stage.
         pnp: options of the query's pose.
         gate: a pose is rejected if chance could have produced its inliers.
         min_baseline_m: least distance of the farthest reference from the mean of all; below it, nothing is
             triangulated.
-        cell_px: side of a cell of the point maps, pixels of the view; so small that two keypoints seldom share a cell.
     """
 
-    structure: StructureOptions = field(default_factory=lambda: StructureOptions(iterations=3))
+    structure: StructureOptions = field(default_factory=StructureOptions)
     pnp: PnpOptions = field(default_factory=PnpOptions)
     gate: GateOptions = field(default_factory=GateOptions)
     min_baseline_m: float = 0.02
-    cell_px: int = 2
 
     def __post_init__(self) -> None:
         check_bounds(self, "min_baseline_m", above=0)
-        check_bounds(self, "cell_px", at_least=1)
 
 
 @dataclass(frozen=True)
@@ -83,24 +83,24 @@ class GeometricReconstructor:
         except Exception as error:  # an error of one request does not fail the others
             return error
 
-    def _reconstruct(self, request: Request) -> Reconstruction | Rejection:
+    def _reconstruct(self, request: Request) -> Triangulation | Rejection:
         references, correspondences = request.references, request.correspondences
         if correspondences is None:
             raise ValueError(f"{self.name} reconstructs from correspondences, and there are none")
         rejection = self._check(references)
         if rejection:
             return rejection
-        structure = self._triangulate(references, correspondences)
+        structure = triangulated_structure(references, correspondences, self.options.structure)
         structure = with_kept_depths(structure, references, correspondences)
         if not len(structure.x_in_world):
             return Rejection(
                 RejectionReason.NO_USABLE_REFERENCES, "the references share no points that could be triangulated"
             )
-        return self._pose_and_scatter(request, structure, correspondences)
+        return self._posed(request, structure, correspondences)
 
-    def _pose_and_scatter(
+    def _posed(
         self, request: Request, structure: Structure, correspondences: Correspondences
-    ) -> Reconstruction | Rejection:
+    ) -> Triangulation | Rejection:
         query, references = request.query, request.references
         matches = vote(structure, [len(r.view.features) for r in references], correspondences)
         x_in_world = structure.x_in_world[matches.point]
@@ -120,7 +120,7 @@ class GeometricReconstructor:
             # With too few matches here, the pose prior is the initial pose from which more are searched.
             pose, inliers = known.world_from_camera, np.zeros(len(matches), bool)
         assert pose is not None
-        return self._scatter(query, references, structure, pose, x_in_world[inliers], pixels[inliers])
+        return Triangulation(structure, pose, matches.point[inliers], matches.keypoint[inliers])
 
     def _judge(
         self, query: View, structure: Structure, matches: PointMatches, pose: RigidTransform | None, priors: Priors
@@ -155,56 +155,42 @@ class GeometricReconstructor:
             )
         return None
 
-    def _triangulate(self, references: Sequence[PosedView], correspondences: Correspondences) -> Structure:
-        options = self.options.structure
-        tracks = correspondences.tracks(references)
-        observations = observe(tracks, references, FIRST_GUESS)
-        points = triangulate(observations)
-        points = adjust_points(observations, points, options.loss_scale_sigma, options.iterations)
-        keep = trustworthy(observations, points, options)
-        return Structure(points[keep], tracks.select(keep), FIRST_GUESS)
 
-    def _scatter(
-        self,
-        query: View,
-        references: Sequence[PosedView],
-        structure: Structure,
-        world_from_query: RigidTransform,
-        query_points: Array,
-        query_pixels: Array,
-    ) -> Reconstruction:
-        """Makes point maps in the frame of the first reference, scaled so that the median point is one unit away."""
-        local_from_world = _unit_frame(references[0].world_from_camera, structure.x_in_world)
-        tracks = structure.tracks
-        views = []
-        for index, reference in enumerate(references):
-            seen = tracks.view == index
-            points = structure.x_in_world[tracks.point[seen]]
-            pixels = reference.view.features.keypoints[tracks.keypoint[seen]].astype(np.float64)
-            views.append(self._view(reference.view, reference.world_from_camera, local_from_world, points, pixels))
-        queried = self._view(query, world_from_query, local_from_world, query_points, query_pixels)
-        return Reconstruction(queried, tuple(views))
-
-    def _view(
-        self, view: View, world_from_camera: RigidTransform, local_from_world: Similarity, points: Array, pixels: Array
-    ) -> ReconstructedView:
-        shape = (-(-view.camera.height_px // self.options.cell_px), -(-view.camera.width_px // self.options.cell_px))
-        maps = ReconstructedView(
-            view.camera.resized(shape[1], shape[0]),
-            np.full((*shape, 3), np.nan, np.float32),
-            np.zeros(shape, np.float32),
-            local_from_world.transform_pose(world_from_camera),
-        )
-        rows, columns, inside = maps.cells(pixels, view.camera)
-        x_in_camera = world_from_camera.inverse().apply(points[inside])
-        maps.point_map[rows[inside], columns[inside]] = local_from_world.scale * x_in_camera
-        maps.confidence[rows[inside], columns[inside]] = 1.0
-        return maps
+def point_maps(triangulation: Triangulation, query: View, references: Sequence[PosedView]) -> Reconstruction:
+    """Makes point maps in the frame of the first reference, scaled so that the median point is one unit away."""
+    structure = triangulation.structure
+    local_from_world = unit_frame(references[0].world_from_camera, structure.x_in_world).inverse()
+    tracks = structure.tracks
+    views = []
+    for index, reference in enumerate(references):
+        seen = tracks.view == index
+        points, keypoints = structure.x_in_world[tracks.point[seen]], tracks.keypoint[seen]
+        views.append(_map(reference.view, reference.world_from_camera, local_from_world, points, keypoints))
+    points = structure.x_in_world[triangulation.point]
+    pose, keypoints = triangulation.world_from_query, triangulation.keypoint
+    return Reconstruction(_map(query, pose, local_from_world, points, keypoints), tuple(views))
 
 
-def _unit_frame(world_from_camera: RigidTransform, x_in_world: Array) -> Similarity:
-    distance_m = float(np.median(np.linalg.norm(x_in_world - world_from_camera.translation, axis=1)))
-    return Similarity(distance_m, world_from_camera.rotation, world_from_camera.translation).inverse()
+def _map(
+    view: View,
+    world_from_camera: RigidTransform,
+    local_from_world: Similarity,
+    points: Array,
+    keypoints: NDArray[np.intp],
+) -> ReconstructedView:
+    shape = (-(-view.camera.height_px // CELL_PX), -(-view.camera.width_px // CELL_PX))
+    maps = ReconstructedView(
+        view.camera.resized(shape[1], shape[0]),
+        np.full((*shape, 3), np.nan, np.float32),
+        np.zeros(shape, np.float32),
+        local_from_world.transform_pose(world_from_camera),
+    )
+    pixels = view.features.keypoints[keypoints].astype(np.float64)
+    rows, columns, inside = maps.cells(pixels, view.camera)
+    x_in_camera = world_from_camera.inverse().apply(points[inside])
+    maps.point_map[rows[inside], columns[inside]] = local_from_world.scale * x_in_camera
+    maps.confidence[rows[inside], columns[inside]] = 1.0
+    return maps
 
 
 def _no_overlap(message: str, matches: PointMatches) -> Rejection:

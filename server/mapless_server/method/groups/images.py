@@ -15,14 +15,12 @@ from mapless.geometry import Array, RigidTransform
 
 from ..answer import Answer, Localization
 from ..match import MatchOptions, search, vote
-from ..observations import triangulate
 from ..options import check_bounds
 from ..pipeline import Prepared
 from ..priors.known import NO_PRIORS, Priors
 from ..rejection import Rejection, RejectionReason
 from ..results import PointMatches, ScaleSource, Structure, Support
-from ..structure import StructureOptions, observe, refine_points, tracks_of
-from ..tracks import Tracks
+from ..structure import StructureOptions, triangulated_structure
 from ..trust.evidence import findable_count, hull_share
 from ..trust.gate import GateOptions, false_alarms, format_false_alarms
 from ..views import Matches, PosedView, View
@@ -243,18 +241,10 @@ def tracked_support(prepared: Prepared) -> Support | None:
     if len(references) < 2:
         return None
     known = prepared.correspondences.query_matches
-    correspondences = prepared.pipeline.matcher.correspond(query, references, True, check, known)
+    in_world = prepared.references_in_world
+    correspondences = prepared.pipeline.matcher.correspond(query, in_world, True, check, known)
     check()
-    options = StructureOptions()
-    tracks = tracks_of(references, correspondences, options)
-    if not tracks.point_count:
-        return None
-    observations = observe(tracks, references, options.first_noise)
-    refined = refine_points(observations, triangulate(observations), options)
-    noise = replace(refined.noise, level_px=float(refined.noise.level_px))
-    left = refined.observations.tracks
-    assert isinstance(left, Tracks)
-    structure = Structure(refined.x_in_world[refined.trusted], left.select(refined.trusted), noise)
+    structure = triangulated_structure(references, correspondences, StructureOptions())
     matches = vote(structure, [len(r.view.features) for r in references], correspondences)
     query_matches = tuple(correspondences.query_matches)
     support = Support(query, references, structure, matches, None, prepared.origin, query_matches=query_matches)

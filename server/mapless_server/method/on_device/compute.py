@@ -14,7 +14,7 @@ from ..coarse.device import DeviceReconstruction
 from ..match import MatchOptions
 from ..observations import back_project
 from ..scale_equations import Known, Predicted, ScaleCandidates, ScaleOptions, scale_candidates
-from ..structure import StructureOptions, refine_points
+from ..structure import StructureOptions, first_points, refine_points
 from ..tracks import positive
 from .match import DevicePoints, MatchInputs, match_on_device
 from .structure import DeviceTracks, StructureInputs, observe_on_device
@@ -100,8 +100,10 @@ def compute(reconstruction: DeviceReconstruction, inputs: Inputs, query_camera: 
 
     prepared = inputs.structure
     depth_m = candidates.metres_per_unit * predicted.depth[prepared.keypoint[:, 0]]
-    start = back_project(prepared.first_centre, prepared.first_ray, depth_m)
-    refined = refine_points(observe_on_device(prepared, options.structure.first_noise), start, options.structure)
+    observations = observe_on_device(prepared, options.structure.first_noise)
+    predicted_points = back_project(prepared.first_centre, prepared.first_ray, depth_m)
+    start = first_points(observations, predicted_points, options.structure)
+    refined = refine_points(observations, start, options.structure)
     tracks = refined.observations.tracks
     assert isinstance(tracks, DeviceTracks)
     points = DevicePoints(refined.x_in_world, prepared.keypoint, tracks.seen & refined.trusted[:, None])

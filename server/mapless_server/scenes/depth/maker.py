@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 from mapless_server.errors import DataLoss, NotFound, RequestError
-from mapless_server.method.coarse import Reconstructor, Request
+from mapless_server.method.coarse import Reconstructor, Request, Triangulation
 from mapless_server.method.correspond import Matcher
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import StageContext, check_bounds
@@ -103,7 +103,7 @@ class DepthMaker:
         if isinstance(outcome, Exception):
             raise outcome
         nothing = dict.fromkeys(it.key for it in given)
-        if isinstance(outcome, Rejection):
+        if isinstance(outcome, Rejection | Triangulation):  # only a network predicts depths
             return nothing
         reconstruction = outcome if isinstance(outcome, Reconstruction) else outcome.fetch()
         scale = estimate_scale(reconstruction, given, correspondences)
