@@ -318,14 +318,22 @@ class ViewColumns:
         residual = self._with_intrinsics(ideal * self.focal + self.offset, bundle.intrinsics)
         return residual, by_point, by_pose
 
-    def equations(self, bundle: Bundle, loss_scale_sigma: float, least_curvature: float = 1.0) -> NormalEquations:
+    def equations(
+        self,
+        bundle: Bundle,
+        loss_scale_sigma: float,
+        least_curvature: float = 1.0,
+        linearized: tuple[Array, Array, Array] | None = None,
+    ) -> NormalEquations:
         """The normal equations of the observations alone, for a Cauchy loss of this scale.
+
+        `linearized` is the result of the method of that name, if it is known.
 
         With `least_curvature` below 1 derivatives J become (I - (1 - c) r r^T / |r|^2) J and residuals r become r / c,
         which leaves the gradient as it is. For a weight w the loss curves by w (2 w - 1) along r. But c^2 is least at
         w = 1/2 and 1 far away, where the curvature is negative.
         """
-        residual, by_point, by_pose = self.linearized(bundle)
+        residual, by_point, by_pose = linearized or self.linearized(bundle)
         squared, last, by_intrinsics = (residual**2).sum(axis=0), self.parts[-1], self.by_intrinsics
         weight = cauchy_weight(squared, loss_scale_sigma)
         if least_curvature < 1:
@@ -354,17 +362,9 @@ class ViewColumns:
             weighted = normal * self.planes.information
             point_block += symmetric_products(weighted[None], normal[None])
             point_gradient += weighted * self.planes.distance(bundle.points)
-        return NormalEquations(
-            self,
-            _block_diagonal(blocks),
-            np.concatenate(gradients),
-            point_block,
-            point_gradient,
-            np.einsum("kao,kbo->abo", weighted_pose, by_point),
-            np.einsum("kao,kbo->abo", weighted_intrinsics, by_point[:, :, last])
-            if self.by_intrinsics.size
-            else np.zeros((0, 3, 0)),
-        )
+        pose_block, pose_gradient = _block_diagonal(blocks), np.concatenate(gradients)
+        by_camera = weighted_pose, weighted_intrinsics
+        return NormalEquations(self, pose_block, pose_gradient, point_block, point_gradient, by_point, *by_camera)
 
 
 @dataclass(frozen=True, eq=False)
@@ -377,8 +377,9 @@ class NormalEquations:
         pose_gradient: g, (6 V + I,).
         point_block: C, (6, P) as in `arrays.SYMMETRIC`.
         point_gradient: h, (3, P).
-        cross: E, (6, 3, O), the block of each observation's view and point.
-        cross_intrinsics: E, (I, 3, O_q), the block of the query's intrinsics.
+        by_point: A, (2, 3, O), derivatives of the residuals by the points.
+        weighted_pose: w J, (2, 6, O), weighted derivatives by the poses. J^T w A is the block of E of an observation.
+        weighted_intrinsics: (2, I, O_q), the same by the query's intrinsics.
     """
 
     columns: ViewColumns
@@ -386,8 +387,9 @@ class NormalEquations:
     pose_gradient: Array
     point_block: Array
     point_gradient: Array
-    cross: Array
-    cross_intrinsics: Array
+    by_point: Array
+    weighted_pose: Array
+    weighted_intrinsics: Array
 
     def reduced(self, damping: float) -> tuple[Array, Array, EliminatedPoints]:
         """Eliminates the points: B - E C^-1 E^T (U, U), g - E C^-1 h (U,), U = 6 V + I; `damping` enlarges diagonals.
@@ -398,21 +400,21 @@ class NormalEquations:
         damped[:3] *= 1 + damping
         factor = _cholesky(damped)
         gradient = np.stack(_forward(factor, self.point_gradient))
-        factors = take(factor, self.columns.point)
-        by_observation = np.stack(_forward(factors, np.swapaxes(self.cross, 0, 1)), axis=1).reshape(18, -1)
-        by_view = np.zeros((len(self.columns.parts), 18, self.point_gradient.shape[1]))
-        for cross, part in zip(by_view, self.columns.parts, strict=True):
-            cross[:, self.columns.point[part]] = by_observation[:, part]  # one observation per point and view
+        seen = self.columns
+        by_point = np.stack(_forward(take(factor, seen.point), np.swapaxes(self.by_point, 0, 1)), axis=1)
+        by_observation = np.einsum("kao,kbo->abo", self.weighted_pose, by_point).reshape(18, -1)
+        by_view = np.zeros((len(seen.parts), 18, self.point_gradient.shape[1]))
+        for cross, part in zip(by_view, seen.parts, strict=True):
+            cross[:, seen.point[part]] = by_observation[:, part]  # one observation per point and view
         wide = by_view.reshape(6 * len(by_view), -1)
-        count = len(self.cross_intrinsics)
-        if count:
-            last = self.columns.parts[-1]
-            forward = _forward(factors[:, last], np.swapaxes(self.cross_intrinsics, 0, 1))
-            by_point = np.zeros((count, 3, self.point_gradient.shape[1]))
-            by_point[:, :, self.columns.point[last]] = np.stack(forward, axis=1)
-            wide = np.concatenate([wide, by_point.reshape(count, -1)])
+        if self.weighted_intrinsics.size:
+            last = seen.parts[-1]
+            of_query = np.einsum("kao,kbo->abo", self.weighted_intrinsics, by_point[:, :, last])
+            its_rows = np.zeros((*of_query.shape[:2], self.point_gradient.shape[1]))
+            its_rows[:, :, seen.point[last]] = of_query
+            wide = np.concatenate([wide, its_rows.reshape(len(of_query), -1)])
         matrix = self.pose_block + damping * np.diag(np.diag(self.pose_block)) - wide @ wide.T
-        return matrix, self.pose_gradient - wide @ gradient.ravel(), EliminatedPoints(factor, gradient, wide)
+        return matrix, self.pose_gradient - wide @ gradient.ravel(), EliminatedPoints(factor, gradient, wide, by_point)
 
 
 @dataclass(frozen=True, eq=False)
@@ -423,15 +425,13 @@ class EliminatedPoints:
         factor: L (6, P), as in `arrays.SYMMETRIC`.
         gradient: L^-1 h, (3, P).
         cross: E L^-T, (U, 3 P).
+        by_point: A L^-T, (2, 3, O), each with the factor of its point.
     """
 
     factor: Array
     gradient: Array
     cross: Array
-
-    def solved(self, vectors: Array, point: NDArray[np.intp]) -> Array:
-        """Solves L y = b for vectors b (3, ..., O), each with the factor of its point (O,)."""
-        return np.stack(_forward(take(self.factor, point), vectors))
+    by_point: Array
 
     def steps(self, motion: Array) -> Array:
         """Steps (P, 3) of the points that follow from a motion (U,) of the cameras."""

@@ -95,7 +95,8 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
             them.
     """
     seen, bundle, thinning = _thinned(problem.by_view, bundle, max_matches)
-    equations = seen.equations(bundle, problem.loss_scale_sigma)
+    residual, _, by_pose = linearized = seen.linearized(bundle)
+    equations = seen.equations(bundle, problem.loss_scale_sigma, linearized=linearized)
     data, gradient, points = equations.reduced(DAMPING)
     query, posed = problem.query_rows, slice(problem.query_rows.stop)
     prior, prior_gradient = np.zeros_like(data), np.zeros_like(gradient)
@@ -105,10 +106,9 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
     to_pose = _rows_of_pose((data + prior)[posed, posed])
     if to_pose is None:
         return None
-    residual, by_point, by_pose = seen.linearized(bundle)
     weight = cauchy_weight((residual**2).sum(axis=0), problem.loss_scale_sigma)
 
-    gain, misfit = _whitened(seen, residual, by_point, weight, points)
+    gain, misfit = _whitened(seen, residual, weight, points)
     cross = points.cross.reshape(len(data), 3, -1)
     matrices, gradients = np.tile(prior, (len(seen.parts), 1, 1)), np.tile(prior_gradient, (len(seen.parts), 1))
     matrices[0] += data
@@ -245,11 +245,9 @@ def _information(
     return np.stack([kept @ kept.T - gone @ gone.T for kept, gone in parts])
 
 
-def _whitened(
-    seen: ViewColumns, residual: Array, by_point: Array, weight: Array, points: EliminatedPoints
-) -> tuple[Array, Array]:
+def _whitened(seen: ViewColumns, residual: Array, weight: Array, points: EliminatedPoints) -> tuple[Array, Array]:
     """For each observation, a R^-T (3, 2, O) and R^-1 e (2, O), with S = R R^T."""
-    across = points.solved(np.moveaxis(by_point, 1, 0), seen.point)
+    across = np.swapaxes(points.by_point, 0, 1)
     misfit = residual - (across * take(points.gradient, seen.point)[:, None]).sum(axis=0)
     least = LEAST_VARIANCE / weight
     (xx, yy), xy = 1 / weight - (across**2).sum(axis=0), -(across[:, 0] * across[:, 1]).sum(axis=0)
