@@ -107,11 +107,16 @@ class View:
     distortion: Distortion | None = None
 
     def has_camera_of(self, other: View) -> bool:
-        """Whether both have the same intrinsics, to a thousandth of the width, and so the same errors of them."""
+        """Whether both have the same intrinsics, to a thousandth of the width, and so the same errors of them.
+
+        The photographs may have been reduced to different sizes.
+        """
         ours, theirs = self.camera, other.camera
-        if (ours.width_px, ours.height_px) != (theirs.width_px, theirs.height_px):
+        widest_px = max(ours.width_px, theirs.width_px)  # reduced sides are rounded to whole pixels
+        if abs(ours.width_px * theirs.height_px - theirs.width_px * ours.height_px) > widest_px:
             return False
-        return bool(np.abs(ours.matrix() - theirs.matrix()).max() < 1e-3 * ours.width_px)
+        resized = theirs.resized(ours.width_px, ours.height_px)
+        return bool(np.abs(ours.matrix() - resized.matrix()).max() < 1e-3 * ours.width_px)
 
 
 @dataclass(frozen=True, eq=False)
