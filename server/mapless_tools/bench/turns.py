@@ -20,8 +20,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from mapless import Client, LocalizationResult
-from mapless.geometry import Array
+from mapless import Client, LocalizationResult, PosePrior, Priors
+from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.serve.signals import terminable
 from mapless_tools.child import CONNECT, ChildServer, child_server
 from mapless_tools.dataset import Dataset, Frame
@@ -54,6 +54,9 @@ def main(
     references: Annotated[int, typer.Option(min=2, help="Photographs that are stored.")] = 30,
     photographs: Annotated[int, typer.Option(min=2, help="Photographs that are localized.")] = 20,
     rounds: Annotated[int, typer.Option(min=1, help="Times that each is localized A B B A.")] = 1,
+    tracking: Annotated[
+        bool, typer.Option(help="With a pose prior, off by 5 cm and 2 degrees about each axis.")
+    ] = False,
 ) -> None:
     """Compare what a warm query costs two commits; settings are those of the environment (MAPLESS_...)."""
     with failures_end_command():
@@ -63,7 +66,7 @@ def main(
             dataset = read_folder(data / scene)
         with terminable(), ExitStack() as stack:
             servers = [stack.enter_context(_server(commit)) for commit in (before, after)]
-            measured = measure(servers, dataset, EvaluationOptions(references, photographs), rounds)
+            measured = measure(servers, dataset, EvaluationOptions(references, photographs), rounds, tracking)
         print("\n".join(report(measured, (before, after or "working tree"))))
 
 
@@ -85,7 +88,7 @@ def _server(commit: str) -> Iterator[ChildServer]:
 
 
 def measure(
-    servers: Sequence[ChildServer], dataset: Dataset, options: EvaluationOptions, rounds: int
+    servers: Sequence[ChildServer], dataset: Dataset, options: EvaluationOptions, rounds: int, tracking: bool = False
 ) -> list[Measured]:
     """Localizes photographs on two servers by turns, after once each on both; the servers choose the references."""
     split = split_frames(len(dataset.frames), options)
@@ -94,11 +97,14 @@ def measure(
         for client in clients:
             store_references(client, SCENE, [dataset.frames[i] for i in split.references], lambda *_: None)
         measured = []
+        random = np.random.default_rng(0)
         for frame in (dataset.frames[i] for i in split.queries):
-            positions = [_call(client, server, frame)[2] for client, server in zip(clients, servers, strict=True)]
+            priors = Priors(pose=_prior_of(frame, random)) if tracking else None
+            sides = zip(clients, servers, strict=True)
+            positions = [_call(client, server, frame, priors)[2] for client, server in sides]
             found: list[list[tuple[float, float]]] = [[], []]
             for side in TURNS * rounds:
-                found[side].append(_call(clients[side], servers[side], frame)[:2])
+                found[side].append(_call(clients[side], servers[side], frame, priors)[:2])
             times = np.moveaxis(np.array(found), 2, 0)
             both = [it for it in positions if it is not None]
             apart_m = float(np.linalg.norm(both[0] - both[1])) if len(both) == 2 else None
@@ -106,11 +112,22 @@ def measure(
     return measured
 
 
-def _call(client: Client, server: ChildServer, frame: Frame) -> tuple[float, float, Array | None]:
+def _prior_of(frame: Frame, random: np.random.Generator) -> PosePrior:
+    """The true pose, off by random errors of the stated standard deviations."""
+    sigmas = np.repeat([0.05, np.radians(2.0)], 3)
+    shift, turn = (sigmas * random.standard_normal(6)).reshape(2, 3)
+    true = frame.world_from_camera
+    pose = RigidTransform(rotation_from_vector(turn) @ true.rotation, true.translation + shift)
+    return PosePrior(pose, np.diag(sigmas**2))
+
+
+def _call(
+    client: Client, server: ChildServer, frame: Frame, priors: Priors | None
+) -> tuple[float, float, Array | None]:
     """Processor time of the server, time of the call, and the position found."""
     image = frame.image_path.read_bytes()
     begin_cpu_s, begin_s = _processor_s(server.process_id), time.perf_counter()
-    answer = client.localize(image, frame.camera, SCENE)
+    answer = client.localize(image, frame.camera, SCENE, priors=priors)
     wall_s, cpu_s = time.perf_counter() - begin_s, _processor_s(server.process_id) - begin_cpu_s
     position = answer.world_from_camera.translation if isinstance(answer, LocalizationResult) else None
     return cpu_s, wall_s, position
