@@ -86,7 +86,8 @@ class Diagnostics:
         stage_s: seconds by stage, in order.
         queue_s, total_s: time in the queue and total time in the server, seconds.
         processed_width_px, processed_height_px: size of the processed image.
-        retrieval: descriptor that chose the references; empty if they were used as given.
+        retrieval: descriptor that chose the references; empty if they were used as given; "pose-prior" if the
+            photograph was tracked.
         captured: whether the server keeps the call for a time, including the photograph.
     """
 
@@ -106,6 +107,11 @@ class Diagnostics:
     server_version: str
     retrieval: str = ""
     captured: bool = False
+
+    @property
+    def is_tracked(self) -> bool:
+        """Whether the references nearest to the pose prior gave the answer, without a search."""
+        return self.retrieval == "pose-prior"
 
 
 @dataclass(frozen=True, eq=False)

@@ -175,6 +175,8 @@ def test_the_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
             "rig_from_left": RigidTransform.identity(),
             "rig_from_right": pose(0.5),
             "tracked": pose(0.0),
+            "odometry_since": RigidTransform.identity(),
+            "covariance_since": 1e-4 * np.eye(6),
             "walk": [("a.jpg", pose(0.0)), ("b.jpg", pose(1.0))],
             "lookup": lambda target, source, stamp_ns: RigidTransform.identity(),
             "image_message": compressed(1_800_000_000_000_000_000, photo),

@@ -435,7 +435,7 @@ def test_the_better_of_strict_and_wide_answer_is_returned(
 
     answers = {False: made(strict), True: made(wide)}
     poses = iter((answers[False], answers[True]))
-    monkeypatch.setattr(method, "_solve", lambda *_: next(poses))
+    monkeypatch.setattr(method, "solve", lambda *_: next(poses))
     found = answer_of(pipeline_of("geometric"))
     expected = answers[wide_wins].outcome
     assert isinstance(expected, Localization)

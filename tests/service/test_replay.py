@@ -30,6 +30,7 @@ from mapless import (
     LocalizationResult,
     NewReference,
     NotFound,
+    PosePrior,
     PositionPrior,
     Priors,
     Rejected,
@@ -55,7 +56,7 @@ BLANK = encode(".png", np.full((384, 512, 3), 90, np.uint8))
 ELSEWHERE = encode(".png", textured(512, 384, seed=9))
 
 
-CAPTURED = 16 + 4
+CAPTURED = 18 + 4
 """Calls that are captured: of each kind, and every fifth again."""
 
 
@@ -84,6 +85,8 @@ def calls(client: Client) -> list[Callable[[], Any]]:
         localize(PHOTOS[2], variant="full"),
         localize(PHOTOS[2], variant="coarse"),
         localize(PHOTOS[0], priors=known_of(QUERIES[0])),
+        localize(PHOTOS[0], priors=Priors(pose=PosePrior(QUERIES[0], 1e-3 * np.eye(6)))),
+        localize(PHOTOS[0], priors=Priors(pose=PosePrior(QUERIES[2], 1e-3 * np.eye(6)))),
         localize(PHOTOS[0], NAMED, priors=Priors(position=PositionPrior(np.array([50.0, 0, 0]), radius_m=1.0))),
         localize(PHOTOS[0], priors=Priors(position=PositionPrior(np.array([50.0, 0, 0]), radius_m=1.0))),
         localize(BLANK),
@@ -112,7 +115,7 @@ def captured(tmp_path_factory: pytest.TempPathFactory) -> Path:
         client.add_references("corner", references)
         client.update_scene("corner", down_in_world=(0, 1, 0))
         answers = [call() for call in calls(client)]
-        assert sum(isinstance(it, LocalizationResult) for it in answers) == 9
+        assert sum(isinstance(it, LocalizationResult) for it in answers) == 11
         assert sum(isinstance(it, Rejected) for it in answers) == 5
         list(pool.map(lambda call: call(), calls(client)[::5]))
         with pytest.raises(NotFound):  # of which nothing is kept

@@ -117,7 +117,8 @@ def lines(answer: LocalizationResult | Rejected) -> list[str]:
     text += [f"  prior     {_checked(check)}" for check in answer.prior_checks]
     text += [f"  camera    {_corrected(check)}" for check in answer.intrinsics_checks if _differs(check)]
     captured = f", {_CAPTURED}" if answer.diagnostics.captured else ""
-    text.append(f"  support   {_support(answer)}, {answer.diagnostics.total_s:.2f} s{captured}")
+    tracked = ", tracked" if answer.diagnostics.is_tracked else ""
+    text.append(f"  support   {_support(answer)}, {answer.diagnostics.total_s:.2f} s{tracked}{captured}")
     if answer.arbitrary_unit:
         text.append("  warning   the scene's unit of length is arbitrary, not the metre")
     if answer.scale_source == "NETWORK":

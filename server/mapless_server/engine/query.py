@@ -21,6 +21,12 @@ if TYPE_CHECKING:
     from mapless_server.scheduling import Flow
     from mapless_server.security import SceneKey
 
+POSE_PRIOR = "pose-prior"
+"""`Choice.descriptor` of references that were chosen by a pose prior, not by similarity."""
+
+TRACK = "track"
+"""The stage of choosing references by the prior and comparing others; or the whole attempt, if it did not suffice."""
+
 UNFINISHED = "/unfinished"
 """Ends the name of a stage: its tier came to no answer, see `Result`."""
 
@@ -148,6 +154,11 @@ class Result:
     choice: Choice | None = None
     attributes: SceneAttributes = field(default_factory=SceneAttributes)
     stage_seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def is_tracked(self) -> bool:
+        """Whether its references were chosen by a pose prior, see `tracking`."""
+        return self.choice is not None and self.choice.descriptor == POSE_PRIOR
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Protocol
@@ -10,17 +11,18 @@ from typing import Protocol
 from mapless.names import reference_name
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.images import ImageLimits, decode_image
-from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.features import FeatureExtractor, reduce_image
 from mapless_server.method.options import StageContext
 from mapless_server.method.views import Photograph, View
 from mapless_server.scenes import Choice, GlobalDescriptor, Selection, rank_references
 from mapless_server.scenes.audit.scene_auditor import AuditTools, SceneAuditor
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import Loaded, ReferenceLibrary
+from mapless_server.scenes.retrieval.ranking import nearest_references
 from mapless_server.security import SceneKey, scene_id_of
 from mapless_server.store import SceneAttributes
 
-from .query import Description, Photo
+from .query import POSE_PRIOR, Description, Photo
 
 
 class QueryViews:
@@ -31,15 +33,26 @@ class QueryViews:
         self._limits = limits
         self._photograph: Photograph | None = None
         self._views: dict[str, View] = {}
+        self._max_pixels: int | None = None
 
     def view(self, extractor: FeatureExtractor, context: StageContext) -> View:
         """The photograph's view with this extractor's features; InvalidArgument if the image is bad."""
         if extractor.name not in self._views:
             photograph = self._decoded(context)
             with context.stage("features"):
-                view = extractor.extract(photograph.read(), photograph.camera)
+                pixels, camera = photograph.read(), photograph.camera
+                if self._max_pixels is not None:
+                    share = min(1.0, math.sqrt(self._max_pixels / (camera.width_px * camera.height_px)))
+                    pixels, camera = reduce_image(pixels, camera, round(share * max(camera.width_px, camera.height_px)))
+                view = extractor.extract(pixels, camera)
             self._views[extractor.name] = replace(view, photograph=photograph)
         return self._views[extractor.name]
+
+    def reduced(self, max_pixels: int, context: StageContext) -> QueryViews:
+        """The same photograph, decoded once, whose features are found in a reduced image with about so many pixels."""
+        views = QueryViews(self._photo, self._limits)
+        views._photograph, views._max_pixels = self._decoded(context), max_pixels
+        return views
 
     def _decoded(self, context: StageContext) -> Photograph:
         if self._photograph is None:
@@ -128,7 +141,7 @@ class References:
         selection: Selection,
         context: StageContext,
     ) -> Choice:
-        """Chooses references for a photograph by its global descriptor.
+        """Chooses references for a photograph by its global descriptor, or near a pose prior without reading it.
 
         Args:
             scene_key: the scene.
@@ -143,6 +156,9 @@ class References:
         """
         # The scene comes first: a wrong name is found before the photograph is described.
         entries = self._indexes.entries(scene_key, context)
+        if selection.near is not None:
+            nearest = nearest_references(entries, selection.near, selection.count)
+            return Choice(tuple(nearest), POSE_PRIOR, entries.generation)
         for index, reference_id in enumerate(selection.among):
             if reference_id not in entries:
                 if self._indexes.is_damaged(scene_key, reference_id):

@@ -21,7 +21,7 @@ from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.groups.images import tracked_support
 from mapless_server.method.hints import hinted
 from mapless_server.method.options import StageContext
-from mapless_server.method.pipeline import Coarse, Prepared
+from mapless_server.method.pipeline import Coarse, Pipeline, Prepared
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import Support
 from mapless_server.method.trust.judge import trust_in_scene
@@ -32,8 +32,9 @@ from mapless_server.scenes.retrieval.ranking import spread_choice
 from mapless_server.scheduling import Abandoned, Done, Ending, Failure, Fallback, Job, Next, StageResult, Step
 from mapless_server.store import SceneAttributes
 
+from . import tracking
 from .failures import failure_of
-from .query import UNFINISHED, Query, Result, Tier
+from .query import TRACK, UNFINISHED, Query, Result, Tier
 from .references import QueryViews, ReferenceSource
 from .tiers import EscalationOptions, better_of, is_doubtful
 
@@ -70,6 +71,7 @@ class Method:
     refine: Callable[[Coarse], Answer] = method.refine
     coarse_answer: Callable[[Coarse], Answer | None] = pipeline.coarse_answer
     tracked_support: Callable[[Prepared], Support | None] = tracked_support
+    track: Callable[..., Answer] = tracking.track
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,9 +125,16 @@ class QueryRun:
     @property
     def kind(self) -> str:
         """Kind of the query's jobs; jobs of one kind take about the same time."""
+        if self.tracks:
+            return "tracked"
         ids = self.query.reference_ids
         count = next((count for count in _COUNTS if len(ids) <= count), _COUNTS[-1])
         return f"tier {self.tier}, {'chosen' if self.query.chooses else f'up to {count}'}"
+
+    @property
+    def tracks(self) -> bool:
+        """Whether this tier begins with the references near the prior."""
+        return self.best is None and tracking.can_track(self.query)
 
     @property
     def first_step(self) -> Step:
@@ -185,6 +194,9 @@ class QueryStages:
             if query.is_generic:
                 attributes = replace(attributes, calibration=None, self_calibrations=())
             run = replace(run, attributes=attributes)
+            tracked = self._tracked(run, tier) if run.tracks else None
+            if tracked is not None:
+                return tracked
             run = self._with_chosen(run, tier) if query.chooses else self._with_named(run, tier)
         finally:
             # Described once and for all: the next queries find the features stored.
@@ -226,8 +238,7 @@ class QueryStages:
             pose = Step(PREPARE, f"{run.kind}, matched", f"{run.kind}, matched", replace(run, unmatched=()), run.kind)
             return self._next(run, again, pose)
         run = replace(run, unmatched=())
-        calibration = run.attributes.self_calibration(tier.kind)
-        pipeline = tier.pipeline.with_trust(calibration.trust_quantiles if calibration else ())
+        pipeline = _pipeline_in(run, tier)
         given = run.view, run.references, pipeline, query.options, run.context, run.query_matches, query.priors
         part = self._method.prepare(*given, not run.attributes.arbitrary_unit)
         if isinstance(part, Answer):
@@ -241,6 +252,43 @@ class QueryStages:
         until_s = run.give_up_s if run.best is not None else run.deadline_s
         until_s = run.start_s + self._escalation.rematch_share * (until_s - run.start_s)
         return time.monotonic() + (tier.pipeline.matcher.pair_s or 0.0) <= until_s
+
+    def _tracked(self, run: QueryRun, tier: Tier) -> StageResult | None:
+        """Answers from the references near the pose prior; None if they do not suffice, and notes the time it took."""
+        seconds, begin_s = run.context.stage_seconds, time.monotonic()
+        found = self._track(run, tier)
+        if found is not None:
+            return Done(found, Ending.OK)
+        kept = {name: seconds[name] for name in ("describe", "decode") if name in seconds}  # the search does not repeat
+        seconds.clear()
+        seconds |= {TRACK: time.monotonic() - begin_s - sum(kept.values())} | kept
+        return None
+
+    def _track(self, run: QueryRun, tier: Tier) -> Result | None:
+        query, context, prior = run.query, run.context, run.query.priors.pose
+        assert prior is not None
+        with context.stage(TRACK):
+            selection = Selection(query.reference_count, near=prior)
+            near = run.source.choose(query.scene_key, run.views, selection, context)
+        if len(near.references) < 2:
+            return None
+        generation, references = self._load_chosen(run, [it.reference_id for it in near.references], tier)
+        views = run.views.reduced(tracking.MAX_PIXELS, context)
+        tier = tracking.tracking_tier(tier)
+        view, pipeline = views.view(tier.extractor, context), _pipeline_in(run, tier)
+        answer = self._method.track(view, references, pipeline, query.options, context, query.priors)
+        if not tracking.suffices(answer, pipeline.options.weak_inliers, self._doubt_in(run)):
+            return None
+        limits = replace(query.narrowing, likely_positions=(), likely_headings=())
+        alike = run.source.choose(query.scene_key, views, Selection(query.reference_count, limits), context)
+        others = [it.reference_id for it in tracking.elsewhere(near, alike)]
+        with context.stage(TRACK):
+            rivals = self._load_chosen(run, others, tier)[1] if others else ()
+            if tracking.is_contradicted(answer, view, rivals, pipeline.matcher):
+                return None
+        tracked = replace(run, generation=generation, references=references, view=view, choice=near)
+        result = replace(self._result(tracked, answer), tier=tier)
+        return result if isinstance(result.answer.outcome, Localization) else None
 
     def _with_named(self, run: QueryRun, tier: Tier) -> QueryRun:
         """Loads the references that the caller named."""
@@ -355,6 +403,12 @@ class QueryStages:
             seconds[f"{prefix}{stage}"] = spent_s
         used = run.references, run.generation, run.view.camera, run.choice, run.attributes
         return Result(answer, tier, *used, seconds)
+
+
+def _pipeline_in(run: QueryRun, tier: Tier) -> Pipeline:
+    """The tier's pipeline with the trust of the scene."""
+    calibration = run.attributes.self_calibration(tier.kind)
+    return tier.pipeline.with_trust(calibration.trust_quantiles if calibration else ())
 
 
 def _emptied() -> Unavailable:

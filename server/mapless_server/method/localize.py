@@ -94,15 +94,15 @@ def refine(coarse: Coarse) -> Answer:
 
 
 def _strict_then_wide(coarse: Coarse, counts_agreement: bool) -> Answer:
-    answer = _solve(coarse, counts_agreement)
+    answer = solve(coarse, counts_agreement)
     if not coarse.prepared.can_improve(answer):
         return answer
-    wide = _solve(with_wide_correspondences(coarse), counts_agreement)
+    wide = solve(with_wide_correspondences(coarse), counts_agreement)
     better = wide if is_better(wide, answer, coarse.prepared.pipeline.options.max_radius_ratio) else answer
     return replace(better, stage_seconds=wide.stage_seconds)
 
 
-def _solve(coarse: Coarse, counts_agreement: bool) -> Answer:
+def solve(coarse: Coarse, counts_agreement: bool = False) -> Answer:
     """Computes an accepted pose from the scale; if `counts_agreement`, gravity and heading count as evidence for it."""
     prepared, scale, stage = coarse.prepared, coarse.scale, coarse.prepared.context.stage
     if isinstance(scale, Rejection):

@@ -190,6 +190,10 @@ class Metrics(Observer, PairObserver):
             extractor, _, stage = name.rpartition("/")
             self._stage_seconds(stage, "1" if extractor else "0").observe(seconds)
 
+    def tracked(self, suffices: bool) -> None:
+        """A query was compared with the references near its pose prior; whether these sufficed."""
+        self._tracking("tracked" if suffices else "searched").inc()
+
     def answered_coarsely(self, seconds: float) -> None:
         """A call got a coarse answer, to be refined, this long after it arrived."""
         self._coarse_answer.observe(seconds)
@@ -382,6 +386,9 @@ class Metrics(Observer, PairObserver):
         self._stage_seconds = _Children(
             histogram("mapless_stage_seconds", "Time of a stage of the method.", STAGE_BUCKETS, ["stage", "tier"])
         )
+        text = "Queries with references near their pose prior: tracked, or the full search followed."
+        tracking = self._counter("mapless_tracking", text, ["outcome"])
+        self._tracking = _Children(tracking, [("tracked",), ("searched",)])
         self._coarse_answer = histogram(
             "mapless_coarse_answer_seconds", "Time from arrival to a coarse answer that is to be refined.", CALL_BUCKETS
         )

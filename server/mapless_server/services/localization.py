@@ -13,7 +13,7 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import localization_service_pb2_grpc as rpcs
 from mapless_server.engine.groups import MAX_FRAMES, MAX_RIG_IMAGES, MIN_FRAMES, GroupResult, PhotoGroup
 from mapless_server.engine.interface import Engine
-from mapless_server.engine.query import Query, Result
+from mapless_server.engine.query import TRACK, Query, Result
 from mapless_server.method.answer import Localization
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.results import MetricScale
@@ -216,6 +216,8 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         """Reports an answer, a rejection or the message of any localization, to the log and the metrics."""
         for result in results:
             self._metrics.stages(result.stage_seconds)
+            if TRACK in result.stage_seconds:
+                self._metrics.tracked(result.is_tracked)
         if isinstance(outcome, Rejection):
             self._metrics.answered(outcome.reason.value)
             call.note(outcome=outcome.reason.value)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.names import reference_name
+from mapless_server.engine.query import POSE_PRIOR
 from mapless_server.engine.references import QueryViews
 from mapless_server.errors import DataLoss
 from mapless_server.images import decode_image
@@ -119,10 +120,15 @@ class RecordedSource:
         selection: Selection,
         context: StageContext,
     ) -> Choice:
-        """Implements ReferenceSource with the captured choice, for any arguments; DamagedCapture if there is none."""
+        """Implements ReferenceSource with the captured choice; DamagedCapture if there is none.
+
+        For any arguments, but that references near a prior are none unless the captured ones were chosen so.
+        """
+        if selection.near is not None and (self.part.choice is None or self.part.choice.descriptor != POSE_PRIOR):
+            return Choice((), POSE_PRIOR, self.part.generation)
         if self.part.choice is None:
             raise DamagedCapture("no choice of references was captured")
-        if self.is_described:
+        if self.is_described and selection.near is None:
             views.view(self.extractor, context)
             with context.stage(RETRIEVAL):  # it takes no time, but the answer lists it
                 pass

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mapless.geometry import Array, RigidTransform
 from mapless_server.method.options import check_bounds
+from mapless_server.method.priors.known import PosePrior
 
 from .descriptor import Vector
 from .index import Entries, Rows
@@ -69,12 +70,14 @@ class Selection:
         narrowing: limits of the camera's pose.
         among: ids of the candidates, unknown ones ignored; empty for the whole scene.
         options: options of the ranking.
+        near: prior near which references are chosen, in place of similar ones; see `nearest_references`.
     """
 
     count: int
     narrowing: Narrowing = field(default_factory=Narrowing)
     among: Collection[str] = ()
     options: RankOptions = field(default_factory=RankOptions)
+    near: PosePrior | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +144,49 @@ def rank_references(entries: Entries, vector: Vector | None, selection: Selectio
     rest = np.setdiff1d(np.arange(len(pool)), order)  # in the order of their scores
     chosen = pool[[*order, *rest[: wanted - len(order)]]]
     return [_ranked(entries, int(rows[i]), float(similarity[i])) for i in chosen]
+
+
+TURN_DEG = 15.0
+"""A reference that looks so far elsewhere counts as twice as far away."""
+
+MAX_TURN_DEG = 60.0
+"""References that look further elsewhere show other things."""
+
+
+def nearest_references(entries: Entries, prior: PosePrior, count: int) -> list[RankedReference]:
+    """The reference with the viewpoint most like a pose prior, and those with viewpoints most like its own.
+
+    So they are the same for all priors around the first, and what depends on them alone is computed once. They are not
+    thinned, except where many stand at one place. Their similarities are 0.
+
+    Returns:
+        At most `count`; none if the prior leaves open which references are near: its standard deviation is larger than
+        the distance of the furthest of them from the first, or the camera is further from the first than that.
+    """
+    rows = entries.rows()
+    pose, sigma_m = prior.world_from_camera, math.sqrt(float(np.linalg.eigvalsh(prior.covariance[:3, :3])[-1]))
+    first = rows[np.argsort(_unlikeness(entries, rows, pose, sigma_m), kind="stable")[:1]]
+    if not len(first):
+        return []
+    _, _, at = entries.reference(int(first[0]))
+    unlikeness = _unlikeness(entries, rows, at, 0.0)
+    pool = _best(-unlikeness, max(RankOptions().pool * count, RankOptions().smallest_pool))
+    pool = pool[np.isfinite(unlikeness[pool])]
+    near = rows[pool]
+    options = RankOptions(nearby_weight=1.0)
+    order = spread(-unlikeness[pool], entries.centres(near), entries.axes(near), count, math.inf, options)
+    chosen = near[order]
+    extent_m = float(np.linalg.norm(entries.centres(chosen) - at.translation, axis=1).max(initial=0.0))
+    if max(sigma_m, float(np.linalg.norm(at.translation - pose.translation))) > extent_m:
+        return []
+    return [_ranked(entries, int(row), 0.0) for row in chosen]
+
+
+def _unlikeness(entries: Entries, rows: Rows, pose: RigidTransform, sigma_m: float) -> Array:
+    """How unlike the viewpoints (N,) of references are to a pose, whose position is uncertain by `sigma_m`."""
+    away_m = np.hypot(np.linalg.norm(entries.centres(rows) - pose.translation, axis=1), sigma_m)
+    turn_deg = np.degrees(np.arccos(np.clip(entries.axes(rows) @ pose.rotation[:, 2], -1.0, 1.0)))
+    return np.where(turn_deg <= MAX_TURN_DEG, away_m * (1 + turn_deg / TURN_DEG), np.inf)
 
 
 def spread(

@@ -1,0 +1,132 @@
+"""Tracking, on photographs of a rendered corner: the prior saves time, and decides nothing that it should not."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.compare import pose_error
+from support.corner import CAMERA, photograph, pose
+
+from mapless.geometry import RigidTransform, rotation_from_vector
+from mapless_server.engine.interface import EngineOptions
+from mapless_server.engine.query import TRACK, Caller, Photo, Query, Result, Tier
+from mapless_server.engine.tracking import can_track
+from mapless_server.method.answer import Localization
+from mapless_server.method.features import SiftExtractor
+from mapless_server.method.options import LocalizeOptions, Variant
+from mapless_server.method.pipeline import Pipeline
+from mapless_server.method.priors.known import NO_PRIORS, PosePrior, Priors
+from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.uncertainty.radii import accuracy_from_covariance
+from mapless_server.scenes import Narrowing
+from mapless_server.scheduling import Flow
+from mapless_server.security import SceneKey
+from mapless_server.serve.assembly import engine_over
+from mapless_server.store import NewReference, Store
+
+SCENE, COPIED = SceneKey("corner"), SceneKey("copies")
+TRUE = pose(2.0, -1.5)
+COPY_M = np.array([5.0, 0.0, 0.0])
+SIGMA_M, SIGMA_DEG = 0.05, 1.5
+Localize = Callable[..., Result]
+
+
+def prior(at: RigidTransform = TRUE, sigma_deg: float = SIGMA_DEG) -> Priors:
+    deviations = [SIGMA_M] * 3 + [np.radians(sigma_deg)] * 3
+    return Priors(pose=PosePrior(at, np.diag(np.square(deviations))))
+
+
+def moved(metres: float, degrees: float) -> RigidTransform:
+    turn = rotation_from_vector(np.radians(degrees) * np.array([0.0, 1.0, 0.0]))
+    return RigidTransform(turn @ TRUE.rotation, TRUE.translation + [metres, 0.0, 0.0])
+
+
+def query(priors: Priors = NO_PRIORS, scene: SceneKey = SCENE, image: bytes = b"", **named: object) -> Query:
+    values = {"reference_ids": (), "narrowing": Narrowing.of(priors), "reference_count": 10} | named
+    options = values.pop("options", LocalizeOptions())
+    return Query(scene, photo=Photo(image, CAMERA, "image"), options=options, priors=priors, **values)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def localize(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Localize]:
+    """A scene of a corner, and one in which a copy of it stands 5 m aside."""
+    caller = Caller(Flow("tenant", "client"), time.monotonic() + 600)
+    folder: Path = tmp_path_factory.mktemp("store")
+    poses = [pose(angle, height) for angle in (-15, -5, 5, 15) for height in (-1.8, -1.2)]
+    image, loop = photograph(TRUE), asyncio.new_event_loop()
+    with Store.open(folder) as store:
+        engine = engine_over(store, [Tier(SiftExtractor(), Pipeline())], EngineOptions())
+        photos = [Photo(photograph(it), CAMERA, "image") for it in poses]
+        described = loop.run_until_complete(engine.describe(photos, caller))
+
+        def added(scene: SceneKey, offsets: Sequence[np.ndarray]) -> None:
+            store.create_scene(scene)
+            for k, offset in enumerate(offsets):
+                shown = zip(photos, poses, described, strict=True)
+                references = [
+                    NewReference(f"{k}-{i}", photo.image, CAMERA, at.shifted(offset), found.views, found.descriptors)
+                    for i, (photo, at, found) in enumerate(shown)
+                ]
+                store.add_references(scene, references)
+
+        added(SCENE, [np.zeros(3)])
+        added(COPIED, [np.zeros(3), COPY_M])
+
+        def answer(priors: Priors = NO_PRIORS, scene: SceneKey = SCENE) -> Result:
+            job = engine.query_job(query(priors, scene, image), caller)
+            return loop.run_until_complete(engine.run(job))
+
+        yield answer
+        loop.run_until_complete(engine.close())
+    loop.close()
+
+
+def localized(result: Result) -> Localization:
+    assert isinstance(result.answer.outcome, Localization)
+    return result.answer.outcome
+
+
+def test_a_right_prior_gives_the_same_pose_within_its_radius(localize: Localize) -> None:
+    full, tracked = localize(), localize(prior())
+    assert (full.is_tracked, tracked.is_tracked) == (False, True)
+    assert tracked.processed.width_px < full.processed.width_px
+    found = localized(tracked)
+    assert found.covariance is not None
+    radii = accuracy_from_covariance(found.covariance)
+    for true in (TRUE, localized(full).world_from_camera):
+        metres, degrees = pose_error(found.world_from_camera, true)
+        assert metres <= radii.position_95_m
+        assert degrees <= radii.rotation_95_deg
+
+
+@pytest.mark.parametrize(("metres", "degrees"), [(0.3, 0.0), (0.0, 10.0)])
+def test_a_wrong_prior_gives_the_answer_without_it(localize: Localize, metres: float, degrees: float) -> None:
+    full, misled = localize(), localize(prior(moved(metres, degrees)))
+    assert not misled.is_tracked
+    assert TRACK in misled.stage_seconds
+    assert localized(misled).prior_checks[0].conflict
+    np.testing.assert_allclose(
+        localized(misled).world_from_camera.matrix(), localized(full).world_from_camera.matrix(), atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("copy", [0, 1])
+def test_a_prior_at_one_of_two_copies_does_not_decide(localize: Localize, copy: int) -> None:
+    for priors in (NO_PRIORS, prior(TRUE.shifted(copy * COPY_M))):
+        outcome = localize(priors, COPIED).answer.outcome
+        assert isinstance(outcome, Rejection)
+        assert outcome.reason is RejectionReason.AMBIGUOUS
+
+
+def test_what_leaves_the_references_open_is_not_tracked() -> None:
+    assert can_track(query(prior()))
+    assert not can_track(query())
+    assert not can_track(query(prior(sigma_deg=21.0)))
+    assert not can_track(query(prior(), reference_ids=("r0",)))
+    assert not can_track(query(prior(), is_part=True))
+    assert not can_track(query(prior(), options=LocalizeOptions(variant=Variant.FULL)))
