@@ -63,14 +63,34 @@ def test_steps_equal_those_of_the_dense_equations(references: int) -> None:
     problem, state = planted("dense", references)
     found = disperse(problem, state, 1000)
     assert found
-    data, gradient = dense(problem, state)
-    offset = -np.linalg.solve(*held(problem, state, data, gradient))[-6:]
+    whole, gradient = held(problem, state, *dense(problem, state))
+    offset = -np.linalg.solve(whole, gradient)[-6:]
     np.testing.assert_allclose(found.offset, offset, atol=1e-4 * np.abs(offset).max())
+    covariance, left = np.linalg.inv(whole)[-6:, -6:], []
     for i in range(references):
         matrix, pull = held(problem, state, *dense(problem, state, i))
-        matrix[-6:, -6:] += LEAST_LEFT * data[-6:, -6:]
+        left.append(np.linalg.eigvals(np.linalg.solve(np.linalg.inv(matrix)[-6:, -6:], covariance)).real.min())
+        matrix[-6:, -6:] += LEAST_LEFT * np.linalg.inv(covariance)
         expected = -np.linalg.solve(matrix, pull)[-6:] - offset
         np.testing.assert_allclose(found.references[i], expected, atol=1e-3 * np.abs(found.references).max())
+    assert found.left == pytest.approx(min(left), abs=1e-4)
+
+
+def test_nothing_is_left_of_a_pose_without_one_of_two() -> None:
+    two, six = (disperse(*planted("two", count), 1000) for count in (2, 6))
+    assert two
+    assert six
+    assert two.left < 0.01
+    assert six.left > 0.2
+
+
+def test_the_gap_is_that_to_the_nearest_reference() -> None:
+    problem, state = planted("gap")
+    found = disperse(problem, state, 1000)
+    assert found
+    query = state.world_from_query
+    apart = np.linalg.norm(state.poses.centres[:-1] - query.translation, axis=1).min()
+    assert found.gap == pytest.approx(apart / np.median(query.inverse().apply(state.points)[:, 2]))
 
 
 def test_the_regions_together_are_the_whole_gradient() -> None:
@@ -119,7 +139,7 @@ def test_covariance_of_three_poses_equals_the_jackknife() -> None:
     references, regions = np.zeros((3, 6)), np.zeros((4, 6))
     references[:, 0], references[:, 4] = [1, 2, 6], [0, 3, 0]
     regions[:, 0] = [1, -1, 2, -2]
-    covariance = Dispersion(references, regions, np.zeros(6)).covariance(3.0)
+    covariance = Dispersion(references, regions, np.zeros(6), 1.0, 0.1).covariance(3.0)
     assert covariance[0, 0] == pytest.approx(2 / 3 * (4 + 1 + 9) + 9 * 10)
     assert covariance[4, 4] == pytest.approx(2 / 3 * (1 + 4 + 1))
     assert covariance[0, 4] == pytest.approx(2 / 3 * (2 - 2 - 3))

@@ -19,10 +19,11 @@ from mapless_server.method.perturbation import rotation_vector
 from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.pose_problem import AdjustOptions
 from mapless_server.method.results import PoseEstimate, PoseStage, Structure, Support
-from mapless_server.method.uncertainty.covariance import UncertaintyOptions, scale_covariance
+from mapless_server.method.uncertainty.covariance import UncertaintyOptions, dispersed_covariance, scale_covariance
+from mapless_server.method.uncertainty.dispersion import Dispersion
 
 POSITION, ROTATION = slice(0, 3), slice(3, 6)
-PLAIN = UncertaintyOptions(position_factor=1.0, rotation_factor=1.0)
+PLAIN = UncertaintyOptions(position_factor=1.0, rotation_factor=1.0, gap_growth=0.0, lone_variance=0.0)
 """What is derived, without what was measured on photographs."""
 PLAIN_ADJUST = AdjustOptions(uncertainty=PLAIN)
 FEW = SceneOptions(point_count=120, reference_count=4, distractor_count=0)
@@ -125,6 +126,20 @@ def test_an_initial_poses_covariance_covers_its_errors() -> None:
     assert np.sqrt(along @ covariance[:3, :3] @ along) == pytest.approx(0.05, rel=0.3)
     refined = with_covariance(support_of(scene, structure, estimate), UNSCALED, wide).covariance
     assert np.sqrt(along @ refined[:3, :3] @ along) < 0.02
+
+
+def test_covariance_grows_with_the_gap_and_without_support() -> None:
+    """As the gap to twice its exponent, and threefold where a reference is all that holds the pose."""
+    one = np.diag([1.0, 2.0, 3.0, 1.0, 2.0, 3.0])
+    options = replace(PLAIN, gap_growth=0.1, lone_variance=0.02)
+
+    def trace(gap: float, left: float) -> float:
+        found = Dispersion(one, np.zeros((9, 6)), np.zeros(6), left, gap)
+        return float(np.trace(dispersed_covariance(found, RigidTransform(np.eye(3), np.zeros(3)), options)))
+
+    assert trace(0.2, 0.5) / trace(0.1, 0.5) == pytest.approx(2**0.2)
+    assert trace(5.0, 0.5) == trace(0.5, 0.5)
+    assert trace(0.1, 0.0) / trace(0.1, 0.99) == pytest.approx(3 / 1.02)
 
 
 def test_factors_multiply_standard_deviations() -> None:

@@ -43,6 +43,7 @@ from ..arrays import take
 from ..bundle import Bundle, BundleProblem, EliminatedPoints, ViewColumns
 from ..intrinsics import IntrinsicsEquations
 from ..optimize import cauchy_weight
+from .radii import SUPPORTING_SHARE
 
 DAMPING = 1e-9
 """Relative, of the points: one without enough observations is determined, and has no information to speak of."""
@@ -55,7 +56,9 @@ LEAST_VARIANCE = 1e-12
 """Of S, as a share of I / w, where its point has no other observation but rounding."""
 
 LEAST_LEFT = 0.01
-"""Share of the pose's information added to what is left without a reference, which may not determine a pose."""
+"""Share of the pose's information added to what is left without a reference, which may not determine a pose. Against
+planted noise, where each of two references is needed, errors are 0.65 to 0.96 of what is stated; with 0.03 they are
+0.89 to 1.07 of it, but photographs with three to five references need more."""
 
 REGIONS = 3
 """Columns of the photograph, and regions in each. With 2 or 4 radii hold about as well."""
@@ -69,12 +72,16 @@ class Dispersion:
         references: (K, 6) change of the optimum without each reference's observations.
         regions: (G, 6) influence of the matches in each region of the photograph.
         offset: (6,) the Gauss-Newton step from the pose to the optimum.
+        left: least share of the pose's information, 0 to 1, in any direction, that is left without one reference.
+        gap: distance to the nearest reference that holds the pose, over the median depth of the points.
         intrinsics: what the data say of errors of the intrinsics; None if the problem has not these unknowns.
     """
 
     references: Array
     regions: Array
     offset: Array
+    left: float
+    gap: float
     intrinsics: IntrinsicsEquations | None = None
 
     def covariance(self, region_factor: float) -> Array:
@@ -119,9 +126,12 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
         others[6 * i : 6 * i + 6] = False  # only the prior is left of its own pose
         matrices[i + 1] += np.where(np.outer(others, others), data - lost @ lost.T, 0)
         gradients[i + 1] += np.where(others, gradient + lost @ misfit[:, part].ravel(), 0)
-    matrices[1:, query, query] += LEAST_LEFT * data[query, query]
-    right = np.concatenate([matrices[:, posed, posed.stop :], gradients[:, posed, None]], axis=2)
+    information = np.asarray(np.linalg.inv(to_pose[:, query]), np.float64)
+    matrices[1:, query, query] += LEAST_LEFT * information
+    unit = np.broadcast_to(np.eye(posed.stop)[:, query], (len(matrices), posed.stop, 6))
+    right = np.concatenate([matrices[:, posed, posed.stop :], gradients[:, posed, None], unit], axis=2)
     solved = np.linalg.solve(matrices[:, posed, posed], right)
+    solved, covariances = solved[:, :, :-6], solved[1:, query, -6:]
     poses = -solved[:, query, -1]
     rest = np.concatenate([matrices[:, posed.stop :, posed.stop :], gradients[:, posed.stop :, None]], axis=2)
     rest -= matrices[:, posed.stop :, posed] @ solved  # of the intrinsics, with the poses eliminated
@@ -132,7 +142,9 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
     influences = _influences(seen, regions, to_both, residual, by_pose, weight, points)
     if not (np.isfinite(poses).all() and np.isfinite(influences).all()):
         return None
-    found = Dispersion(poses[1:] - poses[0], influences[:, :6], poses[0])
+    found = Dispersion(
+        poses[1:] - poses[0], influences[:, :6], poses[0], _left(information, covariances), _gap(seen, bundle)
+    )
     if not len(to_rest):
         return found
     observing = [0, *(i + 1 for i, part in enumerate(seen.parts[:-1]) if part.start < part.stop)]
@@ -157,12 +169,27 @@ def _thinned(seen: ViewColumns, bundle: Bundle, max_matches: int) -> tuple[ViewC
     return seen.of_points(chosen), Bundle(bundle.poses, bundle.points[chosen], bundle.intrinsics), thinning
 
 
+def _left(information: Array, covariances: Array) -> float:
+    """Least share of the pose's information (6, 6) that is left, by covariances (K, 6, 6) without each reference."""
+    root = np.linalg.cholesky(information)
+    largest = np.linalg.eigvalsh(root.T @ covariances @ root)[:, -1].max(initial=1.0)
+    return float(np.clip(1 / largest - LEAST_LEFT, 0.0, 1.0))
+
+
+def _gap(seen: ViewColumns, bundle: Bundle) -> float:
+    """Distance to the nearest reference that holds the pose, over the median depth of the points."""
+    counts = np.array([part.stop - part.start for part in seen.parts[:-1]])
+    centres, rotation, shift = bundle.poses.centres, bundle.poses.rotation[-1], bundle.poses.translation[-1]
+    distances = np.linalg.norm(centres[:-1] - centres[-1], axis=1)[counts >= SUPPORTING_SHARE * counts.max()]
+    return float(distances.min() / np.median(bundle.points @ rotation[2] + shift[2]))
+
+
 def _rows_of_pose(matrix: Array) -> Array | None:
     """Rows (6, U) of the inverse for the query's pose; None if it is not well-conditioned and positive definite."""
     if not np.isfinite(matrix).all():
         return None
     try:
-        rows = np.asarray(np.linalg.inv(matrix)[-6:])
+        rows = np.asarray(np.linalg.solve(matrix, np.eye(len(matrix))[:, -6:]).T)
     except np.linalg.LinAlgError:
         return None
     return rows if _is_definite(rows[:, -6:]) else None

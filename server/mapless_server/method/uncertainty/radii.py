@@ -13,7 +13,7 @@ from mapless.geometry import Array
 
 from ..results import Support
 
-TAIL_95 = 1.51
+TAIL_95 = 1.47
 """Factor on the radius of 95 %, for heavy tails; the covariance is right at 68 %. From `research.radii`."""
 
 
@@ -57,8 +57,8 @@ def error_radii(covariance: Array, probabilities: ArrayLike) -> Array:
     return np.asarray(np.sqrt(2 * scale * gammaincinv(degrees_of_freedom / 2, probabilities)), float)
 
 
-POSITION_GROWTH, ROTATION_GROWTH = 0.3, 0.3
-"""Exponents of the gap in the ratio of errors to radii, from `research.self_calibration`."""
+POSITION_GROWTH, ROTATION_GROWTH = 0.2, 0.2
+"""Exponents of the gap in the ratio of errors to radii, which contain 0.1 of it; from `research.self_calibration`."""
 
 USUAL_GAP = 0.1
 """The gap at which factors are stated."""
@@ -89,7 +89,11 @@ def viewpoint_gap(support: Support) -> tuple[float, float]:
     return float(np.linalg.norm(centres - pose.translation, axis=1).min()) / depth_m, depth_m
 
 
+def gap_ratio(gap: float) -> float:
+    """The gap by the usual one, within the bounds."""
+    return float(np.clip(gap, LEAST_GAP, LARGEST_GAP)) / USUAL_GAP
+
+
 def growth(gap: float) -> tuple[float, float]:
     """Ratios of the errors of position and rotation to their radii at a gap, relative to those at the usual gap."""
-    ratio = float(np.clip(gap, LEAST_GAP, LARGEST_GAP)) / USUAL_GAP
-    return ratio**POSITION_GROWTH, ratio**ROTATION_GROWTH
+    return gap_ratio(gap) ** POSITION_GROWTH, gap_ratio(gap) ** ROTATION_GROWTH
