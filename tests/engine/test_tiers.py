@@ -57,12 +57,12 @@ def localized(
 DISTANCE_M = 10.0
 
 
-def found(answer: Answer, x_m: float, inliers: int) -> Answer:
+def found(answer: Answer, x_m: float, inliers: int, sigma_m: float = 0.01) -> Answer:
     """With the pose that was found, whether accepted or not, of points 10 m ahead."""
     points, none = np.tile([x_m, 0.0, DISTANCE_M], (inliers, 1)), np.empty(0, np.intp)
     matches = PointMatches(np.arange(inliers), np.arange(inliers), np.zeros(inliers, bool), 20.0)
     pose = RigidTransform(np.eye(3), np.array([x_m, 0.0, 0.0]))
-    estimate = PoseEstimate(pose, PoseStage.REFINED, np.ones(inliers, bool), np.zeros(inliers), np.eye(6))
+    estimate = PoseEstimate(pose, PoseStage.REFINED, np.ones(inliers, bool), np.zeros(inliers), sigma_m**2 * np.eye(6))
     structure = Structure(points, Tracks(none, none, none), KeypointNoise(1.0, 0.0))
     unused: Any = None
     return replace(answer, support=Support(unused, (), structure, matches, estimate, np.zeros(3)))
@@ -145,6 +145,12 @@ class TestBetter:
             chosen = better(first, second)
             assert chosen.tier is STRONG
             assert isinstance(chosen.answer.outcome, Localization) is expected
+
+    @pytest.mark.parametrize(("sigma_m", "is_answered"), [(0.1, False), (1.0, True)])
+    def test_a_rejected_pose_contradicts_beyond_its_radius(self, sigma_m: float, is_answered: bool) -> None:
+        first = found(rejected(RejectionReason.GATE), 0.0, 100, sigma_m)
+        second = found(localized(1.0, inliers=100), 1.0, 100)
+        assert isinstance(better(first, second).answer.outcome, Localization) is is_answered
 
     def test_a_rejected_pose_has_the_inliers_of_two_views_too(self) -> None:
         first, second = found(rejected(RejectionReason.AMBIGUOUS), 0.0, 10), found(localized(3.0, inliers=60), 3.0, 60)

@@ -139,6 +139,20 @@ def test_poses_with_trust_below_1_minus_coverage_are_rejected() -> None:
     assert "matches agree" in refused.message
 
 
+@pytest.mark.parametrize(("share", "is_accepted"), [(0.049, True), (0.051, False), (1.0, False)])
+def test_a_radius_beyond_what_is_right_is_rejected(share: float, is_accepted: bool) -> None:
+    """Whatever the coverage; the 68 % radius of one direction is nearly its standard deviation."""
+    support = support_of()
+    assert support.estimate
+    covariance = np.diag([(share * support.distance_m() / 0.9945) ** 2, 0, 0, 1e-6, 1e-6, 1e-6])
+    _, rejection = verdict(replace(support, estimate=replace(support.estimate, covariance=covariance)), 1.0)
+    assert (rejection is None) is is_accepted
+    if rejection:
+        assert rejection.reason is RejectionReason.GATE
+        assert rejection.hint
+        assert rejection.hint.best_reference
+
+
 def test_worse_matches_and_fewer_points_lower_the_trust() -> None:
     clean, noisy, sparse = (verdict(s, 1.0)[0] for s in (support_of(), support_of(0.5), support_of(0.0, 0.3)))
     assert clean > noisy

@@ -96,8 +96,8 @@ def better_of(cheaper: Result, stronger: Result, options: EscalationOptions) -> 
         other = _rejected_pose(cheaper.answer)
         if other is None or stronger.answer.support is None:
             return stronger
-        pose, inlier_count = other
-        reach_m, reach_deg = options.same_share * stronger.answer.support.distance_m(), math.inf
+        pose, inlier_count, radius_m = other
+        reach_m, reach_deg = max(radius_m, options.same_share * stronger.answer.support.distance_m()), math.inf
     else:
         pose, inlier_count = first.world_from_camera, first.inlier_count
         claims = _claim(first), _claim(second)
@@ -118,13 +118,14 @@ def better_of(cheaper: Result, stronger: Result, options: EscalationOptions) -> 
     return replace(stronger, answer=replace(stronger.answer, outcome=rejection))
 
 
-def _rejected_pose(answer: Answer) -> tuple[RigidTransform, int] | None:
-    """The pose that was found and rejected by its evidence, with its number of inliers; None if there was none."""
+def _rejected_pose(answer: Answer) -> tuple[RigidTransform, int, float] | None:
+    """The pose that was found and rejected by its evidence, its number of inliers and 95 % radius; None for no pose."""
     outcome, support = answer.outcome, answer.support
     judged = isinstance(outcome, Rejection) and outcome.reason in (RejectionReason.GATE, RejectionReason.AMBIGUOUS)
     if not judged or support is None or support.estimate is None:
         return None
-    return support.estimate.world_from_camera.shifted(support.origin), support.inlier_count()
+    radius_m = accuracy_from_covariance(support.estimate.covariance).position_95_m
+    return support.estimate.world_from_camera.shifted(support.origin), support.inlier_count(), radius_m
 
 
 def _places_apart(result: Result) -> Hint:
