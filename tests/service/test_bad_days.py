@@ -177,28 +177,6 @@ class TestDisk:
                 assert count_left() == 0
             assert large_photo(7)[1000:1016] not in (disk / "data" / DATABASE_FILE).read_bytes()
 
-    def test_where_the_journal_filled_the_disk_the_error_names_what_to_free(self, tmp_path: Path) -> None:
-        with small_disk(tmp_path / "disk", 6) as disk, served(disk / "data") as client:
-            fill(client, 3)
-            file, journal = disk / "data" / DATABASE_FILE, disk / "data" / f"{DATABASE_FILE}-wal"
-            with closing(SqliteDatabase.open_as_is(file)) as database, database.read() as reading:
-                reading.exec_driver_sql("SELECT count(*) FROM reference")  # the journal cannot begin anew
-                numbers = iter(range(3, 60))
-                while error_of(lambda: client.add_reference("s", large(next(numbers)))) is None:
-                    pass
-                for _ in range(2):  # what room there is for small changes ends, too
-                    error = error_of(lambda: client.delete_scene("s"))
-                assert error is not None
-                assert error.reason == "STORE_FULL"
-                assert "free 1 MiB on it, or as much as its journal" in str(error)
-            size_kib = (6 * 2**20 + max(2**20, journal.stat().st_size)) // 1024
-            assert mount("-o", f"remount,size={size_kib}k", str(disk)) == 0
-            error_of(lambda: client.delete_scene("s"))  # it may be gone already, with rows left
-            client.create_scene("s")
-            wait_until(lambda: health_of(client) == (True, True, True))
-            assert client.get_scene("s").reference_count == 0
-            assert faults_of(disk / "data") == ()
-
     def test_a_disk_full_from_the_start_serves_queries(self, tmp_path: Path) -> None:
         with small_disk(tmp_path / "disk", 8) as disk:
             with served(disk / "stopped") as client:

@@ -51,9 +51,9 @@ def unless_damaged(connection: Connection, read: Callable[[], T], otherwise: Cal
     return otherwise()
 
 
-def disk_full(advice: str = "") -> Overloaded:
-    """The error of a disk without space; `advice` says how much to free."""
-    return Overloaded(f"the store's disk is full{advice}", reason="STORE_FULL")
+def disk_full() -> Overloaded:
+    """The error of a disk without space."""
+    return Overloaded("the store's disk is full", reason="STORE_FULL")
 
 
 def unavailable(message: str) -> Unavailable:

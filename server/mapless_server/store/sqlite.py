@@ -332,7 +332,7 @@ def _translated(error: DBAPIError) -> RequestError | None:
     if "is locked" in text:
         return Unavailable("the store is busy", retry_after_s=RETRY_AFTER_S)
     if "is full" in text:
-        return disk_full(": free 1 MiB on it, or as much as its journal (-wal) takes if that is more")
+        return disk_full()
     if "readonly database" in text:
         return FailedPrecondition("the store can only be read", reason="STORE_READ_ONLY")
     if any(it in text for it in _BROKEN):

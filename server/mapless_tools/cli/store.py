@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict
@@ -87,15 +86,8 @@ def restore_command(
 
     with _store_errors(), progress_bars() as on_progress:
         SqliteDatabase.open_as_is(file).close()  # before a store is made for it
-        url, folder = _settings(config, data_dir)
-        made = next((it for it in (*reversed(folder.absolute().parents), folder) if not it.exists()), None)
         with closing(_open(config, data_dir)) as database:
-            try:
-                found = restore(file, database, on_progress)
-            except BaseException:
-                if made is not None and not url:  # while its lock is held, so that it is nobody else's
-                    shutil.rmtree(made, ignore_errors=True)
-                raise
+            found = restore(file, database, on_progress)
     _report(found, "restored, read again and found whole")
 
 
