@@ -10,7 +10,9 @@ import hashlib
 import logging
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -40,6 +42,8 @@ MAX_ERROR_M = 0.1
 _LIMIT_S = 600.0  # networks may be compiled by the first photograph
 _CAMERA = Camera(640, 480, 520.0, 520.0, 319.5, 239.5)
 _CENTRES_X_M = (-0.6, 0.0, 0.6)
+_FARTHEST = (0, 2)
+"""Numbers of the two centres that are farthest apart."""
 _QUERY_X_M = 0.25
 _WALLS = ((4.0, 4.0), (2.5, 0.8))
 """Distance and half the side of each, metres, the furthest first."""
@@ -92,10 +96,12 @@ class _RenderedReferences:
     """Rendered references in place of the store's."""
 
     def __init__(self, extractors: Sequence[FeatureExtractor]) -> None:
-        self._views = {
-            it.name: tuple(_posed_view(f"r{i}", _pose(x_m), it) for i, x_m in enumerate(_CENTRES_X_M))
-            for it in extractors
-        }
+        self._views: dict[tuple[str, int], PosedView] = {}
+        first, *others = extractors
+        views = [(first, i) for i in range(len(_CENTRES_X_M))]
+        views += [(it, i) for it in others for i in _FARTHEST]  # the others answer only where the first cannot
+        with ThreadPoolExecutor(2) as pool:
+            list(pool.map(self._view, *zip(*views, strict=True)))
 
     def load(
         self,
@@ -106,12 +112,18 @@ class _RenderedReferences:
         waits: bool,
     ) -> tuple[int, tuple[PosedView, ...]]:
         """See ReferenceSource."""
-        return 1, self._views[extractor.name]
+        return 1, tuple(self._view(extractor, i) for i in range(len(_CENTRES_X_M)))
+
+    def _view(self, extractor: FeatureExtractor, number: int) -> PosedView:
+        key = extractor.name, number
+        if key not in self._views:
+            self._views[key] = _reference(extractor, number)
+        return self._views[key]
 
     def pair(self, extractor: FeatureExtractor) -> tuple[PosedView, PosedView]:
         """The two references that are farthest apart."""
-        first, *_, last = self._views[extractor.name]
-        return first, last
+        first, last = _FARTHEST
+        return self._view(extractor, first), self._view(extractor, last)
 
     def attributes(self, scene_key: SceneKey) -> SceneAttributes:
         """See ReferenceSource."""
@@ -131,7 +143,8 @@ def _photograph(world_from_camera: RigidTransform) -> bytes:
     return jpeg.tobytes()
 
 
-def _posed_view(name: str, world_from_camera: RigidTransform, extractor: FeatureExtractor) -> PosedView:
+def _reference(extractor: FeatureExtractor, number: int) -> PosedView:
+    name, world_from_camera = f"r{number}", _pose(_CENTRES_X_M[number])
     pixels = _render(world_from_camera)
     photograph = Photograph(lambda: hashlib.sha256(pixels.tobytes()).hexdigest(), _CAMERA, lambda: pixels)
     view = replace(extractor.extract(pixels, _CAMERA), photograph=photograph)
@@ -162,6 +175,7 @@ def _render(world_from_camera: RigidTransform) -> NDArray[np.uint8]:
     return canvas
 
 
+@cache
 def _texture(seed: int) -> NDArray[np.uint8]:
     """Smooth noise at three scales, (512, 512, 3)."""
     random = np.random.default_rng(seed)

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, Row, Select, Table, and_, delete, select, update
-from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.dialects import sqlite
 
 from mapless.names import reference_name, scene_name
 from mapless_server.errors import AlreadyExists, NotFound
@@ -274,7 +274,11 @@ def _exists(key: str) -> ColumnElement[bool]:
 
 def _upsert(connection: Connection, table: Table) -> Any:
     """An INSERT that supports ON CONFLICT; each of the two dialects has its own class for it."""
-    return postgresql.insert(table) if connection.dialect.name == "postgresql" else sqlite.insert(table)
+    if connection.dialect.name == "sqlite":
+        return sqlite.insert(table)
+    from sqlalchemy.dialects import postgresql  # loads three drivers
+
+    return postgresql.insert(table)
 
 
 def _portions(ids: Sequence[str]) -> Iterator[Sequence[str]]:
