@@ -7,11 +7,10 @@ import json
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
+from support.benchmark_layouts import write_cambridge, write_seven_scenes, write_twelve_scenes
 from support.commands import refusal, run
-from support.images import encode
-from support.wall import Shot, wall
+from support.wall import wall
 
 from mapless.geometry import Camera
 
@@ -20,59 +19,10 @@ KINECT = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
 CENTRED = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
 
 
-def write_pose(file: Path, shot: Shot) -> None:
-    np.savetxt(file, shot[1].matrix())
-
-
-def write_7scenes(scene: Path) -> Path:
-    """Even photographs are seq-01, for training; odd ones seq-02, for tests."""
-    for i, shot in enumerate(wall(KINECT)):
-        sequence = scene / f"seq-0{i % 2 + 1}"
-        sequence.mkdir(parents=True, exist_ok=True)
-        (sequence / f"frame-{i // 2:06d}.color.png").write_bytes(encode(".png", shot[0]))
-        write_pose(sequence / f"frame-{i // 2:06d}.pose.txt", shot)
-    (scene / "TrainSplit.txt").write_text("sequence1\n")
-    (scene / "TestSplit.txt").write_text("sequence2\n")
-    return scene
-
-
-def write_12scenes(room: Path) -> Path:
-    """The first three photographs are the queries' sequence."""
-    (room / "data").mkdir(parents=True)
-    for i, shot in enumerate(wall(CENTRED)):
-        (room / "data" / f"frame-{i:06d}.color.jpg").write_bytes(encode(".jpg", shot[0]))
-        write_pose(room / "data" / f"frame-{i:06d}.pose.txt", shot)
-    (room / "split.txt").write_text(
-        "sequence0 [frames=3]  [start=0 ; end=2]\nsequence1 [frames=6]  [start=3 ; end=8]\n"
-    )
-    k = np.eye(4)
-    k[:3, :3] = CENTRED.matrix()
-    (room / "info.txt").write_text(
-        "m_colorWidth = 640\nm_colorHeight = 480\n"
-        f"m_calibrationColorIntrinsic = {' '.join(str(value) for value in k.ravel())}\n"
-    )
-    return room
-
-
-def write_cambridge(scene: Path) -> Path:
-    """Even photographs are references, odd ones queries."""
-    (scene / "seq1").mkdir(parents=True)
-    lines: dict[str, list[str]] = {"train": [], "test": []}
-    cameras = []
-    for i, (image, pose) in enumerate(wall(CENTRED)):
-        (scene / "seq1" / f"frame{i:05d}.png").write_bytes(encode(".png", image))
-        q, centre = pose.inverse().quaternion(), " ".join(map(str, pose.translation))
-        lines["test" if i % 2 else "train"].append(f"seq1/frame{i:05d}.png {centre} {q.w} {q.x} {q.y} {q.z}")
-        cameras.append(f"seq1/frame{i:05d}.jpg\t500 {q.w} {q.x} {q.y} {q.z} {centre} 0 0")
-    for split, its in lines.items():
-        (scene / f"dataset_{split}.txt").write_text("\n".join(["Visual Landmark Dataset V1", "head", "", *its]) + "\n")
-    (scene / "reconstruction.nvm").write_text("\n".join(["NVM_V3", "", str(len(cameras)), *cameras, "", "0"]))
-    return scene
-
-
 @pytest.fixture(scope="module")
 def chess(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_7scenes(tmp_path_factory.mktemp("7scenes") / "chess")
+    shots = wall(KINECT)
+    return write_seven_scenes(tmp_path_factory.mktemp("7scenes") / "chess", shots[::2], shots[1::2])
 
 
 @pytest.fixture(autouse=True)
@@ -117,8 +67,9 @@ def test_a_failed_scene_stops_no_other_and_is_measured_later(chess: Path, tmp_pa
 def test_measures_every_layout(chess: Path, tmp_path: Path) -> None:
     folder, output = tmp_path / "data", tmp_path / "out"
     shutil.copytree(chess, folder / "chess")
-    write_12scenes(folder / "apt1" / "kitchen")
-    write_cambridge(folder / "ShopFacade")
+    shots = wall(CENTRED)
+    write_twelve_scenes(folder / "apt1" / "kitchen", CENTRED, shots[:3], shots[3:])
+    write_cambridge(folder / "ShopFacade", shots[::2], shots[1::2], [500.0] * len(shots))
     done = run("evaluate", folder, "--sparse", "3", "--max-queries", 2, "--worst", 1, "--output", output)
     assert done.exit_code == 0, done.output
     content = json.loads((output / "evaluation.json").read_text())

@@ -8,27 +8,31 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.benchmark_layouts import write_cambridge, write_seven_scenes, write_twelve_scenes
+from support.images import textured
 from support.layouts import assert_reads, assert_same_camera, assert_same_pose, by_name, reasons, truth, write_image
 
 from mapless.geometry import Camera, RadialTangential, RigidTransform
 from mapless_tools.ingest.formats import Intrinsics, ReadOptions, read_dataset
 
 TRUTH = truth(4, Camera(96, 64, 525.0, 525.0, 320.0, 240.0))
+TWELVE_CAMERA = Camera(96, 64, 572.0, 573.0, 47.25, 30.75)
 
 
-def matrix_text(pose: RigidTransform) -> str:
-    return "\n".join("\t".join(f"{x: .10e}" for x in row) + "\t" for row in pose.matrix()) + "\n"
+SHOTS = [(textured(96, 64, seed=i), pose) for i, pose in enumerate(TRUTH.poses)]
+NVM_K = 0.08
 
 
-def write_seven_scenes(scene: Path) -> Path:
-    """Two frames of sequence 1, for references, and two of sequence 2, for queries."""
-    for i, pose in enumerate(TRUTH.poses):
-        folder = scene / f"seq-{1 + i // 2:02d}"
-        write_image(folder / f"frame-{i % 2:06d}.color.png", seed=i)
-        (folder / f"frame-{i % 2:06d}.pose.txt").write_text(matrix_text(pose))
-    (scene / "TrainSplit.txt").write_text("sequence1\n")
-    (scene / "TestSplit.txt").write_text("sequence2\n\n")
-    return scene
+def write_chess(folder: Path) -> Path:
+    return write_seven_scenes(folder / "chess", SHOTS[:2], SHOTS[2:])
+
+
+def write_kitchen(folder: Path) -> Path:
+    return write_twelve_scenes(folder / "apt1" / "kitchen", TWELVE_CAMERA, SHOTS[:1], SHOTS[1:])
+
+
+def write_shop(folder: Path) -> Path:
+    return write_cambridge(folder / "ShopFacade", SHOTS[:2], SHOTS[2:], [70, 71, 72, 73], NVM_K)
 
 
 def pgt_line(image: str, pose: RigidTransform, focal_px: float) -> str:
@@ -39,7 +43,7 @@ def pgt_line(image: str, pose: RigidTransform, focal_px: float) -> str:
 
 
 def test_seven_scenes_has_poses_intrinsics_and_official_split(tmp_path: Path) -> None:
-    dataset = read_dataset(write_seven_scenes(tmp_path / "chess"))
+    dataset = read_dataset(write_chess(tmp_path))
     assert_reads(dataset, TRUTH)
     assert [frame.name for frame in dataset.frames] == [
         "seq-01_frame-000000",
@@ -55,12 +59,12 @@ def test_seven_scenes_has_poses_intrinsics_and_official_split(tmp_path: Path) ->
 
 def test_seven_scenes_takes_intrinsics_that_are_given(tmp_path: Path) -> None:
     given = Intrinsics(500.0, 501.0, 40.0, 30.0)
-    dataset = read_dataset(write_seven_scenes(tmp_path / "chess"), options=ReadOptions(intrinsics=given))
+    dataset = read_dataset(write_chess(tmp_path), options=ReadOptions(intrinsics=given))
     assert_same_camera(dataset.frames[0].camera, given.camera(96, 64))
 
 
 def test_frames_without_a_pose_are_refused_and_the_rest_is_read(tmp_path: Path) -> None:
-    scene = write_seven_scenes(tmp_path / "chess")
+    scene = write_chess(tmp_path)
     (scene / "seq-01" / "frame-000000.pose.txt").write_text("-inf " * 4 + "\n" + "-inf " * 12)
     (scene / "seq-01" / "frame-000001.pose.txt").unlink()
     (scene / "seq-02" / "frame-000000.pose.txt").write_text("1 0 0 0  0 1 0 0  0 0 -1 0  0 0 0 1")
@@ -73,7 +77,7 @@ def test_frames_without_a_pose_are_refused_and_the_rest_is_read(tmp_path: Path) 
 
 
 def test_a_sequence_that_is_still_packed_is_named(tmp_path: Path) -> None:
-    scene = write_seven_scenes(tmp_path / "chess")
+    scene = write_chess(tmp_path)
     shutil.rmtree(scene / "seq-02")
     dataset = read_dataset(scene)
     assert len(dataset.frames) == 2
@@ -81,7 +85,7 @@ def test_a_sequence_that_is_still_packed_is_named(tmp_path: Path) -> None:
 
 
 def test_contradictory_or_invalid_splits_end_the_reading(tmp_path: Path) -> None:
-    scene = write_seven_scenes(tmp_path / "chess")
+    scene = write_chess(tmp_path)
     (scene / "TestSplit.txt").write_text("sequence1\n")
     with pytest.raises(ValueError, match=r"TestSplit\.txt: seq-01 is in both"):
         read_dataset(scene)
@@ -91,7 +95,7 @@ def test_contradictory_or_invalid_splits_end_the_reading(tmp_path: Path) -> None
 
 
 def test_pseudo_ground_truth_replaces_poses_and_focal_length(tmp_path: Path) -> None:
-    scene = write_seven_scenes(tmp_path / "chess")
+    scene = write_chess(tmp_path)
     better = [pose.shifted([0.1, 0.2, 0.3]) for pose in TRUTH.poses]
     images = [f"seq-{1 + i // 2:02d}/frame-{i % 2:06d}.color.png" for i in range(4)]
     lines = [pgt_line(image, pose, 526.5) for image, pose in zip(images, better, strict=True)]
@@ -112,7 +116,7 @@ def test_pseudo_ground_truth_replaces_poses_and_focal_length(tmp_path: Path) -> 
 
 
 def test_ground_truth_that_is_not_there_or_malformed_is_named(tmp_path: Path) -> None:
-    scene = write_seven_scenes(tmp_path / "chess")
+    scene = write_chess(tmp_path)
     with pytest.raises(ValueError, match="no ground truth of chess"):
         read_dataset(scene, options=ReadOptions(ground_truth=tmp_path))
     (tmp_path / "chess.txt").write_text("seq-01/frame-000000.color.png 1 0 0 0 1 2 3\n")
@@ -120,30 +124,16 @@ def test_ground_truth_that_is_not_there_or_malformed_is_named(tmp_path: Path) ->
         read_dataset(scene, options=ReadOptions(ground_truth=tmp_path))
 
 
-def write_twelve_scenes(room: Path) -> Path:
-    for i, pose in enumerate(TRUTH.poses):
-        write_image(room / "data" / f"frame-{i:06d}.color.jpg", seed=i)
-        (room / "data" / f"frame-{i:06d}.pose.txt").write_text(matrix_text(pose))
-    (room / "info.txt").write_text(
-        "m_versionNumber = 4\nm_sensorName = StructureSensor\nm_colorWidth = 96\nm_colorHeight = 64\n"
-        "m_calibrationColorIntrinsic = 572 0 47.25 0 0 573 30.75 0 0 0 1 0 0 0 0 1 \n"
-    )
-    (room / "split.txt").write_text(
-        "sequence0 [frames=1]  [start=0 ; end=0]\nsequence1 [frames=3]  [start=1 ; end=3]\n"
-    )
-    return room
-
-
 def test_twelve_scenes_takes_the_first_sequence_for_queries(tmp_path: Path) -> None:
-    dataset = read_dataset(write_twelve_scenes(tmp_path / "apt1" / "kitchen"))
-    assert_reads(dataset, replace(TRUTH, camera=Camera(96, 64, 572.0, 573.0, 47.25, 30.75)))
+    dataset = read_dataset(write_kitchen(tmp_path))
+    assert_reads(dataset, replace(TRUTH, camera=TWELVE_CAMERA))
     assert [frame.split for frame in dataset.frames] == ["test", "train", "train", "train"]
     assert (dataset.format, dataset.name) == ("12scenes", "apt1_kitchen")
     assert dataset.frames[0].name == "frame-000000"
 
 
 def test_twelve_scenes_with_pseudo_ground_truth(tmp_path: Path) -> None:
-    room = write_twelve_scenes(tmp_path / "apt1" / "kitchen")
+    room = write_kitchen(tmp_path)
     line = pgt_line("data/frame-000001.color.jpg", TRUTH.poses[2], 1167.8)
     (tmp_path / "apt1_kitchen_train.txt").write_text(line)
     dataset = read_dataset(room, options=ReadOptions(ground_truth=tmp_path))
@@ -166,36 +156,14 @@ def test_twelve_scenes_with_pseudo_ground_truth(tmp_path: Path) -> None:
     ],
 )
 def test_twelve_scenes_names_file_and_field(tmp_path: Path, file: str, text: str, message: str) -> None:
-    room = write_twelve_scenes(tmp_path / "apt1" / "kitchen")
+    room = write_kitchen(tmp_path)
     (room / file).write_text(text)
     with pytest.raises(ValueError, match=message):
         read_dataset(room)
 
 
-NVM_K = 0.08
-
-
-def write_cambridge(scene: Path) -> Path:
-    """Two references and two queries, as VisualSFM poses them."""
-    nvm = []
-    lines: dict[str, list[str]] = {"train": [], "test": []}
-    for i, pose in enumerate(TRUTH.poses):
-        image = f"seq{1 + i // 2}/frame{i:05d}.png"
-        write_image(scene / image, seed=i)
-        q = pose.inverse().quaternion()
-        rotation = f"{q.w:.9f} {q.x:.9f} {q.y:.9f} {q.z:.9f}"
-        x, y, z = pose.translation
-        lines["train" if i < 2 else "test"].append(f"{image} {x} {y} {z} {rotation}")
-        nvm.append(f"{image[:-4]}.jpg\t{70 + i} {rotation} {x} {y} {z} {NVM_K} 0")
-    for split, rows in lines.items():
-        head = "Visual Landmark Dataset V1\nImageFile, Camera Position [X Y Z W P Q R]\n\n"
-        (scene / f"dataset_{split}.txt").write_text(head + "\n".join(rows) + "\n")
-    (scene / "reconstruction.nvm").write_text("NVM_V3 \n\n4\n" + "\n".join(nvm) + "\n\n0\n")
-    return scene
-
-
 def test_cambridge_has_centres_rotations_split_and_focals(tmp_path: Path) -> None:
-    dataset = read_dataset(write_cambridge(tmp_path / "ShopFacade"))
+    dataset = read_dataset(write_shop(tmp_path))
     assert dataset.refused == ()
     assert [frame.split for frame in dataset.frames] == ["train", "train", "test", "test"]
     for i, (frame, pose) in enumerate(zip(dataset.frames, TRUTH.poses, strict=True)):
@@ -209,7 +177,7 @@ def test_cambridge_has_centres_rotations_split_and_focals(tmp_path: Path) -> Non
 
 def test_cambridges_distortion_undoes_visualsfms(tmp_path: Path) -> None:
     """VisualSFM's takes a seen point to an ideal one, ours an ideal one to where it is seen."""
-    camera = read_dataset(write_cambridge(tmp_path / "ShopFacade")).frames[0].camera
+    camera = read_dataset(write_shop(tmp_path)).frames[0].camera
     assert isinstance(camera.distortion, RadialTangential)
     ideal = np.array([[0.1, 0.2], [-0.4, 0.3], [0.5, -0.2]])
     seen = camera.distortion.distort(ideal)
@@ -218,7 +186,7 @@ def test_cambridges_distortion_undoes_visualsfms(tmp_path: Path) -> None:
 
 
 def test_cambridge_without_its_reconstruction_needs_intrinsics(tmp_path: Path) -> None:
-    scene = write_cambridge(tmp_path / "ShopFacade")
+    scene = write_shop(tmp_path)
     (scene / "reconstruction.nvm").unlink()
     with pytest.raises(ValueError, match=r"reconstruction\.nvm cannot be read"):
         read_dataset(scene)
@@ -227,7 +195,7 @@ def test_cambridge_without_its_reconstruction_needs_intrinsics(tmp_path: Path) -
 
 
 def test_cambridge_refuses_single_frames_with_their_reasons(tmp_path: Path) -> None:
-    scene = write_cambridge(tmp_path / "ShopFacade")
+    scene = write_shop(tmp_path)
     (scene / "seq2" / "frame00002.png").unlink()
     file = scene / "dataset_train.txt"
     extra = "seq1/frame00000.png 0 0 0 1 0 0 0\nseq1/other.png 1 2 3 0.5 0 0 0\n../out.png 0 0 0 1 0 0 0\n"
@@ -241,7 +209,7 @@ def test_cambridge_refuses_single_frames_with_their_reasons(tmp_path: Path) -> N
 
 
 def test_a_reconstruction_that_is_cut_off_is_named(tmp_path: Path) -> None:
-    scene = write_cambridge(tmp_path / "ShopFacade")
+    scene = write_shop(tmp_path)
     file = scene / "reconstruction.nvm"
     file.write_text("\n".join(file.read_text().splitlines()[:5]))
     with pytest.raises(ValueError, match=r"reconstruction\.nvm:\d+: .*4 cameras are announced"):
