@@ -8,9 +8,9 @@ import time
 PACED_CODES = frozenset({"RESOURCE_EXHAUSTED", "UNAUTHENTICATED", "PERMISSION_DENIED"})
 """Of what a caller may repeat as fast as it is answered. UNAVAILABLE is not among them, which sends it elsewhere."""
 
-PER_S = 100
-"""Refusals a second, of all callers, that are not delayed: 3 % of a core. A server of twenty answers a second refuses
-fewer at three times what it can do, if its callers wait as long as each refusal says."""
+PER_S = 50
+"""Refusals a second, of all callers, that are not delayed: 2 % of a core. A server of twenty answers a second refuses
+fewer at three times what it can do."""
 
 BURST = 50
 """So many are not delayed although they come at once."""
