@@ -119,7 +119,7 @@ def test_failures_are_outcomes(client: PlantedClient) -> None:
     assert "'32FC1' is none of" in localizer.localize(wrong, RosCamera(CAMERA)).message
 
 
-def test_an_initial_pose_is_moved_by_odometry_until_an_image_is_localized(client: PlantedClient) -> None:
+def test_odometry_moves_an_initial_pose_until_localized(client: PlantedClient) -> None:
     localizer = make(client)
     given = MAP_FROM_ODOM.compose(drive(1.0))
     localizer.guess(pose_with_covariance(at(1.0), "/map", given, np.diag([0.25, 0.25, 0, 0, 0, 0.07])), 0)

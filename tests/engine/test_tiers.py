@@ -135,7 +135,7 @@ class TestBetter:
 
     @pytest.mark.parametrize("reason", [RejectionReason.GATE, RejectionReason.AMBIGUOUS])
     @pytest.mark.parametrize(("inliers", "is_answered"), [(44, False), (45, True)])
-    def test_a_rejected_pose_elsewhere_contradicts_unless_clearly_weaker(
+    def test_a_rejected_pose_elsewhere_contradicts_unless_weaker(
         self, reason: RejectionReason, inliers: int, is_answered: bool
     ) -> None:
         for share, expected in ((0.9, True), (1.1, is_answered)):

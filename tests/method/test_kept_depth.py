@@ -78,7 +78,7 @@ def test_a_keypoint_that_only_the_query_matches_gets_a_point() -> None:
     assert np.quantile(off, 0.99) < 0.02, "half a pixel at four metres is a few millimetres"
 
 
-def test_triangulated_points_come_first_and_single_ones_are_matched() -> None:
+def test_triangulated_points_come_before_single_ones() -> None:
     references = tuple(with_depths(i) for i in range(3))
     structure, correspondences = matched(references)
     found = with_kept_depths(structure, references, correspondences, ALWAYS)
@@ -92,7 +92,7 @@ def test_triangulated_points_come_first_and_single_ones_are_matched() -> None:
     assert len(set(pairs)) == len(pairs), "no keypoint observes two points"
 
 
-def test_a_point_that_its_depth_knows_better_moves_by_what_both_know() -> None:
+def test_a_point_moves_to_the_weighted_mean_with_its_depth() -> None:
     """Along the plane's normal it is the mean of both, weighted by their information; others stay."""
     references = (with_depths(0, noise=0.001), *SCENE.references[1:])
     structure, correspondences = matched(references)
@@ -113,7 +113,7 @@ def test_a_point_that_its_depth_knows_better_moves_by_what_both_know() -> None:
     assert (found.x_in_world[: len(used)] == structure.x_in_world)[~used].all()
 
 
-def test_where_triangulated_points_suffice_the_answer_is_the_same() -> None:
+def test_where_triangulated_points_suffice_depths_change_nothing() -> None:
     references = tuple(with_depths(i) for i in range(3))
     structure, correspondences = matched(references)
     assert with_kept_depths(structure, references, correspondences) is structure
@@ -154,7 +154,7 @@ def test_planes_are_in_the_normal_equations_as_in_the_cost() -> None:
             assert 2 * equations.point_gradient[axis, point] == pytest.approx((ahead - behind) / (2 * step), rel=1e-3)
 
 
-def test_references_that_share_nothing_give_points_by_their_depths() -> None:
+def test_references_that_share_nothing_give_points_by_depth() -> None:
     """Without depths the pose is from matches with the references themselves, or there is none."""
     parts = []
     for index, reference in enumerate(SCENE.references):

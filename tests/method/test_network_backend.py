@@ -149,7 +149,7 @@ def test_a_reconstruction_on_the_device_equals_the_fetched_one(name: str) -> Non
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_photographs_of_odd_shapes_and_intrinsics_are_reconstructed(name: str) -> None:
+def test_odd_shapes_and_intrinsics_are_reconstructed(name: str) -> None:
     """A panorama that fits no grid, references of mixed sizes, one whose focal length is thrice too long."""
     query = view_of(photograph(textured(400, 40, seed=9)))
     photos = [photograph(textured(*size, seed=i)) for i, size in enumerate([(96, 72), (72, 96), (640, 480)])]

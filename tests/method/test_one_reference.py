@@ -168,7 +168,7 @@ def test_exact_depths_give_the_exact_pose() -> None:
     np.testing.assert_allclose(answer.world_from_camera.rotation, given.world_from_query.rotation, atol=1e-3)
 
 
-def test_the_covariance_contains_the_metres_uncertainty_along_the_step() -> None:
+def test_the_covariance_has_the_metres_error_along_the_step() -> None:
     given = planted(random_for("covariance"), Errors(), metre_sigma=0.2)
     precise = found(replace(given, reconstruction=replace(given.reconstruction, metre_sigma=0.0)))
     answer = found(given)

@@ -129,7 +129,7 @@ def test_of_two_frames_the_last_is_where_its_photograph_says(apart_m: float) -> 
     np.testing.assert_allclose(last.translation, found.world_from_camera[-1].translation, atol=1e-6)
 
 
-def test_a_jump_before_frames_without_matches_is_between_the_others() -> None:
+def test_a_jump_before_frames_without_matches_is_found() -> None:
     random = random_for("gap")
     truth = walk(random, 6)
     images = images_of(random, truth, alone=True, own_noise_m=0.005)
@@ -152,7 +152,7 @@ def test_a_jump_is_found_at_a_frame_with_too_few_matches_alone() -> None:
         assert error_m(found.world_from_camera[2], truth[2]) < 0.02
 
 
-def test_a_last_frame_that_contradicts_its_tracked_pose_is_rejected() -> None:
+def test_a_last_frame_that_contradicts_tracking_is_rejected() -> None:
     """It has too few matches for a pose, and none is where the tracking says."""
     random = random_for("lost")
     truth = walk(random, 4)

@@ -145,7 +145,7 @@ def test_a_small_network_has_the_official_output(case: str, network: MapAnything
 
 
 @pytest.mark.parametrize(("small", "file"), [(True, "small_state_dict"), (False, "mapanything_state_dict")])
-def test_networks_have_the_official_entries_under_all_their_names(small: bool, file: str) -> None:
+def test_networks_have_all_official_entries_by_name(small: bool, file: str) -> None:
     entries = json.loads(existing(BESIDE / f"{file}.json").read_text())["keys"]
     assert all(canonical_name(key) == entry.get("alias_of", key) for key, entry in entries.items())
     state = network_without_weights("mapanything", small).state_dict()
@@ -296,7 +296,7 @@ def test_a_mirrored_quaternion_is_the_same_rotation() -> None:
     torch.testing.assert_close(rotations @ rotations.mT, torch.eye(3, dtype=torch.float64).expand(50, 3, 3))
 
 
-def test_views_at_the_place_of_the_first_do_not_count_for_the_scale() -> None:
+def test_views_at_the_place_of_the_first_do_not_scale() -> None:
     places = torch.tensor([[[5.0, 1, 2], [5.0, 1, 2], [8.0, 1, 2], [5.0, 6, 2], [90.0, 0, 0]]])
     identity = torch.tensor([0.0, 0, 0, 1]).expand(1, 5, 4)
     relative = relative_poses(identity, places, torch.tensor([[True, True, True, True, False]]))

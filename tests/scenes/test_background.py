@@ -186,7 +186,7 @@ class TestResults:
             server.background.match_waiting()
             assert set(server.stored()) == {("r0", "r1"), ("r3", "r4")}
 
-    def test_what_is_added_during_a_calibration_is_matched_before_the_next(self, store: Store) -> None:
+    def test_what_a_calibration_missed_is_matched_before_the_next(self, store: Store) -> None:
         server, waiting = Server(store, widths=[False]), list[int]()
 
         class Calibrations:

@@ -131,7 +131,7 @@ def test_what_a_neighbours_run_has_made_is_not_made_again(store: Store) -> None:
     assert it.kept() == {"a", "b", "c"}
 
 
-def test_a_dropped_depth_is_not_tried_again_but_a_neighbours_run_may_keep_it(store: Store) -> None:
+def test_a_dropped_depth_is_kept_only_by_a_neighbours_run(store: Store) -> None:
     it = work(store, {"a": {"a": None, "b": None}, "b": {"b": DEPTH, "a": DEPTH}, "c": {}})
     it.run()
     it.run()
@@ -178,7 +178,7 @@ def test_the_end_of_the_server_stores_nothing_more(store: Store, is_abandoned: b
     assert len(it.kept()) == (2 if is_abandoned else 3)
 
 
-def test_a_server_without_a_maker_makes_none_and_keeps_others_in_use(store: Store) -> None:
+def test_a_server_without_a_maker_uses_depths_of_others(store: Store) -> None:
     it = work(store)
     it.run()
     user = SceneDepths(store, it.finder, None, PairObserver())

@@ -304,7 +304,7 @@ def test_known_distances_and_positions_give_a_scene_metres(
     assert "on one line" in done.stderr
 
 
-def test_a_scene_made_before_the_import_gets_the_unit_of_its_references(
+def test_a_scene_made_before_gets_its_references_unit(
     server: RunningServer, client: Client, scene: str, folder: Path
 ) -> None:
     client.create_scene(scene)
@@ -348,7 +348,7 @@ def test_what_contradicts_the_photographs_is_warned_of(
     assert any(warning in text for text in warnings) if warning else (warnings == [])
 
 
-def test_references_in_another_unit_than_their_scene_are_warned_of(
+def test_references_in_another_unit_are_warned_of(
     server: RunningServer, client: Client, scene: str, folder: Path
 ) -> None:
     assert run_import(server, folder, scene, "--skip-check", "--split", "train").exit_code == 0

@@ -92,9 +92,7 @@ def test_a_taken_port_is_not_shared(server: RunningServer, refusal: Callable[...
     ("environment", "threads", "heaps"),
     [({}, "1", range(1, 2)), ({"OPENBLAS_NUM_THREADS": "2", "MALLOC_ARENA_MAX": "3"}, "2", range(2, 4))],
 )
-def test_libraries_have_one_thread_and_one_heap_unless_set_otherwise(
-    environment: dict[str, str], threads: str, heaps: range
-) -> None:
+def test_libraries_have_one_thread_and_heap_unless_set(environment: dict[str, str], threads: str, heaps: range) -> None:
     """The libraries read the environment when they are imported; each heap keeps what threads needed for a moment."""
     program = """if True:
         import ctypes, os, sys, threading

@@ -182,7 +182,7 @@ def test_answers_say_that_the_unit_is_arbitrary(client: Client) -> None:
     client.delete_scene("units")
 
 
-def test_an_update_that_contradicts_the_references_is_stored_and_said(client: Client, scene: str) -> None:
+def test_an_update_that_contradicts_references_is_reported(client: Client, scene: str) -> None:
     """The references' cameras are upright in a world whose y is down."""
     updated = client.update_scene(scene, down_in_world=(0.0, -1.0, 0.0))
     assert updated.down_in_world == (0.0, -1.0, 0.0)

@@ -138,7 +138,7 @@ def test_one_distance_gives_the_scale_and_several_agree() -> None:
         assert scales == pytest.approx(METRES_FROM_UNITS.scale, rel=1e-9)
 
 
-def test_distances_within_the_bound_are_averaged_and_beyond_refused() -> None:
+def test_distances_within_the_bound_are_averaged_others_refused() -> None:
     known = centres()
     good = (distance(0, 1, known, 1.02), distance(2, 3, known, 0.985))
     assert in_metres(dataset_of(known), MetreOptions(distances=good)).metric
