@@ -19,6 +19,7 @@ from mapless_server.method.correspond import (
     OPTIONS,
     CorrespondOptions,
     Matcher,
+    SharedThreads,
     best_of_both,
     epipolar_distance_px,
     epipolar_distances_px,
@@ -511,3 +512,24 @@ def test_every_extractor_has_its_options() -> None:
         assert make_matcher(name).options == OPTIONS[name]
     with pytest.raises(ValueError, match="unknown features 'surf'"):
         make_matcher("surf")
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_shared_threads_compute_each_item_once_and_in_order(threads: int) -> None:
+    shared, seen = SharedThreads(threads), list[int]()
+
+    def compute(item: int) -> Matches:
+        seen.append(item)
+        if item == 77:
+            raise TimeoutError
+        return np.full((1, 2), item, np.int32)
+
+    items = [*range(70), 80]
+    assert [int(found[0, 0]) for found in shared.map(compute, items)] == items
+    assert sorted(seen) == items
+    assert shared.map(compute, []) == []
+    seen.clear()
+    with pytest.raises(TimeoutError):
+        shared.map(compute, range(1000))
+    assert len(seen) < 1000, "no item is begun after a failure"
+    shared.close()
