@@ -459,6 +459,41 @@ def test_pairs_of_a_deleted_reference_leave_the_cache(matched_pairs: list[tuple[
     assert len(matched_pairs) == 5
 
 
+# Choosing references
+
+
+def best_by_count(count: int) -> Callable[[Sequence[int], Sequence[int]], list[int]]:
+    """Chooses the references with the most matches."""
+    return lambda indices, counts: [i for _, i in sorted(zip((-it for it in counts), indices, strict=True))[:count]]
+
+
+@pytest.mark.parametrize(("enough", "matched"), [(1.0, 6 + 2), (1e6, 6 + 6)])
+def test_references_are_chosen_by_a_sample_unless_it_has_few_matches(
+    matched_pairs: list[tuple[Features, Features]], enough: float, matched: int
+) -> None:
+    scene = make_scene(random_for("chosen"), SceneOptions(reference_count=6, point_count=200))
+    keep = [slice(None, None, step) for step in (4, 1, 4, 4, 1, 4)]  # two references share the most with the query
+    references = [
+        replace(r, view=replace(r.view, features=Features(*(a[rows] for a in vars(r.view.features).values()))))
+        for r, rows in zip(scene.references, keep, strict=True)
+    ]
+    matcher = Matcher(CorrespondOptions(enough_sampled=enough))
+    found = matcher.match_best(scene.query, references, 2, best_by_count(2))
+    assert len(matched_pairs) == matched
+    assert sorted(found) == [1, 4]
+    assert [len(it) for it in found.values()] == sorted((len(it) for it in found.values()), reverse=True)
+    for i, matches in found.items():
+        (expected,) = matcher.match_quickly(scene.query, [references[i]])
+        np.testing.assert_array_equal(matches, expected)
+
+
+def test_where_there_is_nothing_to_choose_each_is_matched_once(matched_pairs: list[tuple[Features, Features]]) -> None:
+    scene = make_scene(random_for("no choice"), SceneOptions(reference_count=3, point_count=100))
+    assert sorted(Matcher().match_best(scene.query, scene.references, 3, best_by_count(3))) == [0, 1, 2]
+    assert len(matched_pairs) == 3
+    assert Matcher().match_best(scene.query, [], 3, best_by_count(3)) == {}
+
+
 # Query matching
 
 

@@ -43,8 +43,8 @@ log = logging.getLogger(__name__)
 PREPARE, COARSE, REFINE = "prepare", "coarse", "refine"
 
 SHORTLIST = 2
-"""So many times the references wanted are matched with the photograph, and the best of them used (see BENCHMARKS.md).
-Those that are chosen would have been matched anyhow."""
+"""So many times the references wanted are matched with a sample of the photograph, and the best of them used (see
+BENCHMARKS.md)."""
 
 THINNED_LATER = RankOptions(nearby_weight=1.0)
 """References near one another are thinned out by their matches, which show better what each is worth."""
@@ -305,11 +305,15 @@ class QueryStages:
         choice = run.source.choose(query.scene_key, run.views, selection, context)
         generation, shortlist = self._load_chosen(run, [it.reference_id for it in choice.references], tier)
         view = run.views.view(tier.extractor, context)
+
+        def choose(indices: Sequence[int], match_counts: Sequence[int]) -> list[int]:
+            centres = [shortlist[i].world_from_camera.translation for i in indices]
+            return [indices[i] for i in spread_choice(match_counts, centres, query.reference_count)]
+
         with context.stage("shortlist"):
-            matches = tier.pipeline.matcher.match_quickly(view, shortlist, context.check)
-        centres = [reference.world_from_camera.translation for reference in shortlist]
-        order = spread_choice([len(it) for it in matches], centres, query.reference_count)
-        references, query_matches = tuple(shortlist[i] for i in order), tuple(matches[i] for i in order)
+            matcher = tier.pipeline.matcher
+            matches = matcher.match_best(view, shortlist, query.reference_count, choose, context.check)
+        references, query_matches = tuple(shortlist[i] for i in matches), tuple(matches.values())
         return replace(
             run, generation=generation, references=references, view=view, choice=choice, query_matches=query_matches
         )

@@ -45,6 +45,10 @@ class Features:
         """Memory of the arrays, bytes."""
         return self.keypoints.nbytes + self.descriptors.nbytes + self.sizes_px.nbytes
 
+    def every(self, step: int) -> Features:
+        """The features 0, step, 2 step, ..."""
+        return Features(self.keypoints[::step], self.descriptors[::step], self.sizes_px[::step])
+
     def unit_descriptors(self, rows: NDArray[np.intp] | slice = slice(None)) -> NDArray[np.float32]:
         """Converts some descriptors, or all, to (R, D) float32 of unit length, so that a product is a cosine.
 
