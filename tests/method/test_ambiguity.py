@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from support import corner
 from support.compare import assert_pose_close
+from support.planted import moved_references
 from support.scenes import make_scene, random_for
 
 from mapless.geometry import RigidTransform, rotation_from_vector
@@ -19,6 +21,7 @@ from mapless_server.method.features import make_extractor
 from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
+from mapless_server.method.pnp import ransac
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.trust import ambiguity
 from mapless_server.method.views import PosedView, View
@@ -32,10 +35,8 @@ PIPELINE = Pipeline(matcher=Matcher())
 
 def copied(references: Sequence[PosedView], which: Sequence[int], where: RigidTransform) -> tuple[PosedView, ...]:
     """The references, some of which (by index) stand in the copy."""
-    return tuple(
-        replace(r, key=f"{r.key}-copy", world_from_camera=where.compose(r.world_from_camera)) if i in which else r
-        for i, r in enumerate(references)
-    )
+    there = moved_references(tuple(references), where)
+    return tuple(there[i] if i in which else r for i, r in enumerate(references))
 
 
 def answer_of(references: Sequence[PosedView], query: View = SCENE.query) -> Answer:
@@ -51,7 +52,7 @@ def rejected(answer: Answer) -> Rejection:
 def test_both_of_two_identical_places_are_hypotheses(offset_m: float) -> None:
     """Every second reference stands in the copy: nothing decides."""
     far = RigidTransform(np.eye(3), np.array([offset_m, -offset_m, 0.0]))
-    references = [replace(r, world_from_camera=far.compose(r.world_from_camera)) for r in SCENE.references]
+    references = moved_references(SCENE.references, far)
     rejection = rejected(answer_of(copied(references, (1, 3, 5), ELSEWHERE)))
     assert rejection.reason is RejectionReason.AMBIGUOUS
     truth = far.compose(SCENE.world_from_query)
@@ -99,6 +100,21 @@ def test_no_second_pose_is_searched_if_nearly_all_matches_agree(monkeypatch: pyt
     """Most queries are saved the search."""
     monkeypatch.setattr(ambiguity, "ransac", None)
     assert isinstance(answer_of(SCENE.references).outcome, Localization)
+
+
+def test_outliers_without_a_common_pose_are_no_second_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of the keypoints lie anywhere."""
+    search = Mock(wraps=ransac)
+    monkeypatch.setattr(ambiguity, "ransac", search)
+    query, random = SCENE.query, random_for("outliers")
+    keypoints = query.features.keypoints.copy()
+    wrong = random.permutation(len(keypoints))[: len(keypoints) // 2]
+    keypoints[wrong] = random.uniform((0, 0), (query.camera.width_px, query.camera.height_px), (len(wrong), 2))
+    query = replace(query, features=replace(query.features, keypoints=keypoints))
+    outcome = answer_of(SCENE.references, query).outcome
+    assert isinstance(outcome, Localization), outcome
+    assert_pose_close(outcome.world_from_camera, SCENE.world_from_query, metres=0.02, degrees=0.3)
+    search.assert_called_once()
 
 
 def test_a_photo_that_fits_two_identical_rooms_is_ambiguous() -> None:
