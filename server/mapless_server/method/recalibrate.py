@@ -27,7 +27,7 @@ WIDE_SIGMA = np.array([0.3, 0.3, 0.3, 1.0])
 MAX_HELD = 3.0
 """An estimate that leaves the prior by more standard deviations has diverged."""
 LINEAR_CHANGE = np.array([0.01, 0.01, 0.01, 0.02])
-"""Changes in the same units below which keypoints move in proportion to them, to a tenth of a pixel."""
+"""Changes, in the units of `WIDE_SIGMA`, below which keypoints move in proportion to them, to a tenth of a pixel."""
 LEAST_MATCHES = 20
 """For a pose and intrinsics."""
 ROUGHLY = 2.0
