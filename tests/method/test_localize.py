@@ -541,7 +541,7 @@ def test_a_coarse_answer_has_the_initial_pose_and_its_stage() -> None:
     for backend in ("geometric", "network", "device"):
         offset = np.full(3, 1e5)
         far = [replace(r, world_from_camera=r.world_from_camera.shifted(offset)) for r in SCENE.references]
-        pipeline = pipeline_of(backend, options=ROUGH)
+        pipeline = replace(pipeline_of(backend, options=ROUGH), matcher=Matcher())  # the structure is another one
         prepared = prepare(SCENE.query, far, pipeline, LocalizeOptions(), StageContext())
         assert isinstance(prepared, Prepared)
         answer = coarse_answer(coarse_of(reconstruct([prepared])[0]))
