@@ -241,7 +241,7 @@ class TestOrder:
 
     def test_a_larger_batch_is_tried_again_ever_more_rarely(self) -> None:
         toy = Toy(WorkQueueOptions(max_queued_s=1e9))
-        toy.scheduler.limit_batch("coarse", "b", 1)
+        toy.scheduler.limit_batch("coarse", "b", 2)
         sizes: list[int] = []
         for _ in range(300):
             for _ in range(4):
@@ -249,12 +249,24 @@ class TestOrder:
             while (batch := toy.scheduler.take("device", toy.now_s)) is not None:
                 sizes.append(len(batch.jobs))
                 if len(batch.jobs) > 1:  # it does not fit, and its halves do
-                    toy.scheduler.limit_batch("coarse", "b", 1)
+                    toy.scheduler.limit_batch("coarse", "b", len(batch.jobs))
                 toy.finish(batch, *[Done("result")] * len(batch.jobs))
         large = [i for i, size in enumerate(sizes) if size > 1]
         between = [later - earlier - 1 for earlier, later in itertools.pairwise([-1, *large])]
         assert between == [64, 128, 256, 512]
         assert set(sizes) == {1, 2}
+
+    def test_a_trial_that_fails_leaves_the_size_that_fits(self) -> None:
+        toy, sizes = Toy(WorkQueueOptions(max_queued_s=1e9)), []
+        for _ in range(400):
+            for _ in range(3):
+                toy.admit(stage="coarse", bucket="b", deadline_s=1e9)
+            batch = toy.take("device")
+            sizes.append(len(batch.jobs))
+            if len(batch.jobs) == 3:
+                toy.scheduler.limit_batch("coarse", "b", 3)
+            toy.finish(batch, *[Done("result")] * len(batch.jobs))
+        assert sizes == [3, *[1] * 64, *[2] * 128, 3, *[2] * 206]
 
     def test_a_lane_computes_as_much_at_a_time_as_it_has_threads(self) -> None:
         toy = Toy(WorkQueueOptions(max_queued_s=1000))

@@ -85,17 +85,24 @@ class _BatchLimit:
         size: the number.
         batches: batches of this size that have fitted since it changed.
         trials: how often a larger size was tried.
+        fits: the size before the last trial, which had fitted; 0 before any, or if something has failed since.
     """
 
     size: int
     batches: int = 0
     trials: int = 0
+    fits: int = 0
 
     def fitted(self, size: int) -> None:
         """Counts a batch; raises the limit by one when it has been kept for long enough."""
         self.batches += size == self.size
         if self.batches >= _TRY_LARGER_AFTER << min(self.trials, 10):
-            self.size, self.batches, self.trials = self.size + 1, 0, self.trials + 1
+            self.size, self.batches, self.trials, self.fits = self.size + 1, 0, self.trials + 1, self.size
+
+    def failed(self, size: int) -> None:
+        """Lowers the limit, since a batch did not fit: to the size before the trial, otherwise to half of the batch."""
+        lower = self.fits if 0 < self.fits < size else size // 2
+        self.size, self.batches, self.fits = max(1, min(lower, self.size)), 0, 0
 
 
 class Scheduler:
@@ -275,14 +282,12 @@ class Scheduler:
             else:
                 self._give_fallback(job, job.fallback, now_s)
 
-    def limit_batch(self, stage: str, bucket: str, size: int) -> None:
-        """Limits the number of jobs of a bucket that are computed together, because more did not fit in memory.
+    def limit_batch(self, stage: str, bucket: str, failed: int) -> None:
+        """Limits the number of jobs of a bucket that are computed together, because `failed` did not fit in memory.
 
         After some batches that fit one more is tried, since another program may have had the memory.
         """
-        limit = self._limits.setdefault((stage, bucket), _BatchLimit(size))
-        limit.size = max(1, min(size, limit.size))
-        limit.batches = 0
+        self._limits.setdefault((stage, bucket), _BatchLimit(failed)).failed(failed)
 
     def drain(self) -> None:
         """Admits nothing from now on."""

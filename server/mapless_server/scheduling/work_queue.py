@@ -322,7 +322,7 @@ class WorkQueue:
         half = len(jobs) // 2
         if failure is Failure.OUT_OF_MEMORY:
             with self._lock:
-                self._scheduler.limit_batch(stage.name, jobs[0].step.bucket, half)
+                self._scheduler.limit_batch(stage.name, jobs[0].step.bucket, len(jobs))
         return self._compute_batch(stage, jobs[:half]) + self._compute_batch(stage, jobs[half:])
 
     def _classify(self, error: Exception) -> Failure:
