@@ -18,7 +18,8 @@ from support.scenes import CAMERA, SceneOptions, SyntheticScene, arc_poses, make
 from mapless.geometry import Array, RigidTransform
 from mapless_server.method import structure as stage
 from mapless_server.method.arrays import SYMMETRIC, columns, invert_symmetric, rows, solve_columns
-from mapless_server.method.correspond import Correspondences, CorrespondOptions, Matcher
+from mapless_server.method.cache import LruCache
+from mapless_server.method.correspond import Correspondences, CorrespondOptions, MatchedReferences, Matcher
 from mapless_server.method.observations import (
     MIN_NOISE_LEVEL_PX,
     ONE_PIXEL,
@@ -535,3 +536,13 @@ def test_structures_are_bounded_and_leave_with_their_references(triangulations: 
     assert len(triangulations) == 4
     triangulated_by(matcher, scene, [b, c, d])
     assert len(triangulations) == 5
+
+
+def test_sets_without_any_point_are_bounded_too() -> None:
+    scene = make_scene(random_for("no points"), SceneOptions(point_count=50, reference_count=3))
+    cache = LruCache[Any](100_000)
+    for number in range(100):
+        references = tuple(replace(it, key=f"{it.key} {number}") for it in scene.references)
+        nothing = Correspondences({}, (), MatchedReferences(references, "rule", cache))
+        assert not len(triangulated_structure(references, nothing, StructureOptions()).x_in_world)
+    assert cache.evictions > 0

@@ -38,6 +38,9 @@ from .results import KeypointNoise, MetricScale, Structure
 from .tracks import Tracks, build_tracks, keypoint_depths, keypoint_offsets, keypoint_rays
 from .views import Matches, PosedView, Reconstruction
 
+ENTRY_BYTES = 2048
+"""Of a cached structure besides its arrays: objects, and the keys of ten references. Many have no points at all."""
+
 
 @dataclass(frozen=True)
 class StructureOptions:
@@ -125,7 +128,7 @@ def triangulated_structure(
     if structure is None:
         structure = _triangulated(given, order, correspondences.reference_pairs, options)
         if source is not None:
-            source.cache.put(source.key(options), structure, structure.size_bytes)
+            source.cache.put(source.key(options), structure, structure.size_bytes + ENTRY_BYTES)
     return structure.moved(order, references[order[0]].world_from_camera.translation)
 
 
