@@ -71,6 +71,7 @@ class Given(Matcher):
     def __init__(self, correspondences: Correspondences) -> None:
         super().__init__()
         self._given = correspondences
+        self.matched: list[Sequence[PosedView]] = []
 
     def correspond(
         self,
@@ -80,6 +81,7 @@ class Given(Matcher):
         check: Callable[[], None] = lambda: None,
         query_matches: Sequence[Matches] | None = None,
     ) -> Correspondences:
+        self.matched.append(references)
         return self._given
 
 
@@ -220,6 +222,18 @@ def test_localize_answers_where_nothing_can_be_triangulated() -> None:
     failed = localize(problem.query, problem.references[:1], pipeline, LocalizeOptions()).outcome
     assert isinstance(failed, Rejection)
     assert failed.reason is RejectionReason.NO_USABLE_REFERENCES
+
+
+def test_references_are_always_matched_at_their_given_poses() -> None:
+    """Whatever the origin of the query's world is, since matches and points are cached."""
+    problem = planted((70, 60, 50), 0.5, 0.3)
+    matcher = Given(problem.correspondences)
+    pipeline = Pipeline(make_reconstructor("geometric", Path()), matcher)
+    far = [replace(it, world_from_camera=it.world_from_camera.shifted(np.full(3, 0.1))) for it in problem.references]
+    assert "two_view" in localize(problem.query, far, pipeline, LocalizeOptions()).stage_seconds
+    assert len(matcher.matched) > 1
+    for references in matcher.matched:
+        assert [it.world_from_camera for it in references] == [it.world_from_camera for it in far]
 
 
 def test_random_matches_have_no_accepted_pose() -> None:

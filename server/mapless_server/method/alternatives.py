@@ -75,7 +75,8 @@ def _two_view_support(coarse: Coarse, found: Support | None) -> Support | None:
     query_matches, matcher = prepared.correspondences.query_matches, prepared.pipeline.matcher
     known = [found.estimate.world_from_camera] if found and found.estimate else []
     with context.stage("two_view"):
-        wide = matcher.correspond(query, references, True, context.check, query_matches)
+        in_world = prepared.references_in_world
+        wide = matcher.correspond(query, in_world, True, context.check, query_matches)
         stages = prepared.structure_options, prepared.match_options, options.adjust
         result = solve_two_view(query, references, wide, known, prepared.origin, *stages, options.two_view)
     if result is None or result.estimate is None:
