@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +18,8 @@ from mapless_server.method.features import undistort_pixels
 from mapless_server.method.intrinsics import ContradictionOptions, IntrinsicsEvidence, corrected, keypoint_motion
 from mapless_server.method.options import IntrinsicsSigma
 from mapless_server.method.pose_problem import AdjustOptions, pose_problem, with_intrinsics
+from mapless_server.method.priors.known import NO_PRIORS
+from mapless_server.method.recalibrate import _with_errors
 from mapless_server.method.rejection import Advice, RejectionReason
 from mapless_server.method.results import PoseEstimate
 from mapless_server.method.trust.intrinsics import intrinsics_checks, wrong_intrinsics
@@ -166,6 +169,20 @@ def test_a_prior_as_wide_as_that_of_estimates_ends() -> None:
     found = adjusted(scene, IntrinsicsSigma(focal_share=0.24))
     assert found.intrinsics
     assert found.intrinsics.removed[0] == pytest.approx(-0.26, abs=0.005)
+
+
+def test_too_few_matches_determine_no_intrinsics() -> None:
+    """Nothing is computed from them: no warnings, which are errors here."""
+    scene = make_scene(random_for("too few"))
+    structure, matches, estimate = stages(scene, scene.references)
+    terms = scene.query, scene.references, structure, matches
+    found = adjust_pose(*terms, estimate, AdjustOptions())
+    assert found.intrinsics
+    usual = IntrinsicsSigma().of(scene.query.camera)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        nowhere = replace(found, world_from_camera=found.world_from_camera.shifted(np.array([0.0, 50.0, 0.0])))
+        assert _with_errors(*terms, nowhere, AdjustOptions(), NO_PRIORS, usual, usual) is None
 
 
 def test_right_intrinsics_are_never_rejected() -> None:

@@ -127,13 +127,14 @@ def _with_errors(
             pixels = view.features.keypoints[matches.keypoint].astype(np.float64)
             errors_px = reprojection_errors_px(view.camera, pose, structure.x_in_world[matches.point], pixels)
             used = np.flatnonzero(errors_px < options.max_error_px)
-            problem, start = pose_problem(view, references, moved, matches, used, pose, options, information)
-            start = start if bundle is None else replace(start, poses=bundle.poses)
         else:
             problem, start, used = solved
-            solved = None
         if len(used) < LEAST_MATCHES:
             return None
+        if solved is None:
+            problem, start = pose_problem(view, references, moved, matches, used, pose, options, information)
+            start = start if bundle is None else replace(start, poses=bundle.poses)
+        solved = None
         problem = problem.replaced(priors=priors, prior_weight=options.error_inflation**2)
         if not left or (change is not None and (np.abs(change) < small).all()):
             break
