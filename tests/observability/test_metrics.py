@@ -49,7 +49,7 @@ FAMILIES = {
     ("counter", "bucket stage"): "mapless_batches_total",
     ("counter", "stage"): "mapless_busy_seconds_total",
     ("counter", "tier"): "mapless_token_cache_hits_total",
-    ("counter", "outcome"): "mapless_answers_total",
+    ("counter", "outcome"): "mapless_answers_total mapless_tracking_total",
     ("gauge", ""): (
         "mapless_background_waiting mapless_calibration_waiting mapless_depth_waiting mapless_capture_bytes "
         "mapless_capture_enabled mapless_python_allocated_blocks mapless_reference_cache_bytes "
