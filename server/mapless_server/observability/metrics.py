@@ -191,7 +191,7 @@ class Metrics(Observer, PairObserver):
             self._stage_seconds(stage, "1" if extractor else "0").observe(seconds)
 
     def tracked(self, suffices: bool) -> None:
-        """A query was compared with the references near its pose prior; whether these sufficed."""
+        """A query has a pose prior that may say which references are near; whether these sufficed."""
         self._tracking("tracked" if suffices else "searched").inc()
 
     def answered_coarsely(self, seconds: float) -> None:
@@ -386,7 +386,7 @@ class Metrics(Observer, PairObserver):
         self._stage_seconds = _Children(
             histogram("mapless_stage_seconds", "Time of a stage of the method.", STAGE_BUCKETS, ["stage", "tier"])
         )
-        text = "Queries with references near their pose prior: tracked, or the full search followed."
+        text = "Queries with a pose prior that may say which references are near: tracked, or searched in full."
         tracking = self._counter("mapless_tracking", text, ["outcome"])
         self._tracking = _Children(tracking, [("tracked",), ("searched",)])
         self._coarse_answer = histogram(
