@@ -9,8 +9,8 @@ The prior chooses the references, and nothing else. Matches are searched in the 
 than to gather those near each point's projection, and leaves the evidence as it is: matches that a wrong prior has
 selected agree with it. Gate, judge and checks are those of every answer. In one way a prior could make a wrong answer
 likelier: the references near it may show a copy of what the photograph shows. So references elsewhere that resemble the
-photograph, wherever the prior is, must not contradict the pose. If they do, the search decides, as it does of every photograph
-with this prior.
+photograph, wherever the prior is, must not contradict the pose. If they do, the search decides, as it does of every
+photograph with this prior.
 """
 
 from __future__ import annotations
