@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from support.scenes import random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless_server.method.priors.known import PosePrior
 from mapless_server.scenes import Cone, Narrowing, RankedReference, RankOptions, Selection, Sphere, rank_references
 from mapless_server.scenes.retrieval.index import Entries, SceneIndex
-from mapless_server.scenes.retrieval.ranking import spread
+from mapless_server.scenes.retrieval.ranking import nearest_references, spread
 from mapless_server.store import IndexedReference, SceneChanges
 
 DIMENSION = 16
@@ -188,6 +189,32 @@ class TestThinning:
         options = RankOptions(0.25, 30.0, weight, same_m, most)
         expected = slow_spread(scores, centres, axes, count, typical, options)
         assert spread(scores, centres, axes, count, typical, options) == expected
+
+
+class TestNearAPrior:
+    @staticmethod
+    def near(entries: Entries, x_m: float, sigma_m: float = 0.1, turned_deg: float = 0.0, count: int = 3) -> str:
+        turn = rotation_from_vector([0.0, math.radians(turned_deg), 0.0])
+        covariance = np.diag([sigma_m**2] * 3 + [1e-4] * 3)
+        pose = RigidTransform(turn, np.array([x_m, 0.0, 0.0]))
+        return ids(nearest_references(entries, PosePrior(pose, covariance), count))
+
+    def test_they_are_those_nearest_to_the_nearest_for_all_priors_around_it(self) -> None:
+        entries = planted([None] * 6, [0.0, 1.0, 2.1, 3.3, 4.6, 6.0])
+        assert {self.near(entries, x_m) for x_m in (1.7, 2.0, 2.6)} == {"2 1 3"}
+
+    def test_those_that_look_elsewhere_count_as_further_or_not_at_all(self) -> None:
+        entries = planted([None] * 4, [0.0, 1.0, 1.5, 1.2], [0.0, 30.0, 0.0, 61.0])
+        assert self.near(entries, 0.1) == "0 2 1"
+
+    @pytest.mark.parametrize(("x_m", "sigma_m", "turned_deg"), [(1.0, 3.0, 0.0), (8.0, 0.1, 0.0), (1.0, 0.1, 61.0)])
+    def test_there_are_none_where_the_prior_does_not_say_which(
+        self, x_m: float, sigma_m: float, turned_deg: float
+    ) -> None:
+        assert self.near(planted([None] * 3, [0.0, 1.0, 2.0]), x_m, sigma_m, turned_deg) == ""
+
+    def test_a_scene_without_references_has_none(self) -> None:
+        assert self.near(planted([]), 0.0) == ""
 
 
 def slow_spread(

@@ -5,12 +5,12 @@ nothing has to be found: the references near the prior are used, the same ones a
 on them alone is in the caches; the photograph is reduced; and the points are triangulated, whichever backend the server
 has. If that does not suffice, the full search follows, as for any photograph.
 
-The prior chooses the references, and nothing else. Matches are searched in the whole photograph, which takes less time
-than to gather those near each point's projection, and leaves the evidence as it is: matches that a wrong prior has
-selected agree with it. Gate, judge and checks are those of every answer. In one way a prior could make a wrong answer
-likelier: the references near it may show a copy of what the photograph shows. So references elsewhere that resemble the
-photograph, wherever the prior is, must not contradict the pose. If they do, the search decides, as it does of every
-photograph with this prior.
+Beyond its part in every answer the prior chooses the references, and nothing else. Matches are searched in the whole
+photograph, which takes less time than to gather those near each point's projection, and leaves the evidence as it is:
+matches that a wrong prior has selected agree with it. Gate, judge and checks are those of every answer. In one way a
+prior could make a wrong answer likelier: the references near it may show a copy of what the photograph shows. So
+references elsewhere that resemble the photograph, wherever the prior is, must not contradict the pose. If they do, the
+search decides, as it does of every photograph with this prior.
 """
 
 from __future__ import annotations

@@ -160,15 +160,16 @@ def nearest_references(entries: Entries, prior: PosePrior, count: int) -> list[R
     thinned, except where many stand at one place. Their similarities are 0.
 
     Returns:
-        At most `count`; none if the prior leaves open which references are near: its standard deviation is larger than
-        the distance of the furthest of them from the first, or the camera is further from the first than that.
+        At most `count`; none if no reference looks where the prior does, or the prior leaves open which references are
+        near: its standard deviation is larger than the distance of the furthest of them from the first, or the camera
+        is further from the first than that.
     """
     rows = entries.rows()
     pose, sigma_m = prior.world_from_camera, math.sqrt(float(np.linalg.eigvalsh(prior.covariance[:3, :3])[-1]))
-    first = rows[np.argsort(_unlikeness(entries, rows, pose, sigma_m), kind="stable")[:1]]
-    if not len(first):
+    unlikeness = _unlikeness(entries, rows, pose, sigma_m)
+    if not np.isfinite(unlikeness).any():
         return []
-    _, _, at = entries.reference(int(first[0]))
+    _, _, at = entries.reference(int(rows[unlikeness.argmin()]))
     unlikeness = _unlikeness(entries, rows, at, 0.0)
     pool = _best(-unlikeness, max(RankOptions().pool * count, RankOptions().smallest_pool))
     pool = pool[np.isfinite(unlikeness[pool])]
