@@ -20,7 +20,7 @@ from urllib.request import urlopen
 import kubernetes_validate  # type: ignore[import-untyped]
 import pytest
 import yaml  # type: ignore[import-untyped]
-from support.manifests import OLDEST, VERSIONS, Json, built, check_confined, check_valid, needs_kubectl
+from support.manifests import OLDEST, Json, built, check_confined, check_valid, needs_kubectl
 
 from mapless_server.networks.weights.catalogue import CATALOGUE
 from mapless_server.observability.exporter import MetricsServer
@@ -355,8 +355,7 @@ def test_the_database_is_let_through_when_there_is_one() -> None:
 def test_scaling_joins_any_of_them_that_shares_a_database(folder: str, tmp_path: Path) -> None:
     """As many as there is work for; no other field sets the number."""
     documents = built(extended(folder, ["postgres", "autoscaling"], tmp_path))
-    for version in VERSIONS:
-        kubernetes_validate.validate(the(documents, "HorizontalPodAutoscaler"), version, strict=True)
+    check_valid(documents)
     scaled = the(documents, "Deployment")
     scaler = the(documents, "HorizontalPodAutoscaler")["spec"]
     assert "replicas" not in scaled["spec"]
