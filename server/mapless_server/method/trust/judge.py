@@ -33,6 +33,7 @@ from ..views import Matches
 from .ambiguity import AmbiguityOptions, find_rival
 from .evidence import AgreementOptions, Evidence, Votes, evidence_of, votes_of
 from .intrinsics import wrong_intrinsics
+from .wrong_camera import WrongCameraOptions, wrong_camera
 
 _RARE = (0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075)
 LEVELS = (*_RARE, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
@@ -51,6 +52,7 @@ class JudgeOptions:
         agreement: options of the comparison of halves.
         ambiguity: options of the search for a second pose.
         intrinsics: options of the check of the photograph's intrinsics.
+        camera: options of the comparison with other cameras.
         max_radius_share: largest 68 % radius of the position, as a share of the distance to what the photograph shows:
             a right answer is off by no more, so of the poses with a larger one too many are wrong. Of 2,416 right
             answers 23 have it, of 116 wrong ones 27.
@@ -64,6 +66,7 @@ class JudgeOptions:
     agreement: AgreementOptions = field(default_factory=AgreementOptions)
     ambiguity: AmbiguityOptions = field(default_factory=AmbiguityOptions)
     intrinsics: ContradictionOptions = field(default_factory=ContradictionOptions)
+    camera: WrongCameraOptions = field(default_factory=WrongCameraOptions)
     max_radius_share: float = 0.05
 
     def __post_init__(self) -> None:
@@ -129,8 +132,9 @@ def contradiction(support: Support, votes: Votes, options: JudgeOptions) -> Reje
     """Rejects a pose whose matches contradict the intrinsics or support a second pose, or whose radius is too large."""
     if support.estimate is not None and support.estimate.intrinsics is not None:
         best = support.references[int(np.argmax(support.inliers_by_reference()))].name
-        wrong = wrong_intrinsics(support.estimate.intrinsics, best, options.intrinsics)
-        if wrong:
+        evidence = support.estimate.intrinsics
+        wrong = wrong_intrinsics(evidence, best, options.intrinsics)
+        if wrong := wrong or wrong_camera(support, evidence, best, options.camera):
             return wrong
     hypotheses = find_rival(support, votes, options.ambiguity)
     return _ambiguous(hypotheses) if hypotheses else _too_uncertain(support, options)
