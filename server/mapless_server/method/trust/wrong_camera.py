@@ -95,7 +95,9 @@ def _best_camera(
         return int((reprojection_errors_px(camera, pose, x_in_world, pixels) < options.pnp.inlier_px).sum())
 
     counts = [(agreeing(camera), camera) for camera in _other_cameras(given, log_focal_sigma, options)]
-    best = max(counts, key=lambda it: it[0], default=(0, given))
+    if not counts:
+        return given, 0
+    best = max(counts, key=lambda it: it[0])
     half_step = 2 ** (0.5 / options.steps_per_octave)
     beside = [_scaled(best[1], factor) for factor in (1 / half_step, half_step)]
     count, camera = max([best, *((agreeing(it), it) for it in beside)], key=lambda it: it[0])
