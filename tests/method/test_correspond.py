@@ -14,19 +14,10 @@ from support.planted import same_points
 from support.scenes import CAMERA, SceneOptions, make_scene, random_for, unit_rows
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method import correspond
-from mapless_server.method.correspond import (
-    OPTIONS,
-    CorrespondOptions,
-    Matcher,
-    SharedThreads,
-    best_of_both,
-    epipolar_distance_px,
-    epipolar_distances_px,
-    make_matcher,
-    mutual_matches,
-)
+from mapless_server.method import correspond, nearest
+from mapless_server.method.correspond import OPTIONS, CorrespondOptions, Matcher, SharedThreads, make_matcher
 from mapless_server.method.features import FEATURES
+from mapless_server.method.nearest import best_of_both, epipolar_distance_px, epipolar_distances_px, mutual_matches
 from mapless_server.method.views import Features, Matches, PosedView, View
 
 
@@ -79,7 +70,7 @@ def test_mutual_matches_equal_brute_force(n: int, m: int, noise: float, ratio: f
 def test_products_of_whole_numbers_are_those_of_floats(n: int, m: int) -> None:
     """To the last bit, since sums of up to 127^2 64 are exact as float32; largest numbers included."""
     torch = pytest.importorskip("torch", reason="the networks extra is not installed")
-    if not correspond._multiplies_exactly(torch):
+    if not nearest._multiplies_exactly(torch):
         pytest.skip("the processor has no products of int8 that do not saturate")
     random = random_for("whole", n, m)
     first, second = (
@@ -88,8 +79,8 @@ def test_products_of_whole_numbers_are_those_of_floats(n: int, m: int) -> None:
     )
     first.descriptors[0] = second.descriptors[-1] = 127
     a, b = (it.descriptors.astype(np.float32) for it in (first, second))
-    expected = a @ b.T * correspond._inverse_lengths(second) * correspond._inverse_lengths(first)[:, None]
-    assert np.concatenate([*correspond.cosine_blocks(first, second)]).tobytes() == expected.tobytes()
+    expected = a @ b.T * nearest._inverse_lengths(second) * nearest._inverse_lengths(first)[:, None]
+    assert np.concatenate([*nearest.cosine_blocks(first, second)]).tobytes() == expected.tobytes()
     plain = first.unit_descriptors() @ second.unit_descriptors().T
     for either in (False, True):
         matches = mutual_matches(first, second, 0.99, either)

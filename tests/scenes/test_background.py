@@ -24,7 +24,7 @@ from support.stores import DATABASES, Folder, Place, place_on
 from support.waiting import wait_until
 
 from mapless_server.errors import Unavailable
-from mapless_server.method import correspond
+from mapless_server.method import correspond, nearest
 from mapless_server.method.correspond import CorrespondOptions, Matcher, PairMatching, in_order
 from mapless_server.method.options import StageContext
 from mapless_server.method.views import Features, Matches, PosedView, View
@@ -136,7 +136,7 @@ def store(place: Folder) -> Iterator[Store]:
 def compared(monkeypatch: pytest.MonkeyPatch) -> Counter[int]:
     """How often two sets of features were compared, by the sum of their first coordinates."""
     counts: Counter[int] = Counter()
-    usual = correspond.mutual_matches
+    usual = nearest.mutual_matches
 
     def counting(first: Features, second: Features, ratio: float, either: bool = False) -> Matches:
         counts[round(1e3 * float(first.keypoints[0, 0] + second.keypoints[0, 0]))] += 1

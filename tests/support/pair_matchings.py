@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from mapless_server.method.correspond import mutual_matches
+from mapless_server.method.nearest import mutual_matches
 from mapless_server.method.views import Matches, View
 
 

@@ -11,6 +11,7 @@ rejection                    "no pose" is a result
 features/                    local features of a photograph
 cache                        results that are kept within a bound, here and by the server
 tracks                       observations of the same point
+nearest                      nearest neighbours of two photographs' descriptors, and their epipolar lines
 lightglue, correspond        matches among references, and of the query with them (lightglue: by a network)
 priors/                      what is known of the query's pose beforehand
 intrinsics                   errors of the query's intrinsics, and the evidence of them

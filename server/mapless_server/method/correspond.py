@@ -13,32 +13,25 @@ queries that fail otherwise.
 
 from __future__ import annotations
 
-import sys
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
-from functools import cache
 from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
-
-from mapless.geometry import Array, cross_matrix
 
 from .cache import LruCache
 from .choices import EDGEPOINT2
+from .nearest import best_of_both, epipolar_distance_px, epipolar_distances_px, mutual_matches
 from .options import check_bounds
 from .tracks import Tracks, build_tracks
-from .views import Features, Matches, PosedView, View
+from .views import Matches, PosedView, View
 
 ItemT = TypeVar("ItemT")
-
-_ROWS_AT_ONCE = 128
-"""With 2,000 columns a block of cosines has 1 MB, as the second-level cache of a core."""
 
 _PAIRS_THAT_COUNT = 10
 """For `Matcher.pair_s`, about."""
@@ -540,130 +533,3 @@ def make_matcher(features: str, threads: int = 1, weights: Path | None = None, d
     if device == "cpu":
         return Matcher(OPTIONS[features], threads, pair_matching=light_glue)
     return Matcher(OPTIONS[features], threads, light_glue)
-
-
-def mutual_matches(first: Features, second: Features, ratio: float, either: bool = False) -> Matches:
-    """Mutual nearest neighbours that pass the ratio test from first to second or, if `either`, from second to first.
-
-    Descriptors have unit length, so with cosine s the distance is sqrt(2 - 2 s).
-    """
-    if len(first) < 2 or len(second) < 2:
-        return np.empty((0, 2), np.int32)
-    if either:
-        return best_of_both(np.concatenate([*cosine_blocks(first, second)]), ratio, either=True)
-    nearest, best, second_best = np.empty(len(first), np.intp), *np.empty((2, len(first)), np.float32)
-    best_of_column, begin = np.full(len(second), -np.inf, np.float32), 0
-    for cosines in cosine_blocks(first, second):
-        part, rows = slice(begin, begin + len(cosines)), np.arange(len(cosines))
-        nearest[part] = cosines.argmax(axis=1)
-        best[part] = cosines[rows, nearest[part]]
-        np.maximum(best_of_column, cosines.max(axis=0), out=best_of_column)
-        cosines[rows, nearest[part]] = -1.0
-        second_best[part] = cosines.max(axis=1)
-        begin = part.stop
-    mutual = best >= best_of_column[nearest]
-    keep = np.flatnonzero(mutual & (best > -1.0) & (1 - best < ratio**2 * (1 - second_best)))
-    return np.stack([keep, nearest[keep]], axis=1).astype(np.int32)
-
-
-def cosine_blocks(first: Features, second: Features) -> Iterator[NDArray[np.float32]]:
-    """Yields the matrix (N, M) of cosines in blocks of rows.
-
-    Descriptors of int8 are multiplied as integers if torch is loaded and the processor has instructions for that, in
-    half to four fifths of the time of float32. A block fits into the processor's cache.
-    """
-    torch = sys.modules.get("torch")
-    is_whole = first.descriptors.dtype == second.descriptors.dtype == np.int8
-    if torch is None or not is_whole or not _multiplies_exactly(torch):
-        yield first.unit_descriptors() @ second.unit_descriptors().T
-        return
-    a, b = torch.tensor(first.descriptors), torch.tensor(second.descriptors).T
-    inverse, other_inverse = (torch.from_numpy(_inverse_lengths(it)) for it in (first, second))
-    for i in range(0, len(a), _ROWS_AT_ONCE):
-        block = slice(i, i + _ROWS_AT_ONCE)
-        cosines = torch._int_mm(a[block], b) * other_inverse
-        yield cosines.mul_(inverse[block, None]).numpy()
-
-
-@cache
-def _multiplies_exactly(torch: Any) -> bool:
-    """Whether torch has fast products of int8 here; processors without AVX-VNNI or AVX512-VNNI saturate the sums."""
-    if not torch.backends.cpu.get_cpu_capability().startswith("AVX"):
-        return False
-    largest = torch.full((_ROWS_AT_ONCE, 64), 127, dtype=torch.int8)
-    return bool((torch._int_mm(largest, largest.T) == 64 * 127**2).all())
-
-
-def _inverse_lengths(features: Features) -> NDArray[np.float32]:
-    """Inverse lengths (N,) of descriptors of integers."""
-    numbers = features.descriptors.astype(np.float32)
-    return np.asarray(1 / np.sqrt(np.maximum(np.einsum("nd,nd->n", numbers, numbers), 1)), np.float32)
-
-
-def best_of_both(
-    similarity: NDArray[np.float32], ratio: float, smallest: float = -1.0, either: bool = False
-) -> Matches:
-    """Entries of a matrix of cosines (N, M) that are mutual maxima, above `smallest`, and pass the ratio test by row.
-
-    If `either`, it suffices to pass the ratio test by column. Overwrites the matrix.
-    """
-    if not similarity.size:
-        return np.empty((0, 2), np.int32)
-    rows = np.arange(len(similarity))
-    nearest = similarity.argmax(axis=1)
-    best = similarity[rows, nearest]
-    # The maximum of its column too: compared by value, because an argmax along columns takes ten times as long.
-    mutual = best >= similarity.max(axis=0)[nearest]
-    similarity[rows[mutual], nearest[mutual]] = -1.0
-    second_best = similarity.max(axis=1)
-    if either:
-        mutual &= np.bincount(nearest[mutual], minlength=similarity.shape[1])[nearest] == 1  # ties are not matched
-        second_best = np.minimum(second_best, similarity.max(axis=0)[nearest])
-    keep = mutual & (best > smallest) & (1 - best < ratio**2 * (1 - second_best))
-    return np.stack([rows[keep], nearest[keep]], axis=1).astype(np.int32)
-
-
-def epipolar_distance_px(first: PosedView, second: PosedView, matches: Matches) -> Array:
-    """Distance (M,) of matches from the epipolar lines of the known poses, the larger of both images.
-
-    The distance is 0 without a baseline, where there is no epipolar line.
-    """
-    fundamental = fundamental_matrix(first, second)
-    x_first = _homogeneous(first.view.features.keypoints[matches[:, 0]])
-    x_second = _homogeneous(second.view.features.keypoints[matches[:, 1]])
-    in_first = (x_first * _lines(x_second @ fundamental.T)).sum(axis=1)
-    in_second = (x_second * _lines(x_first @ fundamental)).sum(axis=1)
-    return np.asarray(np.maximum(np.abs(in_first), np.abs(in_second)))
-
-
-def epipolar_distances_px(first: PosedView, second: PosedView) -> NDArray[np.float32]:
-    """The same distances (N, M) for every keypoint of the first view with every keypoint of the second."""
-    fundamental = fundamental_matrix(first, second)
-    x_first, x_second = (_homogeneous(v.view.features.keypoints) for v in (first, second))
-    in_first = x_first.astype(np.float32) @ _lines(x_second @ fundamental.T).T.astype(np.float32)
-    in_second = _lines(x_first @ fundamental).astype(np.float32) @ x_second.T.astype(np.float32)
-    # In place: with 2,000 keypoints each of these matrices has 16 MB, in every thread that matches.
-    for distances in (in_first, in_second):
-        np.abs(distances, out=distances)
-    return np.maximum(in_first, in_second, out=in_first)
-
-
-def fundamental_matrix(first: PosedView, second: PosedView) -> Array:
-    """F (3, 3) of the known poses, x_first^T F x_second = 0 in homogeneous pixels; a zero matrix without a baseline."""
-    first_from_world = first.world_from_camera.rotation.T
-    # The difference first: world coordinates may be millions of metres.
-    baseline = first_from_world @ (second.world_from_camera.translation - first.world_from_camera.translation)
-    if np.linalg.norm(baseline) < 1e-6:
-        return np.zeros((3, 3))
-    essential = cross_matrix(baseline) @ first_from_world @ second.world_from_camera.rotation
-    k_first_inv, k_second_inv = (np.linalg.inv(v.view.camera.matrix()) for v in (first, second))
-    return np.asarray(k_first_inv.T @ essential @ k_second_inv)
-
-
-def _lines(lines: Array) -> Array:
-    """Scales lines (N, 3) so that the product with a homogeneous pixel is a distance in pixels."""
-    return np.asarray(lines / np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12))
-
-
-def _homogeneous(pixels: NDArray[np.float32]) -> Array:
-    return np.concatenate([pixels.astype(np.float64), np.ones((len(pixels), 1))], axis=1)

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless_server.method.arrays import invert_symmetric
-from mapless_server.method.correspond import Correspondences, epipolar_distance_px, mutual_matches
+from mapless_server.method.correspond import Correspondences
 from mapless_server.method.match import vote
+from mapless_server.method.nearest import epipolar_distance_px, mutual_matches
 from mapless_server.method.observations import Observations, triangulate
 from mapless_server.method.options import check_bounds
 from mapless_server.method.results import Structure

@@ -20,7 +20,7 @@ import poselib
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
-from mapless_server.method.correspond import fundamental_matrix, mutual_matches
+from mapless_server.method.nearest import fundamental_matrix, mutual_matches
 from mapless_server.method.views import Matches, PosedView, View
 
 PAIR_COUNT = 24
