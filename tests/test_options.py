@@ -1,7 +1,5 @@
 """Options check themselves: a value outside its bounds is named with its class, its field and the bound."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import Any
 

@@ -7,8 +7,6 @@ intrinsics of references change. RESULTS gets a file for each scene and number o
 `mapless-server evaluate --json`; what is there is not measured again.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -5,8 +5,6 @@ three degrees of noise that claim to be one; and upside down. On references that
 lost, and on references so few or so far away that many are.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Callable, Iterator, Sequence

@@ -9,8 +9,6 @@ right photographs of every scene are contradicted. It is tested by leaving out o
 intrinsics are wrong themselves take no part: `statue-of-liberty-internet` has one focal length for all cameras.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

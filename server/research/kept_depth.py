@@ -6,8 +6,6 @@ tenth is wrong in a third variant. Prints the number of queries localized and th
 references, with and without depths.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections.abc import Sequence

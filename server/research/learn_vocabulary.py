@@ -8,8 +8,6 @@ Nothing else goes in. Run again it gives the same file up to the last digits of 
 algebra may differ; descriptors are named after the very numbers, so another file means that stored ones are made anew.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -7,8 +7,6 @@ error common to all of them and one of each. Prints errors and the share of radi
 right and wrong poses accepted with the quantiles of all other places, and `OneReferenceOptions.scores`.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

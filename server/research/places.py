@@ -3,8 +3,6 @@
 The method's own modules work on them in this process, without a server. Folders have `cameras.json`.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

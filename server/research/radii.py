@@ -11,8 +11,6 @@ They are tested by leaving out one scene at a time: fitted on the others, how ma
 Answers that are wrong do not count: telling these is what trust is for (`research.trust`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

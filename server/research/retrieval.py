@@ -6,8 +6,6 @@ the last of random vectors, because time does not depend on what they are, and i
 ranks.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import time

@@ -8,8 +8,6 @@ how many are within their radii, and how many right ones are accepted, generic a
 constants are tried on a grid, and chosen for each place by what the others say, so that none is tested on itself.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product

@@ -12,8 +12,6 @@ every place counts alike: with quantiles of all places, 60 to 80 % of the right 
 accepted where 97 % were promised. To test them each place is left out once, and judged by what the others teach.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

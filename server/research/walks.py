@@ -7,8 +7,6 @@ Prints, for each scene, walks with and without a jump: how many are answered, er
 within its radii, the jumps that are found, and the cuts where there is none.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import time

@@ -1,7 +1,5 @@
 """Poses in the axes of other systems, against poses derived by hand from where a camera stands and looks."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Cameras and poses from files: what is written is read, and what is wrong is named."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """What a person reads on the terminal, and the small change of the command's arguments."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import fields, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Connections that cannot be made, and the message for a person."""
 
-from __future__ import annotations
-
 import re
 import socket
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """When a call is tried again, and when not: decided without a server, by a planted clock."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """Places on the Earth against published pairs, and GeoPoses against what was derived by hand."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Geometry by its algebra, and against OpenCV and SciPy where they know the same formula."""
 
-from __future__ import annotations
-
 import math
 from functools import reduce
 

@@ -1,7 +1,5 @@
 """A folder of photographs and a server that has no room for all at once, fails, or goes away."""
 
-from __future__ import annotations
-
 import json
 import threading
 from collections import Counter

@@ -1,7 +1,5 @@
 """A photograph's size, read from its header, is what decoding it gives."""
 
-from __future__ import annotations
-
 import contextlib
 import struct
 

@@ -3,8 +3,6 @@
 And whatever a server answers, a client raises no errors but its own.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """ROS messages and mapless: pixels, cameras and poses, with OpenCV as oracle; messages to the byte by `rosbags`."""
 
-from __future__ import annotations
-
 from datetime import datetime, timezone
 from typing import Any
 

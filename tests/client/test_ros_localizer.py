@@ -1,7 +1,5 @@
 """A robot's localizer without ROS and without a server: answers and odometry are planted."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

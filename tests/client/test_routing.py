@@ -1,7 +1,5 @@
 """Every call that concerns a scene names it in the metadata, with characters that metadata can carry."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

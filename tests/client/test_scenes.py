@@ -1,7 +1,5 @@
 """What is said of a scene as a whole, as messages: what the proto says is ignored may be anything."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

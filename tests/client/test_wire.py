@@ -1,7 +1,5 @@
 """Geometry crosses the wire unchanged, and what breaks the contract is named by its path."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The page about further backends is true: its classes run as they stand there, and are all that is needed."""
 
-from __future__ import annotations
-
 import re
 from contextlib import closing
 from pathlib import Path

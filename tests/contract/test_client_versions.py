@@ -1,7 +1,5 @@
 """The client with the oldest and the newest versions of its dependencies, without the server's packages."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

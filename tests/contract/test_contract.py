@@ -1,7 +1,5 @@
 """What callers rely on: every RPC answers, generated code is that of the protos, and imports go one way."""
 
-from __future__ import annotations
-
 import filecmp
 import importlib.metadata
 import inspect

@@ -1,7 +1,5 @@
 """The C++ client, built with Debian's gRPC and Protobuf, installed, found by CMake, and run against servers."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """The manifests with Envoy are valid for Kubernetes and match the servers, their settings and Envoy's configuration."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 No container engine is needed: the files are read. What is true of an image holds for every target of the Dockerfile.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import re

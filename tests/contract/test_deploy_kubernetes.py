@@ -3,8 +3,6 @@
 Each file by itself, and what kustomize makes of them, where kubectl is there to make it; no cluster is asked.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 import subprocess

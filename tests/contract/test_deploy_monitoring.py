@@ -4,8 +4,6 @@ The series are those of a `Metrics` to which everything happened once. An alert 
 there stays empty for ever, without any error.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

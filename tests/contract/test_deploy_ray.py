@@ -4,8 +4,6 @@ KubeRay's own schema is too large to be kept here. When these manifests were wri
 (KubeRay 1.7, ray-operator/config/crd/bases/ray.io_rayservices.yaml); what remains is the list of the fields they use.
 """
 
-from __future__ import annotations
-
 import importlib
 import re
 from pathlib import Path

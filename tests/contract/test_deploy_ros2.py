@@ -1,7 +1,5 @@
 """The ROS 2 package without ROS: its node on a stand-in for rclpy with messages of `rosbags`, and its files."""
 
-from __future__ import annotations
-
 import importlib
 import runpy
 import sys

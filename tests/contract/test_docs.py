@@ -1,7 +1,5 @@
 """What the pages say is so: links, commands, Python, tables, settings, metrics and figures."""
 
-from __future__ import annotations
-
 import ast
 import asyncio
 import importlib

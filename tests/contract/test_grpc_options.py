@@ -1,7 +1,5 @@
 """Every option of a channel or a server is known to gRPC, which ignores misspelt ones silently."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

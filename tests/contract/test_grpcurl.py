@@ -4,8 +4,6 @@ What stands on a line is read as grpcurl reads it, and the request it would send
 description, by nothing that mapless ships.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import re

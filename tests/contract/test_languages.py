@@ -1,7 +1,5 @@
 """The protos in other languages: names that collide with no generated member, Java that compiles, no break."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The package as others install it: built, put into empty environments, with each of its extras."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

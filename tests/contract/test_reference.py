@@ -1,7 +1,5 @@
 """The reference that is generated from the code is complete, and the site builds from it."""
 
-from __future__ import annotations
-
 import importlib
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The C# for Unity names fields, enum values and methods as the protos have them, and has all but one of these."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a query costs and what it is answered: one tier where that is enough, the better of two where it is not."""
 
-from __future__ import annotations
-
 import asyncio
 import gc
 import hashlib

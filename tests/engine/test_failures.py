@@ -1,7 +1,5 @@
 """What exceptions mean: real ones, as Python and torch raise them, and their texts as they were seen in the wild."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Groups in a busy server: what they hold is counted, what they have computed is kept, and all stages are recorded."""
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 import threading

@@ -1,7 +1,5 @@
 """When stronger features are tried, and which of two answers is the better one: a rule, case by case."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Tracking, on photographs of a rendered corner: the prior saves time, and decides nothing that it should not."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import Callable, Iterator, Sequence

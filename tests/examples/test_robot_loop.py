@@ -1,7 +1,5 @@
 """The example of a robot's loop, on a real video and with a server that stops and returns."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import threading

@@ -4,8 +4,6 @@ Written to the output folder: a table for people and one for programs, and for e
 the next campaign begins with, and what broke a law: `python -m fuzz.run TARGET --input FILE` tries one again.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

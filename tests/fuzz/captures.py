@@ -1,7 +1,5 @@
 """Importers: our own cameras.json, nerfstudio's transforms.json, captures of phones, TUM RGB-D, kapture with a rig."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Importers: COLMAP models, text and binary."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Laws: a setting is read or refused with a ConfigError of printable lines; what i
 address of a database is refused in a line that could not hold it, since it may hold a password.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable

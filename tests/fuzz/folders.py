@@ -4,8 +4,6 @@ Which files there are is the layout's matter: an input is one byte that chooses 
 after file, with a line between them that no format has. Nothing in an input can name a file to be written.
 """
 
-from __future__ import annotations
-
 import os
 import tempfile
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Laws of accepted values, shared by the targets."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -4,8 +4,6 @@ Laws: every call ends once, answered or with a status that a caller can act on, 
 object; only a token of the file opens anything; a file of tokens that is accepted is the same after it was written.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 import logging

@@ -1,7 +1,5 @@
 """Mutations of bytes without atheris, which is not available everywhere."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from random import Random
 

@@ -4,8 +4,6 @@ Laws: a refusal names a field that the request has; what the store gets has keys
 can be written down, and reads back as it was; a page begins after a legal id.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor

@@ -4,8 +4,6 @@ Fuzzing does not return, so each target has a process of its own. Beyond what a 
 finding that makes the process larger or takes longer than any input may.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import resource

@@ -1,7 +1,5 @@
 """The interface of a fuzz target, and the list of targets."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

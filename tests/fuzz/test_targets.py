@@ -3,8 +3,6 @@
 The long campaign is `make fuzz`. What either finds becomes a test of its own (`test_findings.py`).
 """
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """LightGlue on a GPU gives the CPU's matches, also while a network runs."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 

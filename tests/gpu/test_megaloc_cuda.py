@@ -1,7 +1,5 @@
 """MegaLoc on a GPU gives the CPU's vectors up to rounding."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

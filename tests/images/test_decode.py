@@ -1,7 +1,5 @@
 """Images are refused by their header, read as they are stored, and never half read."""
 
-from __future__ import annotations
-
 import re
 import resource
 import time

@@ -1,7 +1,5 @@
 """The final adjustment: its derivatives, its elimination of the points, and its accuracy."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The final adjustment with priors: derivatives; right priors improve weak poses, others change nothing."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

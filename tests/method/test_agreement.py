@@ -1,7 +1,5 @@
 """Halves of the data: a right pose is found again from each of them, a wrong one is not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

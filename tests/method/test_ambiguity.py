@@ -1,7 +1,5 @@
 """Two places that look the same are both hypotheses; one that is clearly better supported is the answer."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from unittest.mock import Mock

@@ -1,7 +1,5 @@
 """Functions of NumPy and torch arrays: both against plain NumPy, and the projection against the client's."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Matching of descriptors: against brute force, against known epipolar geometry; the cache of pairs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import combinations, product

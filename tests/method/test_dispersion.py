@@ -1,7 +1,5 @@
 """Dispersion of a pose without parts of its data: against the dense equations, and in undetermined cases."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Features: planted blobs are found where they are, through reduction and through a lens."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -1,7 +1,5 @@
 """The gate: rejects poses that chance could support; the expected number of such poses."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

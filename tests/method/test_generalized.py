@@ -1,7 +1,5 @@
 """The adapter of PoseLib's generalized solvers: conventions and determinism, by planted poses."""
 
-from __future__ import annotations
-
 import ctypes
 
 import numpy as np

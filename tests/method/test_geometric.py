@@ -1,7 +1,5 @@
 """The geometric backend: reconstructs planted scenes like a network, and rejects what it cannot reconstruct."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 A weak query must be pulled right, a wrong prior must change nothing, to the last bit.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.compare import assert_pose_close, pose_error

@@ -1,7 +1,5 @@
 """Pictures for networks: planted blobs are where the picture's camera projects them, for any lens, shape and size."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

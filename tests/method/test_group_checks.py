@@ -1,7 +1,5 @@
 """A rig with a wrong mounting and a session that is not metric are rejected; right ones are accepted."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any, cast
 

@@ -1,7 +1,5 @@
 """The hint of each rejection of a rig or a sequence: advice, message and best reference."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

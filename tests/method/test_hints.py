@@ -1,7 +1,5 @@
 """The hint of each rejection: stage, advice, message and best reference."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Errors of a photograph's intrinsics: their derivatives, the evidence of them, and what they add to a covariance."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from dataclasses import replace

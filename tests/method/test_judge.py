@@ -1,7 +1,5 @@
 """Trust is the share of right answers that look at most as good, and coverage the share of them that passes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

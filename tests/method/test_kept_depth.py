@@ -1,7 +1,5 @@
 """Depths kept with references: where they put points, how they combine with triangulation, what they gain."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

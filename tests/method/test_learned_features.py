@@ -1,7 +1,5 @@
 """Learned extractors: planted score maps give keypoints where they are, through reduction and lens; random weights."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """LightGlue: the batch against each pair alone and against kornia's own forward; waiting, memory, misuse."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any

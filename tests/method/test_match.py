@@ -1,7 +1,5 @@
 """Matching: planted pairs, votes, and the guided search against loops."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The whole method with a full-size network, once, on the CPU: result and memory."""
 
-from __future__ import annotations
-
 import logging
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The optimizer and its losses: minima against SciPy's, damping, stopping, wrong options."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """Pose errors in world coordinates: derivatives by finite differences, covariances and radii by sampling."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The pose solver: planted poses among wrong matches, its rejections, its covariance, and PoseLib's conventions."""
 
-from __future__ import annotations
-
 from importlib.metadata import version
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Errors of given poses: their covariance, and its sizes as the references' observations determine them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.planted import drift_field

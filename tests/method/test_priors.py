@@ -1,7 +1,5 @@
 """Priors: derivatives against finite differences, distances against their chi-square, conflicts."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

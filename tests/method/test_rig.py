@@ -1,7 +1,5 @@
 """Rigs: a planted pose is found from the matches of several cameras, also where none of them has enough."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

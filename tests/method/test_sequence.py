@@ -1,7 +1,5 @@
 """Sequences: planted poses are found from photographs and a device's drifting tracking."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The token cache: returns what was stored, and stays within its bounds."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Tracks: planted chains, conflicts, and a comparison with a slow union-find."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 

@@ -3,8 +3,6 @@
 Each reference observes points of its own, so nothing can be triangulated; the query observes the points of all.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -4,8 +4,6 @@ Many poses are solved, each with noise of its own, and the mean of their squared
 what was stated, position and rotation apart. With 20 poses the ratio of two standard deviations is known to an eighth.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Intrinsics that are grossly wrong: half or double the focal length, those of another image, one focal length."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A network loads a file of exactly its tensors, bit for bit; otherwise it is unchanged and the error lists why."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -1,7 +1,5 @@
 """EdgePoint2: the official network's own outputs; fused it computes the same; contrast and padding change nothing."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 The fixtures beside the repository are complete, and some of them full-size; a few lie here, thinned out.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -4,8 +4,6 @@ The published weights are not here: those of the tests are made by a rule, small
 as well.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 from pathlib import Path

@@ -3,8 +3,6 @@
 The small fixtures lie here, thinned out; those beside the repository are complete, and some of them full-size.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """The runner has the output of its network, in every way of running it."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from functools import partial

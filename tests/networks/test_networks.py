@@ -1,7 +1,5 @@
 """Laws of the networks that hold for any weights."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Headers of safetensors files: other formats are refused by name, damage never passes."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import math

@@ -1,7 +1,5 @@
 """Weights: wrong files are refused with a reason, and the folder never holds a partial or a wrong file."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import os

@@ -1,7 +1,5 @@
 """Whatever is logged, a line is one JSON object with time and origin, and holds no bytes; repetitions are counted."""
 
-from __future__ import annotations
-
 import io
 import json
 import logging

@@ -1,7 +1,5 @@
 """Metrics have the dashboards' names, count each event once, and do not grow with what callers send."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import math

@@ -1,7 +1,5 @@
 """A call is one trace, continued from the caller's, with its steps in place; no collector can delay or fail it."""
 
-from __future__ import annotations
-
 import logging
 import socket
 import threading

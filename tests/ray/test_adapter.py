@@ -1,7 +1,5 @@
 """The Ray adapter without a cluster: methods on Serve's gRPC server, checks, and the sample configuration."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import socket

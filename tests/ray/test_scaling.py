@@ -1,7 +1,5 @@
 """The number of replicas: the policy's laws, and that it settles under Serve's own rules, in simulated time."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """Photographs from outside the repository: beside it, or in the folder of TEST_DATA."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from functools import cache

@@ -3,8 +3,6 @@
 Each fault is planted in several references in turn. Whatever is not its victim must be found consistent.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial

@@ -1,7 +1,5 @@
 """Rigs and sequences on real photographs: no worse than single photographs, and localized where those are not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np

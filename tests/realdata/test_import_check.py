@@ -1,7 +1,5 @@
 """The epipolar check of imports on real photographs: good poses pass, and planted mistakes are named."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Learned features on real photographs: they localize what cheap features lose, and are used only then."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Gravity on real photographs: a good answer keeps every bit, and an upside-down prior is reported."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import pytest

@@ -1,7 +1,5 @@
 """Accuracy of coarse and refined answers on photographs with known poses, by the shipped server."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

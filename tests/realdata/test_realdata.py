@@ -1,7 +1,5 @@
 """The whole service on real photographs: accuracy, and rejection of photographs of other places."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from functools import partial

@@ -1,7 +1,5 @@
 """Retrieval on real photographs: among the ten that are chosen, one sees the same place."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 

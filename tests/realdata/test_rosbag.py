@@ -1,7 +1,5 @@
 """Photographs of a drone as a recording: the import is that of the folder."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

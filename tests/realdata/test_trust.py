@@ -1,7 +1,5 @@
 """Acceptance at a stated coverage on real photographs: right answers, and almost nothing else."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import chain, combinations

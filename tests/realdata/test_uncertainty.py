@@ -1,7 +1,5 @@
 """Reported radii on real photographs with known poses hold about as often as they state."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The audit reports a planted fault with its kind and size, and nothing else."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

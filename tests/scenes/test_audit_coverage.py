@@ -1,7 +1,5 @@
 """Coverage predicts many matches among the references, none away from them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Matching in the background: its results equal those of a query, each pair is made once, failures are tried again."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,7 +1,5 @@
 """Self-calibration on scenes with a planted truth: what references say of answers, and what wrong ones must not say."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor

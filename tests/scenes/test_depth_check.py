@@ -1,7 +1,5 @@
 """What is kept of predicted depths: right ones, scaled by triangulation; wrong ones are dropped by pixel or whole."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """References are loaded with the requested features, described once, and with photographs that are read when used."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence

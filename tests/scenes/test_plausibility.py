@@ -1,7 +1,5 @@
 """A scene's datum, down and unit against the poses of its references: planted mistakes are named, and no others."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

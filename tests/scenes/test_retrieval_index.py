@@ -1,7 +1,5 @@
 """The index of a scene: equal to a brute-force twin under any changes, and consistent for readers while it changes."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """The ranking of references: its laws on planted similarities, places and headings, against a slow twin."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """VLAD and its vocabularies: invariances, the shipped vocabularies are learned ones, and names distinguish them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from importlib.resources import files
 

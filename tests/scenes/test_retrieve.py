@@ -1,7 +1,5 @@
 """The choice of references: planted counts and positions, and a slow implementation."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

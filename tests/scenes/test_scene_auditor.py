@@ -1,7 +1,5 @@
 """An audit of what is stored: damaged and vanishing references cost themselves and no other."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path

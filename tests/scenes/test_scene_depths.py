@@ -1,7 +1,5 @@
 """Making depths ahead of queries: each reference once, failures later again, nothing after the end; finding them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path

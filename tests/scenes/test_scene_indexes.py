@@ -1,7 +1,5 @@
 """Scenes in memory: a damaged reference affects no other one, and memory is counted."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 from pathlib import Path

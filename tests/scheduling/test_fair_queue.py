@@ -1,7 +1,5 @@
 """Deficit round robin: shares are equal whatever is sent, tenants before their clients, and no caller starves."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import pytest

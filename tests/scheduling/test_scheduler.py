@@ -1,7 +1,5 @@
 """Laws of the scheduler, on a virtual clock with toy stages, in any order of events."""
 
-from __future__ import annotations
-
 import gc
 import itertools
 import math

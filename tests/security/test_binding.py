@@ -1,7 +1,5 @@
 """No server without protection listens beyond this machine by accident."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import re

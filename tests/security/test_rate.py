@@ -1,7 +1,5 @@
 """A tenant uses its rate and what it saved, and at most one job beyond; no tenant waits for ever; memory is bounded."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

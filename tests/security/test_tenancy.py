@@ -1,7 +1,5 @@
 """Keys of scenes: no two tenants share one. That none sees another's is tested in `service/test_security.py`."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

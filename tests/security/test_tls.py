@@ -1,7 +1,5 @@
 """TLS with real handshakes on loopback: which clients connect, and what changes with the files."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import socket

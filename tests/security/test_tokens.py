@@ -1,7 +1,5 @@
 """Tokens: the file and its errors, changes while serving, and which role may call which method."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import logging

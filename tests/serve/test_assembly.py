@@ -1,7 +1,5 @@
 """Settings to tiers: what serves, and what is said where something is missing."""
 
-from __future__ import annotations
-
 import logging
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`mapless-server serve` has a flag for each setting; the commands of the server run without the tools' packages."""
 
-from __future__ import annotations
-
 import pytest
 import typer.main
 from support.programs import printed

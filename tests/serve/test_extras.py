@@ -1,7 +1,5 @@
 """A hint names an extra that exists and brings the package."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Flags beat the environment, which beats the file, which beats the default; nothing misspelt passes."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The warm-up localizes a rendered photograph of known pose; a failure ends the start with one sentence."""
 
-from __future__ import annotations
-
 import signal
 import threading
 import time

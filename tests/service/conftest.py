@@ -1,7 +1,5 @@
 """A server shared by the tests of a module."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 

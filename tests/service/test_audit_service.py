@@ -1,7 +1,5 @@
 """The audit through a real server: planted faults are reported, page by page, and coverage is predicted."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Servers that match references ahead of queries: the same answers for less work, also after one was killed."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -4,8 +4,6 @@ What can be answered is answered, what cannot says why, and everything works aga
 gone.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

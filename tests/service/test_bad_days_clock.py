@@ -4,8 +4,6 @@ A real server runs with a library that moves its wall clock alone (`tests/suppor
 rates and the detection of hanging stages must use the monotonic clock, which the system never sets.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """PostgreSQL is killed under load, or has no connection or no room left: callers are informed, nothing is lost."""
 
-from __future__ import annotations
-
 import signal
 import tempfile
 import threading

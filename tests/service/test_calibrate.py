@@ -4,8 +4,6 @@ The stand-in method answers the pose of the reference that resembles the photogr
 references, stored anew, and its pose in the folder is that reference's, moved by the error that is planted.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path

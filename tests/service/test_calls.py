@@ -1,7 +1,5 @@
 """What every call has: a limit, a deadline, a request id, and errors with what the caller may know."""
 
-from __future__ import annotations
-
 import json
 import logging
 import time

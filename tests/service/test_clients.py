@@ -1,7 +1,5 @@
 """The blocking and the asynchronous client: the same tests with the same server."""
 
-from __future__ import annotations
-
 import asyncio
 import inspect
 import threading

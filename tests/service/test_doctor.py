@@ -1,7 +1,5 @@
 """`mapless doctor` against what can be wrong with a server, an address, a token and a clock."""
 
-from __future__ import annotations
-
 import http.server
 import json
 import socket

@@ -1,7 +1,5 @@
 """Two servers behind a real Envoy, configured as deployed: routing, and answers as without it."""
 
-from __future__ import annotations
-
 import json
 import ssl
 import subprocess

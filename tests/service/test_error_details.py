@@ -1,7 +1,5 @@
 """Details of errors for other clients, and what strangers cannot make a server write into its log."""
 
-from __future__ import annotations
-
 import logging
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`mapless-server evaluate` on the benchmarks' layouts, written here with photographs of a rendered wall."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil

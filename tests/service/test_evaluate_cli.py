@@ -1,7 +1,5 @@
 """`mapless-server evaluate` as a user runs it, on a rendered wall."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """`mapless-server export`: folders can be read again, and images are those stored, bit for bit."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Iterator

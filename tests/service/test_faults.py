@@ -3,8 +3,6 @@
 The other callers are answered, each call ends once, and what was acknowledged is stored.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import resource

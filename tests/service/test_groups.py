@@ -1,7 +1,5 @@
 """LocalizeRig and LocalizeSequence through a real server: requests, answers, refusals."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import replace

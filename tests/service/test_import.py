@@ -1,7 +1,5 @@
 """`mapless-server import` against a real server, and of a folder to a store of its own."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

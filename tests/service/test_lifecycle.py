@@ -1,7 +1,5 @@
 """Start, health, drain and stop, of the server in this process and of the real command."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import re

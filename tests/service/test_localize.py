@@ -1,7 +1,5 @@
 """Localize through a real server: requests, answers, refusals."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from datetime import datetime, timezone

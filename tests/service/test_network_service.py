@@ -1,7 +1,5 @@
 """The whole service on a small network with random weights: its poses are meaningless, but no call fails."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor

@@ -3,8 +3,6 @@
 The caller and the server count each of them once.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Soft priors through a real server: the scene attributes that they need, and how they narrow the choice."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.servers import CAMERA, PHOTO, pose

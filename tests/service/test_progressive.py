@@ -1,7 +1,5 @@
 """LocalizeProgressively through a real server: the order of messages, their content, and how a stream ends."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Streams in the clients: one coarse answer, retries of broken calls, errors last."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import sys

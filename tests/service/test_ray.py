@@ -4,8 +4,6 @@ Two replicas. They answer as the plain server does, bit for bit, with its errors
 client's usual retries notice nothing when replicas are replaced, killed, or broken.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

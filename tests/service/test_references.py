@@ -1,7 +1,5 @@
 """Scenes and references as resources, through a real server and a real store."""
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import threading

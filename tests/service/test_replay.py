@@ -4,8 +4,6 @@ The law: with the same program and settings every replayed answer is the answer,
 into the folder is found, and named.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

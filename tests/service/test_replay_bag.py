@@ -1,7 +1,5 @@
 """`mapless-server replay-bag`: what it writes is read by Foxglove's own libraries, `mcap` and `mcap_ros2`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

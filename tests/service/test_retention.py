@@ -6,8 +6,6 @@ searched for any 16 bytes in a row of what was sent, and for its pixels and what
 what is there is shown by the same server with `capture_dir`, and by planted pieces.
 """
 
-from __future__ import annotations
-
 import inspect
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Retrieval through a real server: by RetrieveReferences, for Localize, and among named references."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A scene's attributes through a real server: set, changed, cleared, and refused by field."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Callers without a valid token or certificate, of another tenant, or over their rate, at a real server."""
 
-from __future__ import annotations
-
 import json
 import logging
 import time

@@ -1,7 +1,5 @@
 """Several servers on one PostgreSQL are one service: a change through one is visible through the others at once."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`mapless.localize` in one line, against a real server."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A backup is one moment of a store that is being changed, is verified, and moves a store between databases."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import stat

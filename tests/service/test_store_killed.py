@@ -5,8 +5,6 @@ and prints a line for each change before it is made (``try``), when it is acknow
 is unknown because the database went away (``lost``). Writers are forked because Python takes long to start.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import signal

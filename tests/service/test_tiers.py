@@ -1,7 +1,5 @@
 """A server with two tiers: what is stored, what is computed, and what an answer reports."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """A scene in a real browser: references, points and a query are drawn, and a click on it opens its report."""
 
-from __future__ import annotations
-
 import json
 from contextlib import AbstractContextManager
 from pathlib import Path

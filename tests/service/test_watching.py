@@ -1,7 +1,5 @@
 """WatchQueries through a real server: events, permission, and how a stream ends."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack

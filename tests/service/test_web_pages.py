@@ -1,7 +1,5 @@
 """The example pages in a real browser, against a real server: an emulated phone, and a photograph that is dropped."""
 
-from __future__ import annotations
-
 import base64
 import json
 import shutil

@@ -1,7 +1,5 @@
 """`mapless-server weights` as a user runs it, without network access."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

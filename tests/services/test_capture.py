@@ -1,7 +1,5 @@
 """The limits of a capture folder hold at every moment, whatever is in it; with planted files."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

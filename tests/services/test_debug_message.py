@@ -3,8 +3,6 @@
 The points, put through the pose and the intrinsics as they were sent, fall on the pixels.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """An answer's pose in its caller's axes and on the Earth, as messages; the conversions have tests of their own."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How far a request's intrinsics may be off, and what an answer says of them."""
 
-from __future__ import annotations
-
 import math
 import re
 

@@ -1,7 +1,5 @@
 """What a call holds while and after it is answered, on an engine that computes nothing."""
 
-from __future__ import annotations
-
 import asyncio
 import gc
 import math

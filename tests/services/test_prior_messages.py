@@ -1,7 +1,5 @@
 """Priors of requests are converted with frames and units, and each wrong field is rejected by its name."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A coarse answer comes once, before the final one; a caller that stops reading cancels the computation."""
 
-from __future__ import annotations
-
 import asyncio
 import gc
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """A photograph's camera, whose lens must show the image, and options that hold for each photograph of a rig."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The recorder never delays or fails a call, counts what it drops, and deletes what the store deletes; all planted."""
 
-from __future__ import annotations
-
 import gc
 import math
 import re

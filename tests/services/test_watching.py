@@ -1,7 +1,5 @@
 """A watcher receives the answers of its scene and of no other, a few at most, and none after its end."""
 
-from __future__ import annotations
-
 import asyncio
 import gc
 import weakref

@@ -1,7 +1,5 @@
 """Stores on either database."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What is known of a scene as a whole is kept exactly, changed one by one, forgotten with it; on either database."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import datetime, timezone

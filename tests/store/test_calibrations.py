@@ -1,7 +1,5 @@
 """Self-calibrations in the store: each scene is claimed by one server, and what is stored holds for its kind alone."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 

@@ -1,7 +1,5 @@
 """A scene that is followed by its changes is at each moment what is read as a whole; on either database."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Features in 8 bits: what they cost, what they round, and how those stored as float32 become them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

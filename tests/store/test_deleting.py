@@ -1,7 +1,5 @@
 """A large scene is deleted in portions, and no reader ever sees a part of it, not even after a crash in the middle."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor

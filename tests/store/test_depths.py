@@ -1,7 +1,5 @@
 """Kept depths: what is read is what was kept, to half a per cent; damaged ones and other versions are never used."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pairs of matchings: those that no server has used for long are deleted, no others, on either database."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Every schema that was ever released becomes the present one, and loses nothing; on either database."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path

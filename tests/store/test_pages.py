@@ -3,8 +3,6 @@
 Features and descriptors here are large enough to lie on pages of their own. A page is found by what was stored in it.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Stored matches of pairs: what is read is what was stored, each reference is claimed by one server at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Several servers on one PostgreSQL: each sees at once what another writes; the database may go away and come back."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor

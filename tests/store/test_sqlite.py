@@ -1,7 +1,5 @@
 """What is particular to SQLite: which library, how connections are set, whose a data folder is, faults of its disk."""
 
-from __future__ import annotations
-
 import logging
 import os
 import sqlite3

@@ -1,7 +1,5 @@
 """The store keeps its promises on either database: exact, atomic, ordered, checked."""
 
-from __future__ import annotations
-
 import inspect
 import math
 import struct

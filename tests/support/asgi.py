@@ -1,7 +1,5 @@
 """Requests to an ASGI application without a socket."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Audits of references that are all in memory."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

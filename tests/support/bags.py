@@ -1,7 +1,5 @@
 """Recordings of robots, hand-built by `rosbags` from planted truth."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any

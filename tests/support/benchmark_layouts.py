@@ -1,7 +1,5 @@
 """7-Scenes, 12-Scenes and Cambridge Landmarks as their authors lay them out, from photographs and their poses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Certificates for tests: an authority, and what it signs for servers and clients."""
 
-from __future__ import annotations
-
 import ipaddress
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone

@@ -3,8 +3,6 @@
 `TEST_CHROMIUM=required` makes its absence a failure. WebGL is computed on the CPU, so machines without a GPU draw too.
 """
 
-from __future__ import annotations
-
 import base64
 import itertools
 import json

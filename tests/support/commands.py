@@ -1,7 +1,5 @@
 """`mapless-server` in this process, as a user runs it."""
 
-from __future__ import annotations
-
 from typer.testing import CliRunner, Result
 
 from mapless_tools.cli.app import app

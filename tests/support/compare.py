@@ -1,7 +1,5 @@
 """Comparison of poses, safe against NaN: an error that is not a number is never small enough."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from mapless.geometry import RigidTransform, rotation_angle_deg

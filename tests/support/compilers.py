@@ -1,7 +1,5 @@
 """Compilers for what the protos generate: skipped without them, or required."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

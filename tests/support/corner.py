@@ -1,7 +1,5 @@
 """Photographs of a corner of a room, rendered in milliseconds: three papered walls, full of features."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

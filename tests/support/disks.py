@@ -1,7 +1,5 @@
 """Disks of a few megabytes for tests, which become full or read-only."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ Of the configuration only what a machine of its own decides is changed: addresse
 often health is asked for, so that tests need not wait.
 """
 
-from __future__ import annotations
-
 import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

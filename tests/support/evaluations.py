@@ -1,7 +1,5 @@
 """Planted results of evaluated queries."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

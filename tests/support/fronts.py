@@ -1,7 +1,5 @@
 """What is in front of several servers lets their errors pass as they are."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Messages of the GeoPose Protocol as its own clients send them, built by hand."""
 
-from __future__ import annotations
-
 import base64
 import time
 import uuid

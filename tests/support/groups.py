@@ -1,7 +1,5 @@
 """Groups of photographs with a planted truth: several cameras in one synthetic scene."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 

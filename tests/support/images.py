@@ -1,7 +1,5 @@
 """Image files of unusual kinds, made byte by byte where no available encoder makes them."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """A check of analytic derivatives against differences."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

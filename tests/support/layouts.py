@@ -4,8 +4,6 @@ The planted cameras stand on a circle and look at its middle; nothing of theirs 
 axes or half a pixel that is wrong shows.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Kubernetes manifests: what kustomize makes of them, whether they are valid, and whether pods are confined."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """Fields of messages by their path, as errors name them: "frames[1].intrinsics.width_px"."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

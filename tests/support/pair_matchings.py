@@ -1,7 +1,5 @@
 """A pair matching that takes no network."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from mapless_server.method.nearest import mutual_matches

@@ -4,8 +4,6 @@ A name's SHA-256 seeds PCG64; its raw output, cut to 24 bits, is mapped to [-1, 
 products and one square root, so that it is the same to the bit everywhere.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import re

@@ -1,7 +1,5 @@
 """The input of a stage if all earlier stages were perfect: matches, tracks, structure, scale."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import combinations
 

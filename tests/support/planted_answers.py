@@ -1,7 +1,5 @@
 """Answers of a planted scene, as a server would give them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from datetime import datetime, timezone
 

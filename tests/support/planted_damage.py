@@ -1,7 +1,5 @@
 """Damage to stored data, as by a bad disk."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from mapless_server.security import SceneKey

@@ -1,7 +1,5 @@
 """An exchange without a server, with a clock that the test sets."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from mapless.errors import MaplessError

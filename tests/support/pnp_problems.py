@@ -1,7 +1,5 @@
 """Planted problems of the pose solver: points all over an image, and which of their matches are wrong."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector

@@ -3,8 +3,6 @@
 Each test gets a schema of its own, which costs milliseconds where a database costs a tenth of a second.
 """
 
-from __future__ import annotations
-
 import atexit
 import ctypes
 import os

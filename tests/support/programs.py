@@ -4,8 +4,6 @@ Run as a program, this file is the latter: everything is the real thing but the 
 appends a line to the file "began" and goes on when there is a file "gate". So tests hold it where they want it.
 """
 
-from __future__ import annotations
-
 import asyncio
 import os
 import re

@@ -1,7 +1,5 @@
 """An observer of work queues that counts their events."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 from mapless_server.scheduling import Ending, Observer, Refusal

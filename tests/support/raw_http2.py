@@ -1,7 +1,5 @@
 """HTTP/2 by hand (RFC 9113, 7541), for clients that no library allows: they never read, or never finish sending."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 import struct

@@ -4,8 +4,6 @@ How the method behaves is in the position of the query's first reference: x is h
 ends, see `FAILS`. Which process answered is what it claims for inliers.
 """
 
-from __future__ import annotations
-
 import os
 import threading
 import time

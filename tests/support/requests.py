@@ -1,7 +1,5 @@
 """A good request of every RPC."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from google.protobuf.message import Message

@@ -1,7 +1,5 @@
 """Valid and invalid safetensors files."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from typing import Any

@@ -4,8 +4,6 @@ References stand on an arc around a box of points and look at its middle; the qu
 a descriptor, and every view sees it with a little noise, so that true matches pass a ratio test of 0.85 by far.
 """
 
-from __future__ import annotations
-
 import math
 import zlib
 from dataclasses import dataclass, field

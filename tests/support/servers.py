@@ -1,7 +1,5 @@
 """A real server on loopback, with a real store and a stand-in for the method."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from collections.abc import Callable, Iterator, Sequence

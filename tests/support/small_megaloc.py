@@ -1,7 +1,5 @@
 """A small MegaLoc with weights made by a rule."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Small networks with random weights, and photographs for them."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Databases for tests that hold on each of them, and references that follow from a seed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field

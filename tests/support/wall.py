@@ -1,7 +1,5 @@
 """Photographs of two upright boards, one behind the other: rendered in milliseconds, and they localize well."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """What the audit command prints and writes, of findings that need no server."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager

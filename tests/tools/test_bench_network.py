@@ -1,7 +1,5 @@
 """The networks' benchmark: its counts are the published ones, its measurements true, and failures reported."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

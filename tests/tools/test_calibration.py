@@ -1,7 +1,5 @@
 """Calibration on planted errors: claims that are wrong by a known factor give that factor, and shares are counted."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """Charts: failures are seen, and colours fit any page."""
 
-from __future__ import annotations
-
 import math
 from xml.etree import ElementTree
 

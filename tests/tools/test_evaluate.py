@@ -1,7 +1,5 @@
 """The evaluation's split, figures and reports, on planted results."""
 
-from __future__ import annotations
-
 import io
 import json
 import math

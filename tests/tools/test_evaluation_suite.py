@@ -1,7 +1,5 @@
 """Evaluation as in the paper: who is a reference, what is averaged, what is kept, what is drawn; on planted results."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

@@ -1,7 +1,5 @@
 """7-Scenes, 12-Scenes and Cambridge as users have them: planted poses come back, wrong frames are named."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

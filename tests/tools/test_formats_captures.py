@@ -1,7 +1,5 @@
 """nerfstudio's transforms.json, TUM RGB-D and phones' captures: planted poses come back in our axes."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable

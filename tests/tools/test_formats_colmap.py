@@ -1,7 +1,5 @@
 """COLMAP models, text and binary: the half pixel, every camera model, files that are cut off or damaged."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """kapture 1.1 and LaMAR's sessions: hand-built tables, rigs, cameras, damage; and kapture's own library both ways."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

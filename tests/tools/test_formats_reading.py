@@ -1,7 +1,5 @@
 """Recognizing layouts, reading cameras.json frame by frame, and writing folders that read back."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Recordings of robots: planted poses come back, and what is damaged, missing or ambiguous is named."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from pathlib import Path
 from typing import Any

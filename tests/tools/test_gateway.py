@@ -1,7 +1,5 @@
 """The gateway: the GeoPose Protocol, the form, calls of browsers, and what it refuses."""
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import http.client

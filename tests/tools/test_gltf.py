@@ -1,7 +1,5 @@
 """A scene as glTF, as trimesh reads it: cameras, points and photographs where they are, upright."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import replace
 from datetime import datetime, timezone

@@ -1,7 +1,5 @@
 """The check of poses: planted poses satisfy their matches, and each usual mistake is noticed and named."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import combinations

@@ -1,7 +1,5 @@
 """Matches that one fundamental matrix explains, and how far they are from satisfying given poses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

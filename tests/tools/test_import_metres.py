@@ -1,7 +1,5 @@
 """Metres for folders without: planted similarities are found, and values that contradict or do not suffice refused."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Storing references through a server that is busy, away, full, or refuses one of a message."""
 
-from __future__ import annotations
-
 import hashlib
 import threading
 from collections.abc import Callable, Sequence

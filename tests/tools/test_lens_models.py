@@ -1,7 +1,5 @@
 """One table decides which lens models there are; a place that does not know one fails by the field's name."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace

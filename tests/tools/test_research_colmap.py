@@ -1,7 +1,5 @@
 """COLMAP beside mapless: on the rendered room, whose poses are exact, and the table of both."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

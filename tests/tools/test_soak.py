@@ -1,7 +1,5 @@
 """A soak's verdict: planted leaks are found, and neither noise, waves nor a curve that has settled is taken for one."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Two servers by turns: what is reported of their times."""
 
-from __future__ import annotations
-
 import os
 import time
 

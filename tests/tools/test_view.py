@@ -1,7 +1,5 @@
 """What the viewer draws lies where it belongs, what it says is text, and it serves its own pages alone."""
 
-from __future__ import annotations
-
 import socket
 import sys
 import threading

@@ -1,7 +1,5 @@
 """Writes the demo's photographs, in a minute: `PYTHONPATH=client:server python -m research.rendered_room FOLDER`."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

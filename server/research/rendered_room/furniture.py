@@ -4,8 +4,6 @@ World axes: x along the long walls, y across, z up, metres; the origin is a corn
 wall x = 0, the bookshelf stands at x = 5, the door is in the wall y = 0, the cupboard stands at y = 4.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field

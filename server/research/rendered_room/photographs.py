@@ -1,7 +1,5 @@
 """Where the cameras stand, and what they do to the light."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

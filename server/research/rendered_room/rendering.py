@@ -8,8 +8,6 @@ frame, x(u, v) = corner + u across + v down, and a pixel p = (x, y, 1),
 so u / depth, v / depth and 1 / depth are linear in the pixel, and nothing is approximate but the filtering of textures.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from typing import NamedTuple

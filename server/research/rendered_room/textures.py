@@ -3,8 +3,6 @@
 There is detail at every scale, for features to hold on to from near and from far, and none of it repeats exactly.
 """
 
-from __future__ import annotations
-
 import colorsys
 import itertools
 from collections.abc import Callable
