@@ -46,13 +46,7 @@ _JPEG_WITHOUT_LENGTH = frozenset(range(0xD0, 0xD8)) | {0x01}
 
 @dataclass(frozen=True)
 class ImageLimits:
-    """Limits of the images that are accepted.
-
-    Attributes:
-        max_bytes: largest size of the encoded file.
-        max_pixels: largest product of width and height.
-        min_side_px, max_side_px: bounds of width and height, inclusive.
-    """
+    """Limits of the images that are accepted; those of the sides are inclusive."""
 
     max_bytes: int = 16 * 2**20
     max_pixels: int = 50_000_000
@@ -63,9 +57,8 @@ class ImageLimits:
 def image_size(data: bytes, limits: ImageLimits, field: str = "image") -> tuple[int, int]:
     """Width and height of an image, pixels, from its header alone.
 
-    Raises:
-        InvalidArgument: the file is empty, has too many bytes, is not a JPEG, PNG or WebP, is cut within its header, or
-            has a size that is not accepted; names `field`.
+    InvalidArgument, naming `field`, if the file is empty, has too many bytes, is not a JPEG, PNG or WebP, is cut within
+    its header, or has a size that is not accepted.
     """
     if not data:
         raise InvalidArgument("the image is empty", reason="IMAGE_EMPTY", field=field)
@@ -100,8 +93,7 @@ def image_size(data: bytes, limits: ImageLimits, field: str = "image") -> tuple[
 def decode_image(data: bytes, limits: ImageLimits, field: str = "image") -> NDArray[np.uint8]:
     """Pixels of an image, (H, W, 3) RGB, as the file stores them: EXIF orientation is not applied.
 
-    Raises:
-        InvalidArgument: as in `image_size`, or the decoder cannot read the file to its end; names `field`.
+    InvalidArgument as of `image_size`, or if the decoder cannot read the file to its end.
     """
     width, height = image_size(data, limits, field)
     if data.startswith(b"\xff\xd8") and _has_many_scans(data):

@@ -24,11 +24,7 @@ _PIECE_BYTES = 2**20
 
 
 class BadChunks(Exception):
-    """A PNG is cut off, or has more data than its pixels need; the message is for the caller.
-
-    Attributes:
-        is_too_much: whether it has too much data.
-    """
+    """A PNG is cut off, or has more data than its pixels need (`is_too_much`); the message is for the caller."""
 
     def __init__(self, message: str, is_too_much: bool) -> None:
         super().__init__(message)
@@ -38,9 +34,8 @@ class BadChunks(Exception):
 def essential_png(data: bytes) -> bytes:
     """The PNG with only header, palette and pixels; the decoder checks their checksums.
 
-    Raises:
-        BadChunks: a chunk exceeds the file's end, the end is missing, there are too many chunks, or there are more data
-            than pixels, which would be inflated all the same.
+    BadChunks if a chunk exceeds the file's end, the end is missing, there are too many chunks, or there are more data
+    than pixels, which would be inflated all the same.
     """
     view = memoryview(data)
     kept: list[memoryview | bytes] = [_SIGNATURE]

@@ -43,11 +43,9 @@ _POLL_S = 0.2
 
 
 class State(Protocol):
-    """State of the server; read by the threads of this port.
+    """State of the server, which the threads of this port read: what health reports, and the last heartbeat.
 
-    Attributes:
-        is_serving: whether health reports SERVING.
-        beaten_s: time of the last heartbeat, by `time.monotonic`; None while the server starts.
+    The heartbeat's time is that of `time.monotonic`; None while the server starts.
     """
 
     is_serving: bool
@@ -58,17 +56,7 @@ class MetricsServer:
     """Serves a registry and the probes until it is closed."""
 
     def __init__(self, registry: CollectorRegistry, host: str, port: int, state: State) -> None:
-        """Begins to listen and to serve.
-
-        Args:
-            registry: the metrics.
-            host: address to listen on.
-            port: port to listen on; 0 for any free one.
-            state: state of the server.
-
-        Raises:
-            OSError: the address cannot be listened on.
-        """
+        """Begins to listen and to serve; port 0 for any free one. OSError if the address cannot be listened on."""
         self._server = _HttpServer(host, port)
         self._server.set_app(_application(registry, state))
         self.port: int = self._server.server_port

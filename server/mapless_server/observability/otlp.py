@@ -31,10 +31,9 @@ Attribute = str | bool | int | float
 
 
 def make_otlp_tracer(endpoint: str) -> OtlpTracer:
-    """Makes a tracer that sends to an address such as "http://host:4317"; does not check whether a collector listens.
+    """Makes a tracer that sends to an address such as "http://host:4317"; ValueError if it is not one.
 
-    Raises:
-        ValueError: the endpoint is not such an address.
+    Whether a collector listens is not checked.
     """
     address = urlsplit(endpoint)
     if address.scheme not in ("http", "https") or not address.hostname:

