@@ -16,6 +16,18 @@ from .geometry import Array, Quaternion, RigidTransform
 from .v1 import localization_service_pb2 as pb
 from .wire import optional
 
+DOUBTFUL_TRUST = 0.15
+"""Below it, an answer looks worse than 17 of 20 right ones of difficult places: the intrinsics may be wrong."""
+
+_FIELDS = {
+    "FOCAL_LENGTH": "focal_x_px",
+    "PRINCIPAL_X": "principal_x_px",
+    "PRINCIPAL_Y": "principal_y_px",
+    "K1": "k1",
+}
+"""Of CameraIntrinsics, as rejections name them, by parameter."""
+_CAPTURED = "captured by the server"
+
 
 @dataclass(frozen=True)
 class Accuracy:
@@ -44,6 +56,14 @@ class Accuracy:
         if self.calibrated:
             return f"on {self.sample_size} photographs" if self.sample_size else "on photographs"
         return ""
+
+    def text(self, kind: str, unit: str) -> str:
+        """The radii of a `kind`, "position" or "rotation", as a phrase; `unit` is "m", "units" or "deg"."""
+        factor, shown = (100, "cm") if unit == "m" else (1, unit)
+        suffix = "m" if kind == "position" else "deg"
+        radii = [factor * getattr(self, f"{kind}_{share}_{suffix}") for share in (68, 95)]
+        note = f"calibrated {self.calibrated_by}" if self.calibrated_by else "uncalibrated"
+        return f"within {radii[0]:.2g} {shown} (68 %), {radii[1]:.2g} {shown} (95 %, {note})"
 
 
 @dataclass(frozen=True)
@@ -149,6 +169,12 @@ class PriorCheck:
     conflict: bool
     used: bool
 
+    def __str__(self) -> str:
+        if self.conflict:
+            ignored = "" if self.used else ", not used"
+            return f"{self.kind} contradicts the photograph: {self.mahalanobis:.1f} standard deviations{ignored}"
+        return f"{self.kind} agrees, " + ("used" if self.used else "less certain than the photograph, not needed")
+
 
 @dataclass(frozen=True)
 class IntrinsicsCheck:
@@ -171,6 +197,14 @@ class IntrinsicsCheck:
     given_sigma: float
     conflict: bool
     used: bool
+
+    def __str__(self) -> str:
+        name = _FIELDS.get(self.parameter, self.parameter)
+        digits = 3 if self.parameter == "K1" else 1
+        return (
+            f"{name} is {self.given:.{digits}f}, the photograph says {self.estimated:.{digits}f} +- "
+            f"{self.estimated_sigma:.{digits}f}{': used' if self.used else ''}"
+        )
 
 
 @dataclass(frozen=True)
@@ -274,6 +308,27 @@ class LocalizationResult:
         """
         return None if self.in_axes is None else self.in_axes.world_from_session
 
+    def __str__(self) -> str:
+        pose = self.world_from_camera if self.in_axes is None else self.in_axes.world_from_camera
+        frame = "" if self.in_axes is None else f"   in {self.in_axes.axes} axes"
+        text = [f"{_outcome(self)}{frame}", *pose_lines(pose, self.accuracy, self.arbitrary_unit)]
+        if self.geo_pose is not None:
+            geo = self.geo_pose
+            text.append(f"  on earth  {geo.lat:.7f}, {geo.lon:.7f}, {geo.h:.2f} m")
+        text += [f"  prior     {check}" for check in self.prior_checks]
+        text += [f"  camera    {check}" for check in self.intrinsics_checks if _differs(check)]
+        captured = f", {_CAPTURED}" if self.diagnostics.captured else ""
+        tracked = ", tracked" if self.diagnostics.is_tracked else ""
+        text.append(f"  support   {_support(self)}, {self.diagnostics.total_s:.2f} s{tracked}{captured}")
+        if self.arbitrary_unit:
+            text.append("  warning   the scene's unit of length is arbitrary, not the metre")
+        if self.scale_source == "NETWORK":
+            text.append("  warning   a single reference: its distance is a network's estimate, as the radius says")
+        if self.trust is not None and self.trust < DOUBTFUL_TRUST:
+            doubtful = f"fewer than {100 * DOUBTFUL_TRUST:g} % of right answers look as doubtful"
+            text.append(f"  warning   {doubtful}: check the intrinsics")
+        return "\n".join(text)
+
 
 @dataclass(frozen=True, eq=False)
 class Rejected:
@@ -300,6 +355,50 @@ class Rejected:
     intrinsics_checks: tuple[IntrinsicsCheck, ...] = ()
     debug: Debug | None = None
     is_final: bool = field(default=True, init=False)
+
+    def __str__(self) -> str:
+        text = rejection_text(self.reason, self.message, self.hint)
+        return f"{text}\n  {_CAPTURED}" if self.diagnostics.captured else text
+
+
+def rejection_text(reason: str, message: str, hint: Hint | None) -> str:
+    """A rejection as a few lines."""
+    text = [f"not localized: {reason}", f"  {message}"]
+    if hint is not None and hint.message:
+        text.append(f"  {hint.message}")
+    if hint is not None and hint.best_reference:
+        text.append(f"  shares most with reference {hint.best_reference.rpartition('/')[2]}")
+    return "\n".join(text)
+
+
+def pose_lines(pose: RigidTransform, accuracy: Accuracy | None, is_arbitrary: bool) -> list[str]:
+    """Position and rotation with their radii, a line each."""
+    (x, y, z), q = pose.translation, pose.quaternion()
+    unit = "units" if is_arbitrary else "m"
+    radii = ["" if accuracy is None else f"   {accuracy.text(*it)}" for it in (("position", unit), ("rotation", "deg"))]
+    return [
+        f"  position  {x:.3f}  {y:.3f}  {z:.3f} {unit}{radii[0]}",
+        f"  rotation  x {q.x:.4f}  y {q.y:.4f}  z {q.z:.4f}  w {q.w:.4f}{radii[1]}",
+    ]
+
+
+def _outcome(answer: LocalizationResult) -> str:
+    if answer.pose_stage == "COARSE":
+        return "coarse pose" if answer.is_final else "coarse pose, the refined one follows"
+    return "localized" if answer.trust is None else f"localized, trust {answer.trust:.3f}"
+
+
+def _support(answer: LocalizationResult) -> str:
+    """Text of a pose's inliers and references."""
+    if answer.pose_stage == "COARSE":
+        return "not verified"
+    used = sum(use.inlier_count > 0 for use in answer.diagnostics.references)
+    return f"{answer.inlier_count} of {answer.match_count} matches, {used} references"
+
+
+def _differs(check: IntrinsicsCheck) -> bool:
+    """Whether the photograph's value was used because it differs from the given one by more than its usual error."""
+    return check.used and abs(check.estimated - check.given) > check.given_sigma
 
 
 def answer_from_message(message: pb.LocalizeResponse) -> LocalizationResult | Rejected:

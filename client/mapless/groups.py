@@ -19,8 +19,10 @@ from .answers import (
     covariance_from_message,
     diagnostics_from_message,
     geo_pose_from_message,
+    pose_lines,
     prior_checks_from_messages,
     rejection_fields,
+    rejection_text,
 )
 from .geodesy import GeoPose
 from .geometry import Array, Camera, RigidTransform, Similarity
@@ -138,6 +140,10 @@ class RigLocalization:
     arbitrary_unit: bool = False
     trust: float | None = None
 
+    def __str__(self) -> str:
+        pose = pose_lines(self.world_from_rig, self.accuracy, self.arbitrary_unit)
+        return "\n".join([f"rig {_support(self)}", *pose])
+
 
 @dataclass(frozen=True, eq=False)
 class SequenceLocalization:
@@ -174,6 +180,16 @@ class SequenceLocalization:
     jumps: tuple[TrackingJump, ...] = ()
     trust: float | None = None
 
+    def __str__(self) -> str:
+        last = pose_lines(self.world_from_camera[-1], self.accuracy, self.arbitrary_unit)
+        unit = "units" if self.arbitrary_unit else "m"
+        jumps = [
+            f"  jump      between photographs {it.before} and {it.after}: {it.shift_m:.3g} {unit}, "
+            f"{it.rotation_deg:.3g} deg"
+            for it in self.jumps
+        ]
+        return "\n".join([f"sequence {_support(self)}", *last, *jumps])
+
 
 @dataclass(frozen=True, eq=False)
 class GroupRejected:
@@ -193,6 +209,15 @@ class GroupRejected:
     hint: Hint | None = None
     hypotheses: tuple[Hypothesis, ...] = ()
     capture_time: datetime | None = None
+
+    def __str__(self) -> str:
+        return rejection_text(self.reason, self.message, self.hint)
+
+
+def _support(answer: RigLocalization | SequenceLocalization) -> str:
+    trust = "" if answer.trust is None else f", trust {answer.trust:.3f}"
+    photographs = f"{len(answer.images)} photographs"
+    return f"localized{trust}: {answer.inlier_count} of {answer.match_count} matches, {photographs}"
 
 
 def rig_from_message(message: pb.LocalizeRigResponse) -> RigLocalization | GroupRejected:

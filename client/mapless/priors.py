@@ -92,6 +92,17 @@ class PosePrior:
     world_from_camera: RigidTransform
     covariance: Array
 
+    @classmethod
+    def from_sigmas(
+        cls, world_from_camera: RigidTransform, position_sigma_m: float, rotation_sigma_deg: float
+    ) -> PosePrior:
+        """A prior with these standard deviations along, and about, each axis; ValueError if one is not above 0."""
+        for name, sigma in (("position_sigma_m", position_sigma_m), ("rotation_sigma_deg", rotation_sigma_deg)):
+            if not sigma > 0:
+                raise ValueError(f"{name} must be above 0, is {sigma:g}")
+        sigmas = [position_sigma_m] * 3 + [np.radians(rotation_sigma_deg)] * 3
+        return cls(world_from_camera, np.diag(np.square(sigmas)))
+
 
 @dataclass(frozen=True, eq=False)
 class Priors:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 
 from . import names, wire
@@ -59,7 +59,7 @@ class Reference:
     image_sha256: str
     feature_count: int
     create_time: datetime
-    image: bytes | None = None
+    image: bytes | None = field(default=None, repr=False)
     warnings: tuple[str, ...] = ()
 
 

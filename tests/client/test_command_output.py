@@ -1,23 +1,32 @@
 """What a person reads on the terminal, and the small change of the command's arguments."""
 
 import json
+import re
 from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support.planted_answers import diagnostics, localized, rejected
+from support.planted_answers import diagnostics, localized, rejected, truth
 
 from mapless import wire
-from mapless.answers import IntrinsicsCheck, PriorCheck
+from mapless.answers import IntrinsicsCheck, LocalizationResult, PriorCheck, Rejected
 from mapless.axes import Axes
 from mapless.cameras import read_camera
+from mapless.cli.arguments import make_parser
 from mapless.cli.folder import Tally
-from mapless.cli.output import line, lines, plain
+from mapless.cli.localize import priors
+from mapless.cli.output import line, plain
 from mapless.errors import Internal
-from mapless.geometry import Camera, Fisheye, RigidTransform
+from mapless.geometry import Camera, Fisheye, RigidTransform, Similarity
+from mapless.groups import GroupRejected, RigLocalization, SequenceLocalization, TrackingJump
+from mapless.priors import Priors
 from mapless.requests import read_image
 from mapless.v1 import localization_service_pb2 as pb
+
+
+def lines(answer: LocalizationResult | Rejected) -> list[str]:
+    return str(answer).splitlines()
 
 
 def test_each_prior_has_its_line() -> None:
@@ -97,6 +106,55 @@ def test_zeros_are_printed_and_what_is_absent_is_not() -> None:
     assert {*plain(pinhole)} == {it.name for it in fields(Camera)} - {"distortion"}
     assert plain(replace(pinhole, distortion=Fisheye(k2=0.1)))["fisheye"] == {"k1": 0, "k2": 0.1, "k3": 0, "k4": 0}
     assert read_camera(json.dumps(plain(pinhole))) == pinhole
+
+
+def test_text_of_a_group_is_its_pose_or_its_reason() -> None:
+    answer, spread = localized(), 1e-4 * np.eye(6)
+    assert answer.accuracy is not None
+    common = spread, answer.accuracy, 180, 200, 0.5, ()
+    assert str(RigLocalization(truth(), *common, trust=0.9)).splitlines() == [
+        "rig localized, trust 0.900: 180 of 200 matches, 0 photographs",
+        *lines(answer)[1:3],
+    ]
+    moved = SequenceLocalization(
+        Similarity(1.0, np.eye(3), np.zeros(3)),
+        0.0,
+        (truth(),),
+        *common,
+        "OPENCV",
+        jumps=(TrackingJump(3, 4, 0.25, 2.0),),
+    )
+    assert str(moved).splitlines()[1:] == [
+        *lines(answer)[1:3],
+        "  jump      between photographs 3 and 4: 0.25 m, 2 deg",
+    ]
+    assert str(GroupRejected("GATE", "No.", (), rejected().hint)).splitlines() == lines(
+        replace(rejected(), reason="GATE", message="No.")
+    )
+
+
+def test_priors_of_the_command_are_those_of_the_client() -> None:
+    pose = '{"rotation": {"w": 1}, "translation_m": {"x": 1}}'
+    flags = "--near 1 2 3 4 --looking 0 0 1 30 --geo-position 47 8 5 --gravity 0 1 0 --gravity-sigma 2"
+    given = make_parser().parse_args(["localize", "hall", "a.jpg", *flags.split(), "--pose-prior", pose, "0.1", "3"])
+    found = priors(given)
+    assert all(getattr(found, it.name) is not None for it in fields(Priors))
+    assert found.pose is not None
+    assert found.pose.world_from_camera.translation.tolist() == [1, 0, 0]
+    np.testing.assert_allclose(np.sqrt(np.diag(found.pose.covariance)), [0.1] * 3 + [np.radians(3)] * 3)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (["[[1]]", "1", "1"], "--pose-prior: pose: world_from_camera as a matrix: must be 3 or 4 rows"),
+        (["{}", "a", "1"], "METRES and DEGREES of --pose-prior must be numbers, are 'a' and '1'"),
+        (['{"rotation": {"w": 1}, "translation_m": {}}', "1", "0"], "rotation_sigma_deg must be above 0, is 0"),
+    ],
+)
+def test_wrong_parts_of_a_pose_prior_are_named(values: list[str], message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        priors(make_parser().parse_args(["localize", "hall", "a.jpg", "--pose-prior", *values]))
 
 
 def test_progress_counts_each_kind_by_its_name() -> None:

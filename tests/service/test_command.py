@@ -82,6 +82,8 @@ def test_a_reference_is_shown_and_its_photograph_downloaded(
     monkeypatch.chdir(tmp_path)
     client.add_reference(scene, NewReference("view", PHOTO, CAMERA, pose(1.5)))
     code, shown, _ = run("reference", "show", scene, "view")
+    assert run("reference", "get", scene, "view") == (0, shown, "")
+    assert run("scene", "show", scene) == run("scene", "get", scene)
     assert (code, shown["reference_id"], shown["world_from_camera"]["translation_m"]["x"]) == (0, "view", 1.5)
     assert run("reference", "download", scene, "view") == (0, {"file": "view.png"}, "")
     assert (tmp_path / "view.png").read_bytes() == PHOTO

@@ -143,7 +143,7 @@ def all_parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentPa
     yield parser
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
-            for child in action.choices.values():
+            for child in dict.fromkeys(action.choices.values()):  # aliases name the same parser
                 yield from all_parsers(child)
 
 
@@ -210,11 +210,11 @@ def _add_scene(scene: argparse.ArgumentParser) -> None:
         help="property to delete; may be repeated",
     )
     update.set_defaults(run=commands.update_scene)
-    for action, run, text in (
-        ("get", commands.get_scene, "its number of references, datum, unit and calibration"),
-        ("delete", commands.delete_scene, "delete it with all of its references"),
+    for action, others, run, text in (
+        ("get", ["show"], commands.get_scene, "its number of references, datum, unit and calibration"),
+        ("delete", [], commands.delete_scene, "delete it with all of its references"),
     ):
-        one = actions.add_parser(action, help=text)  # completion knows only those with a text
+        one = actions.add_parser(action, aliases=others, help=text)  # completion knows only those with a text
         one.add_argument("scene")
         one.set_defaults(run=run)
     listing = actions.add_parser("list", help="all scenes")
@@ -254,12 +254,12 @@ def _add_reference(reference: argparse.ArgumentParser) -> None:
     listing = actions.add_parser("list", help="all references of a scene")
     listing.add_argument("scene")
     listing.set_defaults(run=commands.list_references)
-    for action, run, text in (
-        ("show", commands.show_reference, "its camera, pose, hash and number of features"),
-        ("download", commands.download_reference, "its photograph, the bytes that were stored"),
-        ("delete", commands.delete_reference, "delete it"),
+    for action, others, run, text in (
+        ("show", ["get"], commands.show_reference, "its camera, pose, hash and number of features"),
+        ("download", [], commands.download_reference, "its photograph, the bytes that were stored"),
+        ("delete", [], commands.delete_reference, "delete it"),
     ):
-        one = actions.add_parser(action, help=text)
+        one = actions.add_parser(action, aliases=others, help=text)
         one.add_argument("scene")
         one.add_argument("reference")
         one.set_defaults(run=run)
@@ -280,16 +280,6 @@ def _add_localize(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument("--rerank", action="store_true", help="the server chooses among the references given")
     _add_priors(command)
-    command.add_argument(
-        "--gravity",
-        type=float,
-        nargs=3,
-        metavar=("X", "Y", "Z"),
-        help="gravity prior: down in the camera's axes (x right, y down, z forward), for scenes with a known down",
-    )
-    command.add_argument(
-        "--gravity-sigma", type=float, default=1.0, metavar="DEG", help="its standard deviation (default: %(default)s)"
-    )
     for name, unit, text in (
         ("focal", "PX", "both focal lengths"),
         ("principal", "PX", "the principal point"),
@@ -331,7 +321,7 @@ def _add_questions(groups: argparse._SubParsersAction[_Command]) -> None:
     retrieve.add_argument("photo", type=Path)
     retrieve.add_argument("--camera", required=True, help="its camera, see `mapless --help`")
     retrieve.add_argument("--count", type=_count, default=0, help=f"how many {_COUNT_DEFAULT}")
-    _add_priors(retrieve)
+    _add_limits(retrieve)
     retrieve.set_defaults(run=commands.retrieve)
 
     coverage = groups.add_parser("coverage", help="predict whether a photograph at a pose would be localized")
@@ -341,14 +331,47 @@ def _add_questions(groups: argparse._SubParsersAction[_Command]) -> None:
     coverage.set_defaults(run=commands.coverage)
 
 
-def _add_priors(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--near", type=float, nargs=4, metavar=("X", "Y", "Z", "RADIUS"), help="position prior, metres"
+def _add_limits(command: argparse.ArgumentParser) -> argparse._ArgumentGroup:
+    """Adds the hard priors: limits of the pose and of the references considered."""
+    group = command.add_argument_group("priors")
+    group.add_argument(
+        "--near", type=float, nargs=4, metavar=("X", "Y", "Z", "RADIUS"), help="hard limit of the position, metres"
     )
-    command.add_argument(
+    group.add_argument(
         "--looking",
         type=float,
         nargs=4,
         metavar=("X", "Y", "Z", "ANGLE"),
-        help="heading prior: direction in the world, and degrees around it",
+        help="hard limit of the viewing direction: a direction in the world, and degrees around it",
+    )
+    return group
+
+
+def _add_priors(command: argparse.ArgumentParser) -> None:
+    """Adds all priors; the soft ones have standard deviations, and are not used where the photograph contradicts."""
+    group = _add_limits(command)
+    group.add_argument(
+        "--pose-prior",
+        nargs=3,
+        metavar=("POSE", "METRES", "DEGREES"),
+        help="expected world_from_camera, and standard deviations of its position and rotation about each axis; "
+        "makes the answer faster",
+    )
+    group.add_argument(
+        "--geo-position",
+        type=float,
+        nargs=3,
+        metavar=("LATITUDE", "LONGITUDE", "METRES"),
+        help="of a satellite receiver: WGS84 degrees, and standard deviation of north and of east; for scenes with a "
+        "datum",
+    )
+    group.add_argument(
+        "--gravity",
+        type=float,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="down in the camera's axes (x right, y down, z forward), for scenes with a known down",
+    )
+    group.add_argument(
+        "--gravity-sigma", type=float, default=1.0, metavar="DEG", help="its standard deviation (default: %(default)s)"
     )

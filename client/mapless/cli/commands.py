@@ -19,7 +19,7 @@ from ..names import check_id
 from ..requests import NewReference
 from ..results import Reference, Scene
 from .folder import EXIT_FAILED, EXIT_REJECTED
-from .localize import priors
+from .localize import limits
 from .output import card, show, table
 
 _BLANK = "nothing can be matched with it; it is blank, dark or blurred"
@@ -215,7 +215,7 @@ def delete_reference(client: Client, arguments: argparse.Namespace) -> int:
 def retrieve(client: Client, arguments: argparse.Namespace) -> int:
     """Finds the references most similar to a photograph."""
     camera = read_camera(arguments.camera, arguments.photo)
-    given = priors(arguments)
+    given = limits(arguments)
     found = client.retrieve_references(arguments.photo, camera, arguments.scene, arguments.count, priors=given)
     rows = [(it.name.rpartition("/")[2], f"{it.similarity:.3f}", *_position(it.world_from_camera)) for it in found]
     return show(arguments, found, table(("REFERENCE", "SIMILARITY", "X", "Y", "Z"), rows))

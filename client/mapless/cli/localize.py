@@ -16,11 +16,11 @@ from typing import Any, TextIO
 import numpy as np
 
 from ..answers import LocalizationResult, Rejected
-from ..cameras import FOLDER_FILE, read_camera, read_cameras
+from ..cameras import FOLDER_FILE, read_camera, read_cameras, read_pose
 from ..client import Client
 from ..errors import InvalidArgument, MaplessError, NotFound
 from ..geometry import Camera
-from ..priors import GravityPrior, HeadingPrior, PositionPrior, Priors
+from ..priors import GeoPositionPrior, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
 from ..report import write_report
 from ..requests import ImageSource, IntrinsicsUncertainty
 from ..results import Reference
@@ -66,7 +66,7 @@ def _one(client: Client, arguments: argparse.Namespace) -> int:
             if arguments.output or output.is_json(arguments):
                 print(json.dumps(output.plain(_printed(answer, arguments)), indent=indent), file=file, flush=True)
             else:
-                print("\n".join(output.lines(answer)), file=file, flush=True)
+                print(answer, file=file, flush=True)
     _print_paths(arguments)
     return EXIT_REJECTED if isinstance(answer, Rejected) else 0
 
@@ -243,15 +243,36 @@ def _printed(answer: LocalizationResult | Rejected, arguments: argparse.Namespac
     return answer if arguments.debug else replace(answer, debug=None)
 
 
-def priors(arguments: argparse.Namespace) -> Priors:
-    """The priors that the command line gives."""
+def limits(arguments: argparse.Namespace) -> Priors:
+    """The hard priors that the command line gives."""
     near, looking = arguments.near, arguments.looking
-    gravity = getattr(arguments, "gravity", None)
     return Priors(
         position=PositionPrior(np.array(near[:3]), near[3]) if near else None,
         heading=HeadingPrior(np.array(looking[:3]), looking[3]) if looking else None,
-        gravity=GravityPrior(np.array(gravity), arguments.gravity_sigma) if gravity else None,
     )
+
+
+def priors(arguments: argparse.Namespace) -> Priors:
+    """All priors that the command line gives."""
+    geo_position, gravity = arguments.geo_position, arguments.gravity
+    return replace(
+        limits(arguments),
+        geo_position=GeoPositionPrior(*geo_position) if geo_position else None,
+        gravity=GravityPrior(np.array(gravity), arguments.gravity_sigma) if gravity else None,
+        pose=_pose_prior(*arguments.pose_prior) if arguments.pose_prior else None,
+    )
+
+
+def _pose_prior(pose: str, position_sigma_m: str, rotation_sigma_deg: str) -> PosePrior:
+    try:
+        sigmas = float(position_sigma_m), float(rotation_sigma_deg)
+    except ValueError:
+        given = f"{position_sigma_m!r} and {rotation_sigma_deg!r}"
+        raise ValueError(f"METRES and DEGREES of --pose-prior must be numbers, are {given}") from None
+    try:
+        return PosePrior.from_sigmas(read_pose(pose), *sigmas)
+    except ValueError as error:
+        raise ValueError(f"--pose-prior: {error}") from None
 
 
 def intrinsics_uncertainty(arguments: argparse.Namespace) -> IntrinsicsUncertainty | None:

@@ -275,8 +275,8 @@ def _pose_prior(
     except ValueError as error:
         raise Failure(str(error), field=f"{where}.geopose") from None
     sigma_m = max(math.hypot(accuracy.position, _WALK_M_PER_S * age_s), 0.01)
-    sigma = math.radians(min(max(math.hypot(accuracy.orientation, _TURN_DEG_PER_S * age_s), 0.1), 180.0))
-    return PosePrior(world_from_camera, np.diag([sigma_m**2] * 3 + [sigma**2] * 3)), where
+    sigma_deg = min(max(math.hypot(accuracy.orientation, _TURN_DEG_PER_S * age_s), 0.1), 180.0)
+    return PosePrior.from_sigmas(world_from_camera, sigma_m, sigma_deg), where
 
 
 def _check_past(timestamp_ms: float, now_ms: float, field: str) -> None:
