@@ -4,8 +4,6 @@ A page says `<!-- generated: NAME -->` where the text of `reference.GENERATORS[N
 work in the repository; here those that leave `docs/` lead to the page that shows the file, or become plain text.
 """
 
-from __future__ import annotations
-
 import os
 import posixpath
 import re

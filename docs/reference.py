@@ -4,8 +4,6 @@ Each generator returns Markdown, which `hooks.py` puts where a page asks for it.
 one of them.
 """
 
-from __future__ import annotations
-
 import ast
 import os
 import re

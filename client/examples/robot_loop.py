@@ -7,8 +7,6 @@ skipped, not queued. The previous pose, with the uncertainty of the robot's moti
 server reports if the photograph contradicts it. Needs mapless and OpenCV (to decode the video and encode its frames).
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -1,7 +1,5 @@
 """The command `mapless`: what the client can do, from a shell."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

@@ -1,7 +1,5 @@
 """Answers of Localize: `LocalizationResult` and `Rejected`, and their parts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime

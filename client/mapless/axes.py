@@ -25,8 +25,6 @@ camera), `turned_raster` converts between the two.
 Quaternions need no rule of their own: in each of these, Unity included, (x, y, z, w) stands for the same matrix.
 """
 
-from __future__ import annotations
-
 from enum import Enum
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Reads cameras and poses from the interface's JSON, from four numbers, or from a folder's cameras.json."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import fields

@@ -4,8 +4,6 @@ gRPC tries all of them and reports the last failure. If nothing listens at one a
 other, at which the server listens.
 """
 
-from __future__ import annotations
-
 import re
 import socket
 

@@ -1,7 +1,5 @@
 """Errors of calls. A photograph that could not be localized is not an error but an answer, `Rejected`."""
 
-from __future__ import annotations
-
 import re
 from typing import Any, TypeVar
 from urllib.parse import unquote

@@ -8,8 +8,6 @@ gRPC's own retries are not used. They ignore RetryInfo, so they cannot distingui
 from a message over the limit (never retry), and they repeat a creation without checking who created what then exists.
 """
 
-from __future__ import annotations
-
 import math
 import random
 import time
@@ -57,7 +55,7 @@ class Call:
     response_type: type[Message]
     timeout_s: float | None = None
     is_upload: bool = False
-    on_repeat: Callable[[MaplessError], Exchange[Any]] | None = None
+    on_repeat: "Callable[[MaplessError], Exchange[Any]] | None" = None
     early: Callable[[Any], Any] | None = None
 
     @property

@@ -12,8 +12,6 @@ given in ENU at the place of the pose, so it includes that rotation.
 Heights are above the ellipsoid, as satellite receivers give them, not above the sea: the two differ by up to 107 m.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from dataclasses import asdict, dataclass, field
@@ -113,7 +111,7 @@ class Datum:
         return asdict(self)
 
     @staticmethod
-    def from_json(content: object) -> Datum:
+    def from_json(content: object) -> "Datum":
         """Reads it from a JSON object; enu_from_world is optional.
 
         ValueError if a member is missing, is no number or out of bounds.
@@ -166,7 +164,7 @@ class GeoPose:
         }
 
     @staticmethod
-    def from_json(content: object) -> GeoPose:
+    def from_json(content: object) -> "GeoPose":
         """Reads it from a JSON object; members that the standard does not define are ignored.
 
         ValueError if a member is missing, is no number or out of bounds.

@@ -1,7 +1,5 @@
 """Photographs that are localized together, of a rig or a sequence: inputs and answers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any

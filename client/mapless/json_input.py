@@ -1,7 +1,5 @@
 """Reads messages from JSON that people write: a wrong field is named as written, with its value and bounds."""
 
-from __future__ import annotations
-
 import difflib
 import json
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Names of scenes and references: "scenes/{scene}" and "scenes/{scene}/references/{reference}"."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Options of a client's connection."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import dataclass, field

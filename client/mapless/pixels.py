@@ -1,7 +1,5 @@
 """The size of a JPEG, PNG or WebP image from its header, without decoding."""
 
-from __future__ import annotations
-
 # Frame headers of JPEG: all SOF markers; the others in 0xC0 to 0xCF are tables.
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_ALONE = frozenset({0x01, *range(0xD0, 0xD9)})  # markers that no segment follows

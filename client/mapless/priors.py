@@ -4,8 +4,6 @@ A hard prior is a limit: a pose beyond it is rejected. A soft prior has a value 
 pose and is compared with it (`PriorCheck`); a soft prior that contradicts the photograph is not used.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -95,7 +93,7 @@ class PosePrior:
     @classmethod
     def from_sigmas(
         cls, world_from_camera: RigidTransform, position_sigma_m: float, rotation_sigma_deg: float
-    ) -> PosePrior:
+    ) -> "PosePrior":
         """A prior with these standard deviations along, and about, each axis; ValueError if one is not above 0."""
         for name, sigma in (("position_sigma_m", position_sigma_m), ("rotation_sigma_deg", rotation_sigma_deg)):
             if not sigma > 0:

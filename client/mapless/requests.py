@@ -1,7 +1,5 @@
 """A new reference, how far intrinsics may be off, and the bytes of a photograph."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Scenes, references, and results of retrieval, audit and coverage."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import datetime

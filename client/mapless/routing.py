@@ -4,8 +4,6 @@ A load balancer does not read messages. With this metadata it can route all call
 has the scene's references in memory. Servers ignore it and use the request.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from google.protobuf.message import Message

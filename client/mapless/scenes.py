@@ -1,7 +1,5 @@
 """Properties of a scene: calibration, directions, datum, and their messages, which client and server share."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from datetime import datetime

@@ -3,8 +3,6 @@
 MAPLESS_ADDRESS has the server, MAPLESS_TOKEN the token, MAPLESS_SCENE the scene.
 """
 
-from __future__ import annotations
-
 import atexit
 import os
 import threading

@@ -4,8 +4,6 @@ Reading a message checks all bounds that the proto's comments state. A violation
 field by its path in the request, "requests[3].reference.intrinsics.focal_x_px".
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

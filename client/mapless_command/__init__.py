@@ -1,7 +1,5 @@
 """Entry point of the command `mapless`, outside the package, so that Ctrl-C during its import is quiet, too."""
 
-from __future__ import annotations
-
 import os
 import signal
 

@@ -4,8 +4,6 @@ This module does not import grpc: `code` is the name of a gRPC status, which onl
     is a fault of the server: the caller gets only INTERNAL, and the log has the details.
 """
 
-from __future__ import annotations
-
 
 class RequestError(Exception):
     """Base of all errors of requests; by itself, a fault of the server.

@@ -1,7 +1,5 @@
 """Finds which extra of mapless installs a missing Python package. Imports no package."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 
 _EXTRA_OF = {

@@ -1,7 +1,5 @@
 """The settings of the server: from flags, environment (MAPLESS_...), a TOML file or defaults, in this precedence."""
 
-from __future__ import annotations
-
 import os
 import re
 import sys
@@ -197,7 +195,7 @@ class Settings(BaseModel):
         return path
 
     @model_validator(mode="after")
-    def _check_together(self) -> Settings:
+    def _check_together(self) -> "Settings":
         if self.max_image_mib > self.max_message_mib:
             raise ValueError(_exceeds(self, "max_image_mib", "max_message_mib"))
         if self.default_deadline_s > self.max_deadline_s:

@@ -1,7 +1,5 @@
 """The common parts of all charts: axes without pyplot's global state, curves, and figures as SVG or files."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Sequence

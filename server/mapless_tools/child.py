@@ -1,7 +1,5 @@
 """The real server as a child process on the loopback interface."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

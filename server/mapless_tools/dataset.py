@@ -1,7 +1,5 @@
 """Photographs of one place with known poses, whatever the layout on the disk; `ingest.formats` reads them."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable, Container, Mapping

@@ -1,7 +1,5 @@
 """Files that commands write for programs."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """HTML reports: one file each, that needs nothing else and runs no scripts."""
 
-from __future__ import annotations
-
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 

@@ -3,8 +3,6 @@
 Imports nothing that is slow.
 """
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The health check: whether the server takes calls."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from google.protobuf import wrappers_pb2

@@ -1,7 +1,5 @@
 """Localization of one photograph, of a rig's photographs, and of a sequence."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from datetime import datetime

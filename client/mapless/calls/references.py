@@ -1,7 +1,5 @@
 """Scenes and references: create, get, update, list, delete; retrieval, audit and coverage."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator, Sequence
 

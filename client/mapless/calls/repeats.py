@@ -3,8 +3,6 @@
 The calls made here share the deadline of the change.
 """
 
-from __future__ import annotations
-
 import hashlib
 from typing import Any
 

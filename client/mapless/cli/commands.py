@@ -1,7 +1,5 @@
 """All commands except `localize` and `doctor`: each makes a call and prints its answer."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

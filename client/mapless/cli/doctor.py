@@ -1,7 +1,5 @@
 """`mapless doctor`: checks a connection step by step, and says how to correct what is wrong."""
 
-from __future__ import annotations
-
 import argparse
 import socket
 import ssl

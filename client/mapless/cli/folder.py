@@ -1,7 +1,5 @@
 """Localizing a folder of photographs: number of concurrent calls, outcomes, and progress."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time

@@ -1,7 +1,5 @@
 """`mapless localize`: one photograph, or a folder of them."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import itertools

@@ -1,7 +1,5 @@
 """Answers as JSON, and as text for a terminal."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

@@ -1,7 +1,5 @@
 """Suggestions of existing scenes and references for a name that does not exist."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress

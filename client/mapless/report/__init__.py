@@ -4,8 +4,6 @@ The file is self-contained: no scripts, no links, the photographs are in it. Mat
 requested with `include_debug`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

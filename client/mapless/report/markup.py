@@ -3,8 +3,6 @@
 All external text passes through `text`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from html import escape

@@ -1,7 +1,5 @@
 """The photograph with its matches: inliers with residuals, and outliers."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The report of one answer, composed of its sections."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path

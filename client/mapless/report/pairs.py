@@ -1,7 +1,5 @@
 """The photograph beside its best references, with lines between matched points."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

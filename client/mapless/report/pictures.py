@@ -4,8 +4,6 @@ A viewer rotates a picture by its EXIF orientation, but intrinsics and pixels be
 metadata, and data after the picture, are removed; with them goes the position that phones record.
 """
 
-from __future__ import annotations
-
 import base64
 import io
 import re

@@ -1,7 +1,5 @@
 """The scene from above: references, matched points, and the photograph's pose with its ellipse."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

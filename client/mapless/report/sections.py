@@ -1,7 +1,5 @@
 """Sections of text and tables."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

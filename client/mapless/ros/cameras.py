@@ -1,7 +1,5 @@
 """Cameras of sensor_msgs/CameraInfo."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Pixels and files of sensor_msgs/Image and sensor_msgs/CompressedImage."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Localizes one image of a robot after the other: its prior, the call, and what is published of the answer."""
 
-from __future__ import annotations
-
 import math
 import threading
 from collections import deque

@@ -1,7 +1,5 @@
 """Messages that are published, built from the classes of rclpy or of `rosbags`."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Poses, times and covariances of ROS messages."""
 
-from __future__ import annotations
-
 from datetime import datetime, timedelta, timezone
 from typing import Any
 

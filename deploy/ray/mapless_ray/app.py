@@ -1,7 +1,5 @@
 """The application that a Serve config names: `import_path: mapless_ray.app:build`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from ray import serve

@@ -3,8 +3,6 @@
 `python -m mapless_ray.environment` prints them for a shell; the manifests repeat them, and a test compares.
 """
 
-from __future__ import annotations
-
 import os
 import shlex
 from collections.abc import Mapping

@@ -6,8 +6,6 @@ statuses, which loses the caller's deadline, the time limit of its message, rich
 mapless's own handlers are registered, and a caller sees no difference from a plain server.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable, Coroutine
 from typing import Any, Protocol
@@ -57,7 +55,7 @@ class Ingress:
     """
 
     address = "ray"
-    current: Ingress | None = None
+    current: "Ingress | None" = None
 
     def __init__(self, settings: Settings, services: Services, credentials: grpc.ServerCredentials | None) -> None:
         if credentials is not None:

@@ -1,7 +1,5 @@
 """One replica: a device with its own queue and pipeline, as in a plain server."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import socket

@@ -4,8 +4,6 @@ Serve's own measure, the number of calls, means little if one takes 20 ms and an
 the predicted and the actual costs of its calls.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable
 from typing import Protocol

@@ -1,7 +1,5 @@
 """Classifies exceptions of a computation for the work queue. Knows torch's by name, since it need not be installed."""
 
-from __future__ import annotations
-
 import re
 
 from mapless_server.errors import (

@@ -1,7 +1,5 @@
 """The photographs of a rig or a sequence, each localized like any other; `joint` poses them together."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections import deque

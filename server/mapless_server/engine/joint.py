@@ -1,7 +1,5 @@
 """The poses of a rig and of a sequence, from the results of the single photographs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from mapless.geometry import RigidTransform

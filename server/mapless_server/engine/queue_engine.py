@@ -1,7 +1,5 @@
 """The engine on the work queue: localizes photographs, and describes and audits references, in the queue's threads."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Awaitable, Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager

@@ -1,7 +1,5 @@
 """Photographs and references for the stages of a query: decoded and described once, loaded, chosen."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Callable, Sequence
@@ -48,7 +46,7 @@ class QueryViews:
             self._views[extractor.name] = replace(view, photograph=photograph)
         return self._views[extractor.name]
 
-    def reduced(self, max_pixels: int, context: StageContext) -> QueryViews:
+    def reduced(self, max_pixels: int, context: StageContext) -> "QueryViews":
         """The same photograph, decoded once, whose features are found in a reduced image with about so many pixels."""
         views = QueryViews(self._photo, self._limits)
         views._photograph, views._max_pixels = self._decoded(context), max_pixels

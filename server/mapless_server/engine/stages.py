@@ -4,8 +4,6 @@ The method computes the pose. This module loads the references, finds the photog
 hard priors, chooses between the answers of two tiers, and gives an answer when time runs out.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import time

@@ -5,8 +5,6 @@ the cost; so a tier is tried only if the previous tier's answer is a rejection t
 pose with little support.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -13,8 +13,6 @@ references elsewhere that resemble the photograph, wherever the prior is, must n
 search decides, as it does of every photograph with this prior.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

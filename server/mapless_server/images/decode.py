@@ -8,8 +8,6 @@ Pixels are returned as the file stores them. EXIF orientation is meant for viewe
 sensor.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from typing import Any

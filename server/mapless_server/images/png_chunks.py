@@ -5,8 +5,6 @@ compressed text and profile, megabytes for kilobytes each; so it does not get th
 transparency are not applied, so that nothing is lost.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from collections.abc import Iterable

@@ -10,8 +10,6 @@ What the photograph says of their errors follows from the same normal equations,
 Priors on the query's pose add their terms, unless the photograph alone contradicts them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Poses for queries where `localize` has no points: one reference, or references that share too little."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from .answer import Answer, Localization

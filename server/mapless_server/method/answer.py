@@ -1,7 +1,5 @@
 """The answer of the method to one query."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 
@@ -53,7 +51,7 @@ class Localization:
         trust: float,
         two_view: TwoViewSupport | None = None,
         intrinsics_checks: tuple[IntrinsicsCheck, ...] = (),
-    ) -> Localization:
+    ) -> "Localization":
         """Makes the localization of an accepted estimate, with the two-view matches that it rests on, if any."""
         errors_px, inliers = estimate.errors_px, estimate.inliers
         if two_view is not None:

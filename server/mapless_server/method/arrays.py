@@ -7,8 +7,6 @@ torch, whose functions agree in names and order of arguments, if not in keywords
 Nothing here synchronizes with a device: no value is read, and no shape depends on one.
 """
 
-from __future__ import annotations
-
 from typing import Any, TypeAlias
 
 import numpy as np

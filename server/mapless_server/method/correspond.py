@@ -11,8 +11,6 @@ pass it among the keypoints along the epipolar line: many more, of which more ar
 queries that fail otherwise.
 """
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
@@ -492,7 +490,7 @@ class _Key(NamedTuple):
     strong: bool
 
     @classmethod
-    def of(cls, pair: tuple[PosedView, PosedView], wide: bool, strong: bool) -> _Key:
+    def of(cls, pair: tuple[PosedView, PosedView], wide: bool, strong: bool) -> "_Key":
         return cls(pair[0].key, pair[1].key, wide, strong)
 
 

@@ -3,8 +3,6 @@
 A hint follows from the numbers of the answer: features of the photograph, matches with each reference, inliers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

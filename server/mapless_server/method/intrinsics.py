@@ -16,8 +16,6 @@ contain what matches share, errors of the references and whatever a region of th
 measure how the estimate changes without each of these parts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

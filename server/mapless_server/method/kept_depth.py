@@ -13,8 +13,6 @@ reference observes. Its error is along the ray, so it moves the photograph's key
 adjustment knows that, since it keeps the planes (see `bundle`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -98,7 +96,7 @@ class _KnownDepths:
     sigma: Array
 
     @staticmethod
-    def of(references: Sequence[PosedView]) -> _KnownDepths:
+    def of(references: Sequence[PosedView]) -> "_KnownDepths":
         offsets = keypoint_offsets(references)
         counts = np.diff(offsets)
         depth, sigma = np.full(offsets[-1], np.nan), np.full(offsets[-1], np.nan)

@@ -1,7 +1,5 @@
 """Matching by LightGlue, a network that compares all keypoints of both photographs (see `networks.lightglue`)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -150,7 +148,7 @@ class Padded:
         return self.positions, self.descriptors, self.mask
 
     @classmethod
-    def of(cls, views: Sequence[View], max_keypoints: int) -> Padded:
+    def of(cls, views: Sequence[View], max_keypoints: int) -> "Padded":
         """Pads views that have the same kind of descriptor; uses the first `max_keypoints` keypoints of each."""
         counts = [min(len(v.features), max_keypoints) for v in views]
         shape = (len(views), max(counts))

@@ -6,8 +6,6 @@ Where one reference is given, or the references share too little with one anothe
 `reconstruct` (coarse and scale of a batch of queries; in `pipeline`), `refine` (the rest).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

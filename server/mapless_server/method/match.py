@@ -5,8 +5,6 @@ within a radius. Our form first carries the query's matches with each reference 
 search only adds to them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

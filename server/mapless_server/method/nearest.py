@@ -1,7 +1,5 @@
 """Two photographs: nearest neighbours of their descriptors, and the epipolar lines that their matches must lie on."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from functools import cache

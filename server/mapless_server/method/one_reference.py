@@ -12,8 +12,6 @@ depths share, of the network's metre, changes no residual: it moves the camera a
 pose contains it as s^2 d d^T, with d the step and s its relative standard deviation.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -20,8 +20,6 @@ The weights are those of iteratively reweighted least squares: the gradient of a
 (As in `scipy.optimize.least_squares`, with f_scale = c.)
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

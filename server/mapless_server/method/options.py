@@ -3,8 +3,6 @@
 The options of each stage are in its module; `pipeline.StageOptions` combines them.
 """
 
-from __future__ import annotations
-
 import operator
 import time
 from collections.abc import Callable, Iterator

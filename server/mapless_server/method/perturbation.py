@@ -14,8 +14,6 @@ or with R' = R Exp(w)) have a lever arm as long as the camera is far from the wo
 Atchuthan 2018, "A micro Lie theory".
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ A network reconstructs several queries together, so the stages up to the metric 
 the device if the network's output is on one.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -95,7 +93,7 @@ class Pipeline:
     matcher: Matcher = field(default_factory=Matcher)
     options: StageOptions = field(default_factory=StageOptions)
 
-    def with_trust(self, quantiles: tuple[float, ...]) -> Pipeline:
+    def with_trust(self, quantiles: tuple[float, ...]) -> "Pipeline":
         """The pipeline of a scene whose right answers have these quantiles of trust; empty for the usual ones."""
         if not quantiles:
             return self

@@ -4,8 +4,6 @@ As in the paper, the refined pose replaces the initial one only if it has at lea
 accepted is decided later (see `gate` and `judge`). Priors add candidates, and terms in the cost (see `informed`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

@@ -19,8 +19,6 @@ covariance S + S C S, where S is the matrix. Where references share little, the 
 The random walk is the linear variogram of geostatistics (Matheron, Principles of geostatistics, 1963).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import combinations
 

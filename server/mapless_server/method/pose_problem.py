@@ -7,8 +7,6 @@ covariance C, by which neighbours move together and far references are held less
 references' observations (see `pose_errors`). The points are eliminated (see `bundle`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 

@@ -4,8 +4,6 @@ First all together, which shows the wrong ones; then these alone, the most signi
 again with each value.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Rejections: a photograph that cannot be localized is a result, not an error."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 

@@ -5,8 +5,6 @@
 over a left perturbation (v, w) of camera_from_world P and s, the logarithm of focal length over given focal length.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -9,8 +9,6 @@ The equations are in `scale_equations`, for NumPy arrays and torch tensors, and 
 result on the host.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -16,8 +16,6 @@ R_align; P_q^init      `alignment_rotation`; `align`
 ones, for NumPy arrays and torch tensors (see `arrays`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -10,8 +10,6 @@ deviation of their keypoint; in the paper's form this is one pixel for all.
 The equations are in `observations`, for NumPy arrays and torch tensors.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations

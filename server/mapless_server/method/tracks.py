@@ -1,7 +1,5 @@
 """Tracks: keypoints of several references that show one point, merged from pairwise matches."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -84,7 +82,7 @@ class Tracks:
         """Index (P,) of each point's first observation."""
         return np.flatnonzero(np.diff(self.point, prepend=-1))
 
-    def select(self, points: NDArray[np.bool_]) -> Tracks:
+    def select(self, points: NDArray[np.bool_]) -> "Tracks":
         """The tracks of the chosen points, renumbered; ``points`` is (P,)."""
         keep = points[self.point]
         renumbered = np.cumsum(points) - 1
@@ -114,7 +112,7 @@ class Tracks:
         """Largest of values (O,) over each point's observations, (P,)."""
         return np.maximum.reduceat(values, self.starts) if len(self.starts) else values[:0]
 
-    def prune(self, observations: NDArray[np.bool_]) -> tuple[Tracks, NDArray[np.bool_], NDArray[np.bool_]]:
+    def prune(self, observations: NDArray[np.bool_]) -> "tuple[Tracks, NDArray[np.bool_], NDArray[np.bool_]]":
         """Keeps the chosen observations (O,), without points that have fewer than two of them.
 
         Returns:

@@ -1,7 +1,5 @@
 """Views: photographs reduced to a pinhole camera and local features, and what the coarse stage reconstructs of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -45,7 +43,7 @@ class Features:
         """Memory of the arrays, bytes."""
         return self.keypoints.nbytes + self.descriptors.nbytes + self.sizes_px.nbytes
 
-    def every(self, step: int) -> Features:
+    def every(self, step: int) -> "Features":
         """The features 0, step, 2 step, ..."""
         return Features(self.keypoints[::step], self.descriptors[::step], self.sizes_px[::step])
 
@@ -110,7 +108,7 @@ class View:
     photograph: Photograph | None = None
     distortion: Distortion | None = None
 
-    def has_camera_of(self, other: View) -> bool:
+    def has_camera_of(self, other: "View") -> bool:
         """Whether both have the same intrinsics, to a thousandth of the width, and so the same errors of them.
 
         The photographs may have been reduced to different sizes.

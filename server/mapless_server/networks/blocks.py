@@ -6,8 +6,6 @@ to bfloat16 carries a float32 residual stream through every block that has a Lay
 those that have none, as the official models do under autocast.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """Loads a network's weights from a safetensors file, whose tensors must be exactly the network's."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence

@@ -4,8 +4,6 @@ Poses enter through attention among the posed views, whose queries, keys and val
 (PRoPE, Li et al. 2025); rays are added to the patch tokens.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

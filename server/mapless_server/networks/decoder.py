@@ -3,8 +3,6 @@
 The network is equivariant to the order of views.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Written from the formulas. Each of the four maps gets a size of its own, 4, 2, 1
 is added from the coarsest to the finest.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch.nn.functional as F  # noqa: N812

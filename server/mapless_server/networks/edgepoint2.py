@@ -5,8 +5,6 @@ network as described, but for the last layer of the descriptors, which is applie
 of it; `fuse` makes it compute the same in less time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ They encode each view alone. Pi3 and Pi3X have a ViT-L/14 with registers; MapAny
 without.
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn

@@ -5,8 +5,6 @@ MoGe, Wang et al. 2024) values for each pixel; `MetricDecoder` (Pi3X) a vector f
 and their decoders, which have no LayerScale, carry their residual stream in the type of their weights.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import torch

@@ -11,8 +11,6 @@ aligned with the given poses.
 Written from a description of the official network; modules are named as the entries of its checkpoint.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass

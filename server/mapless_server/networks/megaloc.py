@@ -9,8 +9,6 @@ cluster receives mass one, the dustbin the rest. The sum of features in a cluste
 descriptor; the class token's features are another.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The interface of all networks: images to tokens of each view alone, then tokens to poses and maps."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any

@@ -5,8 +5,6 @@ the scale of the output: align it with them afterwards, as with Pi3. The officia
 fifth of its weights, is left out, since no query has depths.
 """
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A loaded network on a device, run by one thread, in the precision and with the kernels that suit the device."""
 
-from __future__ import annotations
-
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Sequence

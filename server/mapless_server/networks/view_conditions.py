@@ -6,8 +6,6 @@ relative to view 0, and their translations are divided by a common length, which
 The encoders compute in float32, also where the transformer does not.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

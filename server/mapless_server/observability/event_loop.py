@@ -1,7 +1,5 @@
 """Measures the lag of the event loop: how late a periodic timer runs."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import time

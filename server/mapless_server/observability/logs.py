@@ -4,8 +4,6 @@ A record's fields besides its message are given by `extra=`. No value of a field
 written. The thread that logs writes the line at once, so that the last lines before a crash are not lost.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import math

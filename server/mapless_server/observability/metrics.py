@@ -5,8 +5,6 @@ scenes, tenants and requests are in the log. Series whose labels are known befor
 series that appears with its first event hides that event from `rate`.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 import time

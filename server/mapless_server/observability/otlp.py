@@ -1,7 +1,5 @@
 """Traces by OpenTelemetry: names and attributes follow its conventions for RPC; OTLP sends them in the background."""
 
-from __future__ import annotations
-
 import json
 import threading
 import time
@@ -30,7 +28,7 @@ _CANCEL_LIMIT_S = 1.0
 Attribute = str | bool | int | float
 
 
-def make_otlp_tracer(endpoint: str) -> OtlpTracer:
+def make_otlp_tracer(endpoint: str) -> "OtlpTracer":
     """Makes a tracer that sends to an address such as "http://host:4317"; ValueError if it is not one.
 
     Whether a collector listens is not checked.
@@ -56,7 +54,7 @@ class OtlpTracer:
         self._tracer = self._provider.get_tracer("mapless", __version__)
         self._propagator = TraceContextTextMapPropagator()
 
-    def begin(self, method: str, metadata: Metadata, start_s: float) -> _OtlpSpan:
+    def begin(self, method: str, metadata: Metadata, start_s: float) -> "_OtlpSpan":
         """Implements Tracer."""
         keys = ("traceparent", "tracestate")
         carrier = {key: value for key, value in metadata if key in keys and isinstance(value, str)}

@@ -1,7 +1,5 @@
 """Commit of the checkout and name of the processor, for records of answers and measurements."""
 
-from __future__ import annotations
-
 import hashlib
 import platform
 import subprocess

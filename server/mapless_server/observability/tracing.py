@@ -3,8 +3,6 @@
 `NoTracer` traces nothing; `otlp` has the tracer that sends.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol

@@ -1,7 +1,5 @@
 """The call that a servicer answers: its id, caller and deadline, and a record of its steps."""
 
-from __future__ import annotations
-
 import math
 import random
 import re

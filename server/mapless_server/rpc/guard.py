@@ -1,7 +1,5 @@
 """Wraps the handlers of all methods: id, authentication, deadline, log line, and errors as google.rpc.Status."""
 
-from __future__ import annotations
-
 import asyncio
 import inspect
 import logging

@@ -1,7 +1,5 @@
 """Delays refusals beyond a rate, so that callers that call again at once leave the processor to the answers."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 

@@ -5,8 +5,6 @@ whose caller sends only the headers would count as a concurrent call as long as 
 methods are served as if their callers sent streams, of which the first message is read here.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from collections.abc import Callable

@@ -5,8 +5,6 @@ that ends by CancelledError, without a status, does not end its call: the caller
 a status is always sent, behind the earlier messages, and waits for its reader without the handler.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Coroutine
 from typing import Any

@@ -1,7 +1,5 @@
 """Errors in the form that callers receive: google.rpc.Status with details for programs."""
 
-from __future__ import annotations
-
 import grpc
 from google.protobuf.message import Message
 from google.rpc import error_details_pb2, status_pb2

@@ -6,8 +6,6 @@ it waits while the server computes for a caller, except for a small share of one
 too.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import threading

@@ -4,8 +4,6 @@ Features are computed once, when a reference is added. If a store lacks the feat
 that need them compute them from the stored photographs, and store them.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable, Iterator, Sequence

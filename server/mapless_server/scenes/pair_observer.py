@@ -1,7 +1,5 @@
 """Events of the work in the background, ahead of queries, for metrics."""
 
-from __future__ import annotations
-
 
 class PairObserver:
     """Receives the events in any thread; ignores them unless a method is overridden.

@@ -7,8 +7,6 @@ more coarsely, since they may all be inclined. A camera on its side has its x ax
 A wrong unit is found only if it makes positions impossible, since scale does not change any angle.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Lets queries find pairs of references that were matched before."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable, Collection, Sequence
@@ -39,7 +37,7 @@ class Matching:
         return matching_name(self.extractor.name, self.matcher.matching(self.wide, self.strong))
 
     @property
-    def base(self) -> Matching | None:
+    def base(self) -> "Matching | None":
         """The matching whose matches of a pair this one begins with."""
         if self.wide:
             return replace(self, wide=False)

@@ -3,8 +3,6 @@
 The cost of a job is predicted from jobs of its kind (`CostModel`), and booked while it is admitted (`Ledger`).
 """
 
-from __future__ import annotations
-
 from collections import Counter, OrderedDict
 from collections.abc import Mapping
 
@@ -110,7 +108,7 @@ class Ledger:
         of_others = (it.booked_s[lane] for other, it in self._flows.items() if other != flow)
         return until_done_s - own_s + sum(min(other_s, until_done_s) for other_s in of_others)
 
-    def _of(self, flow: Flow | None) -> _Holdings:
+    def _of(self, flow: Flow | None) -> "_Holdings":
         return self._all if flow is None else self._flows.get(flow, _NOTHING)
 
     def _forget_if_empty(self, flow: Flow) -> None:

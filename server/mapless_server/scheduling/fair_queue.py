@@ -1,7 +1,5 @@
 """The order of waiting jobs: deficit round robin over callers, with equal shares for tenants."""
 
-from __future__ import annotations
-
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The types of the work queue: jobs, their steps, what stages return, and how jobs end."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections import Counter

@@ -1,7 +1,5 @@
 """What the queue reports, for metrics."""
 
-from __future__ import annotations
-
 from .jobs import Ending, Refusal
 
 

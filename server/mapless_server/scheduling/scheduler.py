@@ -3,8 +3,6 @@
 A state machine without threads, waiting or a clock: times are passed in, so that it is tested on a virtual clock.
 """
 
-from __future__ import annotations
-
 import heapq
 import itertools
 import weakref

@@ -1,7 +1,5 @@
 """The executor: threads that compute what the scheduler selects, and callers that wait on the event loop."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import math

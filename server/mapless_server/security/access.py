@@ -1,7 +1,5 @@
 """Authentication and authorization: one table has the role that each method needs; other methods are rejected."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from datetime import datetime, timezone
 

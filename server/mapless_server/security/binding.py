@@ -1,7 +1,5 @@
 """Checks that a server does not listen beyond this machine without protection by accident."""
 
-from __future__ import annotations
-
 import ipaddress
 import logging
 import socket

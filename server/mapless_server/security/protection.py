@@ -1,7 +1,5 @@
 """The protection of a server, made from its settings."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass
 
@@ -26,7 +24,7 @@ class Protection:
     quota: RateLimiter | None
 
     @staticmethod
-    def of(settings: Settings) -> Protection:
+    def of(settings: Settings) -> "Protection":
         """Raises SecurityError if a file cannot be used, or the server would listen without protection by accident."""
         level, sentence = assess_binding(settings)
         if level == logging.CRITICAL:

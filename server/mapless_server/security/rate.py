@@ -3,8 +3,6 @@
 Times are arguments. There is no lock here: the work queue calls from many threads with its own lock.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Reads files again when they change, while the server runs; the old values stay in use if that fails."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import os

@@ -4,8 +4,6 @@ The store and its caches use only keys, so that scenes of another tenant do not 
 never see keys.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NewType

@@ -3,8 +3,6 @@
 Open connections are not affected by a change; new ones get the new certificate.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass

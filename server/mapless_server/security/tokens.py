@@ -8,8 +8,6 @@ is JSON, which programs can read and write:
      "tenants": {"acme": {"rate_ms": 500}}}
 """
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import os
@@ -72,7 +70,7 @@ class Tokens(BaseModel):
     tenants: dict[Name, TenantLimits] = {}
 
     @model_validator(mode="after")
-    def _check_unique(self) -> Tokens:
+    def _check_unique(self) -> "Tokens":
         for what, values in (("name", [it.name for it in self.tokens]), ("sha256", [it.sha256 for it in self.tokens])):
             value, count = next(iter(Counter(values).most_common(1)), ("", 0))
             if count > 1:

@@ -3,8 +3,6 @@
 Nothing here imports torch unless the settings name a network.
 """
 
-from __future__ import annotations
-
 import logging
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence

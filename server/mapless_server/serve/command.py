@@ -3,8 +3,6 @@
 Imports what serves only when it runs, so that --help answers at once.
 """
 
-from __future__ import annotations
-
 import asyncio
 import gc
 import inspect

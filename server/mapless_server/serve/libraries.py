@@ -1,7 +1,5 @@
 """What libraries must have before they are imported and before threads are started; commands set it first."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import sys

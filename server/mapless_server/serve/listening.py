@@ -1,7 +1,5 @@
 """The gRPC server of one process: the address it listens on, and the limits of its connections."""
 
-from __future__ import annotations
-
 import grpc
 
 from mapless_server.services.handlers import Services

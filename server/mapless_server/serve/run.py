@@ -1,7 +1,5 @@
 """Runs the server until a signal or an internal failure stops it."""
 
-from __future__ import annotations
-
 import asyncio
 import gc
 import logging

@@ -1,7 +1,5 @@
 """A running server: opens its parts in order, and closes them in reverse order at the end of its block."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import time

@@ -1,7 +1,5 @@
 """Signals of commands."""
 
-from __future__ import annotations
-
 import signal
 import sys
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ Queries still read memory and disk, so a disk that is full or read-only does not
 database that servers share is not watched: if it fails, it fails for all of them.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from collections.abc import Awaitable, Callable

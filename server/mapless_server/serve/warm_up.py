@@ -3,8 +3,6 @@
 The photographs are rendered: two walls with random patterns, one before the other, from four camera centres.
 """
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 import logging

@@ -1,7 +1,5 @@
 """The handlers of all RPCs: both services, health and reflection, each behind the call guard."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Mapping
 from typing import Any

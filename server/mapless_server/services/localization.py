@@ -1,8 +1,6 @@
 """LocalizationService: a request becomes queries, the engine answers them, and the results become a response."""
 # ruff: noqa: N802  methods carry the names of their RPCs
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import AsyncGenerator, Callable, Coroutine, Sequence

@@ -1,8 +1,6 @@
 """ReferenceService: scenes and references as resources; images are described before they are stored."""
 # ruff: noqa: N802  methods carry the names of their RPCs
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -7,8 +7,6 @@ being sent to it stays in memory until it is read or the connection ends. Withou
 dictionary.
 """
 
-from __future__ import annotations
-
 import asyncio
 from collections import deque
 from collections.abc import Callable
@@ -39,7 +37,7 @@ class WatchedAnswer:
 class Watcher:
     """The messages to one watcher of a scene, an asynchronous iterator; ends with Unavailable when the server stops."""
 
-    def __init__(self, unregister: Callable[[Watcher], None], max_message_bytes: int) -> None:
+    def __init__(self, unregister: "Callable[[Watcher], None]", max_message_bytes: int) -> None:
         """Calls `unregister` when closed; messages above the limit are sent without their photograph."""
         self._unregister = unregister
         self._max_message_bytes = max_message_bytes
@@ -60,7 +58,7 @@ class Watcher:
         self._has_ended = True
         self._changed.set()
 
-    def __aiter__(self) -> Watcher:
+    def __aiter__(self) -> "Watcher":
         return self
 
     async def __anext__(self) -> pb.WatchQueriesResponse:

@@ -4,8 +4,6 @@ A backup is one SQLite file, from either database, so it also moves a store from
 and gets its name only after every row of it has been read again and verified.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Iterator, Sequence

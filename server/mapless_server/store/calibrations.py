@@ -7,8 +7,6 @@ unless it is renewed, so a scene whose server is killed is calibrated by another
 that lost its claim, because it was too slow or the scene was deleted, stores nothing.
 """
 
-from __future__ import annotations
-
 import random
 import time
 from dataclasses import dataclass, replace

@@ -27,8 +27,6 @@ them, and marked by bits. A pixel is predicted from three neighbours, as on a pl
 Everything is little-endian.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import struct

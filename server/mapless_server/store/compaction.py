@@ -1,7 +1,5 @@
 """Rewrites stored features that 0.2.0 wrote as float32 in 8 bits, a quarter of the bytes, while the server runs."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The interface of the store's databases: SQLite in a folder, or a PostgreSQL that several servers share."""
 
-from __future__ import annotations
-
 from contextlib import AbstractContextManager
 from typing import Protocol
 

@@ -4,8 +4,6 @@ Detaching changes one short row per reference; deleting means megabytes. If the 
 that are left are deleted when the store is opened again, or with the next scene that is deleted.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import uuid

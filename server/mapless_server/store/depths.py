@@ -5,8 +5,6 @@ network and its weights. Depths of another version are never read. Finished refe
 (see `pairs`), under the kind's name; if a finished one has no depth, this was found wrong, or could not be checked.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ A damaged page fails every statement that reads it, so one damaged photograph wo
 together with it. Where a statement about many rows fails like this, the rows are read one by one (`unless_damaged`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import TypeVar
 

@@ -6,8 +6,6 @@ it is given, so two servers on two names of one file would destroy it. Both lock
 and independent of them.
 """
 
-from __future__ import annotations
-
 import fcntl
 import os
 from contextlib import ExitStack
@@ -28,7 +26,7 @@ class FolderLock:
         self._locks = locks
 
     @staticmethod
-    def take(folder: Path, database_file: str) -> FolderLock:
+    def take(folder: Path, database_file: str) -> "FolderLock":
         """Locks for the one server that reads and writes; creates the database file if missing.
 
         Raises:
@@ -48,7 +46,7 @@ class FolderLock:
             return FolderLock(stack.pop_all())
 
     @staticmethod
-    def share(path: Path) -> FolderLock:
+    def share(path: Path) -> "FolderLock":
         """Takes the lock for one of several servers that only read a database file.
 
         Raises:

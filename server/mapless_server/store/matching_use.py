@@ -7,8 +7,6 @@ for `KEPT_S` after a server last recorded that it uses it. If a server with othe
 its pairs are made again.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable, Collection

@@ -8,8 +8,6 @@ also if others are added later. A server claims a reference, matches its pairs a
 after `CLAIM_S`, so the unfinished work of a killed server is done by another server, or after a restart.
 """
 
-from __future__ import annotations
-
 import random
 import time
 from collections.abc import Collection, Iterable, Mapping, Sequence

@@ -9,8 +9,6 @@ though it may have happened: trying again then raises AlreadyExists, or NotFound
 away, calls fail and its connections are dropped; when it is back, the next call gets a new one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -73,7 +71,7 @@ class PostgresqlDatabase:
         self._engine = engine.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
 
     @staticmethod
-    def open(database_url: str) -> PostgresqlDatabase:
+    def open(database_url: str) -> "PostgresqlDatabase":
         """Connects, and migrates an empty or older database to this program's schema.
 
         Args:
@@ -85,7 +83,7 @@ class PostgresqlDatabase:
         return PostgresqlDatabase._opened(database_url, migrates=True)
 
     @staticmethod
-    def open_as_is(database_url: str) -> PostgresqlDatabase:
+    def open_as_is(database_url: str) -> "PostgresqlDatabase":
         """Connects to a store without migrating it.
 
         Raises:
@@ -94,7 +92,7 @@ class PostgresqlDatabase:
         return PostgresqlDatabase._opened(database_url, migrates=False)
 
     @staticmethod
-    def _opened(database_url: str, migrates: bool) -> PostgresqlDatabase:
+    def _opened(database_url: str, migrates: bool) -> "PostgresqlDatabase":
         url = parse_url(database_url)
         database = PostgresqlDatabase(_create_engine(url), f"{url.host or 'local'}:{url.port or 5432}/{url.database}")
         try:

@@ -1,7 +1,5 @@
 """The reading half of the store, and what it caches."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -50,7 +48,7 @@ def observed(operation: Callable[Concatenate[Any, P], T]) -> Callable[Concatenat
     """Decorator that reports a method of the store to its observer, under the method's name."""
 
     @wraps(operation)
-    def wrapper(self: StoreReader, /, *args: P.args, **kwargs: P.kwargs) -> T:
+    def wrapper(self: "StoreReader", /, *args: P.args, **kwargs: P.kwargs) -> T:
         start_s = time.monotonic()
         try:
             return operation(self, *args, **kwargs)

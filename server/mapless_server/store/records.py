@@ -1,7 +1,5 @@
 """The values that the store takes and returns."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

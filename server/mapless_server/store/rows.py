@@ -1,7 +1,5 @@
 """Conversion between the rows of the tables and `records`; checks everything that is read."""
 
-from __future__ import annotations
-
 import hashlib
 import uuid
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The current schema, in types that SQLite and PostgreSQL share; `migrations` has its history."""
 
-from __future__ import annotations
-
 from sqlalchemy import (
     BigInteger,
     Column,

@@ -1,7 +1,5 @@
 """Verification: reads every row of a store and lists damaged ones."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Which topics and frames of a recording are used."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from mapless.geometry import RigidTransform

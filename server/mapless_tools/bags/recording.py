@@ -4,8 +4,6 @@ Standard messages are the same in every version of ROS 2, so they are read by th
 those in the recording: many recordings have no definitions, or unreadable ones of messages that are not needed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -45,7 +43,7 @@ class Recording:
         self.types = {it.topic: it.msgtype for it in connections}
         self.counts = {name: sum(it.msgcount for it in connections if it.topic == name) for name in self.types}
 
-    def __enter__(self) -> Recording:
+    def __enter__(self) -> "Recording":
         return self
 
     def __exit__(

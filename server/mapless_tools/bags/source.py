@@ -1,7 +1,5 @@
 """The data of one camera in a recording: intrinsics, images, and frames from the camera to the world."""
 
-from __future__ import annotations
-
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -211,7 +209,7 @@ class _Rows:
     """Poses of a child frame while they are read, each stored as eight doubles."""
 
     parent: str
-    table: array[float] = field(default_factory=lambda: array("d"))
+    table: "array[float]" = field(default_factory=lambda: array("d"))
     previous_ns: int | None = None
 
     def add(self, time_s: float, pose: RigidTransform) -> None:

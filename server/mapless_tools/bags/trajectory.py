@@ -1,7 +1,5 @@
 """Poses by time, and trees of frames as tf has them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

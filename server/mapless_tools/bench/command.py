@@ -1,7 +1,5 @@
 """Measures everything and reports it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from mapless_server.observability.provenance import cpu_model

@@ -1,7 +1,5 @@
 """The cost of a call: time and memory of a server that does nothing else."""
 
-from __future__ import annotations
-
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path

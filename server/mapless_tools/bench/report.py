@@ -3,8 +3,6 @@
 For people it is Markdown, as in BENCHMARKS.md, and for programs JSON.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

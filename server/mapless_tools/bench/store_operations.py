@@ -3,8 +3,6 @@
 Run it as `python -m mapless_tools.bench.store_operations`.
 """
 
-from __future__ import annotations
-
 import gc
 import time
 from collections.abc import Callable, Iterator

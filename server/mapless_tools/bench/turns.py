@@ -6,8 +6,6 @@ compared is processor time, which other programs on the machine change least; ra
 photographs, with 95 % intervals by bootstrap over these.
 """
 
-from __future__ import annotations
-
 import subprocess
 import tempfile
 import time

@@ -1,7 +1,5 @@
 """The same command with only torch and NumPy, for a machine with a GPU and no other packages of the server."""
 
-from __future__ import annotations
-
 import argparse
 import os
 

@@ -1,7 +1,5 @@
 """Runs all parts in order. A failed part is reported in the table and the rest goes on, since device time is scarce."""
 
-from __future__ import annotations
-
 import gc
 import json
 import time

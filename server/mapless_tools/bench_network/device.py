@@ -1,7 +1,5 @@
 """The limits of a device, and the memory of a network that serves on it."""
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """A network's forward pass on a CUDA device: its steps with their least and predicted times, kernels, variants."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

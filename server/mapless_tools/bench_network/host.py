@@ -1,7 +1,5 @@
 """Measurements without a CUDA device: operations, time of a block, effects of rounding and of kept tokens."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 

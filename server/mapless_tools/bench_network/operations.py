@@ -1,7 +1,5 @@
 """Counts the operations of a network on the meta device, where none is executed, and predicts its time from them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import prod
@@ -68,7 +66,7 @@ class Operations:
     eager_bytes: int = 0
     fused_bytes: int = 0
 
-    def __add__(self, other: Operations) -> Operations:
+    def __add__(self, other: "Operations") -> "Operations":
         return Operations(*(a + b for a, b in zip(vars(self).values(), vars(other).values(), strict=True)))
 
     def floor_s(self, rates: Rates) -> float:

@@ -4,8 +4,6 @@ The output of random weights has no relation to a scene, and the time of the sta
 network computes as it would, and its output is replaced by the rendered room's true depths and poses, up to a scale.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -64,12 +62,12 @@ class PlantedReconstructor:
         """See the network's `bucket`."""
         return self.network.bucket(query, references)
 
-    def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
+    def reconstruct_many(self, requests: Sequence[Request]) -> "list[Outcome | Exception]":
         """See Reconstructor.reconstruct_many."""
         outcomes = self.network.reconstruct_many(requests)
         return [self._planted(request, outcome) for request, outcome in zip(requests, outcomes, strict=True)]
 
-    def _planted(self, request: Request, outcome: Outcome | Exception) -> Outcome | Exception:
+    def _planted(self, request: Request, outcome: "Outcome | Exception") -> "Outcome | Exception":
         if isinstance(outcome, Rejection | Exception):
             return outcome
         query, references = request.query, request.references

@@ -4,8 +4,6 @@ A query is everything from the encoded photograph to the answer: decoding, featu
 refinement. Protocol and store, which a call adds, are not included.
 """
 
-from __future__ import annotations
-
 import hashlib
 import statistics
 import time

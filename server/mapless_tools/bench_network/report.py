@@ -1,7 +1,5 @@
 """The figures: a table for people, JSON for programs, Markdown for BENCHMARKS.md."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass

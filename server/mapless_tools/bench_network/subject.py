@@ -1,7 +1,5 @@
 """The networks to measure: the official sizes, random weights."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

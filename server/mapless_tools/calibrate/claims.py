@@ -19,8 +19,6 @@ calibrated radii of answers not seen held 94 to 100 % (95 % radius) and 57 to 86
 and 64 to 76 % after 26, 95 or 96 % and 67 to 69 % after 150, where the claims' own 68 % radius held 6 to 100 %.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -54,7 +52,7 @@ class Claim:
     radii: Array
 
     @classmethod
-    def of(cls, error: float, radius_68: float, radius_95: float, covariance: Array) -> Claim:
+    def of(cls, error: float, radius_68: float, radius_95: float, covariance: Array) -> "Claim":
         """Makes the claim of an answer, which states two radii and a covariance (3, 3), in the unit of `error`.
 
         The radius for another probability p is the covariance's (`error_radii`) times what the stated ones are of the
@@ -74,7 +72,7 @@ class Claim:
         radii, levels = np.concatenate([[0.0], self.radii]), np.concatenate([[0.0], LEVELS])
         return np.asarray(np.interp(length, radii, levels, right=1.0), float)
 
-    def times(self, factor_68: float, factor_95: float) -> Claim:
+    def times(self, factor_68: float, factor_95: float) -> "Claim":
         """The claim with its radii multiplied, as in `scaled_accuracy`; linear in the probability in between."""
         factors = np.interp(LEVELS, (0.68, 0.95), (factor_68, factor_95))
         radius_68 = factor_68 * self.radius_68
@@ -104,7 +102,7 @@ class Sample:
     def __len__(self) -> int:
         return len(self.position)
 
-    def times(self, factors: Factors) -> Sample:
+    def times(self, factors: Factors) -> "Sample":
         """The sample with its radii multiplied."""
         return Sample(
             tuple(it.times(factors.position_68, factors.position_95) for it in self.position),

@@ -1,7 +1,5 @@
 """`mapless-server calibrate`: its flags. Imports what it needs when it runs, so that --help answers at once."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Results of a calibration: how often claims hold before and after, the value of trust, and rejections."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -52,7 +50,7 @@ class Share:
         return self.part / self.whole if self.whole else math.nan
 
     @classmethod
-    def of(cls, part: int, whole: int, confidence: float = 0.95) -> Share:
+    def of(cls, part: int, whole: int, confidence: float = 0.95) -> "Share":
         """Makes a share with its interval, from both one-sided tests at (1 - confidence) / 2."""
         tail = (1 - confidence) / 2
         low = float(betaincinv(part, whole - part + 1, tail)) if part else 0.0

@@ -3,8 +3,6 @@
 If a folder's poses are in another world than the scene, every answer is wrong, and all are wrong in the same way.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Sequence

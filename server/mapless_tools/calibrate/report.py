@@ -1,7 +1,5 @@
 """The report of a calibration for people (a table, and one HTML file with charts) and for programs (JSON)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass

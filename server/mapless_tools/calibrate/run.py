@@ -1,7 +1,5 @@
 """A calibration from beginning to end: reads, localizes, computes, stores, and reports."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The command `mapless-server`: all its commands, and which extra each of the tools needs."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import Annotated, Any

@@ -1,7 +1,5 @@
 """`mapless-server demo`, `bench` and `bench-network`: what this installation answers, how accurately, and how fast."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """What commands print: text on a terminal, else JSON; flags decide otherwise."""
 
-from __future__ import annotations
-
 import json
 import sys
 from typing import Annotated, Any

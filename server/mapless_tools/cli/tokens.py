@@ -1,7 +1,5 @@
 """`mapless-server token`: create, list, revoke. Standard output has the token alone, for programs."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime, timezone

@@ -1,7 +1,5 @@
 """`mapless-server weights`: list, fetch, add, check. Results go to standard output, the rest to standard error."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The demo's photographs: the project's own ones of a room, or a folder of real ones."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Left: the photograph with the matched points of the references projected by the 
 shows most of them. Below: the numbers and a plan of the place.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -48,7 +46,7 @@ class Shot:
     keypoints: Array = field(default_factory=lambda: np.empty((0, 2)))
 
     @staticmethod
-    def of(photograph: Photograph, max_side_px: int) -> Shot:
+    def of(photograph: Photograph, max_side_px: int) -> "Shot":
         """Decodes a photograph, reduced if it is large, without EXIF orientation; ValueError if it cannot be read."""
         flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
         image = cv2.imdecode(np.frombuffer(photograph.data, np.uint8), flags)
@@ -59,7 +57,7 @@ class Shot:
         drawn = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
         return Shot(photograph.name, drawn, photograph.camera.resized(*size), photograph.world_from_camera)
 
-    def with_points(self, points: Array, pixels: Array, camera: Camera) -> Shot:
+    def with_points(self, points: Array, pixels: Array, camera: Camera) -> "Shot":
         """The same with points (N, 3), world, at pixels (N, 2) of the photograph as `camera` has it."""
         scale = self.camera.width_px / camera.width_px, self.camera.height_px / camera.height_px
         keypoints = np.stack([resized_pixel(pixels[:, i], scale[i]) for i in (0, 1)], axis=-1)

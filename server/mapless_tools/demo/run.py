@@ -1,7 +1,5 @@
 """The demo: starts a server, adds references, localizes photographs it has not seen, judges and draws the answers."""
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Runs by benchmark, and their figures averaged over scenes: the mean of the scenes' medians, as in the paper."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The paper's benchmarks: their scenes, the numbers of references it uses, and where scenes are in a folder."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The flags of `mapless-server evaluate`. Imports what it needs when it runs, so that --help answers at once."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 

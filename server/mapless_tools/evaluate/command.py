@@ -1,7 +1,5 @@
 """`mapless-server evaluate`: everything is checked first, then measured, then reported."""
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 from typing import Any

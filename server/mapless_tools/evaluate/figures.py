@@ -1,7 +1,5 @@
 """The figures for programs: evaluation.json, evaluation.csv (a line for each run), queries.csv (one for each query)."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict

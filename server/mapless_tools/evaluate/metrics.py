@@ -1,7 +1,5 @@
 """Errors, recall and latency of an evaluation. A query that was not localized has infinite errors."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence

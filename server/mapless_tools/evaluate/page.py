@@ -1,7 +1,5 @@
 """The report as one HTML file with charts; also the facts about its figures, for the terminal, too."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ cm/degrees; its mean over all scenes with all references, then with ever fewer (
 the share of queries within an error.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ A match is green if it fits the true poses, else red. Only red ones: the matches
 the error is after matching. None: the two photographs do not overlap.
 """
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -132,7 +130,7 @@ class _Shown:
     keypoints: Array
 
     @staticmethod
-    def of(frame: Frame, matcher: Matcher) -> _Shown:
+    def of(frame: Frame, matcher: Matcher) -> "_Shown":
         image = decode_image(frame.image_path.read_bytes(), matcher.limits)
         view = matcher.extractor.extract(image, frame.camera)
         scale = HEIGHT_PX / image.shape[0]

@@ -5,8 +5,6 @@ setting all training frames are references; in a sparse one N of them, evenly sp
 evaluated by leaving one out, or with N evenly spread references and queries between them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
@@ -102,7 +100,7 @@ class SuiteOptions:
         """The variant whose scale is varied: the paper's own if it is among the variants."""
         return "full" if "full" in self.variants else self.variants[0]
 
-    def methods(self) -> tuple[Method, ...]:
+    def methods(self) -> "tuple[Method, ...]":
         """The methods of every setting: each variant, then the ablation of the scale."""
         first, *others = self.scales
         return (*(Method(v, first) for v in self.variants), *(Method(self.ablated, scale) for scale in others))

@@ -1,7 +1,5 @@
 """The origin of figures (code, weights, settings, machine, day), without which they cannot be reproduced."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from datetime import datetime, timezone
 

@@ -1,7 +1,5 @@
 """The references of each query: by feature matches, or as a file says."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -44,7 +42,7 @@ class Matcher:
     limits: ImageLimits
 
     @classmethod
-    def of(cls, settings: Settings) -> Matcher:
+    def of(cls, settings: Settings) -> "Matcher":
         """Makes the matcher with the first features that a server with these settings has.
 
         UsageError if it has none.

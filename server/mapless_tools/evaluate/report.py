@@ -1,7 +1,5 @@
 """The report of an evaluation for people (tables) and for programs (JSON)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """An evaluation of a folder from beginning to end, through client, gRPC, decoding, engine and method."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Mapping, Sequence

@@ -4,8 +4,6 @@ A scene has a server of its own, which holds a set of references for each settin
 at once, so that an evaluation of days can be interrupted, and a scene that fails does not stop the others.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math
@@ -46,7 +44,7 @@ class Run:
     scene: SceneWork
     split: SceneSplit
     method: Method
-    journal: Journal
+    journal: "Journal"
 
     @property
     def label(self) -> str:

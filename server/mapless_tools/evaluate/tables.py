@@ -1,7 +1,5 @@
 """The paper's tables with our figures beside its own, for the terminal and for the page."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The gateway's HTTP interface: the paths and their handlers."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import dataclass, field
@@ -88,11 +86,11 @@ def gateway(connect: Callable[[], Client], options: GatewayOptions, rpc: ASGIApp
     return Guard(Starlette(routes=routes, middleware=[cors], exception_handlers=errors), options.guard)
 
 
-def _handler(handle: Callable[[_Handlers, Request], Awaitable[Response]]) -> Callable[[_Handlers, Request], Any]:
+def _handler(handle: "Callable[[_Handlers, Request], Awaitable[Response]]") -> "Callable[[_Handlers, Request], Any]":
     """Answers errors with their JSON; here, so that pages of other origins can read them."""
 
     @wraps(handle)
-    async def handled(self: _Handlers, request: Request) -> Response:
+    async def handled(self: "_Handlers", request: Request) -> Response:
         try:
             return await handle(self, request)
         except Failure as failure:

@@ -1,7 +1,5 @@
 """`mapless-server gateway`: the GeoPose Protocol, plain HTTP and calls of browsers."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """Errors of the gateway: an HTTP status, and JSON that says what is wrong, in which field."""
 
-from __future__ import annotations
-
 import math
 
 from starlette.responses import JSONResponse

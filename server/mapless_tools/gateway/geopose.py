@@ -3,8 +3,6 @@
 Values that clients omit or set to zero are taken as unknown.
 """
 
-from __future__ import annotations
-
 import base64
 import binascii
 import io

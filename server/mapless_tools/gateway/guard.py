@@ -1,7 +1,5 @@
 """Limits which requests reach the gateway: pages of allowed origins, and number and size of requests."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from collections.abc import Sequence

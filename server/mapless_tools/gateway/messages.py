@@ -5,8 +5,6 @@ and the Python library) and the schemas of gpp-access.
 """
 # ruff: noqa: N815  members carry the names of the protocol
 
-from __future__ import annotations
-
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field

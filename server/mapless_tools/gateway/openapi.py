@@ -1,7 +1,5 @@
 """The description of the gateway: as OpenAPI 3.1 for programs, and as a self-contained page for people."""
 
-from __future__ import annotations
-
 import json
 from functools import cache
 from importlib.resources import files

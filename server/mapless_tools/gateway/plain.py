@@ -1,7 +1,5 @@
 """One photograph as a form, for curl: converts a photograph and its intrinsics to a request of Localize."""
 
-from __future__ import annotations
-
 from collections.abc import AsyncGenerator
 from typing import Any
 

@@ -4,8 +4,6 @@ Messages are passed on unchanged, with fields that this version does not know; s
 and errors with their details. Each call has its caller's own token, never the gateway's.
 """
 
-from __future__ import annotations
-
 from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
 from typing import Any

@@ -1,7 +1,5 @@
 """The gateway's process: from options to a server that listens, and its end."""
 
-from __future__ import annotations
-
 import socket
 import sys
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The scene that an import fills, its references, and whether a frame is one of them."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass, fields

@@ -3,8 +3,6 @@
 It can also rescue a damaged store: undamaged references are written.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from mapless import Client, Reference

@@ -1,7 +1,5 @@
 """Fetches the references of a scene concurrently; damaged ones are named."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor

@@ -5,8 +5,6 @@ to the middle of the scene, so that single precision is enough. Each reference i
 right, y up, z back); `extras` have the reference's id, camera and pose, and the scene's datum, down and unit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path

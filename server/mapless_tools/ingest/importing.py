@@ -1,7 +1,5 @@
 """An import: reads, selects, checks, compares with the scene, stores, and reports."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

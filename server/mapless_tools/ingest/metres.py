@@ -7,8 +7,6 @@ transformation parameters between two point patterns", PAMI 1991). The rotation 
 Contradictory values are rejected with their residuals, since a wrong scale cannot be detected once it is stored.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 from collections import Counter
@@ -107,7 +105,7 @@ def in_metres(dataset: Dataset, options: MetreOptions, id_prefix: str = "") -> D
     return replace(dataset, frames=frames, metric=True, down_in_world=down, notes=(*dataset.notes, *notes))
 
 
-def scale_of_distances(distances: Sequence[KnownDistance], find: Finder) -> tuple[float, list[str]]:
+def scale_of_distances(distances: Sequence[KnownDistance], find: "Finder") -> tuple[float, list[str]]:
     """Metres per unit, with a line of text for each distance; ValueError if they contradict each other.
 
     The scale minimizes the squared differences, each in units of its bound.

@@ -1,7 +1,5 @@
 """The report of an import, for people and for programs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

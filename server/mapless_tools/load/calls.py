@@ -5,8 +5,6 @@ are a Poisson process. In a closed loop a client calls again when it has its ans
 and seems better than it is.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

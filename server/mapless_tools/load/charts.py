@@ -3,8 +3,6 @@
 At three times its capacity, a good server answers as many calls as at its capacity, and rejects the others at once.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 
 from matplotlib.axes import Axes

@@ -4,8 +4,6 @@ Each worker makes one kind of call repeatedly, at random times, and counts how i
 caused, also another one by deleting a scene, is expected; any other is a failure.
 """
 
-from __future__ import annotations
-
 import asyncio
 import random
 from collections import Counter

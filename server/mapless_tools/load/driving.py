@@ -1,7 +1,5 @@
 """The real server with a scene, and calls to it: concurrent ones, as fast as possible, or at a rate."""
 
-from __future__ import annotations
-
 import itertools
 import socket
 import tempfile

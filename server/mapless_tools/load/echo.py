@@ -1,7 +1,5 @@
 """The simplest gRPC server in Python, as a program: grpc.aio, bytes in, bytes out."""
 
-from __future__ import annotations
-
 import asyncio
 import signal
 

@@ -5,8 +5,6 @@ the method's three stages only pass the query on. `padded_photo` makes an image 
 pixels, so that decoding it costs nothing either.
 """
 
-from __future__ import annotations
-
 import asyncio
 import os
 import sys

@@ -1,7 +1,5 @@
 """The cost of serving without computing: the largest rate of calls, and the latency beyond a bare gRPC server's."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import tempfile

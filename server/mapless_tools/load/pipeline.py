@@ -1,7 +1,5 @@
 """The real server with a real scene below and above its capacity: latency, goodput and refusals against load."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Sequence
 from dataclasses import dataclass

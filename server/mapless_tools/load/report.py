@@ -1,7 +1,5 @@
 """Figures with their bars, and steps as a table, in Markdown like the project's other reports."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The serialized requests, and the outcomes of answers."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2

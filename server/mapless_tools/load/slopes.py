@@ -7,8 +7,6 @@ without a slope, correlated over one or over five minutes (autoregressive), grow
 MiB a minute in noise of 3 MiB is found in 99 %. A warm-up that is not left out is reported as growth in 16 %.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Queries of all kinds come as a Poisson process: some are cancelled, some have to
 beside them run the workers of `churn`. The rate is nine tenths of the server's capacity, or one that is given.
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """One step of a measurement: calls for a while, counted by the client and by the server."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Awaitable, Callable, Sequence

@@ -1,7 +1,5 @@
 """Observes a server from outside: its metrics, its process in /proc, and its data folder."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 import os
@@ -36,7 +34,7 @@ class Scrape:
     lag_buckets: Mapping[float, int]
     totals: Mapping[str, float] = field(default_factory=dict)
 
-    def since(self, before: Scrape) -> Scrape:
+    def since(self, before: "Scrape") -> "Scrape":
         """The difference from an earlier time."""
         return Scrape(
             self.started - before.started,

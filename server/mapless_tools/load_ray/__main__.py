@@ -1,7 +1,5 @@
 """`python -m mapless_tools.load_ray overhead|throughput|failover|redeploys|all`: prints tables, writes JSON."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Callable, Sequence

@@ -5,8 +5,6 @@ all of it is deleted when the block is left. Ray and HAProxy listen on loopback,
 and HAProxy's statistics, which cannot be configured to.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

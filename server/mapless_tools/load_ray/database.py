@@ -1,7 +1,5 @@
 """A PostgreSQL for a measurement: that of the environment, or a temporary one from the system's package."""
 
-from __future__ import annotations
-
 import os
 import pwd
 import shutil

@@ -3,8 +3,6 @@
 It reads JSON objects, one a line, from standard input, and answers each on standard output. It ends with its input.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

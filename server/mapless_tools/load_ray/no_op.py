@@ -1,7 +1,5 @@
 """Replicas that compute nothing, to measure the cost of serving."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from ray.serve import Application

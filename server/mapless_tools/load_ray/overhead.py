@@ -1,7 +1,5 @@
 """The cost of the ingress: one replica called through HAProxy and at its own port, and a plain server, by turns."""
 
-from __future__ import annotations
-
 import asyncio
 from statistics import median
 

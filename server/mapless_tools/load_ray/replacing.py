@@ -1,7 +1,5 @@
 """Replicas are killed or redeployed while callers call: how every call ended, and which stored references are lost."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading
@@ -50,7 +48,7 @@ class Calls:
         """Those that failed in spite of the client's retries."""
         return [call for call in self.ended if call.error]
 
-    def between(self, begin_s: float, end_s: float) -> Calls:
+    def between(self, begin_s: float, end_s: float) -> "Calls":
         """Those that were in progress at some time between."""
         return Calls([call for call in self.ended if call.end_s >= begin_s and call.begin_s <= end_s])
 

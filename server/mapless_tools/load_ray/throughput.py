@@ -1,7 +1,5 @@
 """Throughput of two replicas on two cores and of one on one core: the real method on a real scene."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 from collections.abc import Iterable, Sequence

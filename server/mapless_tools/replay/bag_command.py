@@ -1,7 +1,5 @@
 """`mapless-server replay-bag`: localizes a robot's recording, and writes the answers as another."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -4,8 +4,6 @@ What it writes is a folder of rosbag2 with an MCAP file, which Foxglove opens an
 their covariances, map > odom and odom > base, what the recording has of /tf_static, and a diagnostic for every image.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -185,7 +183,7 @@ class _Output:
         self._writer = Writer(out, version=8, storage_plugin=StoragePlugin.MCAP)
         self._connections: dict[str, Any] = {}
 
-    def __enter__(self) -> _Output:
+    def __enter__(self) -> "_Output":
         self._writer.open()
         for topic, kind in ((POSE_TOPIC, POSE_TYPE), (TF_TOPIC, TF_TYPE), (DIAGNOSTICS_TOPIC, DIAGNOSTICS_TYPE)):
             self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self._types)

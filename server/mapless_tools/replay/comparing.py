@@ -4,8 +4,6 @@ Durations, the call's id, the server's version and whether it was captured are n
 and weights are compared separately.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

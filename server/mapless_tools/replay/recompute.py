@@ -5,8 +5,6 @@ one is limited in the same way: features that were not completed are not tried, 
 refined.
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 import time

@@ -1,7 +1,5 @@
 """The inputs that a captured call recorded, in place of the store: references, and the choice among them."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Computes a folder of captured calls again: which calls, and what has changed since."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass

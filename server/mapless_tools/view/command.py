@@ -1,7 +1,5 @@
 """`mapless-server view`: a scene in the browser."""
 
-from __future__ import annotations
-
 import sys
 import threading
 from typing import Annotated

@@ -1,7 +1,5 @@
 """Drawing on viser's scene: cameras, points, ellipsoids and lines, in the scenery's place and size."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

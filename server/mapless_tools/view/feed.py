@@ -1,7 +1,5 @@
 """Receives queries as they are answered, by WatchQueries, until it is closed; connects again when needed."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import uuid

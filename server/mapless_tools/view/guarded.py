@@ -6,8 +6,6 @@ pointed at this machine. viser checks neither, and can publish itself through a 
 request, and no tunnel.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout

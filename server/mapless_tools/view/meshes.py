@@ -1,7 +1,5 @@
 """Shapes to draw: the ellipsoid of a covariance, and the lines of a match."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

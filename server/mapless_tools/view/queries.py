@@ -1,7 +1,5 @@
 """Queries, and photographs as the viewer shows them, with the colours of their pixels."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

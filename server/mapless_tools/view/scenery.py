@@ -1,7 +1,5 @@
 """The layout of a scene's references: their places and sizes, and which of them have their photographs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

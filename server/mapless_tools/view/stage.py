@@ -1,7 +1,5 @@
 """The drawn scene, the panel beside it, and the dialogue of a selected query."""
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """The viewer: a client of the server, the stage, and the work in the background that fills it."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable, Iterator

@@ -4,8 +4,6 @@ One call at a time, in a thread of its own, and always with the newest image: an
 arrive during a call are skipped. What is published is computed in `mapless.ros.localizer`, without ROS.
 """
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 from typing import Any

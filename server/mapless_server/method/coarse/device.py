@@ -1,7 +1,5 @@
 """The reconstruction of a network whose output stays on the device."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ on its matches with these points. That is metric: `Variant.BEST` needs no furthe
 variants the sparse points are scattered into point maps, in a local frame with a scale of its own, like a network's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -73,11 +71,11 @@ class GeometricReconstructor:
         """See Reconstructor.bucket."""
         return Bucket(self.name, len(references))
 
-    def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
+    def reconstruct_many(self, requests: Sequence[Request]) -> "list[Outcome | Exception]":
         """See Reconstructor.reconstruct_many; requests are computed one after the other."""
         return [self._attempt(request) for request in requests]
 
-    def _attempt(self, request: Request) -> Outcome | Exception:
+    def _attempt(self, request: Request) -> "Outcome | Exception":
         try:
             return self._reconstruct(request)
         except Exception as error:  # an error of one request does not fail the others

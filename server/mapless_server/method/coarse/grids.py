@@ -4,8 +4,6 @@ The official loader fits one size to the first photograph of a set. Here the siz
 ratio, so that a reference nearly always has the same one, and its tokens can be cached.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Sequence

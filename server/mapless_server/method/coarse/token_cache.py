@@ -4,8 +4,6 @@ Tokens are kept on the device, and in the host's memory if the device has no roo
 depend on, so an entry is never stale.
 """
 
-from __future__ import annotations
-
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass, replace

@@ -4,8 +4,6 @@ One file per extractor. Features are stored with the reference under the extract
 features must change the name. The learned extractors import torch, only when they are made.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Protocol
 

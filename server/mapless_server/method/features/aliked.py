@@ -1,7 +1,5 @@
 """ALIKED (Zhao et al. 2023), the network of kornia with the authors' weights n16."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """EdgePoint2 (Yao et al. 2025) with the authors' weights."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What all extractors share: reducing the image, and undistorting keypoints to an ideal pinhole camera."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

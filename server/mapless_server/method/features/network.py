@@ -1,7 +1,5 @@
 """What the learned extractors share: their options, and maxima of score maps."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import reduce
 

@@ -1,7 +1,5 @@
 """SIFT features: no weights, no torch; the default where there are no weights."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import cv2

@@ -1,7 +1,5 @@
 """SuperPoint (DeTone et al. 2018), the network of transformers; what the paper uses. Its weights: research only."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """XFeat (Potje et al. 2024), the network of kornia with the authors' weights."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@ A wrong mounting or unit still gives a pose with small radii, because the photog
 against it is the inliers that other photographs lose, and the length of the path.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

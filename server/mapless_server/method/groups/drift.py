@@ -8,8 +8,6 @@ cut (see `jumps`).
 If the unit of the session is unknown (monocular tracking), all steps share one more unknown, the scale.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Collection, Sequence
@@ -92,7 +90,7 @@ class SequenceState:
         scale_is_free: bool,
         options: DriftOptions,
         cut: Collection[int] = (),
-    ) -> SequenceState:
+    ) -> "SequenceState":
         """Makes the state of frames at these poses, without the steps `cut`; step i is from frame i to frame i + 1."""
         neighbours = itertools.pairwise(session_from_camera)
         steps = tuple(first.inverse().compose(second) for first, second in neighbours)
@@ -117,14 +115,14 @@ class SequenceState:
         jacobian[:, 6 * image : 6 * image + 6] = np.eye(6)
         return jacobian
 
-    def moved(self, step: Array) -> SequenceState:
+    def moved(self, step: Array) -> "SequenceState":
         """See GroupState."""
         motions = step[: 6 * len(self.frames)].reshape(-1, 6)
         frames = tuple(perturbed(frame, motion) for frame, motion in zip(self.frames, motions, strict=True))
         scale = self.scale * math.exp(step[-1]) if self.scale_is_free else self.scale
         return replace(self, frames=frames, scale=scale)
 
-    def relaxed(self) -> SequenceState:
+    def relaxed(self) -> "SequenceState":
         """The same state with the noise of the steps enlarged to that observed.
 
         One factor for the whole session is estimated by the median over the steps, which jumps do not affect.

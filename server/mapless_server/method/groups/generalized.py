@@ -8,8 +8,6 @@ to. Three 2D-3D matches of any of the cameras determine its pose (gp3p), four al
 for a match's ray from p_i in the direction d_i, in the frame's unit, and its point x_i in metres; s is metres per unit.
 """
 
-from __future__ import annotations
-
 import ctypes
 import math
 import threading
@@ -51,7 +49,7 @@ class CameraMatches:
         pose = camera_in_world(world_from_rig, self.rig_from_camera)
         return reprojection_errors_px(self.camera, pose, self.x_in_world, self.pixels) < inlier_px
 
-    def thinned(self, step: int) -> CameraMatches:
+    def thinned(self, step: int) -> "CameraMatches":
         """Returns the camera with every `step`-th match."""
         return CameraMatches(self.camera, self.rig_from_camera, self.pixels[::step], self.x_in_world[::step])
 

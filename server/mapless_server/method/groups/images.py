@@ -3,8 +3,6 @@
 A photograph that was rejected alone still has matches, and those of the group together may be enough for a pose.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

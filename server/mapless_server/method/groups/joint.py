@@ -10,8 +10,6 @@ rest is a dense system of the references and the group's parameters, whose cost 
 tracked steps for a sequence (see `drift`). Soft priors that agree with the photographs add their terms.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Generic

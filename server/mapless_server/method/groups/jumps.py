@@ -14,8 +14,6 @@ other contradiction is a jump. The last pose is never left out: the answer follo
 If the session's unit is unknown, the chain of least cost over the units that the pairs give is used.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -180,7 +178,7 @@ class _Links:
         session: Sequence[RigidTransform],
         drift: DriftOptions,
         options: JumpOptions,
-    ) -> _Links:
+    ) -> "_Links":
         frames = sorted(own)
         pairs = list(combinations(range(len(frames)), 2))
         shift, tracked, turn, covariances = [], [], [], []

@@ -1,7 +1,5 @@
 """The cost of a group of photographs and its derivatives; see `joint`."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

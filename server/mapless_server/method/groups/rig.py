@@ -4,8 +4,6 @@ A pose is estimated from the matches of all photographs (generalized PnP), also 
 alone; then matches are searched near the projected points, and everything is adjusted together.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -100,11 +98,11 @@ class RigState:
         lever = cross_matrix(camera_from_rig.translation) @ rotation
         return np.block([[rotation, lever], [np.zeros((3, 3)), rotation]])
 
-    def moved(self, step: Array) -> RigState:
+    def moved(self, step: Array) -> "RigState":
         """See GroupState."""
         return RigState(perturbed(self.rig_from_world, step), self.rig_from_camera)
 
-    def relaxed(self) -> RigState:
+    def relaxed(self) -> "RigState":
         """The state itself: a rig is rigid."""
         return self
 

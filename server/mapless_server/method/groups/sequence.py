@@ -11,8 +11,6 @@ So drift does not affect frames with good matches, and accurate tracking poses t
 across a step that the photographs contradict: the last frame's part is answered, if its own photographs localize it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -4,8 +4,6 @@ If no photograph is localized alone, the initial world_from_session is found fro
 the whole sequence as one camera).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 

@@ -6,8 +6,6 @@ images are added, and halves of all matches, or of all references, give poses by
 photograph this is the evidence of `judge`, so that trust means the same for both.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 

@@ -5,8 +5,6 @@ work: it reads no value, so that rejections too are numbers until they are fetch
 (see `arrays`), in float64; the results are those of the host's stages.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -86,7 +84,7 @@ def launch_on_device(
 
 
 def _judged(
-    outputs: Outputs, prepared: HostInputs, reconstruction: DeviceReconstruction, query: View, options: Options
+    outputs: Outputs, prepared: "HostInputs", reconstruction: DeviceReconstruction, query: View, options: Options
 ) -> Refined | Rejection:
     reference_count = len(reconstruction.reference_cameras)
     broken = _not_finite(outputs, reference_count)

@@ -1,7 +1,5 @@
 """The computation on the device, from the network's output to the results for the host, without reading a value."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import torch

@@ -3,8 +3,6 @@
 The match of a point is stored at the point: the index of the keypoint, or the number of keypoints for none.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

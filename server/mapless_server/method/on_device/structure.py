@@ -4,8 +4,6 @@ Removing rows of a tensor would make the host wait for the number of remaining o
 of rows; those without an observation, or whose observation is dropped, are blank.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -116,7 +114,7 @@ class DeviceTracks:
         """See Tracks; minus infinity for a point without rows."""
         return self._by_point(values, -torch.inf).amax(1)
 
-    def prune(self, observations: Tensor) -> tuple[DeviceTracks, slice, slice]:
+    def prune(self, observations: Tensor) -> "tuple[DeviceTracks, slice, slice]":
         """See Tracks; the rows are not moved."""
         seen = self.seen & observations.reshape(self.seen.shape)
         often = seen.sum(1, keepdim=True) >= 2

@@ -1,7 +1,5 @@
 """Transfer between host and device: arrays up without waiting, results down in one piece."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar

@@ -5,8 +5,6 @@ with a tolerance as large as gravity's error in the image, and the best hypothes
 measurement among others.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -5,8 +5,6 @@ much as one match. The best pose is refined without priors, compared with each p
 ones. So a wrong prior does no harm: it is not used, and the answer equals the one without it bit for bit.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 

@@ -5,8 +5,6 @@
 (Cauchy's loss) over the pose alone, six unknowns, by Levenberg-Marquardt. PoseLib's refinement has no priors.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -13,8 +13,6 @@ Keypoints are counted over the matches with each reference, before the majority 
 removes the matches of the weaker place.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

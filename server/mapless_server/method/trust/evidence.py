@@ -7,8 +7,6 @@ a pose that few matches or a flat scene determine badly moves by as much as its 
 agree with the pose around which they were searched, so they take no part unless there are no others.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -58,7 +56,7 @@ class Votes:
     x_in_world: Array
     pixels: Array
 
-    def __getitem__(self, rows: NDArray[np.bool_]) -> Votes:
+    def __getitem__(self, rows: NDArray[np.bool_]) -> "Votes":
         return Votes(self.reference[rows], self.keypoint[rows], self.x_in_world[rows], self.pixels[rows])
 
     def errors_px(self, camera: Camera, world_from_camera: RigidTransform) -> Array:

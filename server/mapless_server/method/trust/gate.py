@@ -5,8 +5,6 @@ Stival 2004). This is a cheap first test, which means the same for every scene; 
 with one another and pass it. `judge` computes the trust of poses that pass.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

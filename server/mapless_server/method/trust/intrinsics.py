@@ -7,8 +7,6 @@ that is off by more than the prior and these standard deviations allow together 
 it was estimated with the photograph's value: the camera's next photograph will have the same error.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from mapless.geometry import Fisheye

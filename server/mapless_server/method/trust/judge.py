@@ -15,8 +15,6 @@ accepted. A right answer is off by at most 5 % of the distance to what the photo
 scenes in metres, 25 cm.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence
@@ -77,7 +75,7 @@ class JudgeOptions:
         if not all(a <= b for a, b in itertools.pairwise(self.scores)):
             raise ValueError(f"JudgeOptions.scores must be rising, is {self.scores}")
 
-    def with_trust(self, quantiles: tuple[float, ...]) -> JudgeOptions:
+    def with_trust(self, quantiles: tuple[float, ...]) -> "JudgeOptions":
         """Options of a scene whose right answers have these quantiles (at `LEVELS`) of the trust by these options."""
         return replace(self, scores=tuple(np.interp(quantiles, LEVELS, self.scores).tolist()))
 

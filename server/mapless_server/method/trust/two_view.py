@@ -14,8 +14,6 @@ Wrong matches of repeated texture agree with one another, so a second reference 
 its own matches. This share gives the trust: the share of right answers with one as low (see `judge`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

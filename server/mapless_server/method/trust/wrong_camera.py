@@ -6,8 +6,6 @@ agree with one pose. So poses are computed with other focal lengths, and, where 
 principal point in the centre and with square pixels. That costs a query nothing of which most matches agree already.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 

@@ -16,8 +16,6 @@ One match is one equation for the six unknowns of a pose. The equations of one r
 open; those of a second one determine it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -61,11 +59,11 @@ class TwoViewMatches:
     def __len__(self) -> int:
         return len(self.reference)
 
-    def __getitem__(self, rows: NDArray[np.bool_]) -> TwoViewMatches:
+    def __getitem__(self, rows: NDArray[np.bool_]) -> "TwoViewMatches":
         return TwoViewMatches(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
     @staticmethod
-    def of(query: View, references: Sequence[PosedView], query_matches: Sequence[Matches]) -> TwoViewMatches:
+    def of(query: View, references: Sequence[PosedView], query_matches: Sequence[Matches]) -> "TwoViewMatches":
         """Makes the matches from those (query keypoint, reference keypoint) with each reference."""
         count = [len(it) for it in query_matches]
         reference = np.repeat(np.arange(len(references)), count)

@@ -13,8 +13,6 @@ The score is sum (1 - r^2 / r_max^2) log10(1 / p) over the inliers, with residua
 is an inlier: an epipolar line excludes less of the image than a point, so such a match counts less.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 

@@ -6,8 +6,6 @@ the reference's pose; so both kinds of match are adjusted by one problem (`adjus
 point without its only reference has no information.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 

@@ -33,8 +33,6 @@ have heavier tails than the normal distribution. `research.radii` measures them 
 on a scene that it was not measured on.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

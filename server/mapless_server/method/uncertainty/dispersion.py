@@ -29,8 +29,6 @@ they are; with the poses eliminated too, what is left says what the data and the
 `intrinsics`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Radii of a pose, which errors do not exceed with a given probability; growth of errors with the distance."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Weights of networks: their catalogue and folder, fetching and checking. Imports no torch."""
 
-from __future__ import annotations
-
 from .catalogue import CATALOGUE, Weights, named
 from .errors import CheckpointError, FetchError, FolderError, UnknownWeights, WeightsError, WeightsMissing
 from .folder import find_weights

@@ -1,7 +1,5 @@
 """The weights that mapless can use: their purpose, licence, source, and digest."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Errors of weights; every message is one sentence for the operator."""
 
-from __future__ import annotations
-
 
 class WeightsError(Exception):
     """Base of all errors of weights."""

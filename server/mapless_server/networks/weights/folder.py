@@ -1,7 +1,5 @@
 """The weights folder: one safetensors file for each name, and beside it its digest as sha256sum writes it."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

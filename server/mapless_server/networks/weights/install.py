@@ -1,7 +1,5 @@
 """Fetches weights or copies them into the folder, and checks them."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace

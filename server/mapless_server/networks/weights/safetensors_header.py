@@ -3,8 +3,6 @@
 No tensor is read, and torch is not needed.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager

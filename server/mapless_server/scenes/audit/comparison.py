@@ -3,8 +3,6 @@
 It also compares two references: whether they are the same photograph, or show the same view.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum

@@ -7,8 +7,6 @@ expected number of matches; their information about the pose gives the expected 
 Occlusion, light and blur are not known: the prediction is for a good photograph without occlusion.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

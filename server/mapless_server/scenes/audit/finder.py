@@ -4,8 +4,6 @@ The poses of a whole scene fit in memory, its features do not. A reference is ju
 in doubt, by theirs; so a scene of any size is audited page by page, and references are loaded as they are needed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property

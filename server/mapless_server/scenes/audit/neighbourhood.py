@@ -9,8 +9,6 @@ about two in scale. A point counts as visible if this holds for one of the refer
 known, so the count is an upper bound.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations

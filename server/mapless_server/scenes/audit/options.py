@@ -1,7 +1,5 @@
 """Options of an audit."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from mapless_server.method.options import check_bounds

@@ -1,7 +1,5 @@
 """The result of an audit, from the comparison that it is based on, with a sentence for the operator."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

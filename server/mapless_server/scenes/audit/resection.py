@@ -6,8 +6,6 @@ sigma of a match has two parts: the keypoint's own, and the projection of the po
 a point that few references triangulate is uncertain along their rays.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from enum import Enum

@@ -1,7 +1,5 @@
 """Audit and coverage of a stored scene, whose references may be deleted or damaged meanwhile."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Results of an audit of a reference, and of a coverage check of a camera at a viewpoint."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 

@@ -1,7 +1,5 @@
 """Calibrates the scenes that have changed, one after the other, for all servers of a database."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable

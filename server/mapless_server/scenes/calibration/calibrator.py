@@ -1,7 +1,5 @@
 """Localizes references of a scene against the others, as queries are localized."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable, Sequence

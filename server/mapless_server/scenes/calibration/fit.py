@@ -19,8 +19,6 @@ The quantiles of trust are those of the n answers and of n0 = `trust_prior` answ
 elsewhere, uniformly. Priors were chosen by leaving whole scenes out (`research.self_calibration`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 

@@ -13,8 +13,6 @@ A reference is dropped whole that has too few triangulated points, whose depths 
 pixels are wrong. Pixels at edges of depth are dropped, because a keypoint there may belong to either side.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

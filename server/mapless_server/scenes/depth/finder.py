@@ -1,7 +1,5 @@
 """Lets queries find the depths stored with references."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Sequence

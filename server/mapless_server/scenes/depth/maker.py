@@ -1,7 +1,5 @@
 """Predicts depths of a reference and its neighbours by a network."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 

@@ -1,7 +1,5 @@
 """The interface of global descriptors: one unit vector per photograph."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import numpy as np

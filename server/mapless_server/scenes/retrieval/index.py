@@ -12,8 +12,6 @@ by a grid, so that a position prior selects few rows; and only then search appro
 quantization, the best 1,000 scored again with these rows), measured against this search.
 """
 
-from __future__ import annotations
-
 import sys
 import threading
 from collections.abc import Collection, Mapping
@@ -57,7 +55,7 @@ class _Table:
     row_of_id: dict[str, int]
 
     @staticmethod
-    def empty(dimension: int, capacity: int) -> _Table:
+    def empty(dimension: int, capacity: int) -> "_Table":
         """Makes a table with room for this many rows."""
         return _Table(np.empty((capacity, dimension), np.int8), np.empty((capacity, 3, 4)), [], [], {}, {})
 

@@ -8,8 +8,6 @@ good, as thinning by distance does, too. It needs no data, and the network's lar
 eight: 0.42 GB of weights instead of 0.91.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Limits are hard: references beyond them are not considered, and a pose beyond th
 choice of references, too, but not to nothing, and never reject a pose.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -109,7 +107,7 @@ class Narrowing:
     likely_headings: tuple[Cone, ...] = ()
 
     @staticmethod
-    def of(priors: Priors) -> Narrowing:
+    def of(priors: Priors) -> "Narrowing":
         """Makes the likely values of priors; gravity gives none."""
         positions, headings = [], []
         for prior in priors:

@@ -9,8 +9,6 @@ Of few candidates whose features are loaded, those with the most matches are cho
 the photographs and the references' poses only, never the query's pose.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, field

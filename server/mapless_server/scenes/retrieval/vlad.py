@@ -15,8 +15,6 @@ data. All three have such a reference among the first ten for every query. With 
 of the same): 0.99 with the rendered vocabulary, 0.95 without data, where SIFT has 0.91.
 """
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 from functools import lru_cache
@@ -125,7 +123,7 @@ class VladDescriptor:
         self._vocabulary = vocabulary
 
     @staticmethod
-    def of(extractor: FeatureExtractor) -> VladDescriptor:
+    def of(extractor: FeatureExtractor) -> "VladDescriptor":
         """Makes the descriptor with the shipped vocabulary of the features, whose kind begins the extractor's name."""
         kind = next((it for it in LEARNED if extractor.name.startswith(f"{it}-")), "")
         return VladDescriptor(extractor.name, shipped(kind))

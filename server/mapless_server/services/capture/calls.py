@@ -8,8 +8,6 @@
 Photographs and features of references are blobs beside it, named by their SHA-256, since many calls share them.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping

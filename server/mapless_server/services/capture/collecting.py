@@ -1,7 +1,5 @@
 """Reads the references that a photograph was compared with from the store, after its call has been answered."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

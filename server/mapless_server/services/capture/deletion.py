@@ -7,8 +7,6 @@
 The limit of size is kept where calls are written, see `CaptureFolder.add`.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

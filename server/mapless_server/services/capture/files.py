@@ -8,8 +8,6 @@
 A tenant's files share nothing with another's, so that an operator can delete its folder.
 """
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import hashlib

@@ -6,8 +6,6 @@ written. A file that cannot be deleted stays counted, and is tried again. Openin
 is damaged, incomplete or outside the limits. Methods may be called from any thread.
 """
 
-from __future__ import annotations
-
 import errno
 import logging
 import os

@@ -1,7 +1,5 @@
 """Builds the recorder from a server's settings, and names the circumstances that decide its answers."""
 
-from __future__ import annotations
-
 import logging
 import os
 import platform

@@ -4,8 +4,6 @@ Calls wait for the disk in a queue that is bounded in number and bytes, and one 
 is counted. `deletion` deletes them on time.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,7 +1,5 @@
 """Messages of an answer: localization or rejection, frames, and diagnostics."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from mapless import wire

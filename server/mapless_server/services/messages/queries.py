@@ -4,8 +4,6 @@ Priors, hard limits and soft ones, are converted to the scene's world. A geograp
 world here; no other module handles latitudes.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

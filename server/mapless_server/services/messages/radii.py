@@ -1,7 +1,5 @@
 """The radii and the covariance that an answer reports: those of the method, times the factors of a calibration."""
 
-from __future__ import annotations
-
 import math
 import sys
 from dataclasses import asdict, astuple, dataclass, replace
@@ -38,7 +36,7 @@ class Factors:
                 raise ValueError(f"{name} must be {MIN_FACTOR:g} to {MAX_FACTOR:g}, is {value:g}")
 
     @classmethod
-    def of(cls, calibration: Calibration) -> Factors:
+    def of(cls, calibration: Calibration) -> "Factors":
         """The factors of a scene's calibration."""
         return cls(
             calibration.position_factor_68,
@@ -48,7 +46,7 @@ class Factors:
         )
 
     @classmethod
-    def of_references(cls, calibration: SelfCalibration, accuracy: Accuracy, gap: float) -> Factors:
+    def of_references(cls, calibration: SelfCalibration, accuracy: Accuracy, gap: float) -> "Factors":
         """Factors of a self-calibration for an answer with these radii at a gap, see `scenes.calibration.fit`."""
         position, rotation = growth(gap)
         factors = (

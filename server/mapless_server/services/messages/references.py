@@ -1,7 +1,5 @@
 """Messages of the ReferenceService: scenes, references, pages of lists, audits, coverage."""
 
-from __future__ import annotations
-
 import base64
 import binascii
 from collections.abc import Callable, Sequence

@@ -14,8 +14,6 @@ step's revision is the number of the schema, which it also writes into `store_ve
 Revision 2 keeps counts that servers of revision 1 would not: revision 1 was on SQLite only, where no second server is.
 """
 
-from __future__ import annotations
-
 import logging
 
 from sqlalchemy import Connection, insert, inspect, select

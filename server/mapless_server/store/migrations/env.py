@@ -1,7 +1,5 @@
 """Run by alembic: executes every pending step, in the caller's transaction."""
 
-from __future__ import annotations
-
 from alembic import context
 
 # In batch mode, a table that SQLite cannot alter is replaced.

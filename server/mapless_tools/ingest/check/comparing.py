@@ -4,8 +4,6 @@ It is made before anything is uploaded. Wrong poses may not show which photograp
 not fit, photographs that are near in the folder's order are compared as well.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field

@@ -8,8 +8,6 @@ The measure does not depend on scale: poses in feet satisfy it like poses in met
 world axes, which changes no relative pose.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass

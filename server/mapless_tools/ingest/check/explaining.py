@@ -4,8 +4,6 @@ A correction converts a pose as it was given to the intended one. If both world 
 still a rotation, so poses of left-handed engines pass all other checks.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence

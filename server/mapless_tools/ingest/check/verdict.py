@@ -3,8 +3,6 @@
 A wrong unit changes no angle, but the depth of the photographed points.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ files. Conventions of a layout end there: the cameras and poses that it returns 
 and its name in `ingest.FORMATS`.
 """
 
-from __future__ import annotations
-
 import importlib
 from pathlib import Path
 from types import ModuleType

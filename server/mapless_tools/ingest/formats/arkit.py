@@ -12,8 +12,6 @@ Camera axes are OpenGL's, x along the longer side of the sensor: poses and intri
 raster whichever way the phone was held. Apple counts principal points from the corner of the top-left pixel.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path

@@ -6,8 +6,6 @@ length and radial distortion of each image; its paths end in .jpg, the files in 
 image's centre.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath

@@ -8,8 +8,6 @@ is arbitrary), ``source``, ``ground_truth``, ``datum`` (where the world is on th
 ``latitude_deg``, ``longitude_deg``, ``height_m``, perhaps ``enu_from_world`` with ``x y z w``) and ``down_in_world``.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any

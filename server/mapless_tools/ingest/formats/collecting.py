@@ -4,8 +4,6 @@ Only errors of a layout as a whole end its reading. Checks that every layout nee
 folder, exists and is named once; the pose is possible.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -10,8 +10,6 @@ Capture: a session's folder with `sensors.txt`, `rigs.txt` (rig_from_sensor), `t
 all sessions share.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

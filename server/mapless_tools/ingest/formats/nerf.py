@@ -8,8 +8,6 @@ undone, and `train_filenames`, `val_filenames`, `test_filenames`.
 Pixels: nerfstudio shoots the ray of pixel (0, 0) through (0.5, 0.5), so principal points count from the corner.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Mapping

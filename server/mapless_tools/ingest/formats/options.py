@@ -1,7 +1,5 @@
 """Options of the readers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 

@@ -7,8 +7,6 @@ have it.
 COLMAP models, as hloc has them: `7scenes_sfm_triangulated/<scene>/triangulated`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

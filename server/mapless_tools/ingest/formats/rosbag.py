@@ -6,8 +6,6 @@ JPEGs and PNGs as they are, others as PNGs. Poses are those of Odometry, PoseSta
 the camera by /tf_static. The recording is read twice, as a stream: what stays in memory is the poses and one message.
 """
 
-from __future__ import annotations
-
 import atexit
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ The layout has no intrinsics. The data set's page gives 585 px, which is the dep
 With SfM pseudo ground truth the focal length comes with the poses.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

@@ -7,8 +7,6 @@ The layout has no intrinsics: they are those published for the camera of freibur
 name, or given. Images of freiburg3 are undistorted already.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

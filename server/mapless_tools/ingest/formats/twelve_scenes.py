@@ -5,8 +5,6 @@ rest the references'. `info.txt` has lines "key = value", among them m_colorWidt
 m_calibrationColorIntrinsic (4x4, row by row). The pose is a 4x4 world_from_camera, not finite where tracking was lost.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A scene's references as a folder of files: images, and a description of their cameras and poses."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Mapping, Sequence

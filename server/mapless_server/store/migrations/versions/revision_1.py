@@ -1,7 +1,5 @@
 """Revision 1: scenes, references, their images and features."""
 
-from __future__ import annotations
-
 import sqlalchemy as sa
 from alembic import op
 

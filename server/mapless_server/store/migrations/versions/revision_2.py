@@ -1,7 +1,5 @@
 """Revision 2 (expand): global descriptors, changes since a generation, and the number of references."""
 
-from __future__ import annotations
-
 import sqlalchemy as sa
 from alembic import op
 

@@ -1,7 +1,5 @@
 """Revision 3 (expand): attributes of a scene."""
 
-from __future__ import annotations
-
 import sqlalchemy as sa
 from alembic import op
 

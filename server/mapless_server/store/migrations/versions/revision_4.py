@@ -1,7 +1,5 @@
 """Revision 4 (expand): matches of pairs of references, and which references are matched."""
 
-from __future__ import annotations
-
 import sqlalchemy as sa
 from alembic import op
 

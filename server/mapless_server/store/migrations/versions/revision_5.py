@@ -1,7 +1,5 @@
 """Revision 5 (expand): when each matching was last used."""
 
-from __future__ import annotations
-
 import time
 
 import sqlalchemy as sa

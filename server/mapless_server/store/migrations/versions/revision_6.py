@@ -1,7 +1,5 @@
 """Revision 6 (expand): self-calibrations of scenes."""
 
-from __future__ import annotations
-
 import sqlalchemy as sa
 from alembic import op
 

@@ -1,7 +1,5 @@
 """Revision 7 (expand): depths that are stored with references."""
 
-from __future__ import annotations
-
 import sqlalchemy as sa
 from alembic import op
 

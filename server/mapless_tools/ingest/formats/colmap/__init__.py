@@ -5,8 +5,6 @@ frames beside it; so those two are not read. Principal points count from the cor
 pixel is taken off here, and put back by `writing`.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

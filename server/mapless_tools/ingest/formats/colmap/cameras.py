@@ -1,7 +1,5 @@
 """COLMAP's camera models, and which of them mapless has."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 

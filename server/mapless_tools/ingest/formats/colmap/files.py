@@ -5,8 +5,6 @@ endian and have no checksum, so every step is compared with the file's size. Obs
 binary ones are mapped, text is read by the line.
 """
 
-from __future__ import annotations
-
 import mmap
 import struct
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """A COLMAP model in memory, and where models are on the disk."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
