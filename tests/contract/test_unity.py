@@ -14,13 +14,8 @@ MODULES: tuple[Any, ...] = (geometry_pb2, localization_service_pb2, reference_se
 MESSAGES = {name: it for module in MODULES for name, it in module.DESCRIPTOR.message_types_by_name.items()}
 
 
-def in_csharp(name: str) -> str:
-    """What protoc calls a field: position_95_m becomes Position95M."""
-    return re.sub(r"_?([a-z]+|\d+)", lambda part: part.group(1).capitalize(), name)
-
-
 def fields(message: Any) -> dict[str, Any]:
-    return {in_csharp(it.name): it for it in message.fields}
+    return {re.sub(r"_?([a-z]+|\d+)", lambda part: part.group(1).capitalize(), it.name): it for it in message.fields}
 
 
 def test_what_is_set_exists() -> None:

@@ -8,12 +8,12 @@ from support.compare import assert_pose_close
 from support.planted import moved_references, true_correspondences
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
-from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
+from mapless.geometry import RigidTransform, Similarity, rotation_from_vector
 from mapless_server.method.coarse import Request, Triangulation, reconstruct_one
 from mapless_server.method.coarse.geometric import GeometricReconstructor, point_maps
 from mapless_server.method.correspond import Correspondences, Matcher
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.views import PosedView, ReconstructedView, Reconstruction, View
+from mapless_server.method.views import PosedView, Reconstruction, View
 
 EXACT = SceneOptions(noise_px=0.0, point_count=300, reference_count=4)
 
@@ -43,10 +43,6 @@ def world_from_local(scene: SyntheticScene, reconstruction: Reconstruction) -> S
     return Similarity(scale, rotation, world[0].translation - scale * rotation @ local[0].translation)
 
 
-def depths_at_keypoints(part: ReconstructedView, view: View) -> Array:
-    return part.depth_at(view.features.keypoints, view.camera)
-
-
 def test_poses_and_depths_are_true_up_to_one_scale() -> None:
     scene = make_scene(random_for("truth"), EXACT)
     reconstruction = reconstruct(scene)
@@ -60,7 +56,7 @@ def test_poses_and_depths_are_true_up_to_one_scale() -> None:
         assert_pose_close(
             similarity.transform_pose(part.local_from_camera), world_from_camera, metres=1e-4, degrees=1e-3
         )
-        depth_m = similarity.scale * depths_at_keypoints(part, view)
+        depth_m = similarity.scale * part.depth_at(view.features.keypoints, view.camera)
         known = np.isfinite(depth_m) & (shown >= 0)
         assert known.sum() > 0.8 * (shown >= 0).sum()
         true_m = world_from_camera.inverse().apply(scene.x_in_world[shown[known]])[:, 2]

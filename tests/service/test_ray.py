@@ -208,14 +208,9 @@ class Guarded:
 CALLERS = {"writer": ("acme", "write"), "robot": ("acme", "localize"), "stranger": ("other", "write")}
 
 
-def behaving(x_s: float, how: float = 0.0) -> RigidTransform:
-    """A pose by which the stand-in method takes so long, and ends so."""
-    return RigidTransform(np.eye(3), np.array([x_s, how, 0.0]))
-
-
 def fill(client: Client, scene: str, x_s: float = 0.0, how: float = 0.0) -> None:
     client.create_scene(scene)
-    client.add_reference(scene, NewReference("r", PHOTO, CAMERA, behaving(x_s, how)))
+    client.add_reference(scene, NewReference("r", PHOTO, CAMERA, RigidTransform(np.eye(3), np.array([x_s, how, 0.0]))))
 
 
 @pytest.fixture(scope="module")

@@ -59,15 +59,11 @@ def make_reference(reference_id: str) -> NewReference:
     )
 
 
-def open_store(address: str) -> Store:
-    return Store.connect(address) if address.startswith("postgresql:") else Store.open(Path(address))
-
-
 def open_when_there(address: str) -> Store:
     """The database may be the one that is being stopped just now."""
     while True:
         with suppress(StoreError):
-            return open_store(address)
+            return Store.connect(address) if address.startswith("postgresql:") else Store.open(Path(address))
         time.sleep(0.01)
 
 

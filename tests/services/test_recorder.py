@@ -63,11 +63,6 @@ def captured_in(folder: Path) -> list[Path]:
     return sorted(calls_of(folder))
 
 
-def scenes_in(folder: Path) -> list[str]:
-    """Of the calls there, by their files' places: the server may delete them at any moment."""
-    return [it.parent.name for it in captured_in(folder)]
-
-
 @pytest.fixture
 def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Client, LocalizationServiceStub, Path]]:
     """A server that captures, and looks at its store all the time."""
@@ -140,7 +135,7 @@ def test_calls_of_deleted_scenes_and_references_are_deleted(
         client.delete_scene("s")
     if deleted == "scene made anew":
         client.create_scene("s")
-    wait_until(lambda: scenes_in(folder) == ["other"])
+    wait_until(lambda: [it.parent.name for it in captured_in(folder)] == ["other"])
 
 
 @pytest.fixture

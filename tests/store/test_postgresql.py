@@ -1,7 +1,7 @@
 """Several servers on one PostgreSQL: each sees at once what another writes; the database may go away and come back."""
 
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
@@ -141,19 +141,6 @@ def own_cluster() -> Iterator[postgres.Cluster]:
         cluster.remove()
 
 
-def operations(store: Store) -> tuple[Callable[[], object], ...]:
-    return (
-        lambda: store.get_scene(OFFICE),
-        lambda: store.list_scenes(DEFAULT_TENANT, 10),
-        lambda: store.load_references(OFFICE, ["a"], EXTRACTOR),
-        lambda: store.list_changes(OFFICE, 1, NAME),
-        lambda: store.read_image(OFFICE, "a"),
-        lambda: store.add_references(OFFICE, [make_reference("lost")]),
-        lambda: store.delete_reference(OFFICE, "a"),
-        lambda: store.create_scene(SceneKey("lost")),
-    )
-
-
 class TestGoingAway:
     @pytest.mark.parametrize("how", [signal.SIGQUIT, signal.SIGINT])
     def test_errors_but_no_data_are_lost_and_all_works_again(self, how: signal.Signals) -> None:
@@ -167,7 +154,16 @@ class TestGoingAway:
                 with ThreadPoolExecutor(4) as pool:  # so that there are connections to drop
                     list(pool.map(lambda _: store.get_scene(OFFICE), range(8)))
                 cluster.stop(how)
-                for operation in operations(store):
+                for operation in (
+                    lambda: store.get_scene(OFFICE),
+                    lambda: store.list_scenes(DEFAULT_TENANT, 10),
+                    lambda: store.load_references(OFFICE, ["a"], EXTRACTOR),
+                    lambda: store.list_changes(OFFICE, 1, NAME),
+                    lambda: store.read_image(OFFICE, "a"),
+                    lambda: store.add_references(OFFICE, [make_reference("lost")]),
+                    lambda: store.delete_reference(OFFICE, "a"),
+                    lambda: store.create_scene(SceneKey("lost")),
+                ):
                     with pytest.raises(errors.Unavailable) as caught:
                         operation()
                     assert caught.value.reason == "STORE_UNAVAILABLE"

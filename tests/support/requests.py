@@ -14,16 +14,11 @@ from support.servers import CAMERA, PHOTO, localize_request, pose
 REFERENCE_SERVICE = "/mapless.v1.ReferenceService/"
 
 
-def new_reference(scene_id: str, reference_id: str) -> reference_pb.CreateReferenceRequest:
-    """For the photograph of all other requests."""
-    return create_request(f"scenes/{scene_id}", NewReference(reference_id, PHOTO, CAMERA, pose(0.0)))
-
-
 def requests_on(scene_id: str, reference_id: str = "r", new_id: str = "r") -> dict[str, Any]:
     """By method, of those that name a scene, none of which would harm it but the deletions, which come last."""
     scene = f"scenes/{scene_id}"
     reference = f"{scene}/references/{reference_id}"
-    new = new_reference(scene_id, new_id)
+    new = create_request(f"scenes/{scene_id}", NewReference(new_id, PHOTO, CAMERA, pose(0.0)))
     at = new.reference.world_from_camera
     photo: dict[str, Any] = {"image": PHOTO, "intrinsics": new.reference.intrinsics}
     frame = localization_pb.SequenceFrame(session_from_camera=at, **photo)

@@ -40,10 +40,6 @@ def place() -> Place:
     return room()
 
 
-def shot(photo: Photograph) -> Shot:
-    return Shot.of(photo, 960)
-
-
 # The room's photographs
 
 
@@ -73,7 +69,7 @@ def test_photographs_show_the_same_points_in_place(place: Place) -> None:
     """Half a pixel would be seen: keypoints of references, lifted by their depths, beside their matches in queries."""
     offsets = []
     queries, references = place.queries[5:7], place.references[9:11]
-    views = {it.name: SiftExtractor().extract(shot(it).image, it.camera) for it in (*queries, *references)}
+    views = {it.name: SiftExtractor().extract(Shot.of(it, 960).image, it.camera) for it in (*queries, *references)}
     for query, reference in itertools.product(queries, references):
         pairs = mutual_matches(views[query.name].features, views[reference.name].features, 0.7)
         keypoints = [views[it.name].features.keypoints[pairs[:, i]] for i, it in enumerate((query, reference))]
