@@ -180,12 +180,6 @@ def test_pixels_are_to_be_encoded_first() -> None:
         read_image(np.zeros((4, 4, 3), np.uint8))  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("numbers", ["1,2", "1,2,3", "1,2,3,", "1,2,3,4,5"])
-def test_a_camera_in_numbers_is_four_of_them(numbers: str) -> None:
-    with pytest.raises(ValueError, match="four numbers"):
-        read_camera(numbers)
-
-
 def test_the_cameras_of_a_folder_are_not_one_camera(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="a single camera is needed"):
         read_camera(tmp_path / "cameras.json")

@@ -96,11 +96,6 @@ def test_no_retry_is_started_that_would_miss_the_deadline() -> None:
     assert (played.result, len(played.tries), played.pauses) == (refused, 1, [])
 
 
-def test_the_second_pause_is_what_a_starting_server_asks_for() -> None:
-    starting = Unavailable("UNAVAILABLE", "starting", retry_after_s=1.0)
-    assert Played(asking(), [starting, starting, Empty()], ConnectOptions()).pauses == pytest.approx([0.2, 1.125])
-
-
 def test_retries_follow_the_servers_delay_until_the_deadline() -> None:
     starting = Unavailable("UNAVAILABLE", "starting", retry_after_s=1.0)
     played = Played(asking(timeout_s=30.0), [starting], ConnectOptions())

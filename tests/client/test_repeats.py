@@ -15,7 +15,7 @@ from support.played import Played
 
 from mapless import wire
 from mapless.calls import localization, references
-from mapless.errors import AlreadyExists, DeadlineExceeded, Internal, NotFound, Unavailable
+from mapless.errors import AlreadyExists, Internal, NotFound, Unavailable
 from mapless.exchange import Exchange
 from mapless.geodesy import Datum
 from mapless.geometry import Camera, Quaternion, RigidTransform
@@ -131,16 +131,6 @@ def test_a_batch_with_another_clients_item_is_not_repeated() -> None:
         page = pb.ListReferencesResponse(references=found)
         played = Played(references.add_batch("a", wanted, None), [GONE, TAKEN, page], ConnectOptions())
         assert played.result is TAKEN
-
-
-def test_an_upload_that_is_looked_up_ends_by_its_deadline() -> None:
-    """Each attempt takes a second; of a large scene there are 31 references to ask for."""
-    wanted = requests(32)
-    page = pb.ListReferencesResponse(references=[stored(wanted[0])], next_page_token="more")
-    singles = [pb.GetReferenceResponse(reference=stored(it)) for it in wanted[1:]]
-    played = Played(references.add_batch("a", wanted, 10.0), [GONE, TAKEN, page, *singles], ConnectOptions())
-    assert isinstance(played.result, DeadlineExceeded)
-    assert played.took_s < 11
 
 
 def a_pose_that_is_none() -> Any:

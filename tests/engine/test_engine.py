@@ -207,11 +207,6 @@ class TestTiers:
         assert outcome.reason is RejectionReason.GATE
         assert outcome.message.startswith("the features disagree: the pose of cheap (5 inliers) and that of strong (5)")
 
-    @pytest.mark.parametrize("reason", RejectionReason)
-    def test_a_rejection_has_a_hint_whatever_its_reason(self, setting: Setting, reason: RejectionReason) -> None:
-        setting.replies = dict.fromkeys(("cheap", "strong"), rejected(reason))
-        assert hint_of(setting.localize()).message
-
     def test_a_rejection_of_the_engine_has_a_hint(self, setting: Setting) -> None:
         """Where tiers disagree, a pose contradicts the prior, a tier fails, or there are no references."""
         near, far = localized(DOUBTFUL_INLIERS), localized(DOUBTFUL_INLIERS, at=pose(3.0))

@@ -85,27 +85,6 @@ def test_products_of_whole_numbers_are_those_of_floats(n: int, m: int) -> None:
         assert matches.tolist() == best_of_both(plain.copy(), 0.99, either=either).tolist()
 
 
-def test_matches_are_one_to_one_and_grow_with_the_ratio() -> None:
-    first, second = related(random_for("nested"), 60, 60, 0.3)
-    previous: set[tuple[int, ...]] = set()
-    for ratio in (0.6, 0.8, 0.9, 1.0):
-        matches = {tuple(m) for m in mutual_matches(first, second, ratio).tolist()}
-        assert previous <= matches
-        for column in zip(*matches, strict=True):
-            assert len(set(column)) == len(column)
-        previous = matches
-    assert previous
-
-
-def test_the_ratio_compares_distances_not_squares() -> None:
-    """Two candidates at distances d and 2 d: the ratio is a half."""
-    query = np.array([[1.0, 0.0], [-1.0, 0.0]])
-    angles = 2 * np.arcsin(np.array([0.1, 0.2]) / 2)  # chords of 0.1 and 0.2
-    candidates = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    assert [0, 0] in mutual_matches(features(query), features(candidates), 0.51).tolist()
-    assert [0, 0] not in mutual_matches(features(query), features(candidates), 0.49).tolist()
-
-
 def test_ambiguous_descriptors_are_not_matched() -> None:
     twice = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     for either in (False, True):
@@ -157,11 +136,6 @@ def slow_epipolar_distance(first: PosedView, second: PosedView, i: int, j: int) 
     return float(max(distances))
 
 
-def test_exact_matches_have_no_epipolar_distance() -> None:
-    first, second = random_pair(random_for("epipolar"))
-    assert epipolar_distance_px(first, second, all_of(50)).max() < 1e-3
-
-
 def test_epipolar_distance_equals_brute_force() -> None:
     random = random_for("epipolar loops")
     first, second = random_pair(random)
@@ -169,16 +143,6 @@ def test_epipolar_distance_equals_brute_force() -> None:
     slow = [slow_epipolar_distance(first, second, i, i) for i in range(50)]
     np.testing.assert_allclose(epipolar_distance_px(first, second, all_of(50)), slow, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(epipolar_distance_px(second, first, all_of(50)), slow, rtol=1e-5, atol=1e-5)
-
-
-def test_side_by_side_epipolar_distance_is_vertical() -> None:
-    random = random_for("stereo")
-    x_in_world = random.uniform([-1, -0.7, 3], [1, 0.7, 6], (20, 3))
-    poses = [RigidTransform.identity(), RigidTransform(np.eye(3), np.array([0.4, 0.0, 0.0]))]
-    first, second = (posed(p, CAMERA.project(p.inverse().apply(x_in_world))) for p in poses)
-    shift = random.normal(0, 3, (20, 2))
-    distance = epipolar_distance_px(first, shifted_keypoints(second, shift), all_of(20))
-    np.testing.assert_allclose(distance, np.abs(shift[:, 1]), atol=1e-3)
 
 
 def test_at_one_place_the_epipolar_constraint_rejects_nothing() -> None:

@@ -73,20 +73,6 @@ def tensors(query: View, references: Sequence[View]) -> list[Tensor]:
     return [torch.from_numpy(a) for a in arrays]
 
 
-def test_a_pair_in_a_batch_equals_the_pair_alone(views: tuple[View, list[View]]) -> None:
-    query, references = views
-    made = network()
-    with torch.inference_mode():
-        index, score = made(*tensors(query, references))
-        for i, alone in enumerate(references):
-            index_alone, score_alone = made(*tensors(query, [alone]))
-            torch.testing.assert_close(score[i], score_alone[0], atol=1e-6, rtol=0)
-            matched = score_alone[0] > 0.01
-            torch.testing.assert_close(index[i][matched], index_alone[0][matched])
-            assert index[i].max() < len(alone.features)
-    assert (score > 0.5).sum() > 40
-
-
 def test_values_in_the_padding_have_no_effect(views: tuple[View, list[View]]) -> None:
     made = network()
     position, descriptor, positions, descriptors, mask = tensors(*views)
@@ -96,18 +82,6 @@ def test_values_in_the_padding_have_no_effect(views: tuple[View, list[View]]) ->
         index_loud, score_loud = made(position, descriptor, positions + 9 * loud, descriptors + 1e3 * loud, mask)
     torch.testing.assert_close(score, score_loud, atol=1e-6, rtol=0)
     torch.testing.assert_close(index[score > 0.01], index_loud[score > 0.01])
-
-
-def test_all_layers_and_keypoints_give_what_the_batch_gives(views: tuple[View, list[View]]) -> None:
-    query, references = views
-    made = network()
-    for other in references:
-        inputs = tensors(query, [other])
-        with torch.inference_mode():
-            index, score = made(*inputs)
-            index_alone, score_alone = made.match_one((inputs[0], inputs[1]), (inputs[2], inputs[3]), 1.0, 1.0)
-        torch.testing.assert_close(score[0], score_alone, atol=1e-6, rtol=0)
-        torch.testing.assert_close(index[0][score_alone > 0.01], index_alone[score_alone > 0.01])
 
 
 def test_it_pauses_between_layers(views: tuple[View, list[View]]) -> None:
@@ -291,16 +265,6 @@ def test_out_of_memory_is_retried_in_halves(views: tuple[View, list[View]]) -> N
         np.testing.assert_array_equal(matches, expected)
     with pytest.raises(torch.OutOfMemoryError):
         Small(network(), options=options).match(query, posed * 2, lambda: None)  # halves hold five
-
-
-def test_the_check_cancels_the_matching(views: tuple[View, list[View]]) -> None:
-    query, references = views
-
-    def cancelled() -> None:
-        raise TimeoutError
-
-    with pytest.raises(TimeoutError):
-        LightGlueMatching(network()).match(query, [reference(references[0], "")], cancelled)
 
 
 def test_weights_are_exactly_those_of_the_checkpoint(tmp_path: Path) -> None:

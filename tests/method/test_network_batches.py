@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import threading
-import time
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -27,12 +23,10 @@ from support.grey_network import (
 )
 from support.small_networks import small_request, small_runner
 
-from mapless_server.engine.failures import failure_of
 from mapless_server.method.choices import NETWORKS
 from mapless_server.method.coarse import Bucket, Request, reconstruct_one
 from mapless_server.method.coarse.network import NetworkReconstructor
 from mapless_server.method.coarse.token_cache import TokenCacheOptions
-from mapless_server.scheduling import Done, Flow, Job, Observer, Stage, StageResult, Step, WorkQueue, WorkQueueOptions
 
 # Kept tokens
 
@@ -168,47 +162,6 @@ def test_a_batch_that_still_does_not_fit_raises() -> None:
     assert runner.batches == [4, 4]
 
 
-def test_the_queue_splits_a_batch_that_does_not_fit() -> None:
-    """Else each full batch would fail anew, and empty the cache each time."""
-    runner = GreyRunner(most_scenes=2)
-    backend, observer, gate = grey_backend(runner), CountingObserver(), threading.Event()
-
-    def compute(jobs: Sequence[Job]) -> list[StageResult]:
-        if jobs[0].step.bucket == "plug":
-            assert gate.wait(20)
-            return [Done(None)]
-        made = backend.reconstruct_many([job.step.payload for job in jobs])
-        return [it if isinstance(it, Exception) else Done(it) for it in made]
-
-    async def test() -> None:
-        options = WorkQueueOptions(max_queued_s=1e6)
-        stages = {Stage("coarse", "toy-device", max_batch=4): compute}
-        queue = WorkQueue(stages, {"toy-device": 1}, options, observer, failure_of)
-
-        def submit(bucket: str, payload: Request | None = None) -> asyncio.Task[Any]:
-            step = Step("coarse", "toy", bucket, payload)
-            return asyncio.ensure_future(queue.run(Job(Flow("t", "c"), step, time.monotonic() + 600, 1)))
-
-        try:
-            for expected in ([4, 4, 2, 2], [2, 2]):
-                runner.batches.clear()
-                gate.clear()
-                plug = submit("plug")
-                calls = [submit("b", Request(*grey_request(i, 50))) for i in range(4)]
-                while queue.job_count < 5:
-                    await asyncio.sleep(0.002)
-                gate.set()
-                results = await asyncio.wait_for(asyncio.gather(*calls, plug), 20)
-                assert [greys_of(outcome) for outcome in results[:4]] == [[i, 50] for i in range(4)]
-                assert runner.batches == expected
-                assert observer.out_of_memory == 1
-        finally:
-            gate.set()
-            await queue.close()
-
-    asyncio.run(test())
-
-
 def test_a_single_query_is_retried_once() -> None:
     runner = GreyRunner(most_scenes=0)
     with pytest.raises(torch.OutOfMemoryError):
@@ -230,16 +183,6 @@ def test_encoding_is_retried_once(failing: int, queries: int) -> None:
     else:  # it may be the others that have taken the room
         with pytest.raises(torch.OutOfMemoryError):
             backend.reconstruct_many(requests)
-
-
-class CountingObserver(Observer):
-    """Counts how often memory did not suffice."""
-
-    def __init__(self) -> None:
-        self.out_of_memory = 0
-
-    def ran_out_of_memory(self) -> None:
-        self.out_of_memory += 1
 
 
 class LostDevice(RuntimeError):

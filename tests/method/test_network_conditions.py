@@ -27,8 +27,6 @@ from support.small_networks import small_request, small_runner
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.method.coarse import Request, reconstruct_one
 from mapless_server.method.coarse.network import NetworkReconstructor, condition_poses
-from mapless_server.method.views import Reconstruction, View
-from mapless_server.networks import pi3
 from mapless_server.networks.conditions import normalize_poses
 
 # Known poses (Pi3X)
@@ -58,60 +56,6 @@ def test_the_querys_placeholder_does_not_change_the_scale() -> None:
     for far in (np.eye(4), poses[0].shifted([30.0, 0.0, 0.0]).matrix()):
         shifted = normalized(np.stack([*(pose.matrix() for pose in poses), far]))[:5]
         assert np.abs(shifted - alone).max() > 0.3
-
-
-def test_conditions_do_not_depend_on_the_worlds_origin() -> None:
-    np.testing.assert_allclose(
-        condition_poses(random_poses(4, offset_m=5e6)), condition_poses(random_poses(4)), atol=1e-8
-    )
-
-
-def test_references_at_one_place_keep_their_scale() -> None:
-    pose = random_poses(1)[0]
-    np.testing.assert_allclose(normalized(condition_poses([pose, pose])), [np.eye(4)] * 3, atol=1e-12)
-
-
-def test_pi3x_normalizes_by_the_references_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Against a plain computation, with a far query pose and the mean without it; with it the output differs."""
-    query, references = small_request(3)
-    runner = small_runner("pi3x")
-    outcome = reconstruct_one(NetworkReconstructor(runner, OPTIONS), query, references)
-    assert isinstance(outcome, Reconstruction)
-    ours = np.stack([view.point_map for view in outcome.references])
-
-    scene = [*(reference.view for reference in references), query]
-    images = torch.stack([torch.from_numpy(_official_picture(view)) for view in scene])
-    intrinsics = torch.stack([torch.from_numpy(_official_intrinsics(view)).float() for view in scene])
-    tokens = runner.encode(images, intrinsics)[None]
-    far = RigidTransform(np.eye(3), np.full(3, 40.0))
-    world_from_views = [*(reference.world_from_camera for reference in references), far]
-    poses = torch.from_numpy(np.stack([pose.matrix() for pose in world_from_views])).float()[None]
-    posed = torch.tensor([[True, True, True, False]])
-
-    misled = runner.reconstruct(tokens, (4, 5), 3, poses, posed).local_points[0].numpy()
-    monkeypatch.setattr(pi3, "normalize_poses", _normalize_without_the_last)
-    plain = runner.reconstruct(tokens, (4, 5), 3, poses, posed).local_points[0].numpy()
-    np.testing.assert_allclose(ours, plain, atol=5e-5 * float(np.abs(plain).max()))
-    assert np.abs(misled - plain).max() > 1e-3 * float(np.abs(plain).max())
-
-
-def _normalize_without_the_last(poses: torch.Tensor) -> torch.Tensor:
-    return torch.cat([normalize_poses(poses[:, :-1]), torch.eye(4)[None, None]], dim=1)
-
-
-def _official_picture(view: View) -> NDArray[np.float32]:
-    from PIL import Image
-
-    assert view.photograph is not None
-    resized = Image.fromarray(view.photograph.read()).resize((70, 56), Image.Resampling.LANCZOS)
-    return np.asarray(resized, np.float32).transpose(2, 0, 1) / np.float32(255)
-
-
-def _official_intrinsics(view: View) -> NDArray[np.float64]:
-    """Scaled along each axis, where the top-left pixel's centre is (0.5, 0.5)."""
-    camera = view.camera
-    k = camera.matrix() + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-    return np.diag([70 / camera.width_px, 56 / camera.height_px, 1.0]) @ k
 
 
 def test_a_single_posed_view_has_no_effect() -> None:
@@ -196,13 +140,3 @@ def test_metric_and_other_scenes_of_a_batch_equal_single_ones() -> None:
     for request, outcome in zip(requests, together, strict=True):
         (alone,) = NetworkReconstructor(runner, OPTIONS).reconstruct_many([request])
         assert_close(outcome, alone)
-
-
-def test_a_first_view_without_a_pose_is_an_error_of_the_caller() -> None:
-    runner = small_runner("mapanything")
-    tokens = runner.encode(torch.rand(3, 3, 56, 70))[None]
-    poses, nothing = torch.eye(4).repeat(1, 3, 1, 1), torch.zeros(1, 3, dtype=torch.bool)
-    with pytest.raises(ValueError, match="the first view must have a pose"):
-        runner.reconstruct(tokens, (4, 5), 2, poses, torch.tensor([[False, True, True]]))
-    none_posed = runner.reconstruct(tokens, (4, 5), 2, poses, nothing)
-    assert torch.equal(none_posed.camera_poses, runner.reconstruct(tokens, (4, 5), 2).camera_poses)

@@ -6,11 +6,10 @@ import numpy as np
 import poselib
 import pytest
 from support.compare import assert_pose_close
-from support.planted import true_structure
 from support.pnp_problems import POSE, Problem, planted, problem_of
-from support.scenes import CAMERA, SceneOptions, make_scene, random_for
+from support.scenes import CAMERA, random_for
 
-from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless.geometry import RigidTransform
 from mapless_server.method import pnp
 from mapless_server.method.perturbation import reprojection_errors_px
 from mapless_server.method.pnp import PnpOptions, ransac, solve_pose
@@ -72,20 +71,6 @@ def test_a_sample_gives_the_pose_of_all_matches(outlier_share: float, monkeypatc
     assert (fast.matrix() == plain.matrix()).all() == (outlier_share == 0.8)
 
 
-def test_the_same_matches_give_the_same_bits() -> None:
-    problem = planted(random_for("bits"), 300, 0.5, 0.5)
-    first, second = solve(problem), solve(problem)
-    assert first.world_from_camera.matrix().tobytes() == second.world_from_camera.matrix().tobytes()
-    assert first.covariance.tobytes() == second.covariance.tobytes()
-
-
-def test_the_pose_of_a_synthetic_scene_is_found() -> None:
-    scene = make_scene(random_for("scene"), SceneOptions(outlier_share=0.3))
-    structure, matches = true_structure(scene)
-    estimate = solve((scene.query, structure, matches), scene.world_from_query)
-    assert_pose_close(estimate.world_from_camera, scene.world_from_query, metres=0.01, degrees=0.1)
-
-
 # Refined or initial
 
 
@@ -139,11 +124,6 @@ def test_without_a_pose_the_reason_is_pnp_failed(monkeypatch: pytest.MonkeyPatch
 
 
 # Covariance
-
-
-def moved_in_world(pose: RigidTransform, error: Array) -> RigidTransform:
-    """The pose after a shift (x, y, z) and a turn (rx, ry, rz) about fixed world axes."""
-    return RigidTransform(rotation_from_vector(error[3:]) @ pose.rotation, pose.translation + error[:3])
 
 
 def test_errors_are_as_large_as_the_covariance() -> None:

@@ -11,7 +11,7 @@ from support.scenes import SceneOptions, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.groups.rig import RigEstimate, RigOptions, RigState, solve_rig
-from mapless_server.method.perturbation import perturbed, rotation_vector
+from mapless_server.method.perturbation import rotation_vector
 from mapless_server.method.priors.known import PositionPrior, Priors
 from mapless_server.method.rejection import Rejection, RejectionReason
 
@@ -168,8 +168,3 @@ def test_the_jacobian_is_that_of_the_cameras_motion() -> None:
         return np.concatenate([after.translation - turn @ before.translation, rotation_vector(turn)])
 
     assert_jacobian(state.jacobian(1), motion, np.zeros(6))
-
-
-def test_a_perturbation_rotates_about_the_targets_origin() -> None:
-    moved = perturbed(RigidTransform(np.eye(3), np.array([1.0, 0, 0])), np.array([0, 0, 5.0, 0, 0, np.pi / 2]))
-    np.testing.assert_allclose(moved.translation, [0, 1, 5], atol=1e-12)

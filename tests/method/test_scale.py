@@ -297,26 +297,7 @@ def test_distant_points_are_not_triangulated() -> None:
     assert scale_of(scene, network, replace(options, min_parallax_deg=0.0)).stage is ScaleStage.TRIANGULATION
 
 
-def test_forty_references_have_the_planted_scale() -> None:
-    options = SceneOptions(point_count=120, reference_count=40, baseline_m=0.15, distractor_count=20)
-    scene = make_scene(random_for("forty"), options)
-    network = FakeNetwork(scene, 13, FakeNetworkOptions(0.01, pose_noise_m=0.02, map_width_px=96, map_height_px=72))
-    matches = true_matches(scene)
-    for strategy in ScaleStrategy:
-        first, second = (scale_of(scene, network, ScaleOptions(strategy=strategy), matches) for _ in range(2))
-        assert first.metres_per_unit == second.metres_per_unit
-        assert first.metres_per_unit == pytest.approx(network.world_from_local.scale, rel=0.02)
-
-
 # Rejections.
-
-
-def test_one_reference_is_rejected() -> None:
-    for count in (0, 1):
-        scene = make_scene(random_for("one"), SceneOptions(point_count=50))
-        scene = replace(scene, references=scene.references[:count])
-        rejection = rejection_of(FakeNetwork(scene).reconstruct(scene.query, scene.references), scene)
-        assert rejection.reason is RejectionReason.NO_USABLE_REFERENCES
 
 
 @pytest.mark.parametrize("strategy", list(ScaleStrategy))

@@ -11,7 +11,7 @@ from support.jacobians import assert_jacobian
 from support.scenes import SceneOptions, look_at, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method.groups.drift import DriftOptions, SequenceState, world_from_session_at
+from mapless_server.method.groups.drift import DriftOptions, SequenceState
 from mapless_server.method.groups.jumps import find_jumps
 from mapless_server.method.groups.rig import RigOptions, solve_rig
 from mapless_server.method.groups.sequence import SequenceEstimate, solve_sequence
@@ -310,17 +310,6 @@ def moved_state(scale_is_free: bool, moved: float) -> SequenceState:
 
 
 @pytest.mark.parametrize("scale_is_free", [False, True])
-def test_jacobian_of_residuals_equals_finite_differences(scale_is_free: bool) -> None:
-    state = moved_state(scale_is_free, 1e-4)
-    for i in range(2):
-
-        def error(step: Array, i: int = i) -> Array:
-            return state.moved(step)._error(i)
-
-        assert_jacobian(state._jacobian_of_error(i), error, np.zeros(state.size), tolerance=1e-3)
-
-
-@pytest.mark.parametrize("scale_is_free", [False, True])
 def test_the_gradient_is_half_that_of_the_cost(scale_is_free: bool) -> None:
     state = moved_state(scale_is_free, 1e-3)
     _, gradient = state.equations()
@@ -346,11 +335,3 @@ def test_drift_grows_with_distance_and_angle() -> None:
     sigma = options.sigma(step)
     np.testing.assert_allclose(sigma[:3], 0.002 + 0.05)
     np.testing.assert_allclose(np.degrees(sigma[3:]), 0.05 + 1.5 + 0.2)
-
-
-def test_a_sessions_pose_maps_its_frame_to_the_frames_pose() -> None:
-    random = random_for("session")
-    pose, frame = walk(random, 2)
-    there = world_from_session_at(pose, frame, 0.37)
-    np.testing.assert_allclose(there.transform_pose(frame).matrix(), pose.matrix(), atol=1e-12)
-    assert there.scale == 0.37

@@ -227,25 +227,6 @@ def test_no_cost_ever_increases(displacement_m: float, iterations: int) -> None:
     assert after[valid].sum() < before[valid].sum()
 
 
-def test_points_converge_after_noise() -> None:
-    random = random_for("return")
-    _, observations, truth = planted("return", SceneOptions(noise_px=0.0))
-    start = truth + random.normal(0, 0.2, truth.shape)
-    returned = adjust_points(observations, start, 2.0, iterations=15)
-    assert np.linalg.norm(returned - truth, axis=1).max() < 1e-4
-
-
-def test_points_converge_despite_a_wrong_observation() -> None:
-    random = random_for("robust")
-    _, observations, truth = planted("robust", SceneOptions(noise_px=0.0, seen_share=1.0, reference_count=7))
-    full = np.bincount(observations.point) == 7
-    wrong = np.zeros(len(observations.point), bool)
-    wrong[observations.tracks.starts] = True
-    pixel = observations.pixel + np.where(wrong[:, None], 40.0, 0.0)
-    adjusted = adjust_points(replace(observations, pixel=pixel), truth + random.normal(0, 0.05, truth.shape), 0.1, 40)
-    assert np.median(np.linalg.norm(adjusted - truth, axis=1)[full]) < 2e-3
-
-
 def test_nan_points_do_not_change_other_points() -> None:
     _, observations, truth = planted("nan", SceneOptions(point_count=50))
     start = truth + 0.05
@@ -340,11 +321,6 @@ def build(
     return structure, np.array([scene.reference_points[v][k] for v, k in first], np.int64)
 
 
-def median_error_m(scene: SyntheticScene, options: StructureOptions) -> float:
-    structure, shown = build(scene, options, FakeNetworkOptions(depth_noise_m=0.05))
-    return float(np.median(np.linalg.norm(structure.x_in_world - scene.x_in_world[shown], axis=1)))
-
-
 def test_predictions_are_scaled_depths_of_the_first_keypoint() -> None:
     scene = make_scene(random_for("predicted"), SceneOptions(noise_px=0.0, point_count=100))
     network = FakeNetwork(scene)
@@ -411,13 +387,6 @@ def test_tracks_over_all_references_beat_the_papers() -> None:
         shown = np.array([scene.reference_points[v][k] for v, k in first])
         errors_m.append(np.median(np.linalg.norm(structure.x_in_world - scene.x_in_world[shown], axis=1)))
     assert errors_m[1] < 0.9 * errors_m[0]
-
-
-def test_optimization_makes_points_more_accurate() -> None:
-    scene = make_scene(random_for("pays"), SceneOptions())
-    still = median_error_m(scene, replace(PAPER_STRUCTURE, optimize=False))
-    assert median_error_m(scene, PAPER_STRUCTURE) < 0.5 * still
-    assert median_error_m(scene, StructureOptions()) < 0.5 * still
 
 
 def test_wrong_observations_are_pruned_from_good_tracks() -> None:

@@ -78,25 +78,6 @@ def random_pairs(draw: st.DrawFn) -> tuple[Pairs, list[int]]:
     return pairs_of(pairs), counts
 
 
-def test_a_chain_of_matches_is_one_track() -> None:
-    tracks = build_tracks(pairs_of({(0, 1): [(5, 2)], (1, 2): [(2, 7)]}), [6, 3, 8])
-    assert as_sets(tracks) == {frozenset({(0, 5), (1, 2), (2, 7)})}
-    assert_is_well_formed(tracks)
-
-
-def test_separate_matches_are_separate_tracks() -> None:
-    tracks = build_tracks(pairs_of({(0, 1): [(0, 1), (1, 0)], (1, 2): [(2, 2)]}), [3, 3, 3])
-    assert as_sets(tracks) == {frozenset({(0, 0), (1, 1)}), frozenset({(0, 1), (1, 0)}), frozenset({(1, 2), (2, 2)})}
-
-
-def test_a_conflict_keeps_the_better_connected_keypoint() -> None:
-    # Keypoints 0 and 1 of view 0 both reach the same point; 1 by two matches, 0 by one.
-    tracks = build_tracks(
-        pairs_of({(0, 1): [(1, 0)], (0, 2): [(1, 0)], (0, 3): [(0, 0)], (2, 3): [(0, 0)]}), [2, 1, 1, 1]
-    )
-    assert as_sets(tracks) == {frozenset({(0, 1), (1, 0), (2, 0), (3, 0)})}
-
-
 def test_a_track_left_with_one_keypoint_is_dropped() -> None:
     # One keypoint of view 1 cannot be matched twice with view 0, but let a caller try.
     tracks = build_tracks(pairs_of({(0, 1): [(0, 0), (1, 0)]}), [2, 1])

@@ -177,33 +177,34 @@ def test_metrics_without_events_are_described(metrics: Metrics) -> None:
     assert families >= {name.removesuffix("_total") for name in NAMES}
 
 
-@pytest.mark.parametrize(
-    ("name", "labels", "event"),
-    [
-        *(("admission_rejected", {"reason": it.value}, partial(Metrics.refused, reason=it)) for it in Refusal),
-        *(
-            ("jobs_terminated", {"stage": stage, "outcome": it.value}, partial(Metrics.ended, stage=stage, ending=it))
-            for stage in STAGES
-            for it in Ending
-        ),
-        *(("answers", {"outcome": it}, partial(Metrics.answered, outcome=it)) for it in OUTCOMES),
-        ("background_failures", {}, Metrics.matching_failed),
-        ("calibration_failures", {}, Metrics.calibration_failed),
-        ("depth_failures", {}, Metrics.depth_failed),
-        ("depth_failures", {}, Metrics.depth_lookup_failed),
-        ("fatal", {}, Metrics.failed_fatally),
-        ("gpu_oom", {}, Metrics.ran_out_of_memory),
-        ("store_errors", {}, Metrics.store_failed),
-        ("stored_pairs_failures", {}, Metrics.pair_lookup_failed),
-    ],
-)
-def test_an_event_is_counted_once_and_was_zero_before(
-    metrics: Metrics, name: str, labels: dict[str, str], event: Callable[[Metrics], None]
-) -> None:
-    before, key = samples_of(metrics), (f"mapless_{name}_total", frozenset(labels.items()))
-    assert before[key] == 0
-    event(metrics)
-    assert changed(before, samples_of(metrics)) == {key: 1}
+EVENTS: list[tuple[str, dict[str, str], Callable[[Metrics], None]]] = [
+    *(("admission_rejected", {"reason": it.value}, partial(Metrics.refused, reason=it)) for it in Refusal),
+    *(
+        ("jobs_terminated", {"stage": stage, "outcome": it.value}, partial(Metrics.ended, stage=stage, ending=it))
+        for stage in STAGES
+        for it in Ending
+    ),
+    *(("answers", {"outcome": it}, partial(Metrics.answered, outcome=it)) for it in OUTCOMES),
+    ("background_failures", {}, Metrics.matching_failed),
+    ("calibration_failures", {}, Metrics.calibration_failed),
+    ("depth_failures", {}, Metrics.depth_failed),
+    ("depth_failures", {}, Metrics.depth_lookup_failed),
+    ("fatal", {}, Metrics.failed_fatally),
+    ("gpu_oom", {}, Metrics.ran_out_of_memory),
+    ("store_errors", {}, Metrics.store_failed),
+    ("stored_pairs_failures", {}, Metrics.pair_lookup_failed),
+]
+
+
+def test_an_event_is_counted_once_and_was_zero_before(metrics: Metrics) -> None:
+    before = start = samples_of(metrics)
+    for name, labels, event in EVENTS:
+        key = (f"mapless_{name}_total", frozenset(labels.items()))
+        assert start[key] == 0
+        event(metrics)
+        after = samples_of(metrics)
+        assert changed(before, after) == {key: 1}
+        before = after
 
 
 def test_watching_is_counted_without_a_latency(metrics: Metrics) -> None:

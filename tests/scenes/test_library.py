@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from support.images import encode, textured
 from support.planted_damage import damage
 from support.servers import CAMERA, StandInExtractor, pose
-from support.stores import Folder
 
 from mapless.geometry import Camera
 from mapless_server.errors import DataLoss, NotFound, RequestError
@@ -112,13 +111,6 @@ class TestPhotographs:
         np.testing.assert_array_equal(kept.view.photograph.read(), PIXELS["r0"])
         with pytest.raises(NotFound, match="deleted"):
             gone.view.photograph.read()
-
-    def test_damaged_ones_are_data_loss(self, store: CountingStore, tmp_path: Path) -> None:
-        _, (reference,) = ReferenceLibrary(store).load(SCENE, ["r0"], OLD, context())
-        Folder(tmp_path).execute("UPDATE image SET data = zeroblob(5000)")
-        assert reference.view.photograph is not None
-        with pytest.raises(DataLoss, match="'r0'"):
-            reference.view.photograph.read()
 
     def test_undecodable_references_are_data_loss_and_no_misuse(self, store: CountingStore) -> None:
         view = OLD.extract(PIXELS["r0"], CAMERA)

@@ -129,24 +129,6 @@ class TestNarrowing:
 
 
 class TestThinning:
-    def test_a_neighbour_loses_half_of_its_lead(self) -> None:
-        """With a typical 0.2, of 0.8 beside 0.9 there is left 0.5: less than 0.55, more than 0.45."""
-        options = RankOptions(apart_m=0.3, nearby_weight=0.5)
-        for elsewhere, expected in ((0.55, [0, 2, 1]), (0.45, [0, 1, 2])):
-            axes = np.tile(AHEAD, (3, 1))
-            centres = np.array([[0.0, 0, 0], [0.2, 0, 0], [5, 0, 0]])
-            assert spread([0.9, 0.8, elsewhere], centres, axes, 3, 0.2, options) == expected
-
-    def test_one_that_looks_elsewhere_is_no_neighbour(self) -> None:
-        options = RankOptions(apart_deg=30.0, nearby_weight=0.0)
-        centres = np.zeros((3, 3))
-        turned = np.array([[0, 0, 1.0], [0, 0, 1.0], [1.0, 0, 0]])
-        assert spread([0.9, 0.8, 0.7], centres, turned, 2, 0.0, options) == [0, 2]
-
-    def test_what_is_below_typical_is_not_raised(self) -> None:
-        centres, axes = np.array([[0.0, 0, 0], [0.1, 0, 0], [5, 0, 0]]), np.tile(AHEAD, (3, 1))
-        assert spread([0.9, 0.1, 0.2], centres, axes, 3, 0.5, RankOptions(nearby_weight=0.0)) == [0, 2, 1]
-
     def test_neighbours_are_thinned_in_the_ranking_too(self) -> None:
         entries = planted([0.9, 0.89, 0.8, 0.1, 0.1, 0.1, 0.1], x_m=[0.0, 0.1, 5.0, 20.0, 30.0, 40.0, 50.0])
         assert ids(rank(entries, QUERY, 2)) == "0 2"

@@ -1,7 +1,6 @@
 """The choice of references: planted counts and positions, and a slow implementation."""
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.scenes import CAMERA, SceneOptions, make_scene, random_for, unit_rows
@@ -10,8 +9,6 @@ from mapless.geometry import Array, RigidTransform
 from mapless_server.method.views import Features, PosedView, View
 from mapless_server.scenes.retrieval.ranking import RetrieveOptions, spread_choice
 from mapless_tools.evaluate.references import choose_references
-
-LINE = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [1.0, 0, 0], [1.1, 0, 0]])
 
 
 def bare_view(descriptors: Array) -> View:
@@ -35,42 +32,6 @@ def slow_choice(counts: list[int], centres: Array, count: int, options: Retrieve
         }
         chosen.append(max(scores, key=lambda i: (scores[i], -i)))
     return chosen
-
-
-def test_the_most_similar_comes_first() -> None:
-    assert spread_choice([3, 9, 5], [[0, 0, 0], [10, 0, 0], [20, 0, 0]], 3) == [1, 2, 0]
-
-
-def test_a_neighbour_needs_twice_the_matches() -> None:
-    options = RetrieveOptions(apart_m=0.3, nearby_weight=0.5)
-    assert spread_choice([100, 90, 0, 44, 0], LINE, 2, options) == [0, 1]
-    assert spread_choice([100, 90, 0, 46, 0], LINE, 2, options) == [0, 3]
-
-
-def test_several_near_neighbours_cost_no_more_than_one() -> None:
-    assert spread_choice([100, 90, 80, 30, 0], LINE, 4, RetrieveOptions(nearby_weight=0.5)) == [0, 1, 2, 3]
-
-
-def test_weight_one_ranks_by_matches_alone() -> None:
-    assert spread_choice([5, 4, 3, 2, 1], LINE, 5, RetrieveOptions(nearby_weight=1.0)) == [0, 1, 2, 3, 4]
-
-
-def test_weight_zero_prefers_references_far_apart() -> None:
-    assert spread_choice([500, 400, 300, 1, 0], LINE, 2, RetrieveOptions(nearby_weight=0.0)) == [0, 3]
-    everyone = spread_choice([500, 400, 300, 1, 0], LINE, 5, RetrieveOptions(nearby_weight=0.0))
-    assert sorted(everyone) == [0, 1, 2, 3, 4]
-
-
-def test_ties_go_to_the_first() -> None:
-    assert spread_choice([7, 7, 7], [[0, 0, 0], [5, 0, 0], [9, 0, 0]], 2) == [0, 1]
-    assert spread_choice([0, 0, 0], [[0, 0, 0], [5, 0, 0], [9, 0, 0]], 3) == [0, 1, 2]
-
-
-@pytest.mark.parametrize("count", [0, 2, 5, 6, 1000])
-def test_no_more_are_chosen_than_there_are(count: int) -> None:
-    chosen = spread_choice([1, 2, 3, 4, 5], LINE, count)
-    assert len(chosen) == len(set(chosen)) == min(count, 5)
-    assert spread_choice([], np.empty((0, 3)), count) == []
 
 
 @given(

@@ -225,31 +225,6 @@ class TestResults:
         async with Toy(compute) as toy:
             assert await toy.together(range(2)) == [0, 1]
 
-    @pytest.mark.parametrize("is_first_stage_cheap", [False, True])
-    async def test_a_light_caller_does_not_wait_for_a_heavy_ones_jobs(self, is_first_stage_cheap: bool) -> None:
-        """Even if only the second stage takes time: the cost of a turn includes all stages."""
-
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
-            if jobs[0].step.stage == "first":
-                return [then(job) for job in jobs]
-            time.sleep(0.1)
-            return [Done(job.step.payload) for job in jobs]
-
-        async with Toy(compute if is_first_stage_cheap else echo) as toy:
-            if is_first_stage_cheap:
-                for _ in range(3):  # learns the costs
-                    await toy.submit("first of all", "first")
-            count = 40 if is_first_stage_cheap else 100
-            toy.seen.clear()
-            plugs = await toy.plug("first", threads=2)
-            heavy = [toy.submit(f"heavy {i}", "first", client="heavy") for i in range(count)]
-            await toy.until_jobs(count + 2)
-            light = toy.submit("light", "first", client="light")
-            await toy.until_jobs(count + 3)
-            toy.gate.set()
-            await outcomes([*plugs, *heavy, light])
-        assert [it for it in toy.seen if len(it) == 1].index(["light"]) < (10 if is_first_stage_cheap else 8)
-
 
 class TestFailure:
     @settings(max_examples=25, deadline=None)
@@ -499,18 +474,6 @@ class TestEndOfAll:
 
 
 class TestCallersWhoLeave:
-    async def test_a_cancelled_waiting_job_is_not_computed(self) -> None:
-        async with Toy() as toy:
-            calls = await toy.waiting(range(3))
-            calls[1].cancel()
-            await toy.until_jobs(3)
-            assert toy.observer.waiting["then"] == 2
-            toy.gate.set()
-            zero, one, two = await outcomes(calls)
-            assert (zero, type(one), two) == (0, asyncio.CancelledError, 2)
-        assert toy.seen == [[0, 2]]
-        assert toy.observer.endings == {Ending.CANCELLED: 1, Ending.OK: 3}
-
     @pytest.mark.parametrize("way", [Ending.CANCELLED, Ending.EXPIRED])
     async def test_a_thread_notices_at_its_next_check_that_a_job_ended(self, way: Ending) -> None:
         """The caller learns it at once; the thread is not interrupted."""
@@ -549,19 +512,6 @@ class TestCallersWhoLeave:
             assert isinstance(outcome, Expired)
             assert not toy.gate.is_set()
         assert toy.seen == [["quick"]]
-
-    async def test_a_fallback_is_given_when_time_runs_out(self) -> None:
-        def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
-            if jobs[0].step.stage == "then":
-                return echo(jobs)
-            fallback = Fallback(lambda: Done("coarse", Ending.DEGRADED), time.monotonic() + 0.4)
-            return [then(job, "plug", fallback) for job in jobs]
-
-        async with Toy(compute) as toy:
-            await toy.submit("quick")  # so that enough time is predicted
-            assert await asyncio.wait_for(toy.submit(0, "first"), LIMIT_S) == "coarse"
-            assert not toy.gate.is_set()
-        assert toy.observer.endings == {Ending.OK: 1, Ending.DEGRADED: 1}
 
     @pytest.mark.parametrize("seed", range(3))
     async def test_in_any_order_everything_comes_to_its_end(self, seed: int) -> None:

@@ -189,15 +189,6 @@ def test_the_client_names_the_bad_reference_of_a_batch(server: RunningServer, sc
         client.add_references(scene, references)
 
 
-def test_a_batch_with_a_taken_id_stores_nothing(client: Client, stubs: Stubs, scene: str) -> None:
-    batch = pb.BatchCreateReferencesRequest(
-        scene=f"scenes/{scene}", requests=[new_reference("n0"), new_reference("r1")]
-    )
-    error = failure_of(stubs.references.BatchCreateReferences, batch)
-    assert (error.code, error.field) == ("ALREADY_EXISTS", "requests[1].reference_id")
-    assert client.get_scene(scene).reference_count == 3
-
-
 def test_names_are_checked_everywhere(client: Client, stubs: Stubs) -> None:
     bad = "scenes/../references/x"
     calls = [

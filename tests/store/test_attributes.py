@@ -17,7 +17,7 @@ from mapless.geometry import Quaternion, rotation_from_vector
 from mapless.scenes import Calibration, unit_vector
 from mapless_server import errors
 from mapless_server.security import DEFAULT_TENANT, SceneKey
-from mapless_server.store import ContradictingDown, DatumWithoutMetres, SceneAttributes, Store, codec, deletion, queries
+from mapless_server.store import ContradictingDown, SceneAttributes, Store, codec, deletion, queries
 
 OFFICE, HALL, NOWHERE = map(SceneKey, ("office", "hall", "nowhere"))
 DATUM = Datum(47.1 / 3, -8.1 / 3, 400.1 / 3, Quaternion(0.0, 0.0, 0.6, 0.8))
@@ -32,10 +32,6 @@ def known_of(store: Store, key: SceneKey) -> SceneAttributes:
     assert scene in store.list_scenes(DEFAULT_TENANT, 10)
     assert store.get_attributes(key) == scene.attributes
     return scene.attributes
-
-
-def test_a_new_scene_has_no_attributes(store: Store) -> None:
-    assert store.create_scene(OFFICE).attributes == known_of(store, OFFICE) == SceneAttributes()
 
 
 def test_attributes_of_a_new_scene_are_stored_exactly(place: Place) -> None:
@@ -107,13 +103,6 @@ def test_a_scene_deleted_and_created_again_has_forgotten(
         store.get_attributes(OFFICE)
     store.create_scene(OFFICE)
     assert known_of(store, OFFICE) == SceneAttributes()
-
-
-def test_a_scene_that_is_not_there_has_none(store: Store) -> None:
-    for call in (store.get_attributes, store.get_generation, lambda key: store.update_scene(key, datum=None)):
-        with pytest.raises(errors.NotFound, match="nowhere") as caught:
-            call(NOWHERE)
-        assert caught.value.field == "scene"
 
 
 def test_a_datum_that_contradicts_down_is_refused_unchanged(store: Store) -> None:
@@ -267,16 +256,6 @@ def test_a_unit_is_the_metre_until_marked(store: Store) -> None:
     assert known_of(store, OFFICE).arbitrary_unit, "it was not damaged, so not to be replaced"
     store.update_scene(OFFICE, arbitrary_unit=False)
     assert known_of(store, OFFICE) == SceneAttributes()
-
-
-def test_a_datum_needs_metres(store: Store) -> None:
-    before = store.create_scene(OFFICE, SceneAttributes(arbitrary_unit=True))
-    with pytest.raises(DatumWithoutMetres):
-        store.update_scene(OFFICE, datum=DATUM)
-    assert store.get_scene(OFFICE) == before
-    assert store.update_scene(OFFICE, datum=DATUM, arbitrary_unit=False).attributes == SceneAttributes(DATUM)
-    with pytest.raises(DatumWithoutMetres):
-        store.update_scene(OFFICE, arbitrary_unit=True)
 
 
 def test_attributes_stored_before_there_was_a_unit_are_read() -> None:

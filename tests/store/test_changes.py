@@ -17,7 +17,6 @@ from support.stores import (
     make_descriptor,
     make_reference,
     place_on,
-    view_of,
 )
 
 from mapless_server import errors
@@ -237,13 +236,6 @@ def test_following_is_reading_whole(
     assert scene.reference_count == len(whole.added) == len(snapshot.references)
     assert scene.generation == whole.generation == snapshot.generation
     assert follower.wholes <= 1 + sum(step == "n" for step, _ in steps)
-
-
-def test_features_of_one_more_extractor_are_no_change(store: Store) -> None:
-    store.create_scene(OFFICE)
-    (a,) = store.add_references(OFFICE, [described("a")])
-    store.add_features(a.key, "other", view_of(make_reference("a")))
-    assert store.list_changes(OFFICE, 2, NAME).generation == 2
 
 
 def test_a_reader_behind_the_kept_deletions_reads_all(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -67,6 +67,9 @@ class TestScenes:
     def test_everything_of_an_unknown_scene_is_not_found(self, store: Store) -> None:
         calls = (
             lambda: store.get_scene(NOWHERE),
+            lambda: store.get_attributes(NOWHERE),
+            lambda: store.get_generation(NOWHERE),
+            lambda: store.update_scene(NOWHERE, datum=None),
             lambda: store.delete_scene(NOWHERE),
             lambda: store.add_references(NOWHERE, [make_reference("a")]),
             lambda: store.get_reference(NOWHERE, "a"),

@@ -51,7 +51,6 @@ from mapless_tools.load.watch import (
     ServerUnderLoad,
     parse_metrics,
     priority_over,
-    read_process,
     reconcile,
 )
 
@@ -338,20 +337,6 @@ async def test_a_refused_closed_loop_caller_waits_the_retry_delay() -> None:
 
 
 # The server's process and its own account
-
-
-def test_a_process_is_read_with_its_threads_and_files() -> None:
-    before = read_process(os.getpid(), 0.0)
-    opened = [os.open(os.devnull, os.O_RDONLY) for _ in range(5)]
-    try:
-        after = read_process(os.getpid(), 1.0)
-    finally:
-        for descriptor in opened:
-            os.close(descriptor)
-    assert after.descriptors == before.descriptors + 5
-    assert after.threads >= 1
-    assert after.resident_mib > 1
-    assert after.cpu_s >= before.cpu_s
 
 
 def test_the_generator_has_priority_while_it_measures_only() -> None:
