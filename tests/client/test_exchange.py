@@ -6,7 +6,7 @@ import pytest
 from google.protobuf import empty_pb2
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.played import Played
+from support.clients import Played
 
 from mapless.errors import (
     AlreadyExists,

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from support.compare import assert_pose_close
-from support.jacobians import assert_jacobian
+from support.compare import assert_jacobian, assert_pose_close
 from support.scenes import CAMERA, random_for
 
 from mapless.geometry import (

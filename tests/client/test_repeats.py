@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from google.protobuf.message import Message
-from support.played import Played
+from support.clients import Played
 
 from mapless import wire
 from mapless.calls import localization, references

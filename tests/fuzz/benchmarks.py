@@ -7,7 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from support.benchmark_layouts import write_cambridge, write_seven_scenes, write_twelve_scenes
+from support.layouts import write_cambridge, write_seven_scenes, write_twelve_scenes
 
 from mapless.geometry import Camera
 from mapless_tools.ingest.formats import ReadOptions

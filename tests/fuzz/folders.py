@@ -34,6 +34,11 @@ _TEXTS = (
 )
 
 
+def joined(number: int, contents: Sequence[bytes]) -> bytes:
+    """The input of a layout's number and its contents."""
+    return bytes([number]) + SEPARATOR.join(contents)
+
+
 def split(data: bytes) -> tuple[int, list[bytes]]:
     """The inverse, whatever the input."""
     return (data[0] if data else 0), data[1:].split(SEPARATOR)
@@ -56,7 +61,7 @@ def mutate(data: bytes, random: Random, mutate_bytes: MutateBytes) -> bytes:
         lines = content.splitlines(keepends=True) or [b""]
         line = random.randrange(len(lines))
         contents[chosen] = b"".join([*lines[: line + 1], *lines[line:]])
-    return bytes([number]) + SEPARATOR.join(contents)
+    return joined(number, contents)
 
 
 def _with_other_word(content: bytes, random: Random) -> bytes:

@@ -11,8 +11,7 @@ import numpy as np
 import torch
 from safetensors.torch import save_file
 from support.images import textured
-from support.small_megaloc import SMALL_MEGALOC, ruled_megaloc
-from support.small_networks import photograph, view_of
+from support.small_networks import SMALL_MEGALOC, photograph, ruled_megaloc, view_of
 
 from mapless_server.networks import blocks
 from mapless_server.scenes.retrieval.megaloc import MegaLocDescriptor, MegaLocOptions

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.linalg
-from support.compare import assert_pose_close, pose_error
-from support.jacobians import assert_jacobian
+from support.compare import assert_jacobian, assert_pose_close, pose_error
 from support.planted import NOISE, disturbed, drifted, stages, true_structure
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 

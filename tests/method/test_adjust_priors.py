@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.compare import assert_pose_close, pose_error
-from support.jacobians import assert_jacobian
+from support.compare import assert_jacobian, assert_pose_close, pose_error
 from support.planted import NOISE, true_structure
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 

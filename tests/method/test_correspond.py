@@ -7,8 +7,7 @@ from itertools import combinations, product
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.pair_matchings import AnyRatio
-from support.planted import same_points
+from support.planted import AnyRatio, same_points
 from support.scenes import CAMERA, SceneOptions, make_scene, random_for, unit_rows
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import optimize
-from support.jacobians import assert_jacobian
+from support.compare import assert_jacobian
 from support.scenes import random_for
 
 from mapless.geometry import Array

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from support.jacobians import assert_jacobian, finite_differences
+from support.compare import assert_jacobian, finite_differences
 from support.scenes import CAMERA, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector

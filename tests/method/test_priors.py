@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from scipy.special import chdtrc, chdtri
-from support.jacobians import assert_jacobian
+from support.compare import assert_jacobian
 from support.scenes import random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector

@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.compare import assert_pose_close
+from support.compare import assert_jacobian, assert_pose_close
 from support.groups import NOTHING, caller_pose, images_of, looking
-from support.jacobians import assert_jacobian
 from support.scenes import SceneOptions, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector

@@ -5,9 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.compare import assert_pose_close, pose_error
+from support.compare import assert_jacobian, assert_pose_close, pose_error
 from support.groups import NOTHING, caller_pose, drifting, error_m, images_of, rescaled, walk
-from support.jacobians import assert_jacobian
 from support.scenes import SceneOptions, look_at, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
+from support.compare import assert_jacobian
 from support.fake_network import FakeNetwork, FakeNetworkOptions
-from support.jacobians import assert_jacobian
 from support.planted import metric_scale, true_correspondences, true_tracks
 from support.scenes import CAMERA, SceneOptions, SyntheticScene, arc_poses, make_scene, random_for
 

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from safetensors.torch import save_file
 from support.images import textured
 from support.parity_rule import images, weights
-from support.small_megaloc import SMALL_MEGALOC, ruled_megaloc
-from support.small_networks import NOTHING, photograph, view_of
+from support.small_networks import NOTHING, SMALL_MEGALOC, photograph, ruled_megaloc, view_of
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
@@ -41,7 +40,7 @@ PUBLISHED = {
     ),
 }
 """By height and width of images, every twelfth number of two descriptors, by the published code with the weights of
-`small_megaloc`. With twelve patches for eight clusters every patch has its say."""
+`small_networks`. With twelve patches for eight clusters every patch has its say."""
 
 
 @pytest.fixture(scope="module")

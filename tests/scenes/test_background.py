@@ -14,11 +14,10 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from support.pair_matchings import AnyRatio
-from support.planted_damage import damage
+from support.planted import AnyRatio
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 from support.servers import StandInDescriptor, StandInExtractor
-from support.stores import DATABASES, Folder, Place, place_on
+from support.stores import DATABASES, Folder, Place, damage, place_on
 from support.waiting import wait_until
 
 from mapless_server.errors import Unavailable

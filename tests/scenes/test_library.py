@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.images import encode, textured
-from support.planted_damage import damage
 from support.servers import CAMERA, StandInExtractor, pose
+from support.stores import damage
 
 from mapless.geometry import Camera
 from mapless_server.errors import DataLoss, NotFound, RequestError

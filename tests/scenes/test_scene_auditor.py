@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.planted_damage import damage
 from support.scenes import SceneOptions, make_scene
+from support.stores import damage
 
 from mapless.geometry import RigidTransform
 from mapless_server.errors import NotFound, Unavailable

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from support.images import encode, textured
-from support.planted_damage import damage
 from support.servers import CAMERA, StandInDescriptor, StandInExtractor, pose
+from support.stores import damage
 
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.method.options import StageContext

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.images import encode
-from support.planted_damage import damage
 from support.servers import serving_really
+from support.stores import damage
 from support.wall import wall
 
 from mapless import Camera, Client, InvalidArgument, NewReference, NotFound, RigidTransform

@@ -25,8 +25,8 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from sqlalchemy import Connection
 from support.disks import fail, failing_disk, mount, small_disk
 from support.images import encode
-from support.planted_damage import lose_page_with
 from support.servers import CAMERA, PHOTO, StandInMethod, pose, serving
+from support.stores import lose_page_with
 from support.waiting import wait_until
 
 from mapless import (

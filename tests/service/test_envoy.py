@@ -20,10 +20,9 @@ import yaml  # type: ignore[import-untyped]
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from support import envoys
 from support.certificates import authority, signed
-from support.clients import Recording, hosted
+from support.clients import FAILING_CALLS, Recording, assert_fails_alike, hosted
 from support.documents import blocks
 from support.envoys import ENVOY, Gateway, configured, fetched, gateway, program
-from support.fronts import FAILING_CALLS, assert_fails_alike
 from support.postgres import shared_cluster
 from support.programs import gated
 from support.servers import CAMERA, PHOTO, RunningServer, localize_request, pose, serving

@@ -6,8 +6,8 @@ import shutil
 from pathlib import Path
 
 import pytest
-from support.benchmark_layouts import write_cambridge, write_seven_scenes, write_twelve_scenes
 from support.commands import refusal, run
+from support.layouts import write_cambridge, write_seven_scenes, write_twelve_scenes
 from support.wall import wall
 
 from mapless.geometry import Camera

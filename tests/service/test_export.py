@@ -11,8 +11,8 @@ import pytest
 from support.commands import run
 from support.images import encode, textured
 from support.layouts import CAMERA, assert_same_camera, assert_same_pose, by_name, truth
-from support.planted_damage import damage
 from support.servers import RunningServer, serving
+from support.stores import damage
 
 from mapless import Client, Datum, NewReference, Scene
 from mapless.geodesy import enu_from_y_up

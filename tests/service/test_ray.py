@@ -22,7 +22,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 from pydantic import SecretStr
 from support import corner
-from support.fronts import FAILING_CALLS, assert_fails_alike
+from support.clients import FAILING_CALLS, assert_fails_alike
 from support.images import encode
 from support.messages import essence
 from support.postgres import Cluster as Database

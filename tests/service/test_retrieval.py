@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.images import encode, textured
-from support.planted_damage import damage
 from support.servers import CAMERA, RunningServer, pose, serving
+from support.stores import damage
 
 from mapless import (
     Camera,

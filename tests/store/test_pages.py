@@ -6,8 +6,7 @@ Features and descriptors here are large enough to lie on pages of their own. A p
 from pathlib import Path
 
 import pytest
-from support.planted_damage import lose_page_with
-from support.stores import EXTRACTOR, Folder, faults_of, make_reference, view_of
+from support.stores import EXTRACTOR, Folder, faults_of, lose_page_with, make_reference, view_of
 
 from mapless_server.errors import AlreadyExists, DataLoss, NotFound
 from mapless_server.security import SceneKey

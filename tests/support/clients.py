@@ -1,4 +1,4 @@
-"""The asynchronous client with a blocking interface, so that one test uses both; and a server with planted failures."""
+"""The asynchronous client with a blocking interface, servers with planted failures, exchanges without a server."""
 
 from __future__ import annotations
 
@@ -8,14 +8,18 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent import futures
 from contextlib import contextmanager
+from dataclasses import replace
 from types import TracebackType
 from typing import Any, TypeAlias, cast
 
 import grpc
+import pytest
 from google.protobuf.message import Message
 from google.rpc import error_details_pb2, status_pb2
 
-from mapless import Client, ConnectOptions, aio
+from mapless import Client, ConnectOptions, InvalidArgument, MaplessError, NotFound, aio
+from mapless.exchange import Attempt, Call, Exchange, Pause, _Clock, attempts
+from support.servers import CAMERA, PHOTO
 
 Connect: TypeAlias = Callable[..., Client]
 
@@ -186,3 +190,65 @@ def losing(address: str, does_it: bool = True) -> Iterator[tuple[str, Failing]]:
 
         with failing([status("UNAVAILABLE")], forward, does_it) as made:
             yield made
+
+
+FAILING_CALLS: dict[str, tuple[type[MaplessError], Callable[[Client, str], Any]]] = {
+    "unknown scene": (NotFound, lambda client, _: client.localize(PHOTO, CAMERA, "nowhere")),
+    "unknown reference": (NotFound, lambda client, scene: client.localize(PHOTO, CAMERA, scene, ("r", "lost"))),
+    "bad image": (InvalidArgument, lambda client, scene: client.localize(b"no image", CAMERA, scene)),
+    "bad camera": (InvalidArgument, lambda client, it: client.localize(PHOTO, replace(CAMERA, width_px=97), it)),
+    "bad name": (InvalidArgument, lambda client, _: client.get_scene("no name")),
+}
+"""On a scene that is there."""
+
+
+def assert_fails_alike(what: str, scene: str, direct: Client, through: Client) -> MaplessError:
+    """With the same details by both ways; the error of the second."""
+    expected, call = FAILING_CALLS[what]
+    with pytest.raises(expected) as here:
+        call(direct, scene)
+    with pytest.raises(expected) as there:
+        call(through, scene)
+    for name in ("code", "reason", "message", "field", "retry_after_s"):
+        assert getattr(there.value, name) == getattr(here.value, name), what
+    assert there.value.request_id
+    return there.value
+
+
+class Played:
+    """An exchange with scripted outcomes; the last is repeated.
+
+    Attributes:
+        tries: the time left to each attempt, seconds.
+        pauses: seconds.
+        took_s: all of them together with the attempts, which take a second each.
+        result: what it returned, or its error.
+    """
+
+    def __init__(
+        self, exchange: Exchange[Any], outcomes: list[Any], options: ConnectOptions, dice: float = 0.5
+    ) -> None:
+        self.tries: list[float] = []
+        self.calls: list[Call] = []
+        self.pauses: list[float] = []
+        self.took_s = 0.0
+        clock = _Clock(lambda: self.took_s, lambda low, high: low + dice * (high - low))
+        steps = attempts(exchange, options, clock)
+        outcomes = list(outcomes)
+        try:
+            step = next(steps)
+            while True:
+                if isinstance(step, Pause):
+                    self.pauses.append(step.duration_s)
+                    self.took_s += step.duration_s
+                    step = next(steps)
+                else:
+                    assert isinstance(step, Attempt)
+                    self.tries.append(step.timeout_s)
+                    self.calls.append(step.call)
+                    self.took_s += 1.0
+                    step = steps.send(outcomes.pop(0) if len(outcomes) > 1 else outcomes[0])
+        except StopIteration as end:
+            self.result: Any = end.value
+        except MaplessError as error:
+            self.result = error

@@ -1,5 +1,6 @@
 """The input of a stage if all earlier stages were perfect: matches, tracks, structure, scale."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
 
@@ -8,12 +9,13 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
 from mapless_server.method.correspond import Correspondences
+from mapless_server.method.nearest import mutual_matches
 from mapless_server.method.observations import ONE_PIXEL, adjust_points, estimate_noise, triangulate
 from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.results import KeypointNoise, MetricScale, PointMatches, PoseEstimate, ScaleStage, Structure
 from mapless_server.method.structure import observe
 from mapless_server.method.tracks import Tracks
-from mapless_server.method.views import Matches, PosedView
+from mapless_server.method.views import Matches, PosedView, View
 from support.scenes import SyntheticScene
 
 
@@ -127,3 +129,17 @@ def drifted(
     return tuple(
         replace(r, world_from_camera=moved(r.world_from_camera, e)) for r, e in zip(references, errors, strict=True)
     )
+
+
+class AnyRatio:
+    """Nearest neighbours without a ratio; which pairs were seen."""
+
+    name = "any-ratio"
+
+    def __init__(self) -> None:
+        self.seen: list[tuple[View, View]] = []
+
+    def match_one(self, first: View, second: View, pause: Callable[[], None] = lambda: None) -> Matches:
+        pause()
+        self.seen.append((first, second))
+        return mutual_matches(first.features, second.features, 1.0)

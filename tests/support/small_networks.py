@@ -6,15 +6,18 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_server.method.coarse.grids import GridOptions
 from mapless_server.method.views import Features, Photograph, PosedView, View
 from mapless_server.networks.mapanything import MapAnything, MapAnythingSizes
+from mapless_server.networks.megaloc import MegaLoc, MegaLocSizes
 from mapless_server.networks.network import Network
 from mapless_server.networks.pi3 import Pi3, Pi3X, Sizes
 from mapless_server.networks.runner import NetworkRunner
 from support.images import textured
+from support.parity_rule import weights
 
 PI3 = Sizes(64, 4, encoder_depth=3, decoder_depth=4, head_depth=2, camera_width=32)
 PI3X = Sizes(64, 4, 3, 10, 2, 32, (64, 32, 16), 8, metric_width=32, metric_heads=2, metric_depth=2)
@@ -94,3 +97,22 @@ def small_request(
     """A query and references of one size, every image another one."""
     photos = [photograph(textured(*size, seed=1000 * seed + i), reads=reads) for i in range(reference_count + 1)]
     return view_of(photos[0]), references_of(photos[1:])
+
+
+SMALL_MEGALOC = MegaLocSizes(64, 4, 3, hidden=32, clusters=8, cluster_width=16, token_width=24, length=96)
+
+
+def ruled_state(network: torch.nn.Module) -> dict[str, Tensor]:
+    """Weights by the rule; scores so far apart that it shows how often Sinkhorn's iteration goes round."""
+    shapes = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
+    state = {name: torch.tensor(weights(name, shape)).reshape(shape) for name, shape in shapes.items()}
+    state["aggregator.agg.score.3.weight"] *= 16
+    return state
+
+
+def ruled_megaloc() -> MegaLoc:
+    """The network with these weights."""
+    with torch.device("meta"):
+        network = MegaLoc(SMALL_MEGALOC)
+    network.load_state_dict(ruled_state(network), assign=True)
+    return network.eval().requires_grad_(False)

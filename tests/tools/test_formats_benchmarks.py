@@ -6,9 +6,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.benchmark_layouts import write_cambridge, write_seven_scenes, write_twelve_scenes
 from support.images import textured
-from support.layouts import assert_reads, assert_same_camera, assert_same_pose, by_name, reasons, truth, write_image
+from support.layouts import (
+    assert_reads,
+    assert_same_camera,
+    assert_same_pose,
+    by_name,
+    reasons,
+    truth,
+    write_cambridge,
+    write_image,
+    write_seven_scenes,
+    write_twelve_scenes,
+)
 
 from mapless.geometry import Camera, RadialTangential, RigidTransform
 from mapless_tools.ingest.formats import Intrinsics, ReadOptions, read_dataset
