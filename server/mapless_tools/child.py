@@ -72,6 +72,7 @@ def child_server(
         "--host": "127.0.0.1",
         "--port": "0",
         "--log-level": "warning",
+        "--log-format": "text",
         "--drain-grace-s": str(GRACE_S),
         "--metrics-port": "0",
     } | dict(more_flags or {})

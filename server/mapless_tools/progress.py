@@ -53,7 +53,7 @@ def _lines() -> Progress:
     def progress(step: str, done: int, total: int) -> None:
         part = done * LINES // total if total else LINES
         if part > printed.get(step, -1):
-            print(f"{step}: {f'{done} of ' if done else ''}{total}", file=sys.stderr, flush=True)
+            print(step if total == 1 else f"{step}: {done} of {total}", file=sys.stderr, flush=True)
             printed[step] = part
 
     return progress

@@ -514,7 +514,10 @@ class Heard:
         self.beats += 1
 
 
-async def test_a_blocked_loop_is_measured_and_logged(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_blocked_loop_is_measured_and_logged(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mapless_server.observability.event_loop.WARN_S", 0.1)
     heard = Heard()
     caplog.set_level(logging.WARNING)
     watching = asyncio.create_task(watch_event_loop(heard))

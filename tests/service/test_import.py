@@ -217,7 +217,7 @@ def test_after_a_termination_the_next_run_continues(tmp_path: Path) -> None:
     process = subprocess.Popen(arguments, env=environment, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stderr is not None
-        while not re.match(r"storing references: \d+ of", process.stderr.readline()):  # some are stored
+        while not re.match(r"storing references: [1-9]\d* of", process.stderr.readline()):  # some are stored
             assert process.poll() is None
         process.send_signal(signal.SIGTERM)
         output, _ = process.communicate(timeout=60)

@@ -106,6 +106,11 @@ def test_an_empty_scene_is_a_rejection(client: Client) -> None:
     answer = rejected(client.localize(PHOTO, CAMERA, "empty"))
     assert answer.reason == "NO_USABLE_REFERENCES"
     assert answer.diagnostics.processed_width_px == 96
+    near = Priors(PositionPrior(np.zeros(3), 3.0))
+    for same in (answer, rejected(client.localize(PHOTO, CAMERA, "empty", priors=near))):
+        assert same.message == "the scene has no references"
+        assert same.hint is not None
+        assert same.hint.message.startswith("There are no references")
     client.delete_scene("empty")
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support.servers import CAMERA, PHOTO, pose
 
-from mapless import Client, InvalidArgument, LocalizationResult, NewReference, PositionPrior, Priors
+from mapless import Client, InvalidArgument, LocalizationResult, NewReference, PositionPrior, Priors, Rejected
 from mapless.geodesy import Datum, geodetic_from_world
 from mapless.priors import GeoPositionPrior, GravityPrior
 
@@ -37,5 +37,6 @@ def test_satellites_and_a_covariance_narrow_the_choice_alike(client: Client) -> 
         answer = client.localize(PHOTO, CAMERA, "square", priors=priors)
         assert {use.name.rpartition("/")[2] for use in answer.diagnostics.references} == {"x0", "x8", "x15"}
     nowhere = client.localize(PHOTO, CAMERA, "square", priors=Priors(PositionPrior(np.array([1e6, 0, 0]), 3.0)))
-    assert getattr(nowhere, "reason", None) == "NO_USABLE_REFERENCES"
+    assert isinstance(nowhere, Rejected)
+    assert (nowhere.reason, nowhere.message) == ("NO_USABLE_REFERENCES", "no reference is where the prior says")
     client.delete_scene("square")

@@ -13,6 +13,6 @@ def test_lines_are_few_however_long_a_step_is(capsys: pytest.CaptureFixture[str]
     out, err = capsys.readouterr()
     lines = err.splitlines()
     assert out == ""
-    assert lines[0] == "storing: 1000"
+    assert lines[0] == "storing: 0 of 1000"
     assert lines[LINES] == "storing: 1000 of 1000"
-    assert lines[LINES + 1 :] == ["checking: 3"]
+    assert lines[LINES + 1 :] == ["checking: 0 of 3"]

@@ -167,7 +167,7 @@ class References:
                 name = reference_name(scene_id, reference_id)
                 raise NotFound(message, field=f"references[{index}]", resource=name)
         if not len(entries):
-            return Choice((), self._descriptor.name, entries.generation)
+            return Choice((), "", entries.generation)
         view = views.view(self._extractors[0], context)
         with context.stage("retrieval"):
             vector = self._descriptor.describe(view)

@@ -200,8 +200,7 @@ class QueryStages:
             # Described once and for all: the next queries find the features stored.
             job.unusual_s = run.context.stage_seconds.get("describe", 0.0)
         if not run.references:
-            unknown = query.narrowing.is_empty
-            where = "the scene has no references" if unknown else "no reference is where the prior says"
+            where = "no reference is where the prior says" if _is_searched(run) else "the scene has no references"
             if run.choice is not None and run.choice.references:
                 where = "what is stored of the references that resemble the photograph is damaged"
             return self._conclude(run, Answer(Rejection(RejectionReason.NO_USABLE_REFERENCES, where)))
@@ -398,7 +397,7 @@ class QueryStages:
         tier, narrowing = self._tiers[run.tier], run.query.narrowing
         answer = _checked_against(narrowing, answer)
         if isinstance(answer.outcome, Rejection):
-            answer = hinted(answer, run.view, run.references, not narrowing.is_empty)
+            answer = hinted(answer, run.view, run.references, _is_searched(run) and not narrowing.is_empty)
         prefix = "" if run.best is None else f"{tier.features}/"
         seconds = {} if run.best is None else dict(run.best.stage_seconds)
         for stage, spent_s in (run.context.stage_seconds | answer.stage_seconds).items():
@@ -411,6 +410,11 @@ def _pipeline_in(run: QueryRun, tier: Tier) -> Pipeline:
     """The tier's pipeline with the trust of the scene."""
     calibration = run.attributes.self_calibration(tier.kind)
     return tier.pipeline.with_trust(calibration.trust_quantiles if calibration else ())
+
+
+def _is_searched(run: QueryRun) -> bool:
+    """Whether the scene has references to choose from."""
+    return run.choice is not None and bool(run.choice.descriptor)
 
 
 def _emptied() -> Unavailable:

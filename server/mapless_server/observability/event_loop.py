@@ -10,7 +10,8 @@ log = logging.getLogger(__name__)
 
 TICK_S = 0.01
 """The timer's period, by which a lag may be underestimated; waking up so often costs 1 to 2 % of a core."""
-WARN_S = 0.1
+WARN_S = 1.0
+"""Less is usual where other processes take the processors; the metric has all."""
 
 
 class LoopObserver(Protocol):

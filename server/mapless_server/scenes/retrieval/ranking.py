@@ -101,7 +101,7 @@ class Choice:
 
     Attributes:
         references: in order, the most similar first except for those that see the same as an earlier one.
-        descriptor: name of the global descriptor that was compared.
+        descriptor: name of the global descriptor that was compared; empty if the scene has no references.
         generation: generation of the scene.
     """
 
