@@ -1,6 +1,7 @@
 """Learned extractors: planted score maps give keypoints where they are, through reduction and lens; random weights."""
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from kornia.feature import ALIKED, XFeat  # noqa: E402
 from safetensors.torch import save_file  # noqa: E402
 from torch import Tensor, nn  # noqa: E402
 
-from mapless_server.method.features.aliked import AlikedExtractor  # noqa: E402
+from mapless_server.method.features.aliked import AlikedExtractor, dense_maps  # noqa: E402
 from mapless_server.method.features.edgepoint2 import SIZE_OF_WIDTH, EdgePoint2Extractor  # noqa: E402
 from mapless_server.method.features.network import (  # noqa: E402
     LearnedOptions,
@@ -81,6 +82,9 @@ def assert_is_well_formed(features: Features, dimension: int) -> None:
     np.testing.assert_allclose(np.linalg.norm(features.unit_descriptors(), axis=1), 1, atol=1e-5)
 
 
+MAPS = "mapless_server.method.features.aliked.dense_maps"
+
+
 def peaks(random: np.random.Generator, width: int, height: int, step_px: int = 20) -> Array:
     """Places between pixels, one in each square of a grid."""
     grid = np.meshgrid(np.arange(step_px, width - step_px, step_px), np.arange(step_px, height - step_px, step_px))
@@ -115,7 +119,7 @@ def test_aliked_keypoints_are_the_peaks_of_the_score_map(
     centres = peaks(random_for("aliked", lens, max_side_px), reduced.width_px, reduced.height_px)
     score_map = bumps(centres, reduced.width_px, reduced.height_px, sigma_px=1.5)
     feature_map = torch.ones(1, 128, reduced.height_px, reduced.width_px)
-    monkeypatch.setattr(aliked._network, "extract_dense_map", lambda _: (feature_map, score_map))
+    monkeypatch.setattr(MAPS, lambda *_: (feature_map, score_map))
     monkeypatch.setattr(aliked, "options", replace(aliked.options, max_side_px=max_side_px, min_score=0.3))
     view = aliked.extract(np.zeros((256, 320, 3), np.uint8), camera)
     assert view.camera == reduced.pinhole()
@@ -126,13 +130,28 @@ def test_aliked_keypoints_are_the_peaks_of_the_score_map(
     assert np.abs((seen - nearest).mean(axis=0)).max() < 0.05
 
 
+@pytest.mark.parametrize("size", [(160, 224), (97, 131), (7, 9)])
+def test_aliked_maps_are_those_of_kornia(aliked: AlikedExtractor, size: tuple[int, int]) -> None:
+    """Offsets of the deformable convolutions reach several pixels, beyond the borders too."""
+    network = deepcopy(aliked._network)
+    for name, parameter in network.named_parameters():
+        if "offset_conv.bias" in name:
+            nn.init.normal_(parameter, 0, 3.0)
+    image = torch.rand(1, 3, *size)
+    with torch.inference_mode():
+        for ours, theirs in zip(dense_maps(network, image), network.extract_dense_map(image), strict=True):
+            torch.testing.assert_close(ours, theirs, rtol=0, atol=2e-5)
+
+
 def test_a_wide_peak_has_a_large_keypoint_size(aliked: AlikedExtractor, monkeypatch: pytest.MonkeyPatch) -> None:
     centres = np.rint(peaks(random_for("wide"), 320, 256))
     feature_map = torch.ones(1, 128, 256, 320)
     sizes = []
     for sigma_px in (0.5, 1.0, 3.0):
         score_map = bumps(centres, 320, 256, sigma_px)
-        monkeypatch.setattr(aliked._network, "extract_dense_map", lambda _, s=score_map: (feature_map, s))
+        monkeypatch.setattr(
+            "mapless_server.method.features.aliked.dense_maps", lambda *_, s=score_map: (feature_map, s)
+        )
         sizes.append(np.median(aliked.extract(np.zeros((256, 320, 3), np.uint8), CAMERA).features.sizes_px))
     assert 0 < sizes[0] < sizes[1] < sizes[2] <= 4 * np.sqrt(8)  # all weight in the corners of five by five pixels
 
