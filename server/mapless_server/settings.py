@@ -187,7 +187,9 @@ class Settings(BaseModel):
             raise ValueError("must be a name or an address")
         return host
 
-    @field_validator("data_dir", "weights_dir", "tls_certificate", "tls_key", "tls_client_ca", "tokens_file")
+    @field_validator(
+        "data_dir", "weights_dir", "tls_certificate", "tls_key", "tls_client_ca", "tokens_file", "capture_dir"
+    )
     @classmethod
     def _check_path(cls, path: Path | None) -> Path | None:
         if path is not None and "\0" in str(path):
@@ -249,6 +251,7 @@ _PLAIN_BOUNDS = {
     "less than": "below",
 }
 _BOUNDS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
+_PASSWORD = re.compile(r"(:/+[^/@]*:)[^@]+(?=@)")  # a path has only one slash of a URL's two
 _COMPUTED_DEFAULTS = {"workers": "all cores", "weights_dir": "~/.cache/mapless/weights"}
 
 
@@ -264,11 +267,10 @@ class LoadedSettings:
     origins: Mapping[str, str]
 
     def __str__(self) -> str:
-        """A line for each setting; secrets show as asterisks."""
+        """A line for each setting; secrets show as asterisks, also the password of a URL in any other setting."""
         width = max(map(len, self.origins))
-        return "\n".join(
-            f"  {name:<{width}}  {getattr(self.settings, name)}  ({origin})" for name, origin in self.origins.items()
-        )
+        shown = {name: _PASSWORD.sub(r"\1**********", str(getattr(self.settings, name))) for name in self.origins}
+        return "\n".join(f"  {name:<{width}}  {shown[name]}  ({origin})" for name, origin in self.origins.items())
 
 
 def load_settings(flags: Mapping[str, Any], config: Path | None = None) -> LoadedSettings:

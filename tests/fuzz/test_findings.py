@@ -294,6 +294,14 @@ def test_settings_that_nothing_can_be_done_with_are_refused(tmp_path: Path, line
         load_settings({}, file)
 
 
+@pytest.mark.parametrize("name", ["tokens_file", "capture_dir", "otlp_endpoint", "host"])
+def test_the_password_of_a_url_in_another_setting_is_not_shown(tmp_path: Path, name: str) -> None:
+    file = tmp_path / "mapless.toml"
+    file.write_text(f'{name} = "postgresql://u:hunter2@db:5432/mapless"\n')
+    assert re.search(rf"{name} .*u:\*+@db", shown := str(load_settings({}, file)))
+    assert "hunter2" not in shown
+
+
 @pytest.mark.parametrize(
     "data", [b"", b"{}", b"[]", b"null", b"\xff", b"1" * 5000, b"[" * 100_000, b'{"camera": 1, "world_from_camera": 2}']
 )

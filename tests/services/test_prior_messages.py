@@ -220,6 +220,13 @@ def test_a_wrong_field_is_rejected_by_name(field: str, fields: dict[str, Any]) -
     assert error.value.field == field
 
 
+def test_a_certain_geo_position_without_a_height_is_a_prior() -> None:
+    _, priors = priors_from_message(request(geoPositionPrior=GEO | {"horizontalSigmaM": 1e-4}), ON_EARTH)
+    assert priors.position is not None
+    sigmas_m = np.sqrt(np.linalg.eigvalsh(priors.position.covariance))
+    np.testing.assert_allclose(sigmas_m, [0.01, 0.01, 1000.0], rtol=1e-4)
+
+
 def test_a_geo_position_needs_a_datum_and_gravity_a_down() -> None:
     for fields, field in (
         ({"geoPositionPrior": GEO}, "geo_position_prior"),

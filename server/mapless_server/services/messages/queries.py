@@ -203,6 +203,10 @@ UNKNOWN_HEIGHT_SIGMA_M = 1000.0
 MIN_SIGMA_M, MAX_SIGMA_M = 1e-4, 1e6
 """Of a position: finer than any survey, wider than any scene."""
 
+MIN_SIGMA_RATIO = 1e-5
+"""Of two directions of a position: rotated to the scene's axes, a smaller one would be lost to rounding. So without a
+height, positions are certain to 1 cm at most."""
+
 MIN_SIGMA_DEG, MAX_SIGMA_DEG = 1e-3, 90.0
 """Of a direction; beyond 90 degrees a prior has no effect."""
 
@@ -280,8 +284,8 @@ def _geo_position(message: pb.GeoPositionPrior, attributes: SceneAttributes, fie
         raise FieldError(f"{field}.height_m", "is required with vertical_sigma_m")
     place = GeoPosition(message.latitude_deg, message.longitude_deg, height_m)
     rotation = world_from_enu_at(place, datum).rotation
-    in_enu = np.diag([message.horizontal_sigma_m] * 2 + [vertical_sigma_m]) ** 2
-    covariance = rotation @ in_enu @ rotation.T
+    sigmas_m = np.array([message.horizontal_sigma_m] * 2 + [vertical_sigma_m])
+    covariance = rotation @ np.diag(sigmas_m.clip(min=MIN_SIGMA_RATIO * sigmas_m.max()) ** 2) @ rotation.T
     return PositionPrior(world_from_geodetic(place, datum), (covariance + covariance.T) / 2)
 
 
