@@ -4,6 +4,7 @@ import filecmp
 import importlib.metadata
 import inspect
 import os
+import re
 import subprocess
 from enum import Enum
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 
 import grpc
 import pytest
+from grpc._cython import cygrpc
 from grpc_reflection.v1alpha import reflection_pb2
 from support.programs import printed
 from support.servers import serving
@@ -110,3 +112,17 @@ def test_reflection_describes_the_services_unless_turned_off(tmp_path: Path, ver
         assert ours <= reflected(server.address, version)
     with serving(tmp_path / "closed", reflection=False) as server, pytest.raises(grpc.RpcError, match="UNIMPLEMENTED"):
         reflected(server.address, version)
+
+
+KNOWN = Path(cygrpc.__file__).read_bytes()
+SOURCES = [path for package in (mapless, mapless_server) for path in Path(package.__path__[0]).rglob("*.py")]
+OPTIONS = sorted({name for path in SOURCES for name in re.findall(r'\("(grpc\.[a-z0-9_.]+)",', path.read_text())})
+
+
+def test_some_are_given() -> None:
+    assert {"grpc.keepalive_time_ms", "grpc.max_receive_message_length"} <= set(OPTIONS)
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_grpc_knows_the_option(name: str) -> None:
+    assert name.encode() + b"\0" in KNOWN

@@ -1,17 +1,30 @@
-"""The gate: rejects poses that chance could support; the expected number of such poses."""
+"""The gate rejects poses that chance could support; two places that a photograph fits are ambiguous."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from support import corner
+from support.compare import assert_pose_close
+from support.planted import moved_references
 from support.pnp_problems import POSE, Problem, planted
-from support.scenes import CAMERA, random_for
+from support.scenes import CAMERA, make_scene, random_for
 
-from mapless.geometry import RigidTransform
-from mapless_server.method.pnp import PnpOptions, solve_pose
+from mapless.geometry import RigidTransform, rotation_from_vector
+from mapless_server.images import ImageLimits, decode_image
+from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.correspond import Matcher
+from mapless_server.method.features import make_extractor
+from mapless_server.method.localize import localize
+from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.pipeline import Pipeline
+from mapless_server.method.pnp import PnpOptions, ransac, solve_pose
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import PointMatches, PoseEstimate
+from mapless_server.method.trust import ambiguity
 from mapless_server.method.trust.gate import (
     GateOptions,
     false_alarms,
@@ -19,6 +32,7 @@ from mapless_server.method.trust.gate import (
     gate_failure,
     log10_false_alarms,
 )
+from mapless_server.method.views import PosedView, View
 
 INLIER_PX = PnpOptions().inlier_px
 
@@ -101,3 +115,114 @@ def test_guided_and_other_matches_have_their_own_chance() -> None:
     assert log10_false_alarms(CAMERA, both, inliers, INLIER_PX) == pytest.approx(
         min(false_alarms(50, 20, share), false_alarms(50, 20, disc / 400))
     )
+
+
+ELSEWHERE = RigidTransform(rotation_from_vector([0.0, 0.7, 0.0]), np.array([20.0, -3.0, 8.0]))
+"""Where the copy stands: another room, turned."""
+
+SCENE = make_scene(random_for("ambiguity"))
+PIPELINE = Pipeline(matcher=Matcher())
+
+
+def copied(references: Sequence[PosedView], which: Sequence[int], where: RigidTransform) -> tuple[PosedView, ...]:
+    """The references, some of which (by index) stand in the copy."""
+    there = moved_references(tuple(references), where)
+    return tuple(there[i] if i in which else r for i, r in enumerate(references))
+
+
+def answer_of(references: Sequence[PosedView], query: View = SCENE.query) -> Answer:
+    return localize(query, references, PIPELINE, LocalizeOptions())
+
+
+def rejected(answer: Answer) -> Rejection:
+    assert isinstance(answer.outcome, Rejection), answer.outcome
+    return answer.outcome
+
+
+@pytest.mark.parametrize("offset_m", [0.0, 1e6])
+def test_both_of_two_identical_places_are_hypotheses(offset_m: float) -> None:
+    """Every second reference stands in the copy: nothing decides."""
+    far = RigidTransform(np.eye(3), np.array([offset_m, -offset_m, 0.0]))
+    references = moved_references(SCENE.references, far)
+    rejection = rejected(answer_of(copied(references, (1, 3, 5), ELSEWHERE)))
+    assert rejection.reason is RejectionReason.AMBIGUOUS
+    truth = far.compose(SCENE.world_from_query)
+    here, there = sorted(rejection.hypotheses, key=lambda it: it.references)
+    assert_pose_close(here.world_from_camera, truth, metres=0.02, degrees=0.3)
+    assert_pose_close(there.world_from_camera, ELSEWHERE.compose(truth), metres=0.02, degrees=0.3)
+    assert set(here.references) == {references[i].name for i in (0, 2, 4)}
+    assert set(there.references) == {references[i].name for i in (1, 3, 5)}
+    assert rejection.hypotheses[0].inlier_count >= rejection.hypotheses[1].inlier_count > 50
+    assert "m apart" in rejection.message
+
+
+@pytest.mark.parametrize("which", [(), (5,)], ids=["no copy", "one reference in the copy"])
+def test_a_place_of_one_reference_is_no_hypothesis(which: Sequence[int]) -> None:
+    """One reference alone has no points, so it proposes no place."""
+    outcome = answer_of(copied(SCENE.references, which, ELSEWHERE)).outcome
+    assert isinstance(outcome, Localization), outcome
+    assert_pose_close(outcome.world_from_camera, SCENE.world_from_query, metres=0.02, degrees=0.3)
+
+
+def test_the_clearly_better_supported_place_is_answered() -> None:
+    """The copy has lost most of its points."""
+    random = random_for("weak copy")
+
+    def worn(view: PosedView) -> PosedView:
+        f = view.view.features
+        kept = random.random(len(f)) < 0.3
+        features = replace(f, keypoints=f.keypoints[kept], descriptors=f.descriptors[kept], sizes_px=f.sizes_px[kept])
+        return replace(view, key=f"{view.key}-worn", view=replace(view.view, features=features))
+
+    copies = [worn(r) if i % 2 else r for i, r in enumerate(SCENE.references)]
+    outcome = answer_of(copied(copies, (1, 3, 5), ELSEWHERE)).outcome
+    assert isinstance(outcome, Localization), outcome
+    assert_pose_close(outcome.world_from_camera, SCENE.world_from_query, metres=0.02, degrees=0.3)
+
+
+def test_poses_within_the_bounds_are_one_place() -> None:
+    """The second half is posed 5 cm off: bad references, but no second place."""
+    nearby = RigidTransform(np.eye(3), np.array([0.05, 0.0, 0.0]))
+    outcome = answer_of(copied(SCENE.references, (1, 3, 5), nearby)).outcome
+    assert not (isinstance(outcome, Rejection) and outcome.reason is RejectionReason.AMBIGUOUS)
+
+
+def test_no_second_pose_is_searched_if_nearly_all_matches_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Most queries are saved the search."""
+    monkeypatch.setattr(ambiguity, "ransac", None)
+    assert isinstance(answer_of(SCENE.references).outcome, Localization)
+
+
+def test_outliers_without_a_common_pose_are_no_second_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of the keypoints lie anywhere."""
+    search = Mock(wraps=ransac)
+    monkeypatch.setattr(ambiguity, "ransac", search)
+    query, random = SCENE.query, random_for("outliers")
+    keypoints = query.features.keypoints.copy()
+    wrong = random.permutation(len(keypoints))[: len(keypoints) // 2]
+    keypoints[wrong] = random.uniform((0, 0), (query.camera.width_px, query.camera.height_px), (len(wrong), 2))
+    query = replace(query, features=replace(query.features, keypoints=keypoints))
+    outcome = answer_of(SCENE.references, query).outcome
+    assert isinstance(outcome, Localization), outcome
+    assert_pose_close(outcome.world_from_camera, SCENE.world_from_query, metres=0.02, degrees=0.3)
+    search.assert_called_once()
+
+
+def test_a_photo_that_fits_two_identical_rooms_is_ambiguous() -> None:
+    """Photographs of a corner, which stands twice in the world."""
+    poses = [corner.pose(-16.0 + 4 * i, height_m=-1.6 + 0.1 * (i % 3)) for i in range(9)]
+    extractor = make_extractor("sift")
+    views = [extractor.extract(decode_image(corner.photograph(it), ImageLimits()), corner.CAMERA) for it in poses]
+    references = [
+        PosedView(f"p{i}", f"scenes/corner/references/p{i}", view, pose)
+        for i, (view, pose) in enumerate(zip(views, poses, strict=True))
+    ]
+    query, truth, others = views[4], poses[4], references[:4] + references[5:]
+    alone = answer_of(others, query).outcome
+    assert isinstance(alone, Localization), alone
+    assert_pose_close(alone.world_from_camera, truth, metres=0.02, degrees=0.3)
+    rejection = rejected(answer_of(copied(others, range(1, 8, 2), ELSEWHERE), query))
+    assert rejection.reason is RejectionReason.AMBIGUOUS, rejection
+    here, there = sorted(rejection.hypotheses, key=lambda it: others[0].name not in it.references)
+    assert_pose_close(here.world_from_camera, truth, metres=0.03, degrees=0.5)
+    assert_pose_close(there.world_from_camera, ELSEWHERE.compose(truth), metres=0.03, degrees=0.5)

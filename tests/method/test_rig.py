@@ -1,18 +1,25 @@
 """Rigs: a planted pose is found from the matches of several cameras, also where none of them has enough."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from support.compare import assert_jacobian, assert_pose_close
 from support.groups import NOTHING, caller_pose, images_of, looking
-from support.scenes import SceneOptions, random_for
+from support.scenes import SceneOptions, make_scene, random_for
 
-from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
+from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.groups.checks import check_mounting, check_unit, hinted_group
+from mapless_server.method.groups.images import rejection_without_matches
 from mapless_server.method.groups.rig import RigEstimate, RigOptions, RigState, solve_rig
+from mapless_server.method.groups.sequence import SequenceEstimate
 from mapless_server.method.perturbation import rotation_vector
 from mapless_server.method.priors.known import PositionPrior, Priors
-from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
+from mapless_server.method.results import MetricScale, PoseStage, ScaleStage
 
 WORLD_FROM_RIG = RigidTransform(rotation_from_vector([0.1, 0.2, -0.1]), np.array([0.3, 0.1, -3.8]))
 CAMERAS = looking((-0.5, 0, -4), (0.2, -0.1, -4.2), (0.6, 0.2, -3.9))
@@ -167,3 +174,113 @@ def test_the_jacobian_is_that_of_the_cameras_motion() -> None:
         return np.concatenate([after.translation - turn @ before.translation, rotation_vector(turn)])
 
     assert_jacobian(state.jacobian(1), motion, np.zeros(6))
+
+
+HERE = RigidTransform.identity()
+
+
+def alone(inliers: int) -> Answer:
+    return Answer(Localization(HERE, None, PoseStage.REFINED, inliers, 2 * inliers, 1.0))
+
+
+def rig(*kept: int) -> RigEstimate:
+    matched = [SimpleNamespace(source=SimpleNamespace(image=i), inliers=np.ones(n)) for i, n in enumerate(kept)]
+    return RigEstimate(HERE, np.eye(6), cast(Any, tuple(matched)), np.zeros(3))
+
+
+def walk(step_m: float, sigma_m: float = 0.01) -> SequenceEstimate:
+    poses = tuple(RigidTransform(np.eye(3), np.array([i * step_m, 0, 0])) for i in range(5))
+    covariances = np.tile(sigma_m**2 * np.eye(6), (5, 1, 1))
+    return SequenceEstimate(cast(Any, None), 0.0, poses, covariances, (), np.zeros(3))
+
+
+def test_photographs_that_lose_their_inliers_reject_the_rig() -> None:
+    found = check_mounting(rig(1, 0, 688), [alone(681), alone(438), alone(690)])
+    assert isinstance(found, Rejection)
+    assert found.reason is RejectionReason.GATE
+    assert "1 of 681 in images[0], 0 of 438 in images[1]" in found.message
+    assert found.hint is not None
+    assert found.hint.advice is Advice.CHECK_CALIBRATION
+
+
+@pytest.mark.parametrize("lost", [alone(29), Answer(Rejection(RejectionReason.GATE, "chance"))])
+def test_photographs_with_few_inliers_alone_reject_nothing(lost: Answer) -> None:
+    estimate = rig(600, 3)
+    assert check_mounting(estimate, [alone(640), lost]) is estimate
+
+
+@pytest.mark.parametrize("unit_m", [0.01, 0.5, 2.0])
+def test_a_walk_of_another_length_is_rejected_with_its_unit(unit_m: float) -> None:
+    found = check_unit(walk(0.5), walk(0.5 / unit_m).world_from_camera)
+    assert isinstance(found, Rejection)
+    assert found.reason is RejectionReason.SCALE_UNRELIABLE
+    assert f"its unit is {unit_m:.2f} m" in found.message
+
+
+@pytest.mark.parametrize(("drift", "sigma_m"), [(1.0, 0.001), (1.1, 0.001), (0.85, 0.001), (2.0, 0.3)])
+def test_drift_and_uncertain_lengths_are_accepted(drift: float, sigma_m: float) -> None:
+    estimate = walk(0.5, sigma_m)
+    assert check_unit(estimate, walk(0.5 * drift).world_from_camera) is estimate
+
+
+SCENE = make_scene(random_for("group hints"))
+NAMES = [reference.name for reference in SCENE.references]
+
+
+def hint_of(reason: RejectionReason, *matches: tuple[int, ...]) -> Hint:
+    """Of a group whose photographs share so many features with the references."""
+    images = [
+        (Answer(Rejection(reason, "alone"), reference_match_counts=counts), SCENE.references) for counts in matches
+    ]
+    outcome = hinted_group(Rejection(reason, "planted"), images)
+    assert (outcome.reason, outcome.message) == (reason, "planted")
+    assert isinstance(outcome.hint, Hint)
+    return outcome.hint
+
+
+@pytest.mark.parametrize("reason", RejectionReason)
+@pytest.mark.parametrize("matches", [(), (0, 0), (20, 5), (60, 50), (400, 9)])
+def test_every_reason_has_a_hint_of_one_sentence(reason: RejectionReason, matches: tuple[int, ...]) -> None:
+    hint = hint_of(reason, matches, ())
+    assert hint.stage == "join"
+    assert hint.message[0].isupper()
+    assert hint.message.endswith(".")
+
+
+def test_the_best_reference_shares_most_with_any_photograph() -> None:
+    assert hint_of(RejectionReason.GATE, (40, 60, 50), (31, 33, 70), ()).best_reference == NAMES[2]
+    assert hint_of(RejectionReason.GATE, (0, 0), ()).best_reference is None
+
+
+@pytest.mark.parametrize(
+    ("reason", "best", "advice"),
+    [
+        (RejectionReason.TOO_FEW_MATCHES, 8, Advice.CHOOSE_OTHER_REFERENCES),
+        (RejectionReason.TOO_FEW_MATCHES, 50, Advice.LOOK_AT_REFERENCE),
+        (RejectionReason.PNP_FAILED, 400, Advice.CHECK_CALIBRATION),
+        (RejectionReason.GATE, 50, Advice.LOOK_AT_REFERENCE),
+        (RejectionReason.SCALE_UNRELIABLE, 400, Advice.RETAKE_PHOTOGRAPH),
+    ],
+)
+def test_the_advice_follows_from_the_shared_features(reason: RejectionReason, best: int, advice: Advice) -> None:
+    hint = hint_of(reason, (best, 3))
+    assert hint.advice is advice
+    if reason is not RejectionReason.SCALE_UNRELIABLE:
+        assert str(best) in hint.message
+
+
+def test_depths_of_a_network_do_not_pose_a_group() -> None:
+    pose = RigidTransform.identity()
+    scale = MetricScale(1.0, ScaleStage.NETWORK, 0.0, 0, Similarity(1.0, np.eye(3), np.zeros(3)), pose)
+    answer = Answer(Localization(pose, np.eye(6), PoseStage.REFINED, 50, 60, 0.7), scale)
+    outcome = rejection_without_matches([replace(NOTHING, answer=answer)])
+    assert outcome.reason is RejectionReason.TOO_FEW_MATCHES
+    assert "with a single reference" in outcome.message
+
+
+def test_without_matches_the_hint_is_the_furthest_photographs() -> None:
+    own = Hint("coarse", Advice.SPREAD_REFERENCES, "Spread them.", NAMES[0])
+    furthest = Rejection(RejectionReason.LOW_OVERLAP, "another place", own)
+    images = [NOTHING, replace(NOTHING, answer=Answer(furthest))]
+    outcome = hinted_group(rejection_without_matches(images), [])
+    assert (outcome.reason, outcome.hint) == (RejectionReason.LOW_OVERLAP, own)

@@ -1,10 +1,15 @@
 """`mapless-server serve` has a flag for each setting; the commands of the server run without the tools' packages."""
 
+import sys
+from pathlib import Path
+
 import pytest
 import typer.main
 from support.programs import printed
 from typer.testing import CliRunner
 
+from mapless_server import extras
+from mapless_server.extras import install_hint
 from mapless_server.settings import Settings, bounds_text, default_text
 from mapless_tools.cli import app as commands
 
@@ -75,3 +80,41 @@ def test_every_command_either_serves_or_needs_an_extra() -> None:
 def test_help_imports_nothing_heavy(module: str) -> None:
     heavy = ("cv2", "grpc", "jinja2", "matplotlib", "numpy", "scipy", "sqlalchemy", "torch")
     assert printed(f"import sys, {module}; print([it for it in {heavy} if it in sys.modules])") == "[]\n"
+
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+PROJECT = Path(__file__).parents[2] / "pyproject.toml"
+DISTRIBUTION_OF = {"PIL": "pillow", "opentelemetry": "opentelemetry-sdk", "python_multipart": "python-multipart"}
+
+
+def test_every_extra_brings_its_packages() -> None:
+    brought = tomllib.loads(PROJECT.read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    for package, extra in extras._EXTRA_OF.items():
+        distribution = DISTRIBUTION_OF.get(package, package)
+        assert any(requirement.startswith(f"{distribution}>=") for requirement in brought[extra]), package
+
+
+@pytest.mark.parametrize(
+    ("error", "hint"),
+    [
+        (
+            ModuleNotFoundError("No module named 'transformers'", name="transformers"),
+            "the Python package transformers is not installed: pip install 'mapless[superpoint]'",
+        ),
+        (
+            ModuleNotFoundError("No module named 'kornia.feature.xfeat'", name="kornia.feature.xfeat"),
+            "No module named 'kornia.feature.xfeat': pip install 'mapless[networks]'",
+        ),
+        (
+            ModuleNotFoundError("No module named 'scipy'", name="scipy"),
+            "the Python package scipy is not installed: pip install 'mapless[server]'",
+        ),
+        (ImportError("libGL.so.1: cannot open"), "libGL.so.1: cannot open"),
+    ],
+)
+def test_a_hint_names_the_fault_and_the_command(error: ImportError, hint: str) -> None:
+    assert install_hint(error) == hint

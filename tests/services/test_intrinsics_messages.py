@@ -1,20 +1,23 @@
-"""How far a request's intrinsics may be off, and what an answer says of them."""
+"""A photograph's camera in messages: its lens and how far it may be off; options of a rig."""
 
 import math
 import re
+from dataclasses import replace
 
 import pytest
 from support.servers import CAMERA, PHOTO
 
-from mapless import wire
+from mapless import Fisheye, RadialTangential, wire
 from mapless.answers import Rejected, answer_from_message
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server.engine.interface import EngineOptions
+from mapless_server.images import ImageLimits
 from mapless_server.method.options import IntrinsicsSigma
 from mapless_server.method.rejection import IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason
 from mapless_server.services.messages.answers import rejection_to_message
-from mapless_server.services.messages.queries import query_from_message
+from mapless_server.services.messages.groups import queries_from_message
+from mapless_server.services.messages.queries import photo_from_message, query_from_message
 from mapless_server.store import SceneAttributes
 
 
@@ -70,3 +73,30 @@ def test_every_parameter_has_a_number() -> None:
     known: wire.ProtoEnum = pb.IntrinsicsParameter
     names = {f"INTRINSICS_PARAMETER_{it.name}" for it in IntrinsicsParameter}
     assert {known.Name(number) for number in known.values()} == names | {"INTRINSICS_PARAMETER_UNSPECIFIED"}
+
+
+def request(lens: RadialTangential | Fisheye) -> pb.LocalizeRequest:
+    return pb.LocalizeRequest(image=PHOTO, intrinsics=wire.camera_to_message(replace(CAMERA, distortion=lens)))
+
+
+@pytest.mark.parametrize("lens", [RadialTangential(k1=-100.0), Fisheye(k1=-100.0)])
+def test_a_lens_that_shows_nothing_is_named(lens: RadialTangential | Fisheye) -> None:
+    with pytest.raises(FieldError, match=r"k1 = -100.* only 0 % of its pixels have a ray") as caught:
+        photo_from_message(request(lens), "", ImageLimits())
+    assert caught.value.field == f"intrinsics.{'fisheye' if isinstance(lens, Fisheye) else 'radial_tangential'}"
+
+
+@pytest.mark.parametrize(
+    "lens", [RadialTangential(-0.4, 0.2, 1e-3, 1e-3, -0.05), RadialTangential(k1=0.5), Fisheye(), Fisheye(0.1, -0.02)]
+)
+def test_lenses_in_use_are_accepted(lens: RadialTangential | Fisheye) -> None:
+    assert photo_from_message(request(lens), "", ImageLimits()).camera.distortion == lens
+
+
+@pytest.mark.parametrize("ignored", [False, True])
+def test_a_rig_ignores_the_calibration_for_each_photograph(ignored: bool) -> None:
+    image = pb.RigImage(image=PHOTO, intrinsics=wire.camera_to_message(CAMERA))
+    options = pb.LocalizeOptions(ignore_calibration=ignored)
+    rig = pb.LocalizeRigRequest(scene="scenes/hall", images=[image, image], options=options)
+    queries = queries_from_message(rig, "images", (1, 8), "", EngineOptions(), SceneAttributes())
+    assert [it.is_generic for it in queries] == [ignored, ignored]

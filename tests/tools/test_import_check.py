@@ -9,13 +9,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.images import encode
-from support.scenes import CAMERA, SceneOptions, look_at, observe, random_for, unit_rows
+from support.scenes import CAMERA, SceneOptions, look_at, make_scene, observe, random_for, unit_rows
 
 from mapless.geometry import Camera, Quaternion, RigidTransform, rotation_from_vector
 from mapless_server.method.views import PosedView, View
 from mapless_tools.dataset import Frame
 from mapless_tools.ingest.check import check_frames
-from mapless_tools.ingest.check.errors import MatchedPair, consistent_matches, more_pairs, pairs_by_order, pairs_by_pose
+from mapless_tools.ingest.check.errors import (
+    MatchedPair,
+    consistent_matches,
+    more_pairs,
+    pair_error_px,
+    pairs_by_order,
+    pairs_by_pose,
+    sampson_px,
+)
 from mapless_tools.ingest.check.verdict import Verdict, judge, suspects_of
 
 OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -234,3 +242,23 @@ def test_photographs_that_cannot_be_read_are_left_to_the_upload(tmp_path: Path) 
     assert verdict.unmatched_count == 0
     assert progress[-1] == (8, 8)
     assert not check_frames(frames[:1], lambda *_: None, NumberedViews(views)).is_known
+
+
+def test_a_moved_keypoints_error_is_its_displacement() -> None:
+    """Sampson's distance is to first order how far both keypoints must move: one alone, moved, at most as far."""
+    options = SceneOptions(noise_px=0.0, reference_count=2, distractor_count=0, seen_share=1.0)
+    first, second = make_scene(random_for("sampson"), options).references
+    matches = consistent_matches(first.view, second.view)
+    assert len(matches) > 300
+    assert sampson_px(first, second, matches).max() < 1e-3
+    features = second.view.features
+    keypoints = features.keypoints + np.array([0.0, 2.0], np.float32)  # across the lines, which are almost level
+    moved = replace(second, view=replace(second.view, features=replace(features, keypoints=keypoints)))
+    np.testing.assert_allclose(np.median(sampson_px(first, moved, matches)), 2 / np.sqrt(2), rtol=0.05)
+
+
+def test_two_photographs_at_one_place_have_no_epipolar_error() -> None:
+    first, second = make_scene(random_for("one place"), SceneOptions(reference_count=2)).references
+    matches = consistent_matches(first.view, second.view)
+    assert np.isnan(pair_error_px(first, replace(second, world_from_camera=first.world_from_camera), matches))
+    assert np.isnan(pair_error_px(first, second, matches[:0]))
