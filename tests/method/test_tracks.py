@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from support.planted import true_correspondences, true_tracks
-from support.scenes import SceneOptions, make_scene, random_for
 
 from mapless_server.method.tracks import Tracks, build_tracks
 from mapless_server.method.views import Matches
@@ -157,10 +155,3 @@ def test_prune_drops_observations_and_single_leftovers(drawn: tuple[Pairs, list[
         )
     for old in np.flatnonzero(~kept):
         assert good[tracks.point == old].sum() < 2
-
-
-def test_true_matches_give_the_points_of_the_scene() -> None:
-    scene = make_scene(random_for("points"), SceneOptions(point_count=100))
-    counts = [len(r.view.features) for r in scene.references]
-    expected, _ = true_tracks(scene)
-    assert as_sets(build_tracks(true_correspondences(scene).reference_pairs, counts)) == as_sets(expected)

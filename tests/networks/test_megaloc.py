@@ -15,13 +15,13 @@ import torch
 from numpy.typing import NDArray
 from safetensors.torch import save_file
 from support.images import textured
-from support.parity_rule import images, weights
+from support.parity_rule import images
 from support.small_networks import NOTHING, SMALL_MEGALOC, photograph, ruled_megaloc, view_of
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
 from mapless_server.method.views import View
-from mapless_server.networks.megaloc import Backbone, MegaLoc, Salad, signed_groups, transport
+from mapless_server.networks.megaloc import Backbone, signed_groups, transport
 from mapless_server.networks.weights import CheckpointError, named
 from mapless_server.networks.weights.install import add
 from mapless_server.scenes import GlobalDescriptor
@@ -69,39 +69,10 @@ def test_a_small_network_equals_the_published_code(size: tuple[int, int]) -> Non
     np.testing.assert_allclose(descriptors[:, ::12].flatten(), PUBLISHED[size], rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("grid", [(5, 7), (23, 23), (40, 3)])
-def test_positions_are_cubic_samples_at_the_published_offsets(grid: tuple[int, int]) -> None:
-    backbone = Backbone(width=4, heads=1, depth=0)
-    learned = np.asarray(weights("pos_embed", (1 + 37 * 37, 4)))
-    backbone.pos_embed.data = torch.from_numpy(learned)[None]
-    expected = [learned[0]]
-    cells = learned[1:].reshape(37, 37, 4)
-    for row in range(grid[0]):
-        for column in range(grid[1]):
-            down, across = (
-                cubic_taps((i + 0.5) * 37 / (n + 0.1) - 0.5) for i, n in zip((row, column), grid, strict=True)
-            )
-            expected.append(sum(a * b * cells[i, j] for i, a in down for j, b in across))
-    found = backbone.positions(grid)[0].detach().numpy()
-    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6)
-
-
 def test_on_the_learned_grid_positions_are_the_learned_ones() -> None:
     backbone = Backbone(width=4, heads=1, depth=0)
     torch.nn.init.normal_(backbone.pos_embed)
     assert torch.equal(backbone.positions((37, 37)), backbone.pos_embed)
-
-
-def cubic_taps(place: float) -> list[tuple[int, float]]:
-    """Cells of a row of 37 and their weights (Keys 1981, a = -0.75) for a sample at ``place``; ends are continued."""
-    first = math.floor(place) - 1
-    return [(min(max(i, 0), 36), keys(abs(place - i))) for i in range(first, first + 4)]
-
-
-def keys(x: float, a: float = -0.75) -> float:
-    if x <= 1:
-        return (a + 2) * x**3 - (a + 3) * x**2 + 1
-    return a * x**3 - 5 * a * x**2 + 8 * a * x - 4 * a if x < 2 else 0.0
 
 
 # ---- SALAD
@@ -140,37 +111,6 @@ def test_images_with_fewer_patches_than_clusters_are_refused() -> None:
         ruled_megaloc()(torch.zeros(1, 3, 28, 42))
 
 
-def test_salad_equals_the_equations_of_its_paper() -> None:
-    salad = Salad(width=5, hidden=7, clusters=3, cluster_width=4, token_width=2)
-    random = torch.Generator().manual_seed(3)
-    for parameter in salad.parameters():
-        parameter.data = torch.randn(parameter.shape, generator=random)
-    patches, of_class = torch.randn(2, 11, 5, generator=random), torch.randn(2, 5, generator=random)
-    found = salad(patches, of_class).detach().numpy()
-    state = {name: tensor.double().numpy() for name, tensor in salad.state_dict().items()}
-    for image in range(2):
-        tokens = patches[image].double().numpy()
-        features = [perceptron(state, "cluster_features", token) for token in tokens]
-        scores = np.array([perceptron(state, "score", token) for token in tokens]).T
-        masses = slow_transport(scores, float(state["dust_bin"]))
-        given = [unit(sum(masses[i, j] * features[j] for j in range(11))) for i in range(3)]
-        scene = unit(perceptron(state, "token_features", of_class[image].double().numpy(), last=2))
-        expected = unit(np.array([*scene, *(given[i][channel] for channel in range(4) for i in range(3))]))
-        np.testing.assert_allclose(found[image], expected, rtol=0, atol=2e-6)
-
-
-def perceptron(state: dict[str, Any], name: str, x: NDArray[np.float64], last: int = 3) -> Any:
-    """Two layers; 1 x 1 convolutions have two sides more."""
-    for i in (0, last):
-        weight = state[f"{name}.{i}.weight"]
-        x = weight.reshape(weight.shape[:2]) @ (x if i == 0 else np.maximum(x, 0)) + state[f"{name}.{i}.bias"]
-    return x
-
-
-def unit(x: Any) -> Any:
-    return x / np.sqrt((x * x).sum())
-
-
 # ---- shortened
 
 
@@ -184,16 +124,6 @@ def test_a_reduced_descriptor_has_signed_sums_of_the_full_one() -> None:
     expected = normalize(expected.unflatten(1, (24, 4)).sum(2), dim=1)
     assert reduced.length == 24
     torch.testing.assert_close(reduced(pictures), expected, rtol=0, atol=1e-6)
-
-
-def test_reduction_is_a_projection_with_orthonormal_rows() -> None:
-    network = MegaLoc(SMALL_MEGALOC)
-    network.aggregator.linear = torch.nn.Linear(96, 96)
-    network.aggregator.linear.weight.data = torch.eye(96)
-    network.reduce(32)
-    rows = network.aggregator.linear.weight
-    torch.testing.assert_close(rows @ rows.T, torch.eye(32))
-    assert ((rows != 0).sum(0) == 1).all(), "every old number has a say, and only one"
 
 
 @pytest.mark.parametrize("similarity", [0.0, 0.6, 0.95])
