@@ -123,6 +123,13 @@ def test_each_number_of_references_is_a_bucket() -> None:
 # Rejections
 
 
+@pytest.mark.parametrize("count", [0, 1])
+def test_one_reference_is_rejected(count: int) -> None:
+    scene = make_scene(random_for("count"), EXACT)
+    rejection = rejection_of(scene.query, scene.references[:count], true_correspondences(scene))
+    assert rejection.reason is RejectionReason.NO_USABLE_REFERENCES
+
+
 def test_references_without_common_points_are_rejected() -> None:
     scene = make_scene(random_for("share nothing"), EXACT)
     correspondences = true_correspondences(scene)
