@@ -22,7 +22,7 @@ from kornia.feature import ALIKED, XFeat  # noqa: E402
 from safetensors.torch import save_file  # noqa: E402
 from torch import Tensor, nn  # noqa: E402
 
-from mapless_server.method.features.aliked import AlikedExtractor, dense_maps  # noqa: E402
+from mapless_server.method.features.aliked import AlikedExtractor, Maps, describe, find_maps  # noqa: E402
 from mapless_server.method.features.edgepoint2 import SIZE_OF_WIDTH, EdgePoint2Extractor  # noqa: E402
 from mapless_server.method.features.network import (  # noqa: E402
     LearnedOptions,
@@ -82,7 +82,14 @@ def assert_is_well_formed(features: Features, dimension: int) -> None:
     np.testing.assert_allclose(np.linalg.norm(features.unit_descriptors(), axis=1), 1, atol=1e-5)
 
 
-MAPS = "mapless_server.method.features.aliked.dense_maps"
+def planted(score_map: Tensor) -> Maps:
+    """What ALIKED computes, with the same features everywhere."""
+    height, width = score_map.shape[2:]
+    levels = [torch.ones(1, 32, height // step, width // step) for step in (1, 2, 8, 32)]
+    return Maps(score_map, levels, (0, 0))
+
+
+FIND_MAPS = "mapless_server.method.features.aliked.find_maps"
 
 
 def peaks(random: np.random.Generator, width: int, height: int, step_px: int = 20) -> Array:
@@ -118,8 +125,7 @@ def test_aliked_keypoints_are_the_peaks_of_the_score_map(
     reduced = camera if max_side_px == 320 else camera.resized(256, 205)
     centres = peaks(random_for("aliked", lens, max_side_px), reduced.width_px, reduced.height_px)
     score_map = bumps(centres, reduced.width_px, reduced.height_px, sigma_px=1.5)
-    feature_map = torch.ones(1, 128, reduced.height_px, reduced.width_px)
-    monkeypatch.setattr(MAPS, lambda *_: (feature_map, score_map))
+    monkeypatch.setattr(FIND_MAPS, lambda *_: planted(score_map))
     monkeypatch.setattr(aliked, "options", replace(aliked.options, max_side_px=max_side_px, min_score=0.3))
     view = aliked.extract(np.zeros((256, 320, 3), np.uint8), camera)
     assert view.camera == reduced.pinhole()
@@ -131,27 +137,26 @@ def test_aliked_keypoints_are_the_peaks_of_the_score_map(
 
 
 @pytest.mark.parametrize("size", [(160, 224), (97, 131), (7, 9)])
-def test_aliked_maps_are_those_of_kornia(aliked: AlikedExtractor, size: tuple[int, int]) -> None:
-    """Offsets of the deformable convolutions reach several pixels, beyond the borders too."""
+def test_aliked_scores_and_descriptors_are_those_of_kornia(aliked: AlikedExtractor, size: tuple[int, int]) -> None:
+    """Offsets of the convolutions and of the samples reach several pixels, beyond the borders too."""
     network = deepcopy(aliked._network)
     for name, parameter in network.named_parameters():
-        if "offset_conv.bias" in name:
+        if "offset_conv" in name and "bias" in name:
             nn.init.normal_(parameter, 0, 3.0)
-    image = torch.rand(1, 3, *size)
+    image, keypoints = torch.rand(1, 3, *size), 2 * torch.rand(50, 2) - 1
     with torch.inference_mode():
-        for ours, theirs in zip(dense_maps(network, image), network.extract_dense_map(image), strict=True):
-            torch.testing.assert_close(ours, theirs, rtol=0, atol=2e-5)
+        maps = find_maps(network, image)
+        ours = maps.scores, describe(network.desc_head, maps, keypoints)
+        features, scores = network.extract_dense_map(image)
+        torch.testing.assert_close(ours, (scores, network.desc_head(features, [keypoints])[0][0]), rtol=0, atol=2e-5)
 
 
 def test_a_wide_peak_has_a_large_keypoint_size(aliked: AlikedExtractor, monkeypatch: pytest.MonkeyPatch) -> None:
     centres = np.rint(peaks(random_for("wide"), 320, 256))
-    feature_map = torch.ones(1, 128, 256, 320)
     sizes = []
     for sigma_px in (0.5, 1.0, 3.0):
         score_map = bumps(centres, 320, 256, sigma_px)
-        monkeypatch.setattr(
-            "mapless_server.method.features.aliked.dense_maps", lambda *_, s=score_map: (feature_map, s)
-        )
+        monkeypatch.setattr(FIND_MAPS, lambda *_, s=score_map: planted(s))
         sizes.append(np.median(aliked.extract(np.zeros((256, 320, 3), np.uint8), CAMERA).features.sizes_px))
     assert 0 < sizes[0] < sizes[1] < sizes[2] <= 4 * np.sqrt(8)  # all weight in the corners of five by five pixels
 

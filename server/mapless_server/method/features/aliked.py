@@ -1,13 +1,15 @@
 """ALIKED (Zhao et al. 2023), the network of kornia with the authors' weights n16."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from kornia.feature.aliked.aliked import ALIKED, DeformableConv2d, InputPadder, ResBlock
+from kornia.feature.aliked.aliked import ALIKED, SDDH, DeformableConv2d, InputPadder, ResBlock
 from numpy.typing import NDArray
 from torch import nn
-from torch.nn.functional import grid_sample
+from torch.nn.functional import conv2d, embedding_bag, grid_sample, normalize
 
 from mapless.geometry import Camera
 from mapless_server.networks.local_features import load_aliked
@@ -15,6 +17,12 @@ from mapless_server.networks.local_features import load_aliked
 from ..views import View
 from .image import reduce_image, view_of
 from .network import LearnedOptions, array_of, image_tensor
+
+_CORNERS = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]])
+"""Pixels around a position, x and y, from the first."""
+
+_AT_ONCE = 256
+"""Keypoints that are described at once, with 20 MB."""
 
 
 class AlikedExtractor:
@@ -43,16 +51,16 @@ class AlikedExtractor:
     def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
         """See FeatureExtractor.extract; the strongest keypoint first."""
         reduced, reduced_camera = reduce_image(image, camera, self.options.max_side_px)
-        feature_map, score_map = dense_maps(self._network, image_tensor(reduced, self._device))
-        found, scores, dispersities = (parts[0] for parts in self._network.dkd(score_map))
+        maps = find_maps(self._network, image_tensor(reduced, self._device))
+        found, scores, dispersities = (parts[0] for parts in self._network.dkd(maps.scores))
         good = scores > self.options.min_score
         found, scores, dispersities = found[good], scores[good], dispersities[good]
         order = torch.argsort(scores, descending=True, stable=True)
         found, dispersities = found[order], dispersities[order]
         if not len(found):
-            dimension = feature_map.shape[1]
+            dimension = self._network.desc_head.sf_conv.in_channels
             return view_of(reduced_camera, np.empty((0, 2)), np.empty((0, dimension), np.float32), array_of(scores))
-        descriptors = self._network.desc_head(feature_map, [found])[0][0]
+        descriptors = describe(self._network.desc_head, maps, found)
         last_pixel = np.array([reduced.shape[1] - 1, reduced.shape[0] - 1])
         pixels = (array_of(found).astype(np.float64) + 1) / 2 * last_pixel
         return view_of(reduced_camera, pixels, array_of(descriptors), self._peak_sizes_px(dispersities))
@@ -67,31 +75,91 @@ class AlikedExtractor:
         return 4 * self._network.nms_radius * np.sqrt(array_of(dispersities))
 
 
-def dense_maps(network: ALIKED, image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Feature map (1, D, H, W) and score map (1, 1, H, W) of an image (1, 3, H, W), in 0 to 1.
+@dataclass(frozen=True, eq=False)
+class Maps:
+    """What the network computes of an image.
 
-    The numbers are those of `ALIKED.extract_dense_map` to the last digits. That holds the feature map three times: its
-    parts, these side by side, and normalized. Here all is in one array, 270 MiB at 640x480 instead of 580, and
-    channels lie side by side in memory, with which the convolutions take 60 % of the time.
+    Attributes:
+        scores: (1, 1, H, W) in 0 to 1.
+        levels: four maps (1, C, h, w) of features at falling resolution, of the padded image. A pixel's features are
+            those of all four, interpolated, side by side, normalized.
+        padding_px: columns left of the image and rows above it that the padding has added.
+    """
+
+    scores: torch.Tensor
+    levels: Sequence[torch.Tensor]
+    padding_px: tuple[int, int]
+
+    def features(self, pixels: torch.Tensor) -> torch.Tensor:
+        """Features (..., 4 C) of whole pixels (..., 2), x and y."""
+        at = pixels.flatten(end_dim=-2) + torch.tensor(self.padding_px, device=pixels.device)
+        full = _size(self.levels[0])
+        found = []
+        for level in self.levels:
+            size = _size(level)
+            position = at * ((size - 1) / (full - 1))
+            before = torch.minimum(position.floor(), (size - 2).clamp(min=0))
+            corners = torch.minimum(before[:, None] + _CORNERS.to(at.device), size - 1).long()
+            share = position - before
+            weights = torch.where(_CORNERS.to(at.device) > 0, share[:, None], 1 - share[:, None]).prod(2)
+            rows = level[0].permute(1, 2, 0).flatten(end_dim=1)
+            index = corners[..., 1] * level.shape[3] + corners[..., 0]
+            found.append(embedding_bag(index, rows, per_sample_weights=weights, mode="sum"))
+        return normalize(torch.cat(found, dim=1), dim=1).view(*pixels.shape[:-1], -1)
+
+
+def _size(x: torch.Tensor) -> torch.Tensor:
+    """Width and height."""
+    return torch.tensor([x.shape[3], x.shape[2]], device=x.device)
+
+
+def find_maps(network: ALIKED, image: torch.Tensor) -> Maps:
+    """The scores and features of an image (1, 3, H, W) in 0 to 1; those of `ALIKED.extract_dense_map` to rounding.
+
+    That holds the features of all pixels three times, 580 MiB at 640x480. Here they are computed where a descriptor
+    needs them: the first layer of the scores weighs the channels alone, so it may precede the interpolation. Channels
+    lie side by side in memory, with which convolutions are faster.
     """
     padder = InputPadder(image.shape[-2], image.shape[-1], 32)
     x1 = network.block1(padder.pad(image).contiguous(memory_format=torch.channels_last))
     x2 = network.block2(network.pool2(x1))
     x3 = _residual(network.block3, network.pool4(x2))
     x4 = _residual(network.block4, network.pool4(x3))
-    first = network.gate(network.conv1(x1))
-    shape = (1, 4 * first.shape[1], *first.shape[2:])
-    maps = torch.empty(shape, dtype=x1.dtype, device=x1.device, memory_format=torch.channels_last)
+    projections = (network.conv1, network.conv2, network.conv3, network.conv4)
+    levels = [network.gate(project(x)) for project, x in zip(projections, (x1, x2, x3, x4), strict=True)]
     del x1
-    parts = maps.chunk(4, dim=1)
-    parts[0].copy_(first)
-    del first
-    parts[1].copy_(network.upsample2(network.gate(network.conv2(x2))))
-    parts[2].copy_(network.upsample8(network.gate(network.conv3(x3))))
-    parts[3].copy_(network.upsample32(network.gate(network.conv4(x4))))
-    scores = torch.sigmoid(network.score_head(maps))
-    maps /= torch.linalg.vector_norm(maps, dim=1, keepdim=True).clamp_min(1e-12)
-    return padder.unpad(maps), padder.unpad(scores)
+    weigh, *rest = network.score_head
+    weights = weigh.get_parameter("weight").chunk(4, dim=1)
+    weighed = conv2d(levels[0], weights[0])
+    enlargements = (network.upsample2, network.upsample8, network.upsample32)
+    for level, weight, enlarge in zip(levels[1:], weights[1:], enlargements, strict=True):
+        weighed += enlarge(conv2d(level, weight))
+    scores = padder.unpad(torch.sigmoid(nn.Sequential(*rest)(weighed)))
+    height, width = (b - a for a, b in zip(image.shape[-2:], weighed.shape[-2:], strict=True))
+    return Maps(scores, levels, (width // 2, height // 2))
+
+
+def describe(head: SDDH, maps: Maps, keypoints: torch.Tensor) -> torch.Tensor:
+    """Descriptors (N, D) of keypoints (N, 2), which are -1 to 1 in the image: the numbers of `SDDH` to rounding."""
+    size = _size(maps.scores)
+    limit = float(size.max()) / 4
+    side = torch.arange(head.kernel_size, device=size.device)
+    around = torch.stack(torch.meshgrid(side, side, indexing="xy"), dim=-1)
+    descriptors = []
+    for some in keypoints.split(_AT_ONCE):
+        centres = (some / 2 + 0.5) * (size - 1)
+        first = torch.minimum((centres.long() - 1).clamp(min=0), size - 1 - head.kernel_size)
+        patches = maps.features(first[:, None, None] + around).permute(0, 3, 1, 2)
+        offsets = head.offset_conv(patches).clamp(-limit, limit).view(len(some), 2, -1).mT
+        positions = centres[:, None] + offsets
+        corners = positions.floor()[:, :, None] + _CORNERS.to(size.device)
+        weights = (1 - (positions[:, :, None] - corners).abs()).prod(3)
+        weights *= ((corners >= 0) & (corners < size)).all(3)
+        pixels = torch.minimum(corners.clamp(min=0), size - 1).long()
+        sampled = (weights[..., None, :] @ maps.features(pixels)).squeeze(2)
+        states = torch.selu(sampled @ head.sf_conv.weight[:, :, 0, 0].T)
+        descriptors.append(states.flatten(1) @ head.get_parameter("agg_weights").flatten(end_dim=1))
+    return normalize(torch.cat(descriptors), dim=1)
 
 
 def _residual(block: ResBlock, x: torch.Tensor) -> torch.Tensor:
