@@ -307,8 +307,9 @@ class LocalizationResult:
         return None if self.in_axes is None else self.in_axes.world_from_session
 
     def __str__(self) -> str:
-        pose = self.world_from_camera if self.in_axes is None else self.in_axes.world_from_camera
-        frame = "" if self.in_axes is None else f"   in {self.in_axes.axes} axes"
+        pose, frame = self.world_from_camera, ""
+        if self.in_axes is not None and self.in_axes.axes != "OPENCV":
+            pose, frame = self.in_axes.world_from_camera, f"   in {self.in_axes.axes} axes"
         text = [f"{_outcome(self)}{frame}", *pose_lines(pose, self.accuracy, self.arbitrary_unit)]
         if self.geo_pose is not None:
             geo = self.geo_pose

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_server.engine.query import Result, Tier
-from mapless_server.engine.tiers import UNRECOVERABLE, EscalationOptions, better_of, is_doubtful
+from mapless_server.engine.tiers import UNRECOVERABLE, EscalationOptions, better_of, is_doubtful, of_two_places
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason
@@ -170,3 +170,34 @@ class TestBetter:
         if abs(apart_m - max(reach_m, OPTIONS.same_position_m)) > 1e-9:
             agree = apart_m < max(reach_m, OPTIONS.same_position_m)
             assert isinstance(chosen.answer.outcome, Localization if agree else Rejection)
+
+
+class TestTwoPlaces:
+    """Poses where a soft prior says the camera is, and 30 m away."""
+
+    @pytest.mark.parametrize(
+        ("there", "elsewhere", "chosen"),
+        [
+            (rejected(), found(localized(30.0), 30.0, 100), "elsewhere"),
+            (found(localized(), 0.0, 100), rejected(), "there"),
+            (found(localized(inliers=100), 0.0, 100), found(localized(30.0, inliers=149), 30.0, 149), "there"),
+            (found(localized(inliers=90), 0.0, 90), found(localized(0.05, inliers=200), 0.05, 200), "there"),
+            (found(rejected(RejectionReason.GATE), 0.0, 80), found(localized(30.0), 30.0, 100), "there"),
+            (found(rejected(RejectionReason.GATE), 0.0, 60), found(localized(30.0), 30.0, 100), "elsewhere"),
+            (found(rejected(RejectionReason.GATE), 29.9, 80), found(localized(30.0), 30.0, 100), "elsewhere"),
+            (found(rejected(), 0.0, 10), found(rejected(), 30.0, 9), "there"),
+            (found(rejected(), 0.0, 10), found(rejected(), 30.0, 11), "elsewhere"),
+            (rejected(), rejected(), "there"),
+        ],
+    )
+    def test_prior_decides_unless_more_is_seen_elsewhere(self, there: Answer, elsewhere: Answer, chosen: str) -> None:
+        results = {"there": Result(there, CHEAP, (), 1, CAMERA), "elsewhere": Result(elsewhere, CHEAP, (), 1, CAMERA)}
+        assert of_two_places(results["there"], results["elsewhere"], OPTIONS) is results[chosen]
+
+    def test_two_poses_are_ambiguous_if_more_is_seen_elsewhere(self) -> None:
+        there, elsewhere = found(localized(), 0.0, 100), found(localized(30.0, inliers=150), 30.0, 150)
+        results = [Result(it, CHEAP, (), 1, CAMERA) for it in (there, elsewhere)]
+        outcome = of_two_places(results[0], results[1], OPTIONS).answer.outcome
+        assert isinstance(outcome, Rejection)
+        assert outcome.reason is RejectionReason.AMBIGUOUS
+        assert [it.inlier_count for it in outcome.hypotheses] == [150, 100]

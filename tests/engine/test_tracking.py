@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.compare import pose_error
 from support.corner import CAMERA, photograph, pose
+from support.images import encode, textured
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.engine.interface import EngineOptions
@@ -18,7 +19,7 @@ from mapless_server.method.answer import Localization
 from mapless_server.method.features import SiftExtractor
 from mapless_server.method.options import LocalizeOptions, Variant
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.priors.known import NO_PRIORS, PosePrior, Priors
+from mapless_server.method.priors.known import NO_PRIORS, HeadingPrior, PosePrior, PositionPrior, Priors
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.uncertainty.radii import accuracy_from_covariance
 from mapless_server.scenes import Narrowing
@@ -27,9 +28,9 @@ from mapless_server.security import SceneKey
 from mapless_server.serve.assembly import engine_over
 from mapless_server.store import NewReference, Store
 
-SCENE, COPIED = SceneKey("corner"), SceneKey("copies")
+SCENE, COPIED, TWO_PLACES = SceneKey("corner"), SceneKey("copies"), SceneKey("places")
 TRUE = pose(2.0, -1.5)
-COPY_M = np.array([5.0, 0.0, 0.0])
+COPY_M, AWAY_M = np.array([5.0, 0.0, 0.0]), np.array([100.0, 0.0, 0.0])
 SIGMA_M, SIGMA_DEG = 0.05, 1.5
 Localize = Callable[..., Result]
 
@@ -52,7 +53,7 @@ def query(priors: Priors = NO_PRIORS, scene: SceneKey = SCENE, image: bytes = b"
 
 @pytest.fixture(scope="module")
 def localize(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Localize]:
-    """A scene of a corner, and one in which a copy of it stands 5 m aside."""
+    """A scene of a corner, one in which a copy of it stands 5 m aside, and one with another place 100 m away."""
     caller = Caller(Flow("tenant", "client"), time.monotonic() + 600)
     folder: Path = tmp_path_factory.mktemp("store")
     poses = [pose(angle, height) for angle in (-15, -5, 5, 15) for height in (-1.8, -1.2)]
@@ -74,6 +75,16 @@ def localize(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Localize]:
 
         added(SCENE, [np.zeros(3)])
         added(COPIED, [np.zeros(3), COPY_M])
+        added(TWO_PLACES, [np.zeros(3)])
+        others = [Photo(encode(".png", textured(512, 384, seed=i)), CAMERA, "image") for i in range(4)]
+        away = zip(others, poses[::2], loop.run_until_complete(engine.describe(others, caller)), strict=True)
+        store.add_references(
+            TWO_PLACES,
+            [
+                NewReference(f"away-{i}", photo.image, CAMERA, at.shifted(AWAY_M), found.views, found.descriptors)
+                for i, (photo, at, found) in enumerate(away)
+            ],
+        )
 
         def answer(priors: Priors = NO_PRIORS, scene: SceneKey = SCENE) -> Result:
             job = engine.query_job(query(priors, scene, image), caller)
@@ -119,6 +130,22 @@ def test_a_prior_at_one_of_two_copies_does_not_decide(localize: Localize, copy: 
         result = localize(priors, COPIED)
         assert isinstance(result.answer.outcome, Rejection)
         assert (TRACK in result.stage_seconds) == bool(priors)
+
+
+@pytest.mark.parametrize(
+    "priors",
+    [
+        prior(TRUE.shifted(AWAY_M)),
+        Priors(position=PositionPrior(TRUE.translation + AWAY_M, np.eye(3))),
+        Priors(heading=HeadingPrior.looking(-TRUE.rotation[:, 2], 1.0)),
+    ],
+    ids=["pose", "position", "heading"],
+)
+def test_a_prior_of_another_place_gives_the_answer_without_it(localize: Localize, priors: Priors) -> None:
+    found = localized(localize(priors, TWO_PLACES))
+    assert found.prior_checks[0].conflict
+    free = localized(localize(NO_PRIORS, TWO_PLACES))
+    np.testing.assert_allclose(found.world_from_camera.matrix(), free.world_from_camera.matrix(), atol=1e-9)
 
 
 def test_what_leaves_the_references_open_is_not_tracked() -> None:

@@ -34,7 +34,7 @@ from . import tracking
 from .failures import failure_of
 from .query import TRACK, UNFINISHED, Query, Result, Tier
 from .references import QueryViews, ReferenceSource
-from .tiers import EscalationOptions, better_of, is_doubtful
+from .tiers import EscalationOptions, better_of, is_doubtful, of_two_places
 
 log = logging.getLogger(__name__)
 
@@ -83,9 +83,10 @@ class QueryRun:
         deadline_s: time after which the answer is useless, by `time.monotonic`.
         on_coarse: called with the first tier's coarse result as soon as there is one, in the computing thread.
         tier: index of the tier that computes.
-        best: best result of the earlier tiers; None in the first.
+        best: best result so far; None in the first search of the first tier.
         start_s: when this tier began, by `time.monotonic`.
         give_up_s: time after which `best` is the answer, if this tier has none by then.
+        narrowed: the query with the soft priors' choice of references, if references elsewhere are now searched.
         listings: how often the scene was listed in this tier.
         context: cancels and times this tier's stages; from here on set by the stage `prepare`.
         references: the references that are used, in order.
@@ -109,6 +110,7 @@ class QueryRun:
     best: Result | None = None
     start_s: float = field(default_factory=time.monotonic)
     give_up_s: float = math.inf
+    narrowed: Query | None = None
     listings: int = 1
     context: StageContext = field(default_factory=StageContext)
     references: tuple[PosedView, ...] = ()
@@ -276,8 +278,9 @@ class QueryStages:
         answer = self._method.track(view, references, pipeline, query.options, context, query.priors)
         if not tracking.suffices(answer, pipeline.options.weak_inliers, self._doubt_in(run)):
             return None
-        limits = replace(query.narrowing, likely_positions=(), likely_headings=())
-        alike = run.source.choose(query.scene_key, views, Selection(query.reference_count, limits), context)
+        alike = run.source.choose(
+            query.scene_key, views, Selection(query.reference_count, query.narrowing.limits), context
+        )
         others = [it.reference_id for it in tracking.elsewhere(near, alike)]
         with context.stage(TRACK):
             rivals = self._load_chosen(run, others, tier)[1] if others else ()
@@ -297,9 +300,7 @@ class QueryStages:
     def _with_chosen(self, run: QueryRun, tier: Tier) -> QueryRun:
         """Chooses, among the references that resemble the photograph most, those with the most matches."""
         query, context = run.query, run.context
-        count = SHORTLIST * query.reference_count
-        selection = Selection(count, query.narrowing, query.reference_ids, THINNED_LATER)
-        choice = run.source.choose(query.scene_key, run.views, selection, context)
+        choice = self._choose(run, query.narrowing)
         generation, shortlist = self._load_chosen(run, [it.reference_id for it in choice.references], tier)
         view = run.views.view(tier.extractor, context)
 
@@ -314,6 +315,11 @@ class QueryStages:
         return replace(
             run, generation=generation, references=references, view=view, choice=choice, query_matches=query_matches
         )
+
+    def _choose(self, run: QueryRun, narrowing: Narrowing) -> Choice:
+        query = run.query
+        selection = Selection(SHORTLIST * query.reference_count, narrowing, query.reference_ids, THINNED_LATER)
+        return run.source.choose(query.scene_key, run.views, selection, run.context)
 
     def _load_chosen(self, run: QueryRun, reference_ids: Sequence[str], tier: Tier) -> Loaded:
         """Loads chosen references without damaged ones; a damaged reference that the caller named is an error."""
@@ -357,17 +363,54 @@ class QueryStages:
         return self._conclude(run, answer)
 
     def _conclude(self, run: QueryRun, answer: Answer) -> StageResult:
-        """Ends a tier: returns the better of two answers, or starts a stronger tier to improve a doubtful one."""
-        result = self._result(run, answer)
-        if run.best is not None:
+        """Ends a search: returns the better of two answers, or searches elsewhere or in a stronger tier for another."""
+        result, query = self._result(run, answer), run.query
+        if run.narrowed is not None:
+            assert run.best is not None
+            better = of_two_places(run.best, result, self._escalation)
+            query = run.narrowed if better is run.best else query
+            result = replace(better, stage_seconds=result.stage_seconds)
+        elif run.best is not None:
             result = replace(better_of(run.best, result, self._escalation), stage_seconds=result.stage_seconds)
+        elif self._may_be_elsewhere(run, answer):
+            return self._again(run, _without_likely(query), run.tier, result)
         if run.tier + 1 < len(self._tiers) and is_doubtful(result.answer, self._doubt_in(run)):
-            now_s = time.monotonic()
-            give_up_s = now_s + self._escalation.time_share * (run.deadline_s - now_s)
-            asked = run.query, run.source, run.views, run.deadline_s, run.on_coarse
-            stronger = QueryRun(*asked, run.tier + 1, result, now_s, give_up_s)
-            return self._next(stronger, stronger.first_step)
+            return self._again(run, query, run.tier + 1, result)
         return Done(result, _ending(result))
+
+    def _again(self, run: QueryRun, query: Query, tier: int, best: Result) -> StageResult:
+        """Starts another search; if it finds nothing better in time, the best result so far is returned."""
+        now_s = time.monotonic()
+        give_up_s = now_s + self._escalation.time_share * (run.deadline_s - now_s)
+        narrowed = run.query if tier == run.tier else None
+        again = QueryRun(
+            query, run.source, run.views, run.deadline_s, run.on_coarse, tier, best, now_s, give_up_s, narrowed
+        )
+        return self._next(again, again.first_step)
+
+    def _may_be_elsewhere(self, run: QueryRun, answer: Answer) -> bool:
+        """Whether soft priors may have led to the wrong references.
+
+        That is if the reference that resembles the photograph most is not where they say, and the photograph was not
+        localized, or references elsewhere contradict the pose.
+        """
+        outcome, query = answer.outcome, run.query
+        is_excluded = isinstance(outcome, Rejection) and bool(outcome.intrinsics_checks)
+        if run.choice is None or query.is_part or is_excluded or not query.narrowing.has_likely:
+            return False
+        with run.context.stage("retrieval"):
+            alike = self._choose(run, query.narrowing.limits).references
+        inside = {it.reference_id for it in run.choice.references}
+        if not alike or alike[0].reference_id in inside:
+            return False
+        if isinstance(outcome, Rejection):
+            return True
+        assert run.view is not None
+        tier = self._tiers[run.tier]
+        others = [it.reference_id for it in alike if it.reference_id not in inside][: tracking.OTHERS]
+        with run.context.stage("correspond"):
+            rivals = self._load_chosen(run, others, tier)[1]
+            return tracking.is_contradicted(answer, run.view, rivals, tier.pipeline.matcher)
 
     def _doubt_in(self, run: QueryRun) -> EscalationOptions:
         """Adapts the options to the scene's quantiles of trust, so that the same answers are doubtful in all scenes."""
@@ -410,6 +453,10 @@ def _pipeline_in(run: QueryRun, tier: Tier) -> Pipeline:
     """The tier's pipeline with the trust of the scene."""
     calibration = run.attributes.self_calibration(tier.kind)
     return tier.pipeline.with_trust(calibration.trust_quantiles if calibration else ())
+
+
+def _without_likely(query: Query) -> Query:
+    return replace(query, narrowing=query.narrowing.limits)
 
 
 def _is_searched(run: QueryRun) -> bool:

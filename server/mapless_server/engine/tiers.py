@@ -13,7 +13,7 @@ import numpy as np
 from mapless.geometry import RigidTransform, rotation_angle_deg
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.options import check_bounds
-from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
+from mapless_server.method.rejection import Advice, Hint, Hypothesis, Rejection, RejectionReason
 from mapless_server.method.uncertainty.radii import Accuracy, accuracy_from_covariance
 
 from .query import Result
@@ -38,7 +38,7 @@ class EscalationOptions:
             LightGlue two were further from a rejected one of EdgePoint2, with over twice its inliers; of nine wrong
             ones all were, seven of them with less than 1.5 times its inliers.
         clearly_more: if two poses contradict each other, that of the stronger features is accepted if it has this many
-            times the inliers of the other.
+            times the inliers of the other; so is one that contradicts a rejected pose where the soft priors are.
         time_share: share of the remaining time that a stronger tier may take. After that the first answer is returned,
             since a doubtful answer is better than none; the rest of the time suffices to send it.
         rematch_share: share of a tier's time after which it stops matching the photograph again by a slow network (see
@@ -114,6 +114,53 @@ def better_of(cheaper: Result, stronger: Result, options: EscalationOptions) -> 
     )
     rejection = Rejection(RejectionReason.GATE, message, _places_apart(stronger))
     return replace(stronger, answer=replace(stronger.answer, outcome=rejection))
+
+
+def of_two_places(narrowed: Result, elsewhere: Result, options: EscalationOptions) -> Result:
+    """The result of references where the soft priors say the camera is, or that of references elsewhere.
+
+    Localized at both, the priors decide, unless the photograph has clearly more inliers elsewhere: then neither is
+    answered. Localized elsewhere alone, the priors are wrong, unless a pose that was rejected where they say has about
+    as many inliers. Of two rejections, the one with more inliers says more.
+    """
+    first, second = narrowed.answer.outcome, elsewhere.answer.outcome
+    if isinstance(second, Rejection):
+        is_better = isinstance(first, Rejection) and _inlier_count(elsewhere) > _inlier_count(narrowed)
+        return elsewhere if is_better else narrowed
+    if isinstance(first, Rejection):
+        other = _rejected_pose(narrowed.answer)
+        if other is None or second.inlier_count >= options.clearly_more * other[1]:
+            return elsewhere
+        return elsewhere if _apart_m(other[0], second) <= max(other[2], _same_m(elsewhere, options)) else narrowed
+    apart_m = _apart_m(first.world_from_camera, second)
+    if apart_m <= _same_m(elsewhere, options) or second.inlier_count < options.clearly_more * first.inlier_count:
+        return narrowed
+    poses = [
+        Hypothesis(it.world_from_camera, it.inlier_count, tuple(used.name for used in of.references))
+        for it, of in ((second, elsewhere), (first, narrowed))
+    ]
+    message = (
+        f"two poses {apart_m:.2f} m apart explain the photograph: the one where the prior says with "
+        f"{first.inlier_count} inliers, the other with {second.inlier_count}"
+    )
+    hint = Hint("judge", Advice.CHECK_PRIOR, "Check the prior: references elsewhere show more of the photograph.", None)
+    rejection = Rejection(RejectionReason.AMBIGUOUS, message, hint, hypotheses=(poses[0], poses[1]))
+    return replace(elsewhere, answer=replace(elsewhere.answer, outcome=rejection))
+
+
+def _inlier_count(result: Result) -> int:
+    support = result.answer.support
+    return 0 if support is None or support.estimate is None else support.inlier_count()
+
+
+def _apart_m(pose: RigidTransform, localization: Localization) -> float:
+    return float(np.linalg.norm(localization.world_from_camera.translation - pose.translation))
+
+
+def _same_m(result: Result, options: EscalationOptions) -> float:
+    support = result.answer.support
+    share_m = 0.0 if support is None else options.same_share * support.distance_m()
+    return max(options.same_position_m, share_m)
 
 
 def _rejected_pose(answer: Answer) -> tuple[RigidTransform, int, float] | None:

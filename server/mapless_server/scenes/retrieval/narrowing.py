@@ -5,7 +5,7 @@ choice of references, too, but not to nothing, and never reject a pose.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,6 +126,16 @@ class Narrowing:
     def is_empty(self) -> bool:
         """Whether nothing is known."""
         return not (self.position or self.heading or self.likely_positions or self.likely_headings)
+
+    @property
+    def has_likely(self) -> bool:
+        """Whether soft priors narrow the choice."""
+        return bool(self.likely_positions or self.likely_headings)
+
+    @property
+    def limits(self) -> "Narrowing":
+        """The hard limits alone."""
+        return replace(self, likely_positions=(), likely_headings=())
 
     @property
     def centre(self) -> Array | None:
