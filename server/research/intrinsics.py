@@ -17,11 +17,11 @@ import numpy as np
 
 from mapless.geometry import Camera, Fisheye
 from mapless_server.method.answer import Localization
-from mapless_server.method.features import FeatureExtractor, undistort_pixels
+from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.intrinsics import ContradictionOptions, corrected
 from mapless_server.method.rejection import IntrinsicsParameter
 from mapless_server.method.uncertainty.radii import accuracy_from_covariance
-from mapless_server.method.views import Features, View
+from mapless_server.method.views import Features, View, undistort_pixels
 
 from .places import METRIC, Measured, Pair, Place, answered, read_place, right_pairs, samples_of_command, spread
 

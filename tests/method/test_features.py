@@ -10,15 +10,8 @@ from support.images import textured
 from support.scenes import random_for
 
 from mapless.geometry import Array, Camera, Distortion, Fisheye, RadialTangential
-from mapless_server.method.features import (
-    MAX_INCIDENCE_DEG,
-    SiftExtractor,
-    SiftOptions,
-    make_extractor,
-    reduce_image,
-    undistort_pixels,
-)
-from mapless_server.method.views import Features
+from mapless_server.method.features import SiftExtractor, SiftOptions, make_extractor
+from mapless_server.method.views import MAX_INCIDENCE_DEG, Features, reduce_image, undistort_pixels
 
 CAMERA = Camera(400, 300, 350.0, 350.0, 199.5, 149.5)
 LENSES = {

@@ -23,7 +23,7 @@ from mapless_server.method.coarse.grids import (
     lay_out,
     natural_grid,
 )
-from mapless_server.method.features import undistort_pixels
+from mapless_server.method.views import undistort_pixels
 
 OPTIONS = GridOptions()
 OFFICIAL_PIXEL_LIMIT = 255_000

@@ -12,7 +12,6 @@ from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, Camera, Distortion, Fisheye, RadialTangential
 from mapless_server.method.adjust import adjust_pose
-from mapless_server.method.features import undistort_pixels
 from mapless_server.method.intrinsics import ContradictionOptions, IntrinsicsEvidence, corrected, keypoint_motion
 from mapless_server.method.options import IntrinsicsSigma
 from mapless_server.method.pose_problem import AdjustOptions, pose_problem, with_intrinsics
@@ -22,6 +21,7 @@ from mapless_server.method.rejection import Advice, IntrinsicsParameter, Rejecti
 from mapless_server.method.results import PoseEstimate, Support
 from mapless_server.method.trust.intrinsics import intrinsics_checks, wrong_intrinsics
 from mapless_server.method.trust.wrong_camera import WrongCameraOptions, wrong_camera
+from mapless_server.method.views import undistort_pixels
 
 LENSES = {
     "pinhole": None,

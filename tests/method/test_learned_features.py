@@ -180,7 +180,7 @@ def test_xfeat_keypoints_are_the_peaks_of_the_keypoint_map(
 @pytest.fixture
 def unrounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """Descriptors as the network gives them."""
-    monkeypatch.setattr("mapless_server.method.features.image.rounded_descriptors", lambda it: it)
+    monkeypatch.setattr("mapless_server.method.views.rounded_descriptors", lambda it: it)
 
 
 @pytest.mark.usefixtures("unrounded")

@@ -16,7 +16,7 @@ from mapless.cameras import read_cameras
 from mapless.geometry import LENS_MODELS, Camera, Distortion, RigidTransform
 from mapless.report.sections import provenance_section
 from mapless.v1 import geometry_pb2 as pb
-from mapless_server.method.features import undistort_pixels
+from mapless_server.method.views import undistort_pixels
 from mapless_server.store.codec import decode_geometry, encode_geometry, sha256_for
 from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.ingest.formats.colmap.cameras import from_camera

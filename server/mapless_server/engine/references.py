@@ -9,9 +9,9 @@ from typing import Protocol
 from mapless.names import reference_name
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.images import ImageLimits, decode_image
-from mapless_server.method.features import FeatureExtractor, reduce_image
+from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import StageContext
-from mapless_server.method.views import Photograph, View
+from mapless_server.method.views import Photograph, View, reduce_image
 from mapless_server.scenes import Choice, GlobalDescriptor, Selection, rank_references
 from mapless_server.scenes.audit.scene_auditor import AuditTools, SceneAuditor
 from mapless_server.scenes.indexes import SceneIndexes

@@ -24,9 +24,8 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, Distortion, RadialTangential
 
-from .features.image import undistort_pixels
 from .options import IntrinsicsSigma, check_bounds
-from .views import View
+from .views import View, undistort_pixels
 
 NAMES = ("focal length", "principal point x", "principal point y", "k1")
 PRINCIPAL = (1, 2)

@@ -18,8 +18,8 @@ from PIL import Image
 from mapless.geometry import Array, Camera
 from mapless_server.networks.encoder import PATCH_PX
 
-from ..features import undistort_pixels
 from ..options import check_bounds
+from ..views import undistort_pixels
 
 PIXEL_LIMIT = 37 * 28 * PATCH_PX**2
 """Of 518x392."""

@@ -14,19 +14,14 @@ from mapless.geometry import Camera
 
 from ..choices import EDGEPOINT2, FEATURES
 from ..views import View
-from .image import MAX_INCIDENCE_DEG, reduce_image, seen_share, undistort_pixels
 from .sift import SiftExtractor, SiftOptions
 
 __all__ = [
     "FEATURES",
-    "MAX_INCIDENCE_DEG",
     "FeatureExtractor",
     "SiftExtractor",
     "SiftOptions",
     "make_extractor",
-    "reduce_image",
-    "seen_share",
-    "undistort_pixels",
 ]
 
 

@@ -14,8 +14,7 @@ from torch.nn.functional import conv2d, embedding_bag, grid_sample, normalize
 from mapless.geometry import Camera
 from mapless_server.networks.local_features import load_aliked
 
-from ..views import View
-from .image import reduce_image, view_of
+from ..views import View, reduce_image, view_of
 from .network import LearnedOptions, array_of, image_tensor
 
 _CORNERS = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]])

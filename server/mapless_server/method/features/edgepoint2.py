@@ -13,8 +13,7 @@ from mapless.geometry import Camera
 from mapless_server.networks.edgepoint2 import DESCRIPTOR_STEP_PX, fuse
 from mapless_server.networks.local_features import load_edgepoint2
 
-from ..views import View
-from .image import reduce_image, view_of
+from ..views import View, reduce_image, view_of
 from .network import LearnedOptions, array_of, image_tensor, peaks, strict_maxima
 
 WINDOW_PX = 5

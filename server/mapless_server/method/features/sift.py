@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Camera
 
 from ..options import check_bounds
-from ..views import View
-from .image import reduce_image, view_of
+from ..views import View, reduce_image, view_of
 
 
 @dataclass(frozen=True)

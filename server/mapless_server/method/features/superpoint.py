@@ -11,8 +11,7 @@ from transformers import SuperPointConfig
 from mapless.geometry import Camera
 from mapless_server.networks.local_features import load_superpoint
 
-from ..views import View
-from .image import reduce_image, view_of
+from ..views import View, reduce_image, view_of
 from .network import LearnedOptions, array_of, image_tensor
 
 WINDOW_PX = 9

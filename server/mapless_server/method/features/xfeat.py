@@ -11,8 +11,7 @@ from torch.nn.functional import log_softmax, normalize, pixel_shuffle
 from mapless.geometry import Camera
 from mapless_server.networks.local_features import load_xfeat
 
-from ..views import View
-from .image import reduce_image, view_of
+from ..views import View, reduce_image, view_of
 from .network import LearnedOptions, array_of, image_tensor, peak_offsets, strict_maxima
 
 MULTIPLE_PX = 32

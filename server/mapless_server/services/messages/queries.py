@@ -21,7 +21,6 @@ from mapless.wire import FieldError, camera_from_message, joined, transform_from
 from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Photo, Query
 from mapless_server.images import ImageLimits, image_size
-from mapless_server.method.features import seen_share
 from mapless_server.method.options import IntrinsicsSigma, LocalizeOptions
 from mapless_server.method.priors.known import (
     GravityPrior,
@@ -31,6 +30,7 @@ from mapless_server.method.priors.known import (
     Priors,
     check_covariance,
 )
+from mapless_server.method.views import seen_share
 from mapless_server.scenes import Cone, Narrowing, Sphere
 from mapless_server.security import SceneKey, key_of
 from mapless_server.store import SceneAttributes
