@@ -113,7 +113,7 @@ class Tested:
 
 def test(samples: Sequence[Sample], growth: float, options: FitOptions | None) -> list[Tested]:
     """Each scene and kind of features, calibrated with these options; None for generic radii."""
-    uncertainty.POSITION_GROWTH = uncertainty.ROTATION_GROWTH = growth
+    uncertainty.GROWTH = growth
     found = []
     for scene, features in dict.fromkeys((it.scene, it.features) for it in samples):
         own = [it for it in samples if (it.scene, it.features) == (scene, features)]

@@ -38,9 +38,8 @@ Change = Callable[[RigidTransform], RigidTransform]
 
 def result(ratio: float, gap: float = USUAL_GAP, trust: float = 0.5, radius_m: float = 0.01) -> LeftOut:
     """Errors that are so many times the radii of 68 %, whose double are those of 95 %."""
-    position, rotation = growth(gap)
-    claimed = Accuracy(radius_m, 2 * radius_m, 0.1, 0.2)
-    return LeftOut(radius_m * ratio * position, 0.1 * ratio * rotation, claimed, trust, gap, 50.0)
+    claimed, grown = Accuracy(radius_m, 2 * radius_m, 0.1, 0.2), ratio * growth(gap)
+    return LeftOut(radius_m * grown, 0.1 * grown, claimed, trust, gap, 50.0)
 
 
 def spread(count: int, factor: float, gap: float = USUAL_GAP) -> list[LeftOut]:
@@ -62,7 +61,7 @@ class TestFit:
     def test_few_answers_count_as_stated(self, factor: float, count: int) -> None:
         options = FitOptions(noise_share=0.01)
         found = fit(spread(count, factor), KIND, 1, options)
-        n0 = options.mismatch * (options.scatter / options.factor_log) ** 2
+        n0 = (options.scatter / options.factor_log) ** 2
         assert np.log(found.position_factor) == pytest.approx(count / (count + n0) * np.log(factor), abs=0.05)
 
     def test_a_larger_gap_explains_larger_errors(self) -> None:

@@ -13,7 +13,13 @@ from support.scenes import random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless.scenes import Calibration
-from mapless_server.method.uncertainty.radii import USUAL_GAP, Accuracy, accuracy_from_covariance
+from mapless_server.method.uncertainty.radii import (
+    SELF_TAIL_95,
+    TAIL_95,
+    USUAL_GAP,
+    Accuracy,
+    accuracy_from_covariance,
+)
 from mapless_server.services.messages.radii import (
     Conditions,
     Factors,
@@ -179,10 +185,25 @@ class TestApplying:
     def test_of_references_hold_at_the_usual_gap(self) -> None:
         before, attributes = Accuracy(1.0, 2.0, 3.0, 4.0), SceneAttributes(self_calibrations=(self.own(),))
         after = reported_radii(before, self.COVARIANCE, SIFT, attributes, USUAL_GAP)
-        assert after.accuracy == Accuracy(2.0, 4.0, 1.5, pytest.approx(4.0 * math.sqrt(0.5)))  # type: ignore[arg-type]
+        assert (after.accuracy.position_68_m, after.accuracy.rotation_68_deg) == (2.0, 1.5)
         assert (after.calibration, after.count) == ("SELF", 30)
         near, far = (reported_radii(before, self.COVARIANCE, SIFT, attributes, it).accuracy for it in (0.05, 0.2))
         assert near.position_68_m < after.accuracy.position_68_m < far.position_68_m
+
+    def test_many_references_leave_less_to_the_tails(self) -> None:
+        before, tails = Accuracy(1.0, 2.0, 3.0, 6.0), []
+        for count in (3, 30, 3000):
+            attributes = SceneAttributes(self_calibrations=(self.own(count=count),))
+            after = reported_radii(before, self.COVARIANCE, SIFT, attributes, USUAL_GAP).accuracy
+            tails.append(after.position_95_m / after.position_68_m)
+            assert after.rotation_95_deg / after.rotation_68_deg == pytest.approx(tails[-1])
+        assert 2.0 > tails[0] > tails[1] > tails[2] == pytest.approx(2.0 * SELF_TAIL_95 / TAIL_95, rel=1e-2)
+
+    def test_the_smallest_factor_of_references_has_radii(self) -> None:
+        smallest = replace(self.own(), position_factor=0.01, rotation_factor=0.01)
+        attributes, before = SceneAttributes(self_calibrations=(smallest,)), Accuracy(1.0, 1.0, 1.0, 1.0)
+        after = reported_radii(before, self.COVARIANCE, SIFT, attributes, gap=0.0).accuracy
+        assert after == Accuracy(0.01, 0.01, 0.01, 0.01)
 
     def test_errors_of_references_are_below_no_radius(self) -> None:
         noisy = SceneAttributes(self_calibrations=(replace(self.own(), reference_noise_m=0.01),))

@@ -15,6 +15,13 @@ TAIL_95 = 1.47
 """Factor on the radius of 95 %, for heavy tails; the covariance is right at 68 %. From `research.radii`."""
 
 
+SELF_TAIL_95 = 1.25
+"""The same for answers of a scene that is calibrated: the other one has to cover that scenes differ."""
+
+TAIL_PRIOR = 5.0
+"""Number of a calibration's answers at which the factor is half-way between the two."""
+
+
 @dataclass(frozen=True)
 class Accuracy:
     """Radii: errors not exceeded in 68 and 95 % of cases."""
@@ -38,6 +45,11 @@ def accuracy_from_covariance(covariance: Array) -> Accuracy:
     )
 
 
+def self_tail(count: int) -> float:
+    """Factor on the radius of 95 % in a scene that is calibrated by so many answers to its references."""
+    return float(TAIL_95 * (SELF_TAIL_95 / TAIL_95) ** (count / (count + TAIL_PRIOR)))
+
+
 def error_radii(covariance: Array, probabilities: ArrayLike) -> Array:
     """Lengths (P,) that a zero-mean normal vector of covariance (n, n) does not exceed with probabilities (P,).
 
@@ -55,14 +67,18 @@ def error_radii(covariance: Array, probabilities: ArrayLike) -> Array:
     return np.asarray(np.sqrt(2 * scale * gammaincinv(degrees_of_freedom / 2, probabilities)), float)
 
 
-POSITION_GROWTH, ROTATION_GROWTH = 0.2, 0.2
-"""Exponents of the gap in the ratio of errors to radii, which contain 0.1 of it; from `research.self_calibration`."""
+GROWTH = 0.2
+"""Exponent of the gap in the ratio of errors to radii, which contain 0.1 of it; from `research.self_calibration`."""
 
 USUAL_GAP = 0.1
 """The gap at which factors are stated."""
 
 LEAST_GAP, LARGEST_GAP = 0.03, 0.5
-"""Beyond these, ratios do not change with the gap."""
+"""Beyond these, radii do not change with the gap."""
+
+SMALLEST_GAP = 0.003
+"""Below, the ratio of errors to radii does not change either: references that are left out of a film of a hall are at
+0.05, its photographs at 0.01 of what they see, and their ratios differ by 1.6."""
 
 SUPPORTING_SHARE = 0.1
 """References with fewer inliers, by those of the one with the most, do not hold the pose."""
@@ -92,6 +108,6 @@ def gap_ratio(gap: float) -> float:
     return float(np.clip(gap, LEAST_GAP, LARGEST_GAP)) / USUAL_GAP
 
 
-def growth(gap: float) -> tuple[float, float]:
-    """Ratios of the errors of position and rotation to their radii at a gap, relative to those at the usual gap."""
-    return gap_ratio(gap) ** POSITION_GROWTH, gap_ratio(gap) ** ROTATION_GROWTH
+def growth(gap: float) -> float:
+    """Ratio of errors to radii at a gap, relative to that at the usual gap; of positions and of angles."""
+    return float((np.clip(gap, SMALLEST_GAP, LARGEST_GAP) / USUAL_GAP) ** GROWTH)

@@ -13,7 +13,7 @@ r the claimed radius, f the factor of the scene, s the errors of the references'
 and which do not shrink with its radius, and g the gap: errors grow faster with the distance to the references than
 radii do, and a reference that is left out is farther from the others than a query is. b comes from scenes with known
 poses. f and s are means of the posterior on a grid. The prior of f is log-normal about 1, the generic radii, as if
-n0 = `mismatch` (`scatter` / `factor_log`)^2 = 5 more answers had needed it; that of s is half-normal.
+n0 = (`scatter` / `factor_log`)^2 = 2.6 more answers had needed it; that of s is half-normal.
 
 The quantiles of trust are those of the n answers and of n0 = `trust_prior` answers whose trust is distributed as it is
 elsewhere, uniformly. Priors were chosen by leaving whole scenes out (`research.self_calibration`).
@@ -52,8 +52,6 @@ class FitOptions:
     Attributes:
         median_ratio: median ratio of errors to their 68 % radius, if the radius is right.
         scatter: standard deviation of the logarithm of this ratio; that of the length of a normal error.
-        mismatch: number of answers that count as one, because neighbours share errors, and left-out references differ
-            from queries.
         factor_log: standard deviation of ln f between scenes.
         noise_share: standard deviation of s, as a share of the median radius.
         trust_prior: n0 of the quantiles of trust.
@@ -62,14 +60,13 @@ class FitOptions:
 
     median_ratio: float = 0.72
     scatter: float = 0.65
-    mismatch: float = 2.0
     factor_log: float = 0.4
     noise_share: float = 0.3
     trust_prior: float = 20.0
     least_answers: int = 3
 
     def __post_init__(self) -> None:
-        check_bounds(self, "median_ratio scatter mismatch factor_log noise_share trust_prior", above=0)
+        check_bounds(self, "median_ratio scatter factor_log noise_share trust_prior", above=0)
         check_bounds(self, "least_answers", at_least=1)
 
 
@@ -115,10 +112,8 @@ def fit(results: Sequence[LeftOut], kind: str, generation: int, options: FitOpti
         return SelfCalibration(kind, generation, 0)
     grown = np.array([growth(it.gap) for it in right])
     claimed = np.array([astuple(it.claimed) for it in right])
-    position, noise_m = _factor_and_noise(np.array([it.error_m for it in right]), claimed[:, 0], grown[:, 0], options)
-    rotation, noise_deg = _factor_and_noise(
-        np.array([it.error_deg for it in right]), claimed[:, 2], grown[:, 1], options
-    )
+    position, noise_m = _factor_and_noise(np.array([it.error_m for it in right]), claimed[:, 0], grown, options)
+    rotation, noise_deg = _factor_and_noise(np.array([it.error_deg for it in right]), claimed[:, 2], grown, options)
     wrong = [it.trust for it in results if not it.is_right]
     quantiles = _trust_quantiles(np.array([it.trust for it in right]), max(wrong, default=0.0), options)
     return SelfCalibration(
@@ -139,7 +134,7 @@ def _factor_and_noise(error: Array, radius: Array, grown: Array, options: FitOpt
     scaled = _FACTORS[:, None, None] * (radius * grown / unit)
     expected = options.median_ratio * np.hypot(scaled, _NOISES[:, None])  # (F, S, N)
     off = (np.log(np.maximum(error / unit, 1e-9)) - np.log(np.maximum(expected, 1e-9))) / options.scatter
-    likelihood = -0.5 * np.minimum(off**2, _FARTHEST_LOG**2).sum(axis=2) / options.mismatch
+    likelihood = -0.5 * np.minimum(off**2, _FARTHEST_LOG**2).sum(axis=2)
     unusual = (np.log(_FACTORS)[:, None] / options.factor_log) ** 2 + (_NOISES / options.noise_share) ** 2
     posterior = likelihood - 0.5 * unusual
     weight = np.exp(posterior - posterior.max())

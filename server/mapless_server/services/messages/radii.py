@@ -9,7 +9,7 @@ import numpy as np
 from mapless.geometry import Array
 from mapless.scenes import MAX_FACTOR, MIN_FACTOR, Calibration
 from mapless_server.method.options import Variant
-from mapless_server.method.uncertainty.radii import Accuracy, growth
+from mapless_server.method.uncertainty.radii import TAIL_95, Accuracy, growth, self_tail
 from mapless_server.store import SceneAttributes, SelfCalibration, calibration_kind
 
 _SELF_CALIBRATED = Variant.BEST.name
@@ -48,13 +48,11 @@ class Factors:
     @classmethod
     def of_references(cls, calibration: SelfCalibration, accuracy: Accuracy, gap: float) -> "Factors":
         """Factors of a self-calibration for an answer with these radii at a gap, see `scenes.calibration.fit`."""
-        position, rotation = growth(gap)
-        factors = (
-            _factor(position * calibration.position_factor, calibration.reference_noise_m, accuracy.position_68_m),
-            _factor(rotation * calibration.rotation_factor, calibration.reference_noise_deg, accuracy.rotation_68_deg),
-        )
-        # A radius of 95 % shrinks by the root only: what photographs from elsewhere may need, references do not show.
-        return cls(*(it for factor in factors for it in (factor, max(factor, min(1.0, math.sqrt(factor))))))
+        own, grown = calibration, growth(gap)
+        position = _factor(grown * own.position_factor, own.reference_noise_m, accuracy.position_68_m)
+        rotation = _factor(grown * own.rotation_factor, own.reference_noise_deg, accuracy.rotation_68_deg)
+        tail = self_tail(own.answer_count) / TAIL_95
+        return cls(position, max(MIN_FACTOR, position * tail), rotation, max(MIN_FACTOR, rotation * tail))
 
 
 @dataclass(frozen=True)
