@@ -84,11 +84,8 @@ def read_cameras(file: str | Path) -> dict[Path, Camera]:
     """Reads the photographs of a cameras.json with their cameras, in the file's order.
 
     The file has `frames`, each with `image` (path beside the file), `width`, `height`, `K` (3x3, pixels) and optionally
-    `dist` (OpenCV's k1 k2 p1 p2 k3) and `lens` ("fisheye": `dist` is then k1 k2 k3 k4); poses are ignored.
-
-    Raises:
-        OSError: the file cannot be read.
-        ValueError: the file has another form; the message names the frame and the field.
+    `dist` (OpenCV's k1 k2 p1 p2 k3) and `lens` ("fisheye": `dist` is then k1 k2 k3 k4); poses are ignored. OSError if
+    the file cannot be read. ValueError if the file has another form; the message names the frame and the field.
     """
     path = Path(file)
     try:

@@ -42,11 +42,7 @@ class PhotoGroup:
     def __init__(self, engine: Engine, queries: Sequence[Query], caller: Caller, list_name: str) -> None:
         """Makes a group whose computation has not begun.
 
-        Args:
-            engine: the engine that computes.
-            queries: the photographs.
-            caller: the caller of the group.
-            list_name: the field of the request that holds them, for messages about one of them.
+        Messages about a photograph name the request's field, `list_name`.
         """
         self.records: tuple[list[StageRecord], ...] = tuple([] for _ in queries)
         self._engine = engine
@@ -61,10 +57,8 @@ class PhotoGroup:
         """Localizes the photographs, as many concurrently as the engine can compute.
 
         All of them together would exceed the number that a caller may have waiting. A photograph for which the queue
-        has no room waits until another one of the group is done; only the first one can be refused.
-
-        Raises:
-            RequestError: as in `Engine.run`, with the field's path in the list.
+        has no room waits until another one of the group is done; only the first one can be refused. RequestError as in
+        `Engine.run`, with the field's path in the list.
         """
         count = min(len(self._queries), self._engine.parallel_queries)
         workers = [asyncio.ensure_future(self._work()) for _ in range(count)]

@@ -80,18 +80,11 @@ class QueueEngine:
         quota: Quota | None = None,
         method: Method | None = None,
     ) -> None:
-        """Makes an engine; its queue begins to compute with the first job.
+        """Makes an engine over tiers, the cheapest first; its queue begins to compute with the first job.
 
-        Args:
-            tiers: the tiers, the cheapest first; usually there is one.
-            references: references with features of every tier.
-            options: limits of the engine.
-            observer: is notified of what the queue does.
-            quota: quota of computing time for each tenant.
-            method: replaces the method's parts in tests.
-
-        Raises:
-            ValueError: no tier, or two with the same extractor or matcher.
+        The references have features of every tier. The observer is notified of what the queue does; the quota is the
+        computing time of each tenant; `method` replaces the method's parts in tests. ValueError for no tier, or two
+        with the same extractor or matcher.
         """
         check_tiers(tiers)
         self.tiers = tuple(tiers)
@@ -125,13 +118,9 @@ class QueueEngine:
     ) -> Job:
         """Makes the job of localizing a photograph, for `run`; its `records` list the stages that it has been through.
 
-        Args:
-            query: the photograph and what to compare it with.
-            caller: the caller of the query.
-            source: source of the references; None for those of the scene.
-            on_coarse: called on the event loop, before the answer, with the first tier's localization before its
-                refinement, if there is one; nothing has checked it. Called again if references are deleted while they
-                are used. The answer does not depend on it.
+        The references are those of the scene without another source. `on_coarse` is called on the event loop, before
+        the answer, with the first tier's localization before its refinement, if there is one; nothing has checked it.
+        It is called again if references are deleted while they are used. The answer does not depend on it.
         """
         views = QueryViews(query.photo, self.options.image_limits)
         run = QueryRun(query, source or self.references, views, caller.deadline_s)
@@ -144,8 +133,7 @@ class QueueEngine:
     async def run(self, job: Job) -> Result:
         """Computes a query's job and returns its result.
 
-        Raises:
-            RequestError: a bad image, unknown scene or reference, a full queue, a passed deadline.
+        RequestError for a bad image, unknown scene or reference, a full queue, a passed deadline.
         """
         with _as_request_errors():
             return cast(Result, await self.queue.run(job))
@@ -154,8 +142,7 @@ class QueueEngine:
     def hold(self, queries: Sequence[Query], caller: Caller) -> Iterator[None]:
         """Reserves the memory of a group's photographs for the duration of its call, however many of them are queued.
 
-        Raises:
-            RequestError: the queue has no room for them.
+        RequestError if the queue has no room for them.
         """
         with ExitStack() as stack:
             with _as_request_errors():
@@ -176,8 +163,7 @@ class QueueEngine:
     async def describe(self, photos: Sequence[Photo], caller: Caller) -> list[Description]:
         """Computes features and descriptors of photographs, in order.
 
-        Raises:
-            RequestError: a bad image, a full queue, a passed deadline.
+        RequestError for a bad image, a full queue, a passed deadline.
         """
         size_bytes = sum(len(photo.image) for photo in photos)
         return await self._each(DESCRIBE, photos, self.references.describe, caller, size_bytes)
@@ -187,8 +173,7 @@ class QueueEngine:
     ) -> Choice:
         """Chooses the references of a scene that resemble a photograph most.
 
-        Raises:
-            RequestError: a bad image, an unknown scene, a full queue, a passed deadline.
+        RequestError for a bad image, an unknown scene, a full queue, a passed deadline.
         """
 
         def choose(photo: Photo, check: Callable[[], None]) -> Choice:
@@ -204,9 +189,7 @@ class QueueEngine:
         """Audits references of a scene by their neighbours; returns the scene's generation and the audits, in order.
 
         References that do not exist any more are left out if `are_listed`, that is, if the caller did not name them.
-
-        Raises:
-            RequestError: an unknown scene or named reference, a full queue, a passed deadline.
+        RequestError for an unknown scene or named reference, a full queue, a passed deadline.
         """
         auditor = self.references.auditor(scene_key, () if are_listed else reference_ids)
         audits = await self._each(AUDIT, reference_ids, auditor.audit, caller, 0, jobs=1)
@@ -215,8 +198,7 @@ class QueueEngine:
     async def check_coverage(self, scene_key: SceneKey, view: Viewpoint, caller: Caller) -> tuple[int, Coverage]:
         """Predicts whether a photograph would be localized at a viewpoint; also returns the scene's generation.
 
-        Raises:
-            RequestError: an unknown scene, a full queue, a passed deadline.
+        RequestError for an unknown scene, a full queue, a passed deadline.
         """
         auditor = self.references.auditor(scene_key)
         (coverage,) = await self._each(COVERAGE, [view], auditor.check_coverage, caller, 0)
@@ -252,8 +234,7 @@ class QueueEngine:
     async def join(self, compute: Callable[[], Joined], caller: Caller) -> Joined:
         """Computes from several photographs' answers, in its turn in the queue, which does not refuse it.
 
-        Raises:
-            RequestError: a passed deadline.
+        RequestError for a passed deadline.
         """
 
         def once(_: None, check: Callable[[], None]) -> Joined:

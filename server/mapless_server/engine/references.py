@@ -141,16 +141,8 @@ class References:
     ) -> Choice:
         """Chooses references for a photograph by its global descriptor, or near a pose prior without reading it.
 
-        Args:
-            scene_key: the scene.
-            views: the photograph.
-            selection: how many references to choose, and among which.
-            context: cancels the computation and measures its time.
-
-        Raises:
-            NotFound: there is no such scene (field "scene") or reference (field "references[i]").
-            DataLoss: a named reference is damaged (field "references[i]").
-            InvalidArgument: the image is bad.
+        NotFound if there is no such scene (field "scene") or reference (field "references[i]"); DataLoss if a named
+        reference is damaged (same field); InvalidArgument if the image is bad.
         """
         # The scene comes first: a wrong name is found before the photograph is described.
         entries = self._indexes.entries(scene_key, context)

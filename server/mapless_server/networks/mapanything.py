@@ -211,8 +211,7 @@ class MapAnything(Network):
     def conditions(self, poses: Tensor, posed: Tensor, metric: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
         """See Network.conditions; returns the arguments unchanged, since scenes may differ in which views are posed.
 
-        Raises:
-            ValueError: the first view of a scene has no pose, but another one has.
+        ValueError if the first view of a scene has no pose, but another one has.
         """
         if (posed.any(1) & ~posed[:, 0]).any():
             raise ValueError("the first view must have a pose if any has: poses are relative to it")

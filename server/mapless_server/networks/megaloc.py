@@ -130,8 +130,7 @@ class Backbone(PlainEncoder):
     def forward(self, images: Tensor) -> Tensor:
         """Images (B, 3, H, W), sides multiples of 14, to tokens (B, 1 + P, C) float32; the class token comes first.
 
-        Raises:
-            ValueError: a side is not a multiple of 14.
+        ValueError if a side is not a multiple of 14.
         """
         patch_grid(images)
         tokens: Tensor = self.norm(super().forward(images))
@@ -175,8 +174,7 @@ class MegaLoc(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         """Images (B, 3, H, W) in [0, 1], sides multiples of 14, to descriptors (B, length) float32 of unit length.
 
-        Raises:
-            ValueError: a side is not a multiple of 14, or there are no more patches than SALAD has clusters.
+        ValueError if a side is not a multiple of 14, or there are no more patches than SALAD has clusters.
         """
         tokens = self.backbone((images - self.image_mean) / self.image_std)
         descriptors: Tensor = F.normalize(self.aggregator(tokens), dim=1)
@@ -197,10 +195,8 @@ class MegaLoc(nn.Module):
         """Shortens all later descriptors; the similarity of two keeps its expected value.
 
         Each new number is a sum of `signed_groups` of old ones, divided by the root of their count: a random projection
-        with orthonormal rows. It is built into the linear layer, which shrinks as the descriptors do.
-
-        Raises:
-            ValueError: the length does not divide the present one.
+        with orthonormal rows. It is built into the linear layer, which shrinks as the descriptors do. ValueError if the
+        length does not divide the present one.
         """
         if length == self.length:
             return

@@ -207,10 +207,8 @@ class Pi3X(PiNetwork):
     def conditions(self, poses: Tensor, posed: Tensor, metric: Tensor) -> tuple[Tensor, ...] | None:
         """See Network.conditions: normalized poses, and the indices (B, M') of the views that have one, two at least.
 
-        The unit does not matter. Views without a pose need plausible values, for these enter the scale.
-
-        Raises:
-            ValueError: scenes with different numbers of posed views.
+        The unit does not matter. Views without a pose need plausible values, for these enter the scale. ValueError for
+        scenes with different numbers of posed views.
         """
         counts = posed.sum(1)
         if (counts != counts[0]).any():

@@ -94,15 +94,9 @@ class BackgroundMatching:
     ) -> None:
         """Makes the object; nothing is matched before `start` or `match_waiting`.
 
-        Args:
-            store: store of the references.
-            indexes: by which references are chosen for queries.
-            matchings: the matchings to make, the most important first, with the finder that queries use for each.
-            is_idle: whether the server computes nothing for a caller.
-            observer: receives the events.
-            options: options of the matching.
-            calibrations: calibrates scenes when all references are matched; None calibrates none.
-            depths: makes depths of references, before the calibrations, which use them; None makes none.
+        The matchings are ordered, the most important first, each with the finder that queries use for it. `is_idle` is
+        whether the server computes nothing for a caller. Depths of references are made before scenes are calibrated,
+        which uses them and happens when all references are matched; None makes none.
         """
         self._store = store
         self._pairs = PairStore(store.database)

@@ -33,12 +33,8 @@ class SceneIndexes:
     ) -> None:
         """Makes the object without any index.
 
-        Args:
-            store: store of the references.
-            library: loads references that have no descriptor yet.
-            descriptor: global descriptor that the indexes contain.
-            extractor: extractor of the features that the descriptor is computed from.
-            capacity_bytes: largest size of all indexes; the most recently used one is kept however large it is.
+        The library loads references that have no descriptor yet, with the extractor's features, from which descriptors
+        are computed. All indexes have at most `capacity_bytes`; the most recently used one is kept however large it is.
         """
         self._store = store
         self._library = library
@@ -59,11 +55,8 @@ class SceneIndexes:
         """Returns the references of a scene as it is now.
 
         References without a descriptor are described now, one by one, and finished ones are kept if the context is
-        cancelled. A reference that cannot be described because it is damaged remains without a descriptor.
-
-        Raises:
-            NotFound: there is no such scene (field "scene").
-            Abandoned: the context is cancelled.
+        cancelled. A reference that cannot be described because it is damaged remains without a descriptor. NotFound if
+        there is no such scene (field "scene"); Abandoned if the context is cancelled.
         """
         # Even if the scene is evicted meanwhile, this call continues with the same index.
         cached = self._get(scene_key)

@@ -108,13 +108,9 @@ class ReferenceLibrary:
 
         References without features of the extractor are described now, one by one, and finished ones are kept if the
         context is cancelled; if `waits` is False, they are described in the background. Photographs are read when their
-        pixels are first used.
-
-        Raises:
-            FeaturesMissing: references lack features and `waits` is False.
-            NotFound: there is no such scene (field "scene") or reference (field "references[i]").
-            Abandoned: the context is cancelled.
-            DataLoss: stored data of one of them are damaged.
+        pixels are first used. FeaturesMissing if references lack features and `waits` is False; NotFound if there is no
+        such scene (field "scene") or reference (field "references[i]"); Abandoned if the context is cancelled; DataLoss
+        if stored data of one of them are damaged.
         """
         while True:
             snapshot = self._store.load_references(scene_key, reference_ids, extractor.name)
@@ -200,13 +196,9 @@ def load_usable(
 ) -> Loaded:
     """Loads references with these ids, in order, except those that cannot be loaded.
 
-    All are read at one moment. If some cannot be loaded, the others are read again, also at one moment.
-
-    Args:
-        load: function that loads some references, and fails if one of them fails.
-        reference_ids: ids of the references.
-        unusable: errors for which a reference is omitted; errors about the scene are raised.
-        report: called for each reference that is omitted.
+    All are read at one moment. If some cannot be loaded, because `load` fails with one of the errors `unusable`, the
+    others are read again, also at one moment, and `report` is called for each that is omitted. Errors about the scene
+    are raised.
     """
 
     def is_usable(reference_id: str) -> bool:

@@ -48,11 +48,7 @@ class Matching:
     ) -> Matches | None:
         """Matches two references, given `in_order`; None if the pair needs no matches of this kind.
 
-        Args:
-            first: a reference.
-            second: another one.
-            begun: matches by `base`, if they are stored.
-            pause: see `PairMatching`.
+        `begun` are matches by `base`, if they are stored; for `pause` see `PairMatching`.
         """
         if self.strong and not self.wide:
             nearest = self.matcher.match_pair(first, second) if begun is None else begun

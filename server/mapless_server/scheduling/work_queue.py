@@ -137,12 +137,8 @@ class WorkQueue:
     async def run(self, job: Job) -> Any:
         """Submits a job and waits for its result; cancelling the wait cancels the job.
 
-        Raises:
-            ValueError: the job has been run already.
-            Refused: there is no room for it.
-            Expired: its deadline passed.
-            Fatal: the queue has ended.
-            Exception: the exception with which its stage failed.
+        ValueError if the job has been run already; Refused if there is no room for it; Expired if its deadline passed;
+        Fatal if the queue has ended; or the exception with which its stage failed.
         """
         if job.is_over:
             raise ValueError("a job that has ended cannot be run again")
@@ -170,8 +166,7 @@ class WorkQueue:
     def hold(self, flow: Flow, size_bytes: int) -> Iterator[None]:
         """Books memory that a call of several jobs needs during the block; their own sizes then exclude it.
 
-        Raises:
-            Refused: there is no room for it.
+        Refused if there is no room for it.
         """
         with self._lock:
             self._scheduler.hold(flow, size_bytes)

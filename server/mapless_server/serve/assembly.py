@@ -136,21 +136,11 @@ def engine_over(
     pair_observer: PairObserver | None = None,
     depth_network: Reconstructor | None = None,
 ) -> QueueEngine:
-    """Makes an engine, and the references in memory that it uses.
+    """Makes an engine over tiers, the cheapest first, and the references in memory that it uses.
 
-    Args:
-        store: store of the references.
-        tiers: the tiers, the cheapest first.
-        options: limits of the engine.
-        observer: see `QueueEngine`.
-        quota: see `QueueEngine`.
-        method: see `QueueEngine`.
-        descriptor: global descriptor for choosing references; None makes one from the first tier's features.
-        pair_observer: receives events of the matching and the depths of references.
-        depth_network: makes the depths stored with references; None makes none.
-
-    Raises:
-        ValueError: there is no tier, two have the same extractor or matcher, or the descriptor uses other features.
+    For observer, quota and method see `QueueEngine`. The descriptor chooses references; None makes one from the first
+    tier's features. The depth network makes the depths that are stored with references; None makes none. ValueError if
+    there is no tier, two have the same extractor or matcher, or the descriptor uses other features.
     """
     check_tiers(tiers)
     extractors = [tier.extractor for tier in tiers]
@@ -220,12 +210,9 @@ def _tiers(features: str, device: str) -> tuple[tuple[str, ...], ...]:
 def make_tiers(settings: Settings) -> tuple[Tier, ...]:
     """Makes the tiers of the settings, the cheapest first.
 
-    `auto` leaves out features without weights or packages, and logs it; in the worst case only SIFT is used.
-
-    Raises:
-        ValueError: there is no such device.
-        WeightsError: weights are missing, or do not fit.
-        ImportError: a package that a network needs is not installed.
+    `auto` leaves out features without weights or packages, and logs it; in the worst case only SIFT is used. ValueError
+    if there is no such device; WeightsError if weights are missing, or do not fit; ImportError if a package that a
+    network needs is not installed.
     """
     device = device_for(settings)
     missing = _Missing()
@@ -322,8 +309,7 @@ def _present(tiers: Iterable[Sequence[str]], settings: Settings) -> Iterator[str
 def choose_device(device: str) -> str:
     """Chooses the device of networks; `auto` is a CUDA device if torch is installed and finds one, else the CPU.
 
-    Raises:
-        ValueError: there is no such device.
+    ValueError if there is no such device.
     """
     chosen = _find_device(device)
     if chosen != "cpu":

@@ -29,11 +29,7 @@ class GrpcServer:
     def __init__(
         self, settings: Settings, services: Services, credentials: grpc.ServerCredentials | None = None
     ) -> None:
-        """Binds its port.
-
-        Raises:
-            AddressTaken: another server uses the address, or it is not an address of this machine.
-        """
+        """Binds its port; AddressTaken if another server uses the address, or it is not an address of this machine."""
         self._server = grpc.aio.server(options=_options(settings), maximum_concurrent_rpcs=MAX_CONCURRENT_RPCS)
         services.add_to(self._server)
         host = f"[{settings.host}]" if ":" in settings.host else settings.host

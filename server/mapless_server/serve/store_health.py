@@ -23,10 +23,7 @@ async def watch_store(
 ) -> None:
     """Reports each change of whether the store can be written, until it is cancelled.
 
-    Args:
-        store: written to once at the beginning.
-        notify: called with the new value; the initial value is True.
-        interval_s: time between checks.
+    The store is written to once at the beginning; `notify` is called with the new value, which is True at first.
     """
     if store.database.is_shared:
         return

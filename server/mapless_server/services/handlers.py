@@ -135,9 +135,7 @@ class Services:
     async def drain(self, delay_s: float, grace_s: float) -> None:
         """Reports that the server stops serving; after a delay, refuses new calls and waits for the running ones.
 
-        Args:
-            delay_s: time for load balancers to notice, which send calls until their next health check.
-            grace_s: longest wait for running calls.
+        The delay is for load balancers, which send calls until their next health check; the wait is at most `grace_s`.
         """
         await self.set_serving(False)
         if delay_s:

@@ -51,12 +51,8 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
     ) -> None:
         """Makes the service; computes nothing yet.
 
-        Args:
-            engine: function that returns the engine; raises Unavailable while the server starts.
-            metrics: count answers and their quality.
-            store: the store of the scenes' attributes.
-            watchers: receive each answer of a single photograph.
-            recorder: captures answered calls; None to capture none.
+        `engine` returns the engine, and raises Unavailable while the server starts. Watchers receive each answer to a
+        single photograph; the recorder captures answered calls, None to capture none.
         """
         self._engine = engine
         self._metrics = metrics
@@ -239,14 +235,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
 async def localize_photographs(engine: Engine, queries: Sequence[Query], call: Call, list_name: str) -> GroupResult:
     """Localizes each photograph of a rig or a sequence, and records their stages even if one of them fails.
 
-    Args:
-        engine: the engine that computes.
-        queries: the photographs, of one scene.
-        call: the call that they belong to.
-        list_name: the field of the request that holds them.
-
-    Raises:
-        RequestError: as in `PhotoGroup.localize`.
+    The photographs, of one scene, are in the request's field `list_name`. RequestError as in `PhotoGroup.localize`.
     """
     call.note(scene=queries[0].scene_key, images=len(queries))
     group = PhotoGroup(engine, queries, call.caller, list_name)
@@ -262,14 +251,9 @@ async def coarse_then_final(
 ) -> AsyncGenerator[pb.LocalizeProgressivelyResponse, None]:
     """Yields the coarse answer as soon as it is known, if there is one, and then the final answer.
 
-    The answer is computed whether the messages are read or not, so a slow reader delays only its own messages. Closing
-    the generator cancels the answer, and frees its place in the queue.
-
-    Args:
-        answer: function that returns the final answer; before, it may set its argument to the coarse answer.
-
-    Raises:
-        Exception: any exception of `answer`, after the coarse message if there was one.
+    `answer` returns the final one; before, it may set its argument to the coarse one. It is computed whether the
+    messages are read or not, so a slow reader delays only its own messages. Closing the generator cancels the answer,
+    and frees its place in the queue. Any exception of `answer` is raised, after the coarse message if there was one.
     """
     coarse: FutureCoarseAnswer = asyncio.get_running_loop().create_future()
     answering = asyncio.ensure_future(answer(coarse))

@@ -86,12 +86,7 @@ class Watchers:
     """The watchers of all scenes."""
 
     def __init__(self, are_allowed: bool, max_message_bytes: int = 32 * 2**20) -> None:
-        """Makes the object without watchers.
-
-        Args:
-            are_allowed: the setting `allow_watching`: whether callers' photographs may be shown to others.
-            max_message_bytes: the largest message that can be sent.
-        """
+        """Makes the object without watchers; `are_allowed` is the setting `allow_watching`."""
         self._are_allowed = are_allowed
         self._max_message_bytes = max_message_bytes
         self._by_scene: dict[SceneKey, set[Watcher]] = {}
@@ -103,14 +98,7 @@ class Watchers:
     def publish(
         self, scene_key: SceneKey, request: pb.LocalizeRequest, response: pb.LocalizeResponse, debug: pb.Debug | None
     ) -> None:
-        """Sends an answer to the watchers of its scene.
-
-        Args:
-            scene_key: the scene.
-            request: the request with the photograph.
-            response: the response to the caller; it is copied, not changed.
-            debug: the matches; None if the computation ended before.
-        """
+        """Sends a copy of an answer to the watchers of its scene; no matches if the computation ended before."""
         watchers = self._by_scene.get(scene_key)
         if watchers is None:
             return
@@ -128,9 +116,7 @@ class Watchers:
     def check(self, tenant: str) -> None:
         """Checks whether a tenant may have another watcher.
 
-        Raises:
-            FailedPrecondition: the server is not configured to allow it.
-            Overloaded: there are too many watchers.
+        FailedPrecondition if the server is not configured to allow it; Overloaded if there are too many watchers.
         """
         if not self._are_allowed:
             raise FailedPrecondition(
@@ -145,8 +131,7 @@ class Watchers:
     def watch(self, scene_key: SceneKey) -> Watcher:
         """Makes a watcher of the scene's answers from now on, until it is closed.
 
-        Raises:
-            FailedPrecondition, Overloaded: see `check`.
+        FailedPrecondition or Overloaded, see `check`.
         """
         self.check(tenant_of(scene_key))
         watcher = Watcher(lambda it: self._unregister(scene_key, it), self._max_message_bytes)

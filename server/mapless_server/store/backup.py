@@ -37,10 +37,8 @@ _NOT_RESTORED = (store_version, alembic_version, scene_generation, removed_refer
 def back_up(database: Database, path: Path, on_progress: Progress = ignore_progress) -> Verification:
     """Copies a store to a file, as of one moment; servers may go on reading and writing it.
 
-    Data that are damaged in the store are damaged in the copy, too, and listed in the result.
-
-    Raises:
-        StoreError: the file exists or cannot be written, or differs from the store.
+    Data that are damaged in the store are damaged in the copy, too, and listed in the result. StoreError if the file
+    exists or cannot be written, or differs from the store.
     """
     if path.exists():
         raise StoreError(f"{path} exists already")
@@ -68,8 +66,7 @@ def back_up(database: Database, path: Path, on_progress: Progress = ignore_progr
 def restore(path: Path, database: Database, on_progress: Progress = ignore_progress) -> Verification:
     """Copies a backup into a store without scenes, either completely or not at all.
 
-    Raises:
-        StoreError: the file is damaged, of a newer program or no backup; or the store has scenes or cannot be written.
+    StoreError if the file is damaged, of a newer program or no backup; or the store has scenes or cannot be written.
     """
     with (
         _faults_as_store_errors(f"backup {path} cannot be restored"),

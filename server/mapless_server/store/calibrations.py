@@ -88,11 +88,8 @@ def release(database: Database, claim: CalibrationClaim) -> None:
 def add(store: Store, claim: CalibrationClaim, calibration: SelfCalibration, wait_s: float) -> bool:
     """Stores the calibration of a claimed scene, and ends the claim; False if the claim was lost.
 
-    Args:
-        store: store of the scene, whose cached values of the scene are dropped.
-        claim: claim of the scene.
-        calibration: the calibration; storing it is not a change of the scene.
-        wait_s: time until the scene may be calibrated again, however often it changes.
+    It is not a change of the scene, but cached values of the scene are dropped. The scene may be calibrated again after
+    `wait_s`, however often it changes.
     """
     data = codec.encode_calibration(calibration)
     sha256 = codec.sha256_for(rows.calibration_owner(claim.scene_key, claim.kind), data)

@@ -71,11 +71,7 @@ def sha256_for(owner: str, data: bytes) -> str:
 
 
 def encode_geometry(camera: Camera, world_from_camera: RigidTransform) -> bytes:
-    """Camera and pose as JSON.
-
-    Raises:
-        ValueError: a number is not finite.
-    """
+    """Camera and pose as JSON; ValueError if a number is not finite."""
     pose = {"rotation": world_from_camera.rotation.tolist(), "translation": world_from_camera.translation.tolist()}
     return _to_json({"camera": _camera_to_dict(camera), "world_from_camera": pose})
 
@@ -83,8 +79,7 @@ def encode_geometry(camera: Camera, world_from_camera: RigidTransform) -> bytes:
 def decode_geometry(owner: str, data: bytes, sha256: str) -> tuple[Camera, RigidTransform]:
     """The camera and pose that `encode_geometry` was given; read-only arrays.
 
-    Raises:
-        Damaged: the checksum or the form of the data is wrong.
+    Damaged if the checksum or the form of the data is wrong.
     """
     check(owner, data, sha256, "camera and pose")
     with _checked_form("camera and pose"):
@@ -109,11 +104,7 @@ def encode_attributes(attributes: SceneAttributes) -> bytes | None:
 
 
 def decode_attributes(owner: str, data: bytes | None, sha256: str | None) -> SceneAttributes:
-    """The attributes that `encode_attributes` was given.
-
-    Raises:
-        Damaged: the checksum or the form of the data is wrong.
-    """
+    """The attributes that `encode_attributes` was given; Damaged if the checksum or the form of the data is wrong."""
     if data is None and sha256 is None:
         return SceneAttributes()
     check(owner, data, sha256 or "", "datum, down and calibration")
@@ -133,19 +124,14 @@ def decode_attributes(owner: str, data: bytes | None, sha256: str | None) -> Sce
 
 
 def encode_calibration(calibration: SelfCalibration) -> bytes:
-    """A self-calibration as JSON.
-
-    Raises:
-        ValueError: a number is not finite.
-    """
+    """A self-calibration as JSON; ValueError if a number is not finite."""
     return _to_json(asdict(calibration))
 
 
 def decode_calibration(owner: str, data: bytes, sha256: str) -> SelfCalibration:
     """The self-calibration that `encode_calibration` was given.
 
-    Raises:
-        Damaged: the checksum or the form of the data is wrong.
+    Damaged if the checksum or the form of the data is wrong.
     """
     check(owner, data, sha256, "calibration")
     with _checked_form("calibration"):
@@ -155,8 +141,7 @@ def decode_calibration(owner: str, data: bytes, sha256: str) -> SelfCalibration:
 def encode_view(view: View) -> bytes:
     """Processed camera and features as one blob, of format 2 if descriptors have 8 bits.
 
-    Raises:
-        ValueError: an array is not float32 (storing it would round it), or a number is not finite.
+    ValueError if an array is not float32 (storing it would round it), or a number is not finite.
     """
     features = view.features
     if features.descriptors.dtype.itemsize == 1:
@@ -193,8 +178,7 @@ def _blob(version: int, view: View, how: dict[str, Any], arrays: Sequence[NDArra
 def decode_view(owner: str, blob: bytes, sha256: str) -> View:
     """The view that `encode_view` was given, apart from the rounding of format 2; read-only arrays.
 
-    Raises:
-        Damaged: the checksum does not match, or the format is unknown.
+    Damaged if the checksum does not match, or the format is unknown.
     """
     check(owner, blob, sha256, "features")
     with _checked_form("features"):
@@ -241,8 +225,7 @@ def decode_poses(geometries: Sequence[bytes]) -> list[RigidTransform]:
 def encode_descriptor(vector: NDArray[np.float32]) -> bytes:
     """A global descriptor, rounded to float16.
 
-    Raises:
-        ValueError: it is not a vector, is empty, or a number is not finite as float16.
+    ValueError if it is not a vector, is empty, or a number is not finite as float16.
     """
     if vector.ndim != 1 or not len(vector):
         raise ValueError(f"a global descriptor must be a vector, has shape {vector.shape}")
@@ -272,8 +255,7 @@ def encode_matches(matches: Matches) -> bytes:
 def decode_matches(owner: str, data: bytes, sha256: str) -> Matches:
     """The matches that `encode_matches` was given; read-only.
 
-    Raises:
-        Damaged: the checksum or the form of the data is wrong.
+    Damaged if the checksum or the form of the data is wrong.
     """
     check(owner, data, sha256, "matches")
     with _checked_form("matches"):
@@ -283,8 +265,7 @@ def decode_matches(owner: str, data: bytes, sha256: str) -> Matches:
 def encode_depth(kept: KeptDepth) -> bytes:
     """A depth map, rounded to 1 %.
 
-    Raises:
-        ValueError: a depth is not above 0, or the farthest is e^600 times as far as the nearest.
+    ValueError if a depth is not above 0, or the farthest is e^600 times as far as the nearest.
     """
     known = np.isfinite(kept.depth)
     if not (kept.depth[known] > 0).all():
@@ -307,8 +288,7 @@ def encode_depth(kept: KeptDepth) -> bytes:
 def decode_depth(owner: str, blob: bytes, sha256: str) -> KeptDepth:
     """The depth map that `encode_depth` was given, rounded; read-only.
 
-    Raises:
-        Damaged: the checksum or the form of the data is wrong, or the format is unknown.
+    Damaged if the checksum or the form of the data is wrong, or the format is unknown.
     """
     check(owner, blob, sha256, "depth")
     with _checked_form("depth"):

@@ -69,8 +69,7 @@ class PendingDeletions:
     def run(self) -> None:
         """Deletes the rows of all detached scenes; references on pages that cannot be freed are moved aside.
 
-        Raises:
-            Overloaded: the disk has too little space even to delete one reference.
+        Overloaded if the disk has too little space even to delete one reference.
         """
         if not self._is_pending():
             return

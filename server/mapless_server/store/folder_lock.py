@@ -29,9 +29,7 @@ class FolderLock:
     def take(folder: Path, database_file: str) -> "FolderLock":
         """Locks for the one server that reads and writes; creates the database file if missing.
 
-        Raises:
-            StoreError: another server has them.
-            OSError: the folder or the file cannot be used.
+        StoreError if another server has them; OSError if the folder or the file cannot be used.
         """
         with ExitStack() as stack:
             holder = _open(stack, folder / LOCK_FILE, os.O_RDWR | os.O_CREAT)
@@ -49,9 +47,7 @@ class FolderLock:
     def share(path: Path) -> "FolderLock":
         """Takes the lock for one of several servers that only read a database file.
 
-        Raises:
-            StoreError: a server that may write has it.
-            OSError: there is no such file, or it cannot be read.
+        StoreError if a server that may write has it; OSError if there is no such file, or it cannot be read.
         """
         with ExitStack() as stack:
             if not _is_locked(_open(stack, path, os.O_RDONLY), fcntl.LOCK_SH):

@@ -91,9 +91,7 @@ class PairStore:
     def claim(self, matching: str, progress: Progress) -> Claim | None:
         """Claims a reference whose pairs are not matched; None if none may be claimed now.
 
-        Args:
-            matching: name of the matching.
-            progress: this server's progress with this matching, new at first; it is updated.
+        `progress` is this server's with this matching, new at first; it is updated.
         """
         while True:
             with self._database.read() as connection:

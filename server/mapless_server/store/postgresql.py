@@ -74,21 +74,14 @@ class PostgresqlDatabase:
     def open(database_url: str) -> "PostgresqlDatabase":
         """Connects, and migrates an empty or older database to this program's schema.
 
-        Args:
-            database_url: "postgresql://user:password@host:5432/database"; libpq's options may follow after "?".
-
-        Raises:
-            StoreError: the URL is invalid, the database cannot be reached, or it contains something else.
+        The URL is "postgresql://user:password@host:5432/database"; libpq's options may follow after "?". StoreError if
+        it is invalid, the database cannot be reached, or it contains something else.
         """
         return PostgresqlDatabase._opened(database_url, migrates=True)
 
     @staticmethod
     def open_as_is(database_url: str) -> "PostgresqlDatabase":
-        """Connects to a store without migrating it.
-
-        Raises:
-            StoreError: as in `open`, or the database is empty.
-        """
+        """Connects to a store without migrating it; StoreError as in `open`, or if the database is empty."""
         return PostgresqlDatabase._opened(database_url, migrates=False)
 
     @staticmethod

@@ -120,12 +120,7 @@ class StoreReader:
 
     @observed
     def get_scene(self, scene_key: SceneKey) -> SceneRecord:
-        """Returns a scene.
-
-        Raises:
-            NotFound: there is no such scene.
-            DataLoss: its attributes are damaged.
-        """
+        """Returns a scene; NotFound if there is no such scene; DataLoss if its attributes are damaged."""
         with self._database.read() as connection:
             return rows.scene_record(queries.find_scene(connection, scene_key))
 
@@ -139,11 +134,8 @@ class StoreReader:
     def get_attributes(self, scene_key: SceneKey) -> SceneAttributes:
         """Attributes of a scene, with its self-calibrations.
 
-        They are cached if only this process writes, since every query needs them.
-
-        Raises:
-            NotFound: there is no such scene.
-            DataLoss: the attributes are damaged.
+        They are cached if only this process writes, since every query needs them. NotFound if there is no such scene;
+        DataLoss if the attributes are damaged.
         """
         state = self._state
         cached = None if self._database.is_shared else self._attributes.get(scene_key)
@@ -161,8 +153,7 @@ class StoreReader:
     def list_scenes(self, tenant: str, limit: int, after: str = "") -> list[SceneRecord]:
         """At most `limit` scenes of a tenant, ordered by id, with ids greater than `after`.
 
-        Raises:
-            DataLoss: the attributes of one of them are damaged.
+        DataLoss if the attributes of one of them are damaged.
         """
         page = queries.select_scenes_of(tenant, after).limit(limit)
         with self._database.read() as connection:
@@ -178,9 +169,7 @@ class StoreReader:
     def get_reference(self, scene_key: SceneKey, reference_id: str) -> ReferenceRecord:
         """Returns a reference without its image.
 
-        Raises:
-            NotFound: there is no such scene or reference.
-            DataLoss: its camera and pose are damaged.
+        NotFound if there is no such scene or reference; DataLoss if its camera and pose are damaged.
         """
         with self._database.read() as connection:
             key = queries.find_key(connection, scene_key, reference_id)
@@ -191,9 +180,7 @@ class StoreReader:
     def read_image(self, scene_key: SceneKey, reference_id: str) -> bytes:
         """Reads the image's bytes as they were added.
 
-        Raises:
-            NotFound: there is no such scene or reference.
-            DataLoss: the bytes are damaged.
+        NotFound if there is no such scene or reference; DataLoss if the bytes are damaged.
         """
         with self._database.read() as connection:
             return _read_image(connection, queries.find_key(connection, scene_key, reference_id))
@@ -202,9 +189,7 @@ class StoreReader:
     def read_image_of(self, key: str) -> bytes:
         """Reads the image's bytes as they were added, by the reference's key.
 
-        Raises:
-            NotFound: the reference was deleted.
-            DataLoss: the bytes are damaged.
+        NotFound if the reference was deleted; DataLoss if the bytes are damaged.
         """
         with self._database.read() as connection:
             return _read_image(connection, key)
@@ -213,20 +198,14 @@ class StoreReader:
     def list_references(self, scene_key: SceneKey, limit: int, after: str = "") -> list[ReferenceRecord]:
         """At most `limit` references of a scene, ordered by id, with ids greater than `after`.
 
-        Raises:
-            NotFound: there is no such scene.
-            DataLoss: camera and pose of one of them are damaged.
+        NotFound if there is no such scene; DataLoss if camera and pose of one of them are damaged.
         """
         found = self._read_page(select(tables.reference), scene_key, limit, after)
         return [rows.reference_record(row) for row in found]
 
     @observed
     def list_reference_ids(self, scene_key: SceneKey, limit: int, after: str = "") -> list[str]:
-        """Ids of at most `limit` references, including damaged ones.
-
-        Raises:
-            NotFound: there is no such scene.
-        """
+        """Ids of at most `limit` references, including damaged ones; NotFound if there is no such scene."""
         found = self._read_page(select(tables.reference.c.reference_id), scene_key, limit, after)
         return [row.reference_id for row in found]
 
@@ -241,8 +220,7 @@ class StoreReader:
     def find_keys(self, scene_key: SceneKey, reference_ids: Sequence[str]) -> dict[str, str]:
         """Keys, by id, of those of these references that exist, including damaged ones.
 
-        Raises:
-            NotFound: there is no such scene.
+        NotFound if there is no such scene.
         """
         with self._database.read() as connection:
             queries.read_generation(connection, scene_key)
@@ -254,16 +232,9 @@ class StoreReader:
     ) -> SceneSnapshot:
         """Loads references with their features, those without features, and the generation, all read at one moment.
 
-        References that were loaded before come from memory.
-
-        Args:
-            scene_key: the scene.
-            reference_ids: which references, in the order wanted; None for all, ordered by id.
-            extractor: name of the extractor of the features.
-
-        Raises:
-            NotFound: there is no such scene (field "scene") or reference (field "references[i]").
-            DataLoss: features, camera or pose of one of them are damaged.
+        They are in the order of their ids' list; all, ordered by id, for None. References that were loaded before come
+        from memory. NotFound if there is no such scene (field "scene") or reference (field "references[i]"); DataLoss
+        if features, camera or pose of one of them are damaged.
         """
         state, last_deletion = self._state, self._last_deletion
         names = None if reference_ids is None else tuple(reference_ids)
@@ -313,15 +284,9 @@ class StoreReader:
 
     @observed
     def list_changes(self, scene_key: SceneKey, since_generation: int | None, descriptor_name: str) -> SceneChanges:
-        """Reads what has changed in a scene since a generation, at one moment.
+        """Reads what has changed in a scene since a generation, None for the whole scene, at one moment.
 
-        Args:
-            scene_key: the scene.
-            since_generation: the generation that the caller knows; None for the whole scene.
-            descriptor_name: name of the global descriptor.
-
-        Raises:
-            NotFound: there is no such scene.
+        NotFound if there is no such scene.
         """
         with self._database.read() as connection:
             return read_changes(connection, scene_key, since_generation, descriptor_name)

@@ -77,10 +77,8 @@ class SqliteDatabase:
     def open(folder: Path) -> SqliteDatabase:
         """Opens the database of a data folder, migrated to this program's schema; creates both if missing.
 
-        A database on a read-only disk can be read; changes are refused.
-
-        Raises:
-            StoreError: the folder or file cannot be used, is in use, or contains something else.
+        A database on a read-only disk can be read; changes are refused. StoreError if the folder or file cannot be
+        used, is in use, or contains something else.
         """
         path = folder / DATABASE_FILE
         try:
@@ -120,8 +118,7 @@ class SqliteDatabase:
     def open_scratch(path: Path, version: int = SCHEMA_VERSION) -> SqliteDatabase:
         """Opens a file that may be lost until it is complete, without waiting for the disk; creates it if missing.
 
-        Raises:
-            StoreError: as in `open`.
+        StoreError as in `open`.
         """
         return SqliteDatabase._opened(path, None, version, is_scratch=True)
 
@@ -129,8 +126,7 @@ class SqliteDatabase:
     def open_as_is(path: Path) -> SqliteDatabase:
         """Opens a database for reading without migrating it: a running server's, or a backup.
 
-        Raises:
-            StoreError: there is no such file, or it contains something else.
+        StoreError if there is no such file, or it contains something else.
         """
         if not path.is_file():
             raise StoreError(f"there is no database {path}")
@@ -240,13 +236,10 @@ def _explain(error: DBAPIError, name: str) -> str:
 def create_sqlite_engine(
     path: Path, only_reads: bool = False, is_scratch: bool = False, never_changes: bool = False
 ) -> Engine:
-    """Makes connections to a file, each configured for a store that must not lose anything.
+    """Makes connections to a file, created if missing, each configured for a store that must not lose anything.
 
-    Args:
-        path: the file, created if missing.
-        only_reads: the file must exist, and is not changed.
-        is_scratch: the file may be lost.
-        never_changes: no process writes it, so no lock is taken and no file created beside it.
+    If it `only_reads`, the file must exist, and is not changed. A file `is_scratch` if it may be lost. If it
+    `never_changes`, no process writes it, so no lock is taken and no file created beside it.
     """
     library = choose_library()
     safe_mode = has_wal_reset_bug(library.sqlite_version_info)

@@ -58,15 +58,10 @@ class Store(StoreReader):
 
     @staticmethod
     def open(data_dir: Path, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Store:
-        """Opens the store of a data folder; creates both if missing.
+        """Opens the store of a data folder, on a local disk that no other server uses; creates both if missing.
 
-        Args:
-            data_dir: a folder on a local disk that no other server uses.
-            cache_bytes: largest size of the features cached in memory, 0 or more.
-
-        Raises:
-            StoreError: the folder or the database cannot be used, with one sentence that says why.
-            ValueError: cache_bytes is negative.
+        At most `cache_bytes` of features are cached in memory. StoreError if the folder or the database cannot be used,
+        with one sentence that says why; ValueError if `cache_bytes` is negative.
         """
         described: LruCache[DescribedReference] = LruCache(cache_bytes)
         return Store._resumed(SqliteDatabase.open(data_dir), described)
@@ -75,13 +70,9 @@ class Store(StoreReader):
     def connect(database_url: str, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Store:
         """Opens the store of a PostgreSQL database, which other servers may use, too; creates tables if missing.
 
-        Args:
-            database_url: "postgresql://user:password@host:5432/database"; libpq's options may follow after "?".
-            cache_bytes: largest size of the features cached in memory, 0 or more.
-
-        Raises:
-            StoreError: the database cannot be reached or used, with one sentence that says why, without the password.
-            ValueError: cache_bytes is negative.
+        The URL is as in `PostgresqlDatabase.open`; at most `cache_bytes` of features are cached in memory. StoreError
+        if the database cannot be reached or used, with one sentence that says why, without the password; ValueError if
+        `cache_bytes` is negative.
         """
         described: LruCache[DescribedReference] = LruCache(cache_bytes)
         return Store._resumed(PostgresqlDatabase.open(database_url), described)
@@ -96,10 +87,7 @@ class Store(StoreReader):
         """The same database without caches, for reading what queries do not; the caches and their counts do not change.
 
         It is valid as long as this store, and need not be closed. Only features are written through it, which does not
-        invalidate this store's caches.
-
-        Args:
-            cache_bytes: largest size of a cache of features of its own.
+        invalidate this store's caches. It may have a cache of features of its own, of `cache_bytes`.
         """
         return Store(self._database, LruCache(cache_bytes), name_cache_bytes=0)
 
@@ -118,11 +106,7 @@ class Store(StoreReader):
 
     @observed
     def create_scene(self, scene_key: SceneKey, attributes: SceneAttributes = NO_ATTRIBUTES) -> SceneRecord:
-        """Creates a scene without references.
-
-        Raises:
-            AlreadyExists: the id is taken.
-        """
+        """Creates a scene without references; AlreadyExists if the id is taken."""
         now, scene = _now(), tables.scene
         with self.changing() as connection:
             generation = queries.raise_generation(connection, scene_key)
@@ -147,13 +131,9 @@ class Store(StoreReader):
         """Changes attributes of a scene; None deletes an attribute.
 
         Damaged attributes are replaced if datum, down_in_world and calibration are given; then the unit is the metre
-        unless it is given.
-
-        Raises:
-            NotFound: there is no such scene.
-            DataLoss: an attribute that is not given is damaged.
-            ContradictingDown: datum and down_in_world do not belong to the same world.
-            DatumWithoutMetres: there would be a datum, and an arbitrary unit.
+        unless it is given. NotFound if there is no such scene; DataLoss if an attribute that is not given is damaged;
+        ContradictingDown if datum and down_in_world do not belong to the same world; DatumWithoutMetres if there would
+        be a datum, and an arbitrary unit.
         """
         if isinstance(calibration, Calibration):
             calibration = replace(calibration, create_time=_now())
@@ -175,18 +155,12 @@ class Store(StoreReader):
 
     @observed
     def delete_scene(self, scene_key: SceneKey) -> frozenset[str]:
-        """Deletes a scene and all its references.
+        """Deletes a scene and all its references; returns the keys of those that were cached in memory.
 
         The scene does not exist any more after one transaction. Its rows are then deleted in portions, so that other
         calls need not wait; if that is interrupted, it is completed when the store is opened again, or by the next call
-        of this method.
-
-        Returns:
-            Keys of its references that were cached in memory.
-
-        Raises:
-            NotFound: there is no such scene.
-            Overloaded: the disk is full; the scene may be deleted all the same, with some of its rows left.
+        of this method. NotFound if there is no such scene; Overloaded if the disk is full, and the scene may be deleted
+        all the same, with some of its rows left.
         """
         try:
             with self.changing() as connection:
@@ -208,14 +182,9 @@ class Store(StoreReader):
     def add_references(self, scene_key: SceneKey, references: Sequence[NewReference]) -> list[ReferenceRecord]:
         """Adds all of the references or none, each with all its features and descriptors, as one change of the scene.
 
-        Returns:
-            The new references in the order given.
-
-        Raises:
-            NotFound: there is no such scene.
-            AlreadyExists: an id is taken or occurs twice; the field is "requests[i].reference_id".
-            ValueError: features are not float32, a number of a camera, pose or descriptor is not finite, no reference
-                is given, or one without any features.
+        Returns the new references in the order given. NotFound if there is no such scene; AlreadyExists if an id is
+        taken or occurs twice (field "requests[i].reference_id"); ValueError if features are not float32, a number of a
+        camera, pose or descriptor is not finite, no reference is given, or one without any features.
         """
         if not references:
             raise ValueError("references must have at least one item")
@@ -242,15 +211,9 @@ class Store(StoreReader):
     def add_features(self, key: str, extractor: str, view: View) -> None:
         """Stores another extractor's features of a reference's image; not a change of the scene, see SceneRecord.
 
-        Args:
-            key: key of the reference; its id may now be that of another image.
-            extractor: name of the extractor of the features.
-            view: processed camera and features.
-
-        Raises:
-            NotFound: the reference was deleted.
-            AlreadyExists: the reference has features of this extractor.
-            ValueError: features are not float32, or a number of the camera is not finite.
+        The key is the reference's, whose id may now be that of another image. NotFound if the reference was deleted;
+        AlreadyExists if it has features of this extractor; ValueError if features are not float32, or a number of the
+        camera is not finite.
         """
         row = rows.features_row(key, extractor, view)
         with self.changing() as connection:
@@ -261,18 +224,10 @@ class Store(StoreReader):
 
     @observed
     def add_descriptor(self, key: str, name: str, vector: NDArray[np.float32]) -> None:
-        """Stores a global descriptor that a reference lacks, and keeps an existing one; a change of its scene.
+        """Stores a global descriptor (D,) that a reference lacks, and keeps an existing one; a change of its scene.
 
-        `list_changes` then lists the reference among those added.
-
-        Args:
-            key: key of the reference.
-            name: name of the global descriptor.
-            vector: (D,) the descriptor, finite.
-
-        Raises:
-            NotFound: the reference was deleted.
-            ValueError: the descriptor is not a vector, or a number is not finite as float16.
+        `list_changes` then lists the reference among those added. NotFound if the reference was deleted; ValueError if
+        the descriptor is not a vector, or a number is not finite as float16.
         """
         row = rows.descriptor_row(key, name, vector)
         reference = tables.reference
@@ -290,11 +245,7 @@ class Store(StoreReader):
     def delete_reference(self, scene_key: SceneKey, reference_id: str) -> str:
         """Deletes a reference with its image and features, also a damaged one, whose pages are then lost.
 
-        Returns:
-            The reference's key.
-
-        Raises:
-            NotFound: there is no such scene or reference.
+        Returns its key. NotFound if there is no such scene or reference.
         """
         try:
             key = self._delete_reference(scene_key, reference_id, deletion.delete_references)

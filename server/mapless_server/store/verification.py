@@ -59,11 +59,8 @@ def verify(connection: Connection, on_progress: Progress = ignore_progress) -> V
     """Checks the whole store, in the caller's transaction, which must see one moment.
 
     Remaining rows of a deleted scene are counted, but not checked. Matches of references are not checked here, but when
-    they are used; damaged ones are made again.
-
-    Raises:
-        ValueError: the database is no store, or one of a newer program.
-        DataLoss: the database itself is damaged, so that not even its version can be read.
+    they are used; damaged ones are made again. ValueError if the database is no store, or one of a newer program;
+    DataLoss if the database itself is damaged, so that not even its version can be read.
     """
     version = read_version(connection)
     if version is None:

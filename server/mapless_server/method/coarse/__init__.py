@@ -122,8 +122,7 @@ class Reconstructor(Protocol):
     def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
         """Returns the bucket of a query, which has at least one reference.
 
-        Raises:
-            ValueError: a view lacks input of the backend.
+        ValueError if a view lacks input of the backend.
         """
         ...
 

@@ -221,8 +221,7 @@ class Layout:
     def picture(self, photograph: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Makes the picture (3, H, W), 0 to 1, of a photograph (H, W, 3) RGB, filled with the mean of the shown pixels.
 
-        Raises:
-            ValueError: the photograph is not of its camera's size.
+        ValueError if the photograph is not of its camera's size.
         """
         if photograph.shape != (self.source.height_px, self.source.width_px, 3):
             raise ValueError(f"a photograph of shape {photograph.shape} does not belong to {self.source}")

@@ -87,8 +87,7 @@ SUPPORTING_SHARE = 0.1
 def viewpoint_gap(support: Support) -> tuple[float, float]:
     """Distance to the nearest reference that holds the pose, over the median depth of the inliers; and that depth.
 
-    Raises:
-        ValueError: there is no estimate.
+    ValueError if there is no estimate.
     """
     if support.estimate is None:
         raise ValueError("support.estimate must not be None")

@@ -77,14 +77,9 @@ class Auditor:
         check: Callable[[], None] = lambda: None,
         cached_findings: int = 3000,
     ) -> None:
-        """Makes the auditor of a scene.
+        """Makes the auditor of a scene; `check` is called before each comparison, and may raise.
 
-        Args:
-            finder: finder of the scene's references.
-            options: options of the audit.
-            pairs: caches matches between calls.
-            check: called before each comparison; may raise.
-            cached_findings: number of findings that are kept.
+        The pairs cache matches between calls; `cached_findings` is the number of findings that are kept.
         """
         self._finder, self._options, self._pairs, self._check = finder, options, pairs, check
         self._findings: LruCache[_Finding] = LruCache(cached_findings)

@@ -76,14 +76,9 @@ def check_coverage(
     pairs: PairMatches,
     options: CoverageOptions | None = None,
 ) -> Coverage:
-    """Predicts whether a photograph taken by a camera at a pose would be localized.
+    """Predicts whether a photograph taken by a camera (of the processed image, without distortion) would be localized.
 
-    Args:
-        camera: camera of the processed image, without distortion.
-        world_from_camera: its pose, metric.
-        finder: finder of the scene's references.
-        pairs: caches matches between calls.
-        options: options of the prediction.
+    The pose is metric; `pairs` caches matches between calls.
     """
     options = options or CoverageOptions()
     world_from_camera = world_from_camera.shifted(-finder.origin)

@@ -48,15 +48,10 @@ class ReferenceFinder:
         similar: Similar,
         cached_views: int = 500,
     ) -> None:
-        """Makes a finder of references among rows of a scene's entries.
+        """Makes a finder of references among rows (N,) of a scene's entries, ascending.
 
-        Args:
-            scene_id: the scene, of which the references' names are made.
-            entries: entries of the scene.
-            rows: (N,) the rows to be found, ascending.
-            load: loads references by name, in order, except those that have been deleted or damaged.
-            similar: finds similar references.
-            cached_views: number of loaded references that are kept, about 1.2 MB each.
+        `load` returns references by name, in order, except those that have been deleted or damaged; the names are made
+        of the scene's id. `cached_views` loaded references are kept, about 1.2 MB each.
         """
         self._scene_id, self._entries, self._rows = scene_id, entries, rows
         # World coordinates may be millions of metres (UTM, ECEF), which would cost digits of differences of squares.

@@ -20,14 +20,10 @@ def report(
     is_same_photograph: bool = False,
     change: Change | None = None,
 ) -> ReferenceAudit:
-    """Makes the result for a reference.
+    """Makes the result for a reference, from the comparison on which the verdict is based.
 
-    Args:
-        comparison: the comparison on which the verdict is based.
-        verdict: the verdict on the reference.
-        other: partner of a swap or duplicate, or the neighbour that it contradicts.
-        is_same_photograph: whether a duplicate is the same photograph, not only the same view.
-        change: change of the scene, if one was searched for.
+    `other` is the partner of a swap or duplicate, or the neighbour that it contradicts; `is_same_photograph` whether a
+    duplicate is more than the same view; `change` the scene's, if one was searched for.
     """
     fit = _fitted(comparison, verdict)
     best = comparison.fits.get(Free.BOTH)

@@ -88,9 +88,8 @@ class SceneAuditor:
     def audit(self, reference_id: str, check: Callable[[], None]) -> ReferenceAudit | None:
         """Audits a reference; None if it is missing and was not named.
 
-        Raises:
-            NotFound: there is no such scene (field "scene") or reference that was named (field "references[i]").
-            Unavailable: the scene is being emptied.
+        NotFound if there is no such scene (field "scene") or reference that was named (field "references[i]");
+        Unavailable if the scene is being emptied.
         """
         self._check = check
         return self._retried(lambda: self._audit(reference_id))
@@ -98,9 +97,7 @@ class SceneAuditor:
     def check_coverage(self, view: Viewpoint, check: Callable[[], None]) -> Coverage:
         """Predicts whether a photograph taken at a viewpoint would be localized.
 
-        Raises:
-            NotFound: there is no such scene (field "scene").
-            Unavailable: the scene is being emptied.
+        NotFound if there is no such scene (field "scene"); Unavailable if the scene is being emptied.
         """
         self._check = check
         return self._retried(lambda: self._check_coverage(view))

@@ -59,8 +59,7 @@ class SceneCalibrations:
     def calibrate_next(self, pause: Callable[[], None]) -> bool:
         """Calibrates one scene that may be claimed now; returns False if there is none. Raises if the store fails.
 
-        Args:
-            pause: called in the middle of the work; may raise, which ends it.
+        `pause` is called in the middle of the work; it may raise, which ends it.
         """
         database = self._store.database
         claim = claim_scene(database, self.kind)

@@ -80,14 +80,8 @@ class Calibrator:
     ) -> SelfCalibration:
         """Localizes references of a scene, and fits the model to the results.
 
-        Args:
-            scene_key: key of the scene.
-            library: loads its references.
-            newest: ids of its latest references, the latest first.
-            pause: called between the stages of each; may raise, which ends it.
-
-        Raises:
-            NotFound: there is no such scene (field "scene").
+        `newest` are ids of its latest references, the latest first; `pause` is called between the stages of each, and
+        may raise, which ends it. NotFound if there is no such scene (field "scene").
         """
         begin_s = time.thread_time()
         context = StageContext(pause)

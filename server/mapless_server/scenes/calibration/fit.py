@@ -98,14 +98,7 @@ class LeftOut:
 
 
 def fit(results: Sequence[LeftOut], kind: str, generation: int, options: FitOptions | None = None) -> SelfCalibration:
-    """Fits the calibration of a scene; without enough right answers it changes nothing.
-
-    Args:
-        results: results of the references that were localized.
-        kind: kind of the answers.
-        generation: generation of the scene.
-        options: options of the model.
-    """
+    """Fits the calibration of a scene to answers of a kind; without enough right answers it changes nothing."""
     options = options or FitOptions()
     right = [it for it in results if it.is_right]
     if len(right) < options.least_answers:

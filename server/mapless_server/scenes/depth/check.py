@@ -76,18 +76,10 @@ def checked_depths(
     correspondences: Correspondences,
     options: DepthCheckOptions,
 ) -> list[KeptDepth | None]:
-    """Returns the part of each reference's predicted depths that is kept.
+    """Returns the part of each reference's predicted depths that is kept; None if nothing is.
 
-    Args:
-        reconstruction: reconstruction of the references and the photograph whose pose was not given.
-        scale: its metric scale.
-        references: the references, with their poses.
-        world_from_query: the pose that was not given.
-        correspondences: matches of the references with one another.
-        options: options of the check.
-
-    Returns:
-        For each reference its depth, or None if nothing is kept.
+    The reconstruction, in the metric scale, is of the references and of the photograph whose pose was not given, but is
+    `world_from_query`; the correspondences are those of the references with one another.
     """
     structure = triangulated_structure(
         references, correspondences, StructureOptions(min_parallax_deg=options.min_parallax_deg)

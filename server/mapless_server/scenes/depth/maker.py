@@ -72,18 +72,8 @@ class DepthMaker:
         """Makes the depths of a reference and of its neighbours that the network gets with it, by key.
 
         A depth that is not kept is None. The result is empty if the reference has fewer than two neighbours that share
-        matches with it.
-
-        Args:
-            scene_key: key of the scene.
-            library: loads its references.
-            reference_id: id of the reference.
-            check: called between the steps; may raise, which ends it.
-
-        Raises:
-            NotFound: the reference or the scene was deleted.
-            DataLoss: the reference is damaged.
-            Exception: any exception of the network.
+        matches with it. `check` is called between the steps, and may raise, which ends it. NotFound if the reference or
+        the scene was deleted, DataLoss if the reference is damaged, or any exception of the network.
         """
         context = StageContext(check)
         _, (subject,) = library.load(scene_key, [reference_id], self._extractor, context)

@@ -54,8 +54,7 @@ class SceneDepths:
     def make_next(self, pause: Callable[[], None]) -> bool:
         """Makes the depth of one reference that may be claimed now; False if there is none. Raises if the store fails.
 
-        Args:
-            pause: called in the middle of the work; may raise, which ends it.
+        `pause` is called in the middle of the work; it may raise, which ends it.
         """
         if self._maker is None:
             return False

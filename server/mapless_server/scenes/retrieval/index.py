@@ -169,8 +169,7 @@ class SceneIndex:
     def apply(self, changes: SceneChanges) -> None:
         """Updates the index; readers see all of the change or none.
 
-        Raises:
-            ValueError: a descriptor has another length; nothing is changed then.
+        ValueError if a descriptor has another length; nothing is changed then.
         """
         for reference in changes.added:
             if reference.descriptor is not None:
@@ -186,8 +185,7 @@ class SceneIndex:
     def describe(self, vectors: Mapping[str, Vector]) -> None:
         """Adds vectors that were computed later, by the references' keys; ignores unknown references.
 
-        Raises:
-            ValueError: a vector has another length.
+        ValueError if a vector has another length.
         """
         for vector in vectors.values():
             self._check(vector)

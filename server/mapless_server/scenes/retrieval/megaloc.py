@@ -104,9 +104,7 @@ class MegaLocDescriptor:
     def describe(self, view: View) -> Vector:
         """See GlobalDescriptor.describe.
 
-        Raises:
-            ValueError: the view has no photograph.
-            RequestError: the photograph cannot be read.
+        ValueError if the view has no photograph; RequestError if the photograph cannot be read.
         """
         vector: Vector = self.describe_many([view])[0]
         return vector

@@ -111,15 +111,10 @@ class Choice:
 
 
 def rank_references(entries: Entries, vector: Vector | None, selection: Selection) -> list[RankedReference]:
-    """Selects references, in the order of choice.
+    """Selects references by the photograph's descriptor (D,), None if it has none, in the order of choice.
 
     References without a descriptor come last. These, or all references if the photograph has no descriptor, are ordered
     by their distance from the likely position of the camera, or as they were stored.
-
-    Args:
-        entries: entries of the scene.
-        vector: the photograph's descriptor, (D,); None if it has none.
-        selection: which references to select.
     """
     options, narrowing, count = selection.options, selection.narrowing, selection.count
     rows = entries.rows(selection.among or None)

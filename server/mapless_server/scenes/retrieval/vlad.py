@@ -129,11 +129,7 @@ class VladDescriptor:
         return VladDescriptor(extractor.name, shipped(kind))
 
     def describe(self, view: View) -> Vector:
-        """See GlobalDescriptor.describe.
-
-        Raises:
-            ValueError: the features are of another kind than the vocabulary.
-        """
+        """See GlobalDescriptor.describe; ValueError if the features are of another kind than the vocabulary."""
         descriptors = view.features.unit_descriptors()
         if not len(descriptors):
             return np.zeros(DIMENSION, np.float32)

@@ -154,11 +154,8 @@ def encode_call(call: CapturedCall) -> bytes:
 def decode_call(data: bytes) -> CapturedCall:
     """Decodes the content of a call's file.
 
-    All names, times and blobs are checked, since a digest shows damage, but not who wrote the file.
-
-    Raises:
-        DamagedCapture: the file is cut or changed.
-        CaptureError: the file has the format of another version.
+    All names, times and blobs are checked, since a digest shows damage, but not who wrote the file. DamagedCapture if
+    the file is cut or changed; CaptureError if the file has the format of another version.
     """
     digest, body = data[:_DIGEST_BYTES], data[_DIGEST_BYTES:]
     if hashlib.sha256(body).digest() != digest:

@@ -64,19 +64,11 @@ class Collector:
     def part(
         self, scene: SceneRecord, used: UsedReferences, extractors: Sequence[str], blobs: dict[str, bytes]
     ) -> CapturedPart:
-        """Reads what a photograph was compared with.
+        """Reads what a photograph was compared with; `blobs` receives the blobs that the folder lacks.
 
-        Args:
-            scene: the scene as it is now.
-            used: the photograph's used references.
-            extractors: names of all the server's extractors, since a replay may use each of them.
-            blobs: receives the blobs that the folder lacks.
-
-        Raises:
-            ReferencesDeleted: a reference that was used was deleted or replaced meanwhile; or none was used and the
-                scene has changed, so that it may be another scene of the same name.
-            DataLoss: a reference is damaged.
-            Unavailable: the store cannot be read.
+        The extractors are all of the server's, since a replay may use each of them. ReferencesDeleted if a reference
+        that was used was deleted or replaced meanwhile, or none was used and the scene has changed, so that it may be
+        another scene of the same name; DataLoss if a reference is damaged; Unavailable if the store cannot be read.
         """
         if not used.used and used.generation != scene.generation:
             raise ReferencesDeleted

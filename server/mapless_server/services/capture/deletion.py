@@ -39,15 +39,10 @@ class StaleCalls:
         self._known: dict[SceneKey, tuple[int, References]] = {}
 
     def delete(self, folder: CaptureFolder) -> int:
-        """Deletes these calls; a fault of one scene or file does not keep those of the others.
+        """Deletes these calls; a fault of one scene or file does not keep those of the others. Returns their number.
 
-        Returns:
-            The number of calls that were deleted.
-
-        Raises:
-            Unavailable: the store cannot be read; nothing more is found until it can.
-            OSError: a file cannot be deleted.
-            Exception: a scene cannot be read.
+        Unavailable if the store cannot be read, and nothing more is found until it can; OSError if a file cannot be
+        deleted; any exception for which a scene cannot be read.
         """
         entries = sorted(folder.entries(), key=lambda it: it.scene_key)
         by_scene = {key: list(calls) for key, calls in groupby(entries, lambda it: it.scene_key)}
@@ -96,12 +91,9 @@ class Deletion:
     """Deletes the calls of one folder on time, until it is closed."""
 
     def __init__(self, folder: CaptureFolder, store: Store, report_fault: Callable[[str, Exception], None]) -> None:
-        """Starts its threads.
+        """Starts its threads, of which only one reads the store.
 
-        Args:
-            folder: the folder of the calls.
-            store: the store of the scenes; only one of the threads reads it.
-            report_fault: called with what failed and the error, from any thread, and again after every attempt.
+        `report_fault` is called with what failed and the error, from any thread, and again after every attempt.
         """
         self._folder = folder
         self._stale = StaleCalls(store)

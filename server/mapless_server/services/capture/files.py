@@ -42,8 +42,7 @@ def disk_bytes(size_bytes: int) -> int:
 def open_folder(folder: Path) -> int:
     """Creates the folder, or checks that it is a capture folder, and locks it until the descriptor is closed.
 
-    Raises:
-        CaptureError: the folder cannot be written, has other files, is in use, or has the format of another version.
+    CaptureError if the folder cannot be written, has other files, is in use, or has the format of another version.
     """
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -69,8 +68,7 @@ def is_locked_by(folder: Path, lock: int) -> bool:
 def check_format(folder: Path) -> None:
     """Checks that a folder is a capture folder that this version can read.
 
-    Raises:
-        CaptureError: the folder does not exist, is no capture folder, or has the format of another version.
+    CaptureError if the folder does not exist, is no capture folder, or has the format of another version.
     """
     try:
         found = json.loads((folder / MARKER_FILE).read_bytes())["format"]

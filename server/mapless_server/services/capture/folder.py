@@ -97,8 +97,7 @@ class CaptureFolder:
     def __init__(self, path: Path, retention: Retention, clock: Callable[[], float] = time.time) -> None:
         """Opens and locks the folder, creates it if it does not exist, and applies the limits to what is in it.
 
-        Raises:
-            CaptureError: as in `files.open_folder`, or a file in the folder cannot be read or deleted.
+        CaptureError as in `files.open_folder`, or if a file in the folder cannot be read or deleted.
         """
         self.path = path
         self._retention = retention
@@ -147,18 +146,11 @@ class CaptureFolder:
     def add(self, call: CapturedCall, blobs: Mapping[str, bytes]) -> bool:
         """Writes a call, after deleting as many of the oldest ones as it needs room.
 
-        Args:
-            call: the call; its tenant and scene must be valid names.
-            blobs: its blobs that the folder lacks, by SHA-256.
-
-        Returns:
-            Whether the call was written. A call that exceeds the limit alone is not, and nothing is deleted for it.
-
-        Raises:
-            OSError: the call cannot be written, for example because the disk is full; no part of it is left in the
-                folder.
-            BlobDeleted: a blob that the folder had was deleted meanwhile; collect the call's blobs again.
-            CaptureError: the folder was deleted by hand, and another server uses it now.
+        Its tenant and scene are valid names. The blobs, by SHA-256, are those that the folder lacks. Returns whether
+        the call was written: one that exceeds the limit alone is not, and nothing is deleted for it. OSError if it
+        cannot be written, for example because the disk is full, and no part of it is left; BlobDeleted if a blob that
+        the folder had was deleted meanwhile, so that the call's blobs must be collected again; CaptureError if the
+        folder was deleted by hand, and another server uses it now.
         """
         data = encode_call(call)
         with self._guard:
@@ -186,13 +178,9 @@ class CaptureFolder:
             return True
 
     def expire(self) -> float:
-        """Deletes expired calls.
+        """Deletes expired calls; returns the seconds until the next one expires, or the limit of time if there is none.
 
-        Returns:
-            Seconds until the next call expires; the limit of time if there is none.
-
-        Raises:
-            OSError: a file cannot be deleted; all others are deleted, and it is tried again next time.
+        OSError if a file cannot be deleted; all others are deleted, and it is tried again next time.
         """
         with self._guard:
             now_s, monotonic_s = self._clock(), time.monotonic()

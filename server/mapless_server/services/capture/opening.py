@@ -59,8 +59,7 @@ log = logging.getLogger(__name__)
 def open_recorder(settings: Settings, store: Store, metrics: Metrics) -> Recorder | None:
     """Opens the recorder if the settings want one; logs a warning, since photographs are then stored.
 
-    Raises:
-        CaptureError: the folder cannot be used, or capture_tenants has an invalid name.
+    CaptureError if the folder cannot be used, or capture_tenants has an invalid name.
     """
     if settings.capture_dir is None:
         return None

@@ -132,14 +132,11 @@ class Recorder:
         circumstances: Callable[[Sequence[Tier]], Mapping[str, str]] = lambda _: {},
         tenants: frozenset[str] = frozenset(),
     ) -> None:
-        """Starts the threads that write and delete; does not wait for the store.
+        """Starts the threads that write and delete.
 
-        Args:
-            folder: the folder of the calls; closed with the recorder.
-            store: the store of the references; to be closed after the recorder.
-            observer: counts calls.
-            circumstances: function that returns what else decides the tiers' answers, see `circumstances_of`.
-            tenants: tenants whose calls are captured; empty for all.
+        Does not wait for the store, which is to be closed after the recorder. The folder is closed with the recorder.
+        For `circumstances`, which also decide the tiers' answers, see `circumstances_of`. Only calls of the tenants are
+        captured; of all, if there are none.
         """
         self.folder = folder
         self._observer = observer
@@ -166,15 +163,10 @@ class Recorder:
         parts: Sequence[tuple[Query, Result]],
         tiers: Sequence[Tier],
     ) -> None:
-        """Queues an answered call for writing; to be called on the event loop.
+        """Queues an answered call for writing, with its photographs in order and their results.
 
-        Args:
-            request: the message as it was received.
-            response: the message; its diagnostics are set to say whether the call is captured. Neither message may
-                change later.
-            call: the call.
-            parts: its photographs, in order, with their results.
-            tiers: all tiers of the server.
+        Called on the event loop. The response's diagnostics are set to say whether the call is captured. Neither
+        message may change later.
         """
         if self._tenants and call.principal.tenant not in self._tenants:
             return

@@ -228,15 +228,11 @@ def set_frames(
     session_from_camera: RigidTransform | None,
     datum: Datum | None,
 ) -> None:
-    """Sets the pose in the caller's frames: `in_axes`, and `geo_pose` if there is a datum.
+    """Sets the pose in the caller's frames: `in_axes`, and `geo_pose` if the scene has a datum.
 
-    Args:
-        message: the answer, which is changed.
-        world_from_camera: pose of the camera in OpenCV's axes.
-        covariance: (6, 6) as reported, so calibrated if the answer is; None if there is none.
-        axes: axes of the caller.
-        session_from_camera: the device's pose at the time of capture, in these axes; None if the request has none.
-        datum: datum of the scene.
+    `world_from_camera` is in OpenCV's axes; the covariance (6, 6) is as reported, calibrated if the answer is, None if
+    there is none. `session_from_camera` is the device's pose at the time of capture, in the caller's axes; None if the
+    request has none.
     """
     framed = message.in_axes
     framed.axes = enum_to_message(axes, pb.Axes)

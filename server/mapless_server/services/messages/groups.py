@@ -59,18 +59,10 @@ def queries_from_message(
     engine: EngineOptions,
     attributes: SceneAttributes,
 ) -> tuple[Query, ...]:
-    """Converts the photographs of a request to queries.
+    """Converts the photographs of a request, in its field `list_name`, to queries of the tenant.
 
-    Args:
-        request: the message.
-        list_name: its field that holds them.
-        bounds: least and largest number of photographs.
-        tenant: the scene's owner.
-        engine: limits and defaults.
-        attributes: attributes of the scene; may be empty unless `needs_attributes` is true for a photograph.
-
-    Raises:
-        FieldError, InvalidArgument: names the wrong field, "images[2].intrinsics".
+    Their number has the least and largest value `bounds`. The scene's attributes may be empty unless `needs_attributes`
+    is true for a photograph. FieldError and InvalidArgument name the wrong field, "images[2].intrinsics".
     """
     scene_id = wire.scene_id_from_name(request.scene, "scene")
     messages = getattr(request, list_name)

@@ -66,8 +66,7 @@ def reference_key_from_name(name: str, field: str, tenant: str) -> tuple[SceneKe
 def reference_ids_from_names(names_given: Sequence[str], scene_id: str, most: int) -> tuple[str, ...]:
     """Ids of the references in a request's `references`, in order.
 
-    Raises:
-        FieldError: there are more than `most`, or a name is not a reference's, of another scene, or repeated.
+    FieldError if there are more than `most`, or a name is not a reference's, of another scene, or repeated.
     """
     if len(names_given) > most:
         more = f"; at most {MAX_CANDIDATES} with options.rerank_references (--rerank)" if most == MAX_REFERENCES else ""
@@ -87,9 +86,8 @@ def reference_ids_from_names(names_given: Sequence[str], scene_id: str, most: in
 def photo_from_message(message: Any, path: str, limits: ImageLimits) -> Photo:
     """Reads the photograph of a message's `image` and `intrinsics`; reads only the image's header, so it is fast.
 
-    Raises:
-        FieldError: the intrinsics are missing, out of range, or of another size than the image.
-        InvalidArgument: the image is refused by its header.
+    FieldError if the intrinsics are missing, out of range, or of another size than the image; InvalidArgument if the
+    image is refused by its header.
     """
     if not message.HasField("intrinsics"):
         raise FieldError(joined(path, "intrinsics"), "is required")
@@ -179,12 +177,7 @@ def reference_count_from_message(message: pb.LocalizeOptions) -> int:
 
 
 def options_from_message(message: pb.LocalizeOptions, coverage: float) -> LocalizeOptions:
-    """Reads the options of the method; FieldError names a wrong field.
-
-    Args:
-        message: the request's options.
-        coverage: the default of the server.
-    """
+    """Reads the options of the method, with the server's default `coverage`; FieldError names a wrong field."""
     if not 0 <= message.coverage < 1:
         raise FieldError("options.coverage", f"must be above 0 and below 1, or 0, is {message.coverage:g}")
     defaults = LocalizeOptions()
@@ -221,14 +214,9 @@ def needs_attributes(request: Any) -> bool:
 def priors_from_message(request: Any, attributes: SceneAttributes) -> tuple[Narrowing, Priors]:
     """Reads the priors of a request: limits on the references to choose from, and priors on the pose.
 
-    Args:
-        request: any message with some of the fields position_prior, geo_position_prior, gravity_prior, heading_prior
-            and pose_prior.
-        attributes: attributes of its scene.
-
-    Raises:
-        FieldError: a value is out of range; or a geo position is given together with a position or for a scene without
-            a datum, or gravity although neither the request nor the scene has a down direction in the world.
+    The request has some of the fields position_prior, geo_position_prior, gravity_prior, heading_prior and pose_prior.
+    FieldError if a value is out of range; or a geo position is given together with a position or for a scene without a
+    datum, or gravity although neither the request nor the scene has a down direction in the world.
     """
     limits: dict[str, Any] = {}
     soft: dict[str, Any] = {}

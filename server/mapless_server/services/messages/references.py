@@ -172,8 +172,7 @@ def attributes_from_message(request: pb.CreateSceneRequest) -> SceneAttributes:
 def changes_from_message(request: pb.UpdateSceneRequest) -> dict[str, Any]:
     """Reads the arguments of `Store.update_scene`: the fields in a request's mask, None for those that its scene lacks.
 
-    Raises:
-        FieldError: the mask is empty or names a field that cannot be changed, or a value is wrong.
+    FieldError if the mask is empty or names a field that cannot be changed, or a value is wrong.
     """
     paths = list(dict.fromkeys(request.update_mask.paths))
     if not paths:

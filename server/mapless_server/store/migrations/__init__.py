@@ -26,8 +26,7 @@ log = logging.getLogger(__name__)
 def read_version(connection: Connection) -> int | None:
     """Version of the schema; None for an empty database.
 
-    Raises:
-        ValueError: the database holds something else, or a store of a newer program.
+    ValueError if the database holds something else, or a store of a newer program.
     """
     names = inspect(connection).get_table_names()
     if not names:
@@ -43,16 +42,10 @@ def read_version(connection: Connection) -> int | None:
 
 
 def migrate(connection: Connection, to_version: int = SCHEMA_VERSION) -> int | None:
-    """Migrates a database in the connection's transaction, which must be the only one.
+    """Migrates a database in the connection's transaction, which must be the only one; returns its version before.
 
-    An empty database gets the current schema at once, which is quicker; a test checks that the steps lead to the same
-    schema. Only copies of older databases need another version.
-
-    Returns:
-        The version before the migration; None for an empty database.
-
-    Raises:
-        ValueError: as in `read_version`.
+    An empty database, whose version is None, gets the current schema at once, which is quicker; a test checks that the
+    steps lead to the same schema. Only copies of older databases need another version. ValueError as in `read_version`.
     """
     found = read_version(connection)
     if found is None and to_version == SCHEMA_VERSION:
