@@ -383,7 +383,9 @@ class TestRematching:
         planted = self.pair_matching(setting)
         setting.engine.tiers[1].pipeline.matcher.pair_s = 8.0
         cost_s = {"prepare": 0.1, "coarse": 0.5, "refine": 9.0}
-        monkeypatch.setattr(CostModel, "predict", lambda _, stage, kind: 8.0 if "rematch" in kind else cost_s[stage])
+        monkeypatch.setattr(
+            CostModel, "predict", lambda _, stage, kind, *__: 8.0 if "rematch" in kind else cost_s[stage]
+        )
         result = setting.localize(deadline_s)
         assert result.tier.extractor.name == "strong"
         assert planted.calls == calls
@@ -500,7 +502,9 @@ class TestDescribingReferences:
         self, setting: Setting, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         seen: list[tuple[str, float]] = []
-        monkeypatch.setattr(CostModel, "observe", lambda _, stage, __, seconds: seen.append((stage, seconds)))
+        monkeypatch.setattr(
+            CostModel, "observe", lambda _, stage, __, ___, seconds, ____: seen.append((stage, seconds))
+        )
         setting.replies["cheap"] = localized(SURE_INLIERS)
         add_undescribed(setting, 2)
         extract = setting.extractors["cheap"].extract

@@ -40,7 +40,7 @@ from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import PoseStage
 from mapless_server.observability.metrics import Metrics
-from mapless_server.scheduling import CostModel, Job
+from mapless_server.scheduling import CostModel, Flow, Job
 from mapless_server.security import RateLimiter
 from mapless_server.serve.assembly import MakeEngine, StartupError, engine_options, engine_over, make_tiers
 from mapless_server.serve.warm_up import ROUNDS, warm_up
@@ -106,6 +106,9 @@ def engine_of(localize: Callable[..., Answer], begin: Callable[[], object] = lam
     return make
 
 
+NEW = Flow("", "new")
+
+
 async def test_the_queue_expects_the_duration_of_the_last_round(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -113,9 +116,9 @@ async def test_the_queue_expects_the_duration_of_the_last_round(
     seen: list[tuple[str, str, float]] = []
     observe = CostModel.observe
 
-    def watched(costs: CostModel, stage: str, kind: str, seconds: float) -> None:
+    def watched(costs: CostModel, stage: str, kind: str, flow: Flow, seconds: float, now_s: float) -> None:
         seen.append((stage, kind, seconds))
-        observe(costs, stage, kind, seconds)
+        observe(costs, stage, kind, flow, seconds, now_s)
 
     monkeypatch.setattr(CostModel, "observe", watched)
 
@@ -128,7 +131,7 @@ async def test_the_queue_expects_the_duration_of_the_last_round(
         pass
     assert [stage for stage, _, _ in seen] == ["prepare", "coarse", "refine"] * ROUNDS
     for stage, kind, seconds in seen[-3:]:
-        assert engine.queue._scheduler.costs.predict(stage, kind) == pytest.approx(seconds)
+        assert engine.queue._scheduler.costs.predict(stage, kind, NEW, 0.0) == pytest.approx(seconds)
 
 
 def test_the_warm_up_is_charged_to_no_tenant(tmp_path: Path) -> None:

@@ -3,42 +3,64 @@
 The cost of a job is predicted from jobs of its kind (`CostModel`), and booked while it is admitted (`Ledger`).
 """
 
-from collections import Counter, OrderedDict
+import math
+from collections import Counter, OrderedDict, deque
 from collections.abc import Mapping
+from statistics import median_low
 
 from .jobs import Flow, Job, Refusal, Refused
 from .options import WorkQueueOptions
 
-MAX_KINDS = 1000
 FIRST_GUESS_S = 0.25
 """Predicted before anything is observed."""
 MEMORY = 10
 """About so many of the last jobs of a kind count."""
+MAX_OF_CALLERS = 4000
+"""Predictions for single callers that are kept, about four of each."""
+FORGOTTEN_S = 30.0
+"""What a caller's jobs cost longer ago does not count: as long as it is refused, nothing corrects its prediction."""
+MAX_BOOKED_SHARE = 0.25
+"""Largest share of `max_queued_s` that is booked for one job, and that a caller's only job is refused for: otherwise
+long ones would be admitted on an idle server only, and then leave no room for others."""
 
 
 class CostModel:
-    """Predicts the computing time of a job in a stage: an average over its kind, with more weight for recent jobs."""
+    """Predicts the computing time of a job in a stage from earlier ones of its kind.
+
+    Photographs of a caller resemble one another, and those of another caller may take fifty times as long: so its own
+    jobs count, as an average with more weight for recent ones, which begins with what is typical. That is the median of
+    all callers' last jobs.
+    """
 
     def __init__(self) -> None:
-        self._kinds: OrderedDict[tuple[str, str], tuple[int, float]] = OrderedDict()
+        self._of_callers: OrderedDict[tuple[str, str, Flow], tuple[int, float, float]] = OrderedDict()
+        self._of_all: dict[tuple[str, str], deque[float]] = {}
 
     def forget(self) -> None:
         """Forgets all observations."""
-        self._kinds.clear()
+        self._of_callers.clear()
+        self._of_all.clear()
 
-    def predict(self, stage: str, kind: str) -> float:
-        """Predicted seconds; for an unknown kind, the average over all kinds in the stage."""
-        known = self._kinds.get((stage, kind)) or self._kinds.get((stage, ""))
-        return FIRST_GUESS_S if known is None else known[1]
+    def predict(self, stage: str, kind: str, flow: Flow, now_s: float) -> float:
+        """Predicted seconds; for an unknown kind, what is typical of all kinds in the stage."""
+        _, mean_s, seen_s = self._of_callers.get((stage, kind, flow), (0, 0.0, -math.inf))
+        if now_s - seen_s <= FORGOTTEN_S:
+            return mean_s
+        known = self._of_all.get((stage, kind)) or self._of_all.get((stage, ""))
+        return median_low(known) if known else FIRST_GUESS_S
 
-    def observe(self, stage: str, kind: str, seconds: float) -> None:
+    def observe(self, stage: str, kind: str, flow: Flow, seconds: float, now_s: float) -> None:
         """Records the computing time of a job; its share, if it was computed with others."""
-        for key in ((stage, kind), (stage, "")):
-            count, mean_s = self._kinds.pop(key, (0, 0.0))
-            count = min(count + 1, MEMORY)
-            self._kinds[key] = (count, mean_s + (seconds - mean_s) / count)
-        while len(self._kinds) > MAX_KINDS:
-            self._kinds.popitem(last=False)
+        count, mean_s, seen_s = self._of_callers.pop((stage, kind, flow), (0, 0.0, -math.inf))
+        if now_s - seen_s > FORGOTTEN_S:
+            known = self._of_all.get((stage, kind))
+            count, mean_s = (1, median_low(known)) if known else (0, 0.0)
+        count = min(count + 1, MEMORY)
+        self._of_callers[stage, kind, flow] = (count, mean_s + (seconds - mean_s) / count, now_s)
+        if len(self._of_callers) > MAX_OF_CALLERS:
+            self._of_callers.popitem(last=False)
+        for key in (kind, ""):
+            self._of_all.setdefault((stage, key), deque(maxlen=MEMORY)).append(seconds)
 
 
 class Ledger:
@@ -94,6 +116,10 @@ class Ledger:
     def size_bytes(self, flow: Flow | None = None) -> int:
         """Memory held by one caller, or by all."""
         return self._of(flow).size_bytes
+
+    def job_count(self, flow: Flow) -> int:
+        """Number of one caller's jobs."""
+        return self._of(flow).jobs
 
     def booked_s(self, lane: str, flow: Flow | None = None) -> float:
         """Computing time predicted for the jobs of one caller, or of all."""
@@ -169,12 +195,19 @@ class Admission:
     def check_queue(self, flow: Flow, cost_s: Counter[str]) -> None:
         """Raises Refused if no job of this cost can be admitted for a caller, whatever its deadline and size.
 
-        An idle server admits any cost: the prediction may be wrong, and only computing corrects it.
+        An idle server admits any cost: the prediction may be wrong, and only computing corrects it. A caller without
+        jobs is also admitted if its job would be done soon although all others got as much of the server as it does.
         """
         if self._is_closed:
             raise Refused(Refusal.DRAINING, "the server is stopping", UNKNOWN_RETRY_S)
-        for lane, own_s in cost_s.items() if self._ledger.jobs else ():
+        ledger = self._ledger
+        if not ledger.jobs:
+            return
+        is_first = not ledger.job_count(flow)
+        for lane, own_s in (self.bookable(cost_s) if is_first else cost_s).items():
             excess_s = self._excess_s(flow, lane, own_s)
+            if is_first:
+                excess_s = min(excess_s, ledger.ahead_s(flow, lane, own_s) + own_s - self._bound_s(lane))
             if excess_s > 0:
                 message = "as much is admitted already as can be computed soon"
                 raise Refused(Refusal.QUEUE_FULL, message, max(MIN_RETRY_S, excess_s / self._threads[lane]))
@@ -197,26 +230,24 @@ class Admission:
     def fits(self, job: Job, cost_s: Counter[str]) -> bool:
         """Whether an admitted job may continue although it now needs more than it was admitted with.
 
-        The only job may, since no other job waits. It is booked `within_bounds`, so that others are still admitted.
+        The only job may, since no other job waits.
         """
         if len(self._ledger.jobs) == 1:
             return True
         added_s = {lane: own_s - job.booked_s[lane] for lane, own_s in cost_s.items()}
         return all(it <= 0 or self._excess_s(job.flow, lane, it) <= 0 for lane, it in added_s.items())
 
-    def within_bounds(self, job: Job, cost_s: Counter[str]) -> Counter[str]:
-        """The part of an admitted job's cost that its caller may have, but no less than it was admitted with."""
-        bounded_s: Counter[str] = Counter()
-        for lane, own_s in cost_s.items():
-            room_s = max(0.0, -self._excess_s(job.flow, lane, 0.0))
-            bounded_s[lane] = min(own_s, job.booked_s[lane] + room_s)  # type: ignore[assignment]  # not int
-        return bounded_s
+    def bookable(self, cost_s: Counter[str]) -> Counter[str]:
+        """The part of a job's cost that is booked."""
+        return Counter({lane: min(own_s, MAX_BOOKED_SHARE * self._bound_s(lane)) for lane, own_s in cost_s.items()})
 
     def _excess_s(self, flow: Flow, lane: str, added_s: float) -> float:
         """Computing time by which a caller would exceed its bound with this much more."""
-        bound_s = self._options.max_queued_s * self._threads[lane]
         held_s = self._ledger.booked_s(lane, flow)
-        return held_s + added_s - self._share(bound_s, self._ledger.booked_s(lane), held_s)
+        return held_s + added_s - self._share(self._bound_s(lane), self._ledger.booked_s(lane), held_s)
+
+    def _bound_s(self, lane: str) -> float:
+        return self._options.max_queued_s * self._threads[lane]
 
     def _share(self, bound: float, held: float, held_by_flow: float) -> float:
         """The part of a bound that one caller may have, given what it and all callers have."""

@@ -10,6 +10,9 @@ from .jobs import Flow
 
 J = TypeVar("J", bound=Hashable)
 
+MAX_DEBTORS = 100
+"""Callers without waiting jobs whose debts are kept."""
+
 
 @dataclass
 class _Account(Generic[J]):
@@ -23,15 +26,15 @@ class FairQueue(Generic[J]):
     """Waiting jobs in the order in which they are to be computed.
 
     Deficit round robin (Shreedhar and Varghese, 1996) with overdrawing: each caller in turn is credited a quantum of
-    time and served while it has credit. If its last job costs more, it pays the rest back in later rounds, as long as
-    it has jobs waiting. So while two callers both wait, their shares differ by at most a quantum and two jobs, whatever
-    they send.
+    time and served while it has credit. If its last job costs more, it pays the rest back in later rounds, also if its
+    next job comes later, as the next step of a long one does. So while two callers both wait, their shares differ by at
+    most a quantum and two jobs, whatever they send.
     """
 
     def __init__(self, quantum_s: float) -> None:
         """A tenant's only caller gets `quantum_s` per round, which should be at least the cost of a typical job."""
         self._quantum_s = quantum_s
-        # Callers with waiting jobs only, in the order of their turns.
+        # Callers with waiting jobs or debts, in the order of their turns.
         self._accounts: OrderedDict[Flow, _Account[J]] = OrderedDict()
         self._callers_of_tenant: Counter[str] = Counter()
         self._flow_of: dict[J, Flow] = {}
@@ -66,27 +69,28 @@ class FairQueue(Generic[J]):
         flow = self._flow_of.pop(job)
         cost_s = self._accounts[flow].jobs.pop(job)
         self._cost_s -= cost_s
-        # Callers come and go without end, so neither credit nor debt is kept without waiting jobs.
-        if not self._accounts[flow].jobs:
-            del self._accounts[flow]
-            self._callers_of_tenant[flow.tenant] -= 1
-            if not self._callers_of_tenant[flow.tenant]:
-                del self._callers_of_tenant[flow.tenant]
+        self._forget_if_settled(flow)
+        debtors = [it for it, account in self._accounts.items() if not account.jobs]
+        if len(debtors) > MAX_DEBTORS:  # callers come and go without end
+            self._accounts[debtors[0]].credit_s = 0.0
+            self._forget_if_settled(debtors[0])
         return cost_s
 
-    def pop(self) -> J:
-        """Removes the next job and charges its caller; raises IndexError if none waits."""
-        if not self._flow_of:
+    def pop(self, is_allowed: Callable[[J], bool] = lambda _: True) -> J:
+        """Removes the next of the allowed jobs and charges its caller; raises IndexError if none waits."""
+        firsts = ((flow, next(filter(is_allowed, it.jobs), None)) for flow, it in self._accounts.items())
+        first_of = {flow: job for flow, job in firsts if job is not None}
+        if not first_of:
             raise IndexError("nothing waits")
-        for flow in list(self._accounts):
-            if self._accounts[flow].credit_s > 0:
-                return self._charge(next(iter(self._accounts[flow].jobs)))
-            self._begin_turn(flow, 1)
-        # All are in debt: skip the rounds in which no caller would be served.
-        idle_rounds = min(int(-it.credit_s / self._share_s(flow)) for flow, it in self._accounts.items())
-        for flow in list(self._accounts):
-            self._begin_turn(flow, max(0, idle_rounds))
-        return self.pop()
+        while True:
+            for flow in list(self._accounts):
+                if flow in first_of and self._accounts[flow].credit_s > 0:
+                    return self._charge(first_of[flow])
+                self._begin_turn(flow, 1)
+            # All are in debt: skip the rounds in which no caller would be served.
+            idle_rounds = min(int(-self._accounts[it].credit_s / self._share_s(it)) for it in first_of)
+            for flow in list(self._accounts):
+                self._begin_turn(flow, max(0, idle_rounds))
 
     def pop_alike(self, is_alike: Callable[[J], bool], at_most: int) -> list[J]:
         """Removes further jobs to compute with the last one, from each caller in turn, and charges for them."""
@@ -97,8 +101,19 @@ class FairQueue(Generic[J]):
         return [self._charge(job) for job in in_turn[:at_most]]
 
     def _begin_turn(self, flow: Flow, rounds: int) -> None:
-        self._accounts[flow].credit_s += rounds * self._share_s(flow)
+        account, share_s = self._accounts[flow], self._share_s(flow)
+        account.credit_s = min(account.credit_s + rounds * share_s, max(share_s, account.credit_s))
         self._accounts.move_to_end(flow)
+        self._forget_if_settled(flow)
+
+    def _forget_if_settled(self, flow: Flow) -> None:
+        """Forgets a caller that neither waits nor is in debt."""
+        if self._accounts[flow].jobs or self._accounts[flow].credit_s < 0:
+            return
+        del self._accounts[flow]
+        self._callers_of_tenant[flow.tenant] -= 1
+        if not self._callers_of_tenant[flow.tenant]:
+            del self._callers_of_tenant[flow.tenant]
 
     def _share_s(self, flow: Flow) -> float:
         """The credit of a caller per round, seconds."""
@@ -106,5 +121,6 @@ class FairQueue(Generic[J]):
 
     def _charge(self, job: J) -> J:
         account = self._accounts[self._flow_of[job]]
-        account.credit_s -= self.remove(job)
+        account.credit_s -= account.jobs[job]
+        self.remove(job)
         return job

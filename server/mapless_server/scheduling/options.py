@@ -8,8 +8,9 @@ class WorkQueueOptions:
     """Bounds of admission, order of computing, and supervision of the threads.
 
     Attributes:
-        max_queued_s: largest predicted computing time of the admitted jobs, seconds per thread of a lane. The result of
-            a job admitted beyond it would be late, and a longer queue has no higher throughput.
+        max_queued_s: largest predicted computing time of the admitted jobs, seconds per thread of a lane, besides a
+            caller's only job (see `Admission.check_queue`). The result of a job admitted beyond it would be late, and a
+            longer queue has no higher throughput.
         max_bytes: largest memory of admitted jobs, and of calls that consist of several jobs, together.
         flow_share: share, 0 to 1, that one caller may use of what other callers leave of either bound, so that there is
             always room for the next caller.

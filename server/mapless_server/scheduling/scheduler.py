@@ -6,13 +6,13 @@ A state machine without threads, waiting or a clock: times are passed in, so tha
 import heapq
 import itertools
 import weakref
-from collections import Counter
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
-from .admission import Admission, CostModel, Ledger
+from .admission import MAX_OF_CALLERS, Admission, CostModel, Ledger
 from .fair_queue import FairQueue
 from .jobs import (
     Abandoned,
@@ -35,6 +35,10 @@ from .observer import Observer
 from .options import WorkQueueOptions
 
 _TRY_ONE_IN = 8
+
+_ARRIVALS = 16
+_MUCH_SHORTER = 4
+"""A job that takes so many times less than the steps of others does not wait for them, if a lane has two threads."""
 
 _ENDED_TIMERS = 16
 """Timers of ended jobs that are kept in any case, so that they are not swept out too often."""
@@ -62,6 +66,8 @@ class _Lane:
         free: number of idle threads.
         passed_over: batches since the first stage that has waiting jobs was served.
         busy_s: sum of the threads' computing times so far.
+        computing_s: predicted times of the steps that are computed, by number of the batch.
+        arrivals: of the last jobs that have come to wait: caller, predicted time with later stages, time of arrival.
     """
 
     threads: int
@@ -69,6 +75,20 @@ class _Lane:
     free: int
     passed_over: int = 0
     busy_s: float = 0.0
+    computing_s: dict[int, float] = field(default_factory=dict)
+    arrivals: deque[tuple[Flow, float, float]] = field(default_factory=lambda: deque(maxlen=_ARRIVALS))
+
+    def allows(self, flow: Flow, seconds: float, now_s: float) -> bool:
+        """Whether a thread may compute a caller's step of this time.
+
+        It may not if all others compute such steps, and much shorter jobs are likely to come meanwhile, which would
+        wait for their ends. They are likely if one of another caller has come within as long a time.
+        """
+        short_s = seconds / _MUCH_SHORTER
+        others_are_long = sum(it > short_s for it in self.computing_s.values()) >= self.threads - 1 > 0
+        return not others_are_long or not any(
+            its_s <= short_s and now_s - came_s <= seconds and other != flow for other, its_s, came_s in self.arrivals
+        )
 
 
 _TRY_LARGER_AFTER = 64
@@ -139,6 +159,7 @@ class Scheduler:
         }
         self._limits: dict[tuple[str, str], _BatchLimit] = {}
         self._declined: Counter[tuple[str, str]] = Counter()
+        self._first_steps: OrderedDict[tuple[Flow, str], Step] = OrderedDict()
         self._ledger = Ledger()
         self._admission = Admission(options, lanes, self._ledger)
         # Timers. Weak references, because a job holds photographs and must be freed when it ends, not when it is due.
@@ -174,7 +195,9 @@ class Scheduler:
 
     def admit(self, job: Job, now_s: float) -> None:
         """Admits a job, which then ends exactly once; raises Refused without any change."""
-        cost_s = self._predict(job.step)
+        cost_s = self._predict(job.step, job.flow, now_s)
+        if not job.continues:
+            self._remember(job.flow, job.step)
         with self._refusals_reported():
             self._admission.check(job, cost_s, now_s)
             # The server's own jobs have no tenant and are free; a job that continues others is charged when it ends.
@@ -184,7 +207,7 @@ class Scheduler:
                 if wait_s > 0:
                     raise Refused(Refusal.TENANT_QUOTA, "the tenant's computing time is used up", wait_s)
         self._observer.admitted(cost_s.total())
-        self._ledger.open(job, cost_s)
+        self._ledger.open(job, self._admission.bookable(cost_s))
         self._enqueue(job, now_s)
 
     def hold(self, flow: Flow, size_bytes: int) -> None:
@@ -197,10 +220,14 @@ class Scheduler:
         """Undoes `hold`."""
         self._ledger.release(flow, size_bytes)
 
-    def check_room(self, flow: Flow, step: Step) -> None:
-        """Raises Refused if a caller's job with this first step would not be admitted, whatever its deadline."""
+    def check_room(self, flow: Flow, step: Step, now_s: float) -> None:
+        """Raises Refused if a caller's job would not be admitted, whatever its deadline.
+
+        That is a job as the caller's last one with this stage as its first, or with this step if there was none.
+        """
         try:
-            self._admission.check_queue(flow, self._predict(step))
+            step = self._first_steps.get((flow, step.stage), step)
+            self._admission.check_queue(flow, self._predict(step, flow, now_s))
         except Refused as refused:
             self._observer.refused(refused.reason)
             raise
@@ -214,21 +241,29 @@ class Scheduler:
         """Selects what a thread of a lane computes now; None if all threads are busy or no job waits."""
         self.expire(now_s)
         lane = self._lanes[lane_name]
-        waiting = [stage for stage in lane.stages if self._queues[stage.name]]
-        if not (lane.free and waiting):
+        if not lane.free:
+            return None
+
+        def is_allowed(job: Job) -> bool:
+            return lane.allows(job.flow, self._step_s(job, now_s), now_s)
+
+        waiting = [stage for stage in lane.stages if any(map(is_allowed, self._queues[stage.name]))]
+        if not waiting:
             return None
         # Late stages first: jobs that have begun hold memory, and time has been spent on them.
         is_first_due = lane.passed_over >= self._options.first_stage_interval - 1
         stage = waiting[0] if is_first_due else waiting[-1]
         lane.passed_over = 0 if stage is waiting[0] else lane.passed_over + 1
         lane.free -= 1
-        jobs = self._pop_batch(stage)
+        jobs = self._pop_batch(stage, is_allowed)
         for job in jobs:
             job.is_computed = True
             self._observer.waited(stage.name, now_s - job.waits_since_s)
         self._running[stage.name] += len(jobs)
         self._report_load(stage)
-        return Batch(stage, jobs, now_s, next(self._batch_number))
+        batch = Batch(stage, jobs, now_s, next(self._batch_number))
+        lane.computing_s[batch.number] = self._step_s(jobs[0], now_s)
+        return batch
 
     def finish(self, batch: Batch, results: Sequence[StageResult], now_s: float) -> None:
         """Handles the results of a batch: each of its jobs ends or continues, unless it has ended meanwhile."""
@@ -236,6 +271,7 @@ class Scheduler:
         lane = self._lanes[stage.lane]
         lane.free += 1
         lane.busy_s += seconds
+        del lane.computing_s[batch.number]
         self._running[stage.name] -= len(batch.jobs)
         bucket = batch.jobs[0].step.bucket
         self._observer.computed(stage.name, bucket, len(batch.jobs), seconds)
@@ -246,9 +282,9 @@ class Scheduler:
         for job, result in zip(batch.jobs, results, strict=True):
             # Failures are not learned from, since they come early; abandoned jobs only if they took long already.
             usual_s = max(0.0, seconds - unusual_s) / len(batch.jobs)
-            is_slow = isinstance(result, Abandoned) and usual_s > self.costs.predict(stage.name, job.step.kind)
+            is_slow = isinstance(result, Abandoned) and usual_s > self._step_s(job, now_s)
             if is_slow or not isinstance(result, Exception):
-                self.costs.observe(stage.name, job.step.kind, usual_s)
+                self._learn(job, stage, usual_s, isinstance(result, Done), now_s)
             job.used_s += share_s
             job.unusual_s = 0.0
             job.is_computed = False
@@ -302,6 +338,14 @@ class Scheduler:
                 self._ledger.close(job)
                 job.end(Ending.FAILED, error)
 
+    def _learn(self, job: Job, stage: Stage, seconds: float, is_done: bool, now_s: float) -> None:
+        """Records what a job took in a stage, and that one that is done takes nothing in those that usually follow."""
+        kind = job.step.kind
+        self.costs.observe(stage.name, kind, job.flow, seconds, now_s)
+        while is_done and stage.then:
+            stage, kind = self._stages[stage.then], job.step.later_kind or kind
+            self.costs.observe(stage.name, kind, job.flow, 0.0, now_s)
+
     @contextmanager
     def _refusals_reported(self) -> Iterator[None]:
         try:
@@ -310,16 +354,27 @@ class Scheduler:
             self._observer.refused(refused.reason)
             raise
 
-    def _predict(self, step: Step) -> Counter[str]:
-        """Predicted computing time, by lane, of a step and of those that usually follow."""
+    def _remember(self, flow: Flow, step: Step) -> None:
+        """Keeps the first step of a caller's last job, without its payload, for `check_room`."""
+        self._first_steps[flow, step.stage] = replace(step, payload=None)
+        self._first_steps.move_to_end((flow, step.stage))
+        if len(self._first_steps) > MAX_OF_CALLERS:
+            self._first_steps.popitem(last=False)
+
+    def _predict(self, step: Step, flow: Flow, now_s: float) -> Counter[str]:
+        """Predicted computing time, by lane, of a caller's step and of those that usually follow."""
         cost_s: Counter[str] = Counter()
         stage: Stage | None = self._stages[step.stage]
         kind = step.kind
         while stage is not None:
-            cost_s[stage.lane] += self.costs.predict(stage.name, kind)  # type: ignore[assignment]  # not int
+            cost_s[stage.lane] += self.costs.predict(stage.name, kind, flow, now_s)  # type: ignore[assignment]  # not int
             stage = self._stages[stage.then] if stage.then else None
             kind = step.later_kind or step.kind
         return cost_s
+
+    def _step_s(self, job: Job, now_s: float) -> float:
+        """Predicted computing time of a job's current step."""
+        return self.costs.predict(job.step.stage, job.step.kind, job.flow, now_s)
 
     def _continue(self, job: Job, result: Next, now_s: float) -> None:
         """Queues a job for its next step, or, if that would end too late or cost too much, for the alternative.
@@ -327,7 +382,7 @@ class Scheduler:
         Ends the job with its fallback if neither is worthwhile.
         """
         job.step, job.fallback = result.step, result.fallback
-        cost_s = self._predict(job.step)
+        cost_s = self._predict(job.step, job.flow, now_s)
         if job.fallback is None:
             cost_s &= job.booked_s  # it was admitted for no more
         elif not self._is_worthwhile(job, cost_s, now_s):
@@ -337,18 +392,14 @@ class Scheduler:
             if not self._is_tried_anyway(job.step):
                 self._give_fallback(job, job.fallback, now_s)
                 return
-        self._ledger.rebook(job, self._admission.within_bounds(job, cost_s))
+        self._ledger.rebook(job, self._admission.bookable(cost_s))
         self._enqueue(job, now_s)
 
     def _is_worthwhile(self, job: Job, cost_s: Counter[str], now_s: float) -> bool:
         """Whether a job's next step fits within the bounds and ends before the job is due."""
         lane = self._lanes[self._stages[job.step.stage].lane]
         coming_first = lane.stages[lane.stages.index(self._stages[job.step.stage]) :]
-        wait_s = sum(
-            self.costs.predict(stage.name, other.step.kind)
-            for stage in coming_first
-            for other in self._queues[stage.name]
-        )
+        wait_s = sum(self._step_s(other, now_s) for stage in coming_first for other in self._queues[stage.name])
         return self._admission.fits(job, cost_s) and now_s + wait_s / lane.threads + cost_s.total() <= job.due_s
 
     def _is_tried_anyway(self, step: Step) -> bool:
@@ -360,7 +411,9 @@ class Scheduler:
         stage = self._stages[job.step.stage]
         job.waits_since_s = now_s
         # The cost includes later stages: with a cheap first stage the order would otherwise be first in, first out.
-        self._queues[stage.name].push(job, job.flow, self._predict(job.step).total())
+        cost_s = self._predict(job.step, job.flow, now_s).total()
+        self._queues[stage.name].push(job, job.flow, cost_s)
+        self._lanes[stage.lane].arrivals.append((job.flow, cost_s, now_s))
         if job.timer_s != job.due_s:
             job.timer_s = job.due_s
             heapq.heappush(self._due, (job.due_s, next(self._tick), weakref.ref(job)))
@@ -374,9 +427,9 @@ class Scheduler:
             self._due = [entry for entry in self._due if id(entry[2]()) in alive]
             heapq.heapify(self._due)
 
-    def _pop_batch(self, stage: Stage) -> tuple[Job, ...]:
+    def _pop_batch(self, stage: Stage, is_allowed: Callable[[Job], bool]) -> tuple[Job, ...]:
         queue = self._queues[stage.name]
-        first = queue.pop()
+        first = queue.pop(is_allowed)
         bucket = first.step.bucket
         limit = self._limits.get((stage.name, bucket))
         at_most = stage.max_batch if limit is None else min(stage.max_batch, limit.size)

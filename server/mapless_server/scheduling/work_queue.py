@@ -177,9 +177,12 @@ class WorkQueue:
                 self._scheduler.release(flow, size_bytes)
 
     def check_room(self, flow: Flow, step: Step) -> None:
-        """Raises Refused if no job of a caller would be admitted with this first step, whatever its deadline."""
+        """Raises Refused if a caller's next job would not be admitted, whatever its deadline.
+
+        It is taken for one like the last whose first step had the same stage, or with this step if there was none.
+        """
         with self._lock:
-            self._scheduler.check_room(flow, step)
+            self._scheduler.check_room(flow, step, time.monotonic())
 
     def forget_costs(self) -> None:
         """Forgets the observed computing times, because those of later jobs will differ."""
@@ -354,13 +357,13 @@ class ItemList(Generic[ItemT, ResultT]):
         self.results: list[ResultT] = [None] * len(items)  # type: ignore[list-item]  # each is set before it is read
 
     def compute_next(self, job: Job) -> StageResult:
-        """Computes one item; the job is done when none is left."""
+        """Computes one item, if one is left; the job is done with the last."""
         try:
             index, item = self._remaining.popleft()
         except IndexError:
             return Done(None)
         self.results[index] = self._compute(item, job.check)
-        return Next(job.step)
+        return Next(job.step) if self._remaining else Done(None)
 
 
 def compute_items(jobs: Sequence[Job]) -> list[StageResult]:
