@@ -494,11 +494,7 @@ def bundle_of(
 ) -> tuple[Observations, Bundle, float]:
     """Sets up an adjustment: observations, initial bundle and median depth of the chosen points of a structure, metres.
 
-    Args:
-        tracks: the tracks of these points over the views.
-        views: the references, then the query.
-        structure: the points.
-        chosen: mask or indices of the points to use.
+    The tracks of these points are over the views: the references, then the query.
     """
     observations = observe(tracks, views, structure.noise)
     bundle = Bundle(Poses.of(view.world_from_camera for view in views), structure.x_in_world[chosen])

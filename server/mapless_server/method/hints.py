@@ -79,14 +79,9 @@ def hinted(
     has_prior: bool = False,
     options: HintOptions | None = None,
 ) -> Answer:
-    """Adds a hint to a rejection without one.
+    """Adds a hint to a rejection without one; the references are in the order of the answer's counts.
 
-    Args:
-        answer: the answer of the method.
-        query: the photograph.
-        references: used for the query, in the order of the answer's counts.
-        has_prior: whether the request has a prior on position or heading.
-        options: options of the hints.
+    `has_prior` is whether the request has a prior on position or heading.
     """
     rejection = answer.outcome
     if not isinstance(rejection, Rejection) or rejection.hint is not None:

@@ -56,16 +56,10 @@ def with_kept_depths(
     correspondences: Correspondences,
     options: KeptDepthOptions | None = None,
 ) -> Structure:
-    """Adds the points that stored depths give to a structure, after the triangulated ones.
+    """Adds the points that stored depths give to a structure, after the triangulated ones, with its `planes`.
 
-    Args:
-        structure: the triangulated structure, possibly without points.
-        references: the references, in the order of its tracks; those without depths add nothing.
-        correspondences: matches of the query with each reference.
-        options: options of using stored depths.
-
-    Returns:
-        The structure with its `planes`; unchanged if no reference has depths, or they are not needed.
+    The references are in the order of the structure's tracks; the correspondences are those of the query with each. The
+    structure, possibly without points, is unchanged if no reference has depths, or they are not needed.
     """
     options = options or KeptDepthOptions()
     if all(reference.depths is None for reference in references):

@@ -53,17 +53,11 @@ def match_points(
     options: MatchOptions,
     prior_pose: RigidTransform | None = None,
 ) -> PointMatches:
-    """Matches the query with the points of a structure.
+    """Matches the query with the metric points of a structure, whose tracks number the references in their order.
 
-    Args:
-        query: the query.
-        references: in the order that the structure's tracks number them.
-        structure: metric points.
-        correspondences: matches between query and references.
-        world_from_query: the query's initial pose.
-        options: options of matching; `PAPER_MATCH` for the paper's form.
-        prior_pose: world_from_query of a pose prior; the search starts from it if more of the matches through tracks
-            are inliers of it than of the initial pose.
+    The correspondences are between query and references. `world_from_query` is the initial pose; the search starts from
+    the prior's pose, if it is given and more of the matches through tracks are inliers of it. `PAPER_MATCH` is the
+    paper's form.
     """
     nothing = np.empty(0, np.intp)
     known = PointMatches(nothing, nothing, np.empty(0, bool), options.radius_px)

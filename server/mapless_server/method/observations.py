@@ -206,16 +206,10 @@ def better_start(observations: Observations, first: AnyArray, second: AnyArray, 
 def adjust_points(
     observations: Observations, x_in_world: AnyArray, loss_scale_sigma: float, iterations: int
 ) -> AnyArray:
-    """Minimizes the soft L1 reprojection error over the points alone, all at once.
+    """Minimizes the soft L1 reprojection error over the points (P, 3) alone, all at once, by Levenberg-Marquardt steps.
 
-    Args:
-        observations: observations of all points.
-        x_in_world: (P, 3) initial points; rows with NaN stay as they are.
-        loss_scale_sigma: residual at which the loss turns from square to linear, standard deviations.
-        iterations: number of Levenberg-Marquardt steps.
-
-    Returns:
-        The points (P, 3). No point has a higher cost than at the start.
+    Rows with NaN stay as they are, and no point has a higher cost than at the start. The loss turns from square to
+    linear at `loss_scale_sigma` standard deviations.
     """
     problem = observations.columns
 

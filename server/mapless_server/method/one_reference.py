@@ -106,19 +106,10 @@ def solve_one_reference(
     origin: Array,
     options: OneReferenceOptions,
 ) -> Found | Rejection:
-    """Estimates the pose of a query from its matches with a single reference.
+    """Estimates the pose of a query from its matches with a single reference; TOO_FEW_MATCHES or PNP_FAILED without.
 
-    Args:
-        query: the photograph.
-        references: the single posed reference.
-        reconstruction: the reconstruction, with predicted depths.
-        scale: metres per unit of the reconstruction, with the relative standard deviation.
-        query_matches: matches with the reference.
-        origin: (3,) origin of the reference's world in the caller's world.
-        options: options of the pose from one reference.
-
-    Returns:
-        The pose, or a rejection: TOO_FEW_MATCHES or PNP_FAILED.
+    The reconstruction has predicted depths; the scale is metres per unit of it, with the relative standard deviation;
+    `origin` (3,) is that of the reference's world in the caller's world.
     """
     (reference,), (matches,) = references, query_matches
     points = _predicted(reference, reconstruction, scale, matches)

@@ -121,17 +121,11 @@ def minimize_each(
     iterations: int,
     damping: float = 1e-3,
 ) -> AnyArray:
-    """Finds minima of many independent problems of three unknowns, each with its own damping.
+    """Finds minima of many independent problems of three unknowns, each with its own damping, from points (3, P).
 
-    Reads no value, so that nothing synchronizes with a device: all problems take the same number of steps.
-
-    Args:
-        cost: function that returns the cost (P,) of each of the points (3, P).
-        linearize: function that returns, at points (3, P), hessians (6, P) as in `arrays.SYMMETRIC` and gradients (3,
-            P) of half the cost.
-        start: (3, P) initial points.
-        iterations: number of steps.
-        damping: initial value of the damping.
+    Reads no value, so that nothing synchronizes with a device: all problems take the same number of steps. `cost`
+    returns the costs (P,) at points (3, P); `linearize` the hessians (6, P), as in `arrays.SYMMETRIC`, and gradients
+    (3, P) of half the cost.
     """
     xp, x = namespace(start), start
     damped, least = xp.full_like(start[0], damping), cost(start)

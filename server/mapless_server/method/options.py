@@ -20,13 +20,8 @@ _HOLDS = {"above": operator.gt, "at_least": operator.ge, "below": operator.lt, "
 def check_bounds(options: object, names: str, **bounds: float) -> None:
     """Checks that fields of a dataclass, and every number of a tuple, are within bounds; NaN is out of bounds.
 
-    Args:
-        options: the dataclass.
-        names: names of the fields, separated by spaces.
-        bounds: any of above, at_least, below and at_most.
-
-    Raises:
-        ValueError: a number is out of bounds.
+    The names are separated by spaces; bounds are any of above, at_least, below and at_most. ValueError if a number is
+    out.
     """
     for name in names.split():
         value = getattr(options, name)

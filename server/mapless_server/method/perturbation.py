@@ -55,10 +55,8 @@ def world_jacobian(world_from_camera: RigidTransform) -> Array:
 def world_covariance(information: Array, world_from_camera: RigidTransform) -> Array:
     """Covariance (6, 6) of world_from_camera, order x y z rx ry rz, about fixed world axes.
 
-    Args:
-        information: (6, 6) inverse covariance of a left perturbation (v, w) of camera_from_world. Directions without
-            information are left out (pseudo-inverse).
-        world_from_camera: the pose.
+    The information (6, 6) is the inverse covariance of a left perturbation (v, w) of camera_from_world. Directions
+    without information are left out (pseudo-inverse).
     """
     jacobian = world_jacobian(world_from_camera)
     covariance = jacobian @ np.linalg.pinv(information, hermitian=True) @ jacobian.T

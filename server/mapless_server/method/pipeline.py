@@ -196,22 +196,15 @@ class Coarse:
 
 
 def reconstruct(batch: Sequence[Prepared]) -> list[Coarse | Answer | Exception]:
-    """Computes the coarse stage of a batch of queries, then the metric scale of each.
+    """Computes the coarse stage of a batch of queries of one reconstructor, then the metric scale of each.
 
-    For a reconstruction on a device, scale, structure and matches are computed there too; the device has finished with
-    these queries when this returns.
+    Those of one bucket are reconstructed together. For a reconstruction on a device, scale, structure and matches are
+    computed there too; the device has finished with these queries when this returns.
 
-    Args:
-        batch: queries of one reconstructor. Those of one bucket are reconstructed together.
-
-    Returns:
-        For each query, in order: its reconstruction and scale; or its answer, if nothing remains to be computed; or its
-        own exception, unchanged: raised by its check, or while it alone was computed, such as a torch.OutOfMemoryError
-        for a batch of one.
-
-    Raises:
-        ValueError: several reconstructors.
-        Exception: of the batch as a whole; splitting it shows which query caused it.
+    Returns for each query, in order, its reconstruction and scale; or its answer, if nothing remains to be computed; or
+    its own exception, unchanged: raised by its check, or while it alone was computed, such as a torch.OutOfMemoryError
+    for a batch of one. ValueError for several reconstructors; any other exception is of the batch as a whole, and
+    splitting it shows which query caused it.
     """
     if len({id(prepared.pipeline.reconstructor) for prepared in batch}) > 1:
         raise ValueError("batch must have queries of one reconstructor only")

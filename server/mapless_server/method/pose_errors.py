@@ -90,17 +90,11 @@ def pose_errors(
     depth_m: float,
     observing: NDArray[np.intp] | None = None,
 ) -> PoseErrors:
-    """Computes the two parts of the covariance of references' errors.
+    """Computes the two parts of the covariance of the errors of K references.
 
-    Args:
-        centres: (K, 3) camera centres, metres.
-        rotations: (K, 3, 3) camera_from_world.
-        query_centre: (3,) camera centre of the query, metres.
-        level_px: noise of the structure, pixels.
-        focal_px: focal length of the references.
-        depth_m: median depth of the points.
-        observing: indices of the references that observe points; None for all. The others, which may be in another part
-            of the scene, do not count for d.
+    Centres (K, 3) and (3,) of the query are in metres, rotations (K, 3, 3) are camera_from_world. `level_px` is the
+    noise of the structure, `depth_m` the median depth of the points. References that are not `observing` points (None
+    for all) may be in another part of the scene, and do not count for d.
     """
     unit = level_px / focal_px * np.array([depth_m, 1.0])
     between = np.linalg.norm(centres[:, None] - centres, axis=2)

@@ -28,21 +28,12 @@ def estimate_scale(
     correspondences: Correspondences,
     options: ScaleOptions | None = None,
 ) -> MetricScale | Rejection:
-    """Estimates the metric scale of a reconstruction, and with it the query's initial pose.
+    """Estimates the metric scale of a reconstruction, and with it the query's initial pose; by default as the paper.
 
-    Args:
-        reconstruction: query and references up to scale, its references in the order of `references`.
-        references: the references, with known poses.
-        correspondences: matches between references; those with the query are not used.
-        options: options of the scale; by default the paper's.
-
-    Returns:
-        The scale, with finite values only; or a rejection: NO_USABLE_REFERENCES for fewer than two references,
-        DEGENERATE_REFERENCES for references too close to one another, SCALE_UNRELIABLE if the reconstruction is not
-        finite or the strategy finds no scale.
-
-    Raises:
-        ValueError: the reconstruction has another number of references.
+    The reconstruction's references are in the order of `references`; of the correspondences, those with the query are
+    not used. Returns the scale, with finite values only, or a rejection: NO_USABLE_REFERENCES for fewer than two
+    references, DEGENERATE_REFERENCES for references too close to one another, SCALE_UNRELIABLE if the reconstruction is
+    not finite or the strategy finds no scale. ValueError if it has another number of references.
     """
     options = options or ScaleOptions()
     predicted = predict(reconstruction, references)
@@ -58,11 +49,8 @@ def estimate_scale(
 def network_scale(reconstruction: Reconstruction, reference: PosedView) -> MetricScale | Rejection:
     """Returns the scale of a reconstruction from a single reference whose unit is approximately the metre.
 
-    Returns:
-        One metre per unit, with the query's pose that follows; SCALE_UNRELIABLE if the reconstruction is not finite.
-
-    Raises:
-        ValueError: the reconstruction's unit is arbitrary, or it has several references.
+    It is one metre per unit, with the query's pose that follows; SCALE_UNRELIABLE if the reconstruction is not finite.
+    ValueError if the reconstruction's unit is arbitrary, or it has several references.
     """
     (view,) = reconstruction.references
     if reconstruction.metre_sigma is None:
@@ -92,15 +80,9 @@ def known_scale(
 ) -> MetricScale | Rejection:
     """The scale of a reconstruction that was triangulated from the known poses, so that it is metric already.
 
-    Args:
-        structure: the points, at least one.
-        world_from_query: the query's initial pose.
-        references: the references, in the order of the structure's tracks.
-        options: options of the scale. The references' places must be within its bounds; any strategy finds this scale.
-
-    Returns:
-        The scale of the frame `unit_frame`; or a rejection: NO_USABLE_REFERENCES for fewer than two references,
-        DEGENERATE_REFERENCES for references too close to one another.
+    The structure has at least one point, and its tracks the references' order; any strategy finds this scale, of the
+    frame `unit_frame`. The references' places must be within the options' bounds: NO_USABLE_REFERENCES for fewer than
+    two, DEGENERATE_REFERENCES for references too close to one another.
     """
     options = options or ScaleOptions()
     rejection = check_references(references, options)

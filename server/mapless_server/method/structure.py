@@ -95,15 +95,8 @@ def build_structure(
 ) -> Structure:
     """Triangulates metric points from the references' tracks, starting at the reconstruction's depths; possibly none.
 
-    Args:
-        reconstruction: query and references up to scale, its references in the order of `references`.
-        scale: its metric scale.
-        references: the references, with known poses.
-        correspondences: matches between the references.
-        options: options of the structure; `PAPER_STRUCTURE` for the paper's form.
-
-    Returns:
-        The structure. Every point is finite and in front of the references that observe it.
+    The reconstruction's references are in the order of `references`; the correspondences are those between them. Every
+    point is finite and in front of the references that observe it. `PAPER_STRUCTURE` is the paper's form.
     """
     tracks = tracks_of(references, correspondences, options)
     observations = observe(tracks, references, options.first_noise)
@@ -257,16 +250,10 @@ def predicted_points(
 def tracks_with_query(
     structure: Structure, point: NDArray[np.intp], keypoint: NDArray[np.intp], view: int
 ) -> tuple[Tracks, NDArray[np.bool_]]:
-    """Builds tracks over references and query, of the points that the query is matched with.
+    """Builds tracks over references and query, of the points that the query, view number `view`, is matched with.
 
-    Args:
-        structure: the structure of P points.
-        point: (M,) point of each match, none twice.
-        keypoint: (M,) keypoint of the query.
-        view: index of the query as a view.
-
-    Returns:
-        The tracks, and a mask (P,) of the points that they belong to.
+    Each match has a point (M,) of the structure's P, none twice, and a keypoint (M,) of the query. Also returns a mask
+    (P,) of the points that the tracks belong to.
     """
     chosen = np.zeros(len(structure.x_in_world), bool)
     chosen[point] = True

@@ -115,8 +115,7 @@ class Tracks:
     def prune(self, observations: NDArray[np.bool_]) -> "tuple[Tracks, NDArray[np.bool_], NDArray[np.bool_]]":
         """Keeps the chosen observations (O,), without points that have fewer than two of them.
 
-        Returns:
-            The tracks, and masks (O,) and (P,) of the observations and points that are kept.
+        Also returns masks (O,) and (P,) of the observations and points that are kept.
         """
         count = np.bincount(self.point[observations], minlength=self.point_count)
         rows, points = observations & (count[self.point] >= 2), count >= 2
@@ -127,16 +126,10 @@ class Tracks:
 def build_tracks(
     pairs: Mapping[tuple[int, int], Matches], keypoint_counts: Sequence[int], anchor: int | None = None
 ) -> Tracks:
-    """Merges pairwise matches into tracks.
+    """Merges pairwise matches, of views i < j, into tracks.
 
-    Args:
-        pairs: matches of views i < j.
-        keypoint_counts: number of keypoints of each view.
-        anchor: None merges all pairs; the index of a view merges only the pairs of that view (the paper), so that
-            every track begins at one of its keypoints.
-
-    Returns:
-        The tracks. Where a chain of matches reaches two keypoints of one view, the one with more matches is kept.
+    An anchor merges only the pairs of that view (the paper), so that every track begins at one of its keypoints. Where
+    a chain of matches reaches two keypoints of one view, the one with more matches is kept.
     """
     offsets = np.concatenate([[0], np.cumsum(keypoint_counts)])
     used = [

@@ -246,14 +246,10 @@ class Reconstruction:
 def reduce_image(
     image: NDArray[np.uint8], camera: Camera, max_side_px: int, multiple_px: int = 1
 ) -> tuple[NDArray[np.uint8], Camera]:
-    """Reduces an image so that its longer side is at most `max_side_px`; returns it and its camera.
+    """Reduces an image, (H, W) or (H, W, 3), so that its longer side is at most `max_side_px`.
 
-    Args:
-        image: (H, W) or (H, W, 3).
-        camera: the image's camera, of the same size.
-        max_side_px: longest side of the result, a multiple of `multiple_px`.
-        multiple_px: both sides of the result are multiples of it, the nearest ones that keep the aspect; the image may
-            grow for that by less than one multiple.
+    Returns it and its camera. Both sides of the result are multiples of `multiple_px`, as is its longest side: the
+    nearest ones that keep the aspect. The image may grow for that by less than one multiple.
     """
     height, width = image.shape[:2]
     scale = min(1.0, max_side_px / max(height, width))
@@ -309,13 +305,8 @@ def view_of(
 ) -> View:
     """Makes the view of keypoints found in an image: undistorted, without those that have no undistorted pixel.
 
-    Descriptors are rounded to 8 bits, for queries as for stored references.
-
-    Args:
-        camera: of the image, with its lens distortion.
-        pixels: (N, 2) keypoints in the image.
-        descriptors: (N, D): float32, or uint8 as in Features.
-        sizes_px: (N,), see Features.
+    The camera is the image's, with its lens distortion; pixels (N, 2), descriptors and sizes are as in Features, but
+    descriptors that are float32 are rounded to 8 bits, for queries as for stored references.
     """
     is_exact = descriptors.dtype == np.uint8
     rounded = descriptors if is_exact else rounded_descriptors(np.asarray(descriptors, np.float32))

@@ -18,11 +18,7 @@ MIN_MOTION = 0.02
 def rays_from_intrinsics(intrinsics: Tensor, height_px: int, width_px: int) -> Tensor:
     """Rays (V, 2, H, W), x and y at depth 1, of the pixels' centres.
 
-    Args:
-        intrinsics: (V, 3, 3), in which (0.5, 0.5) is the centre of the top-left pixel; elsewhere in mapless it is (0,
-            0).
-        height_px: height of the images.
-        width_px: width of the images.
+    In the intrinsics (V, 3, 3), (0.5, 0.5) is the centre of the top-left pixel; elsewhere in mapless it is (0, 0).
     """
     columns = torch.arange(width_px, device=intrinsics.device) + 0.5
     rows = torch.arange(height_px, device=intrinsics.device) + 0.5
@@ -48,16 +44,10 @@ def invert_poses(poses: Tensor) -> Tensor:
 
 
 def normalize_poses(poses: Tensor) -> Tensor:
-    """Converts poses of each scene's views to be relative to the first, at the scale of the network's training.
+    """Converts poses (B, N, 4, 4), world_from_camera, to be relative to the first view, at the scale of the training.
 
     The mean distance of all other views from the first becomes 1, including views whose pose is not used. So the value
     given for an unknown pose matters.
-
-    Args:
-        poses: (B, N, 4, 4) world_from_camera.
-
-    Returns:
-        (B, N, 4, 4), the first of each scene the identity.
     """
     relative = invert_poses(poses[:, :1]) @ poses
     translation = relative[..., :3, 3]

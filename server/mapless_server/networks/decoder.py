@@ -50,15 +50,10 @@ class AlternatingDecoder(nn.ModuleList):
         return self[0](tokens, rope)
 
     def forward(self, tokens: Tensor, rope: Rope, inject: Injection | None = None) -> Tensor:
-        """Computes the other blocks.
+        """Computes the other blocks from tokens (B, N, T, C) of B scenes with N views, after `begin`.
 
-        Args:
-            tokens: (B, N, T, C) of B scenes with N views, after `begin`.
-            rope: rotary positions of one view.
-            inject: changes the output of a block over the whole scene; None changes nothing.
-
-        Returns:
-            (B, N, T, 2 C): the last block within views, then the last one over the scene.
+        `rope` has the rotary positions of one view; `inject` changes the output of a block over the whole scene.
+        Returns (B, N, T, 2 C): the last block within views, then the last one over the scene.
         """
         scenes, views = tokens.shape[:2]
         x = within = tokens

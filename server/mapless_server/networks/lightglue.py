@@ -221,16 +221,11 @@ def _mutual_best(log_probabilities: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def load_lightglue(features: str, weights: Path) -> tuple[LightGlue, str]:
-    """Loads the LightGlue for an extractor's features with the authors' weights; returns it and their SHA-256.
+    """Loads the LightGlue for features "aliked" or "superpoint" with the authors' weights.
 
-    Args:
-        features: "aliked" or "superpoint".
-        weights: safetensors file; for ALIKED with the names of the authors' checkpoint, for SuperPoint with those of
-            transformers.
-
-    Raises:
-        ValueError: there is no LightGlue for these features.
-        CheckpointError: the weights do not fit.
+    Returns it and their SHA-256. The safetensors file has the names of the authors' checkpoint for ALIKED, those of
+    transformers for SuperPoint. ValueError if there is no LightGlue for these features; CheckpointError if the weights
+    do not fit.
     """
     if features == "aliked":
         network = LightGlue(input_dim=128)
@@ -243,13 +238,8 @@ def load_lightglue(features: str, weights: Path) -> tuple[LightGlue, str]:
 def load_superpoint_lightglue(weights: Path, config: LightGlueConfig | None = None) -> tuple[LightGlue, str]:
     """Loads LightGlue from transformers' file, whose tensors are split differently; returns it and the file's SHA-256.
 
-    Args:
-        weights: safetensors file with transformers' names. The tensors of SuperPoint itself in it are not used.
-        config: configuration of transformers' network; None for that of the published weights.
-
-    Raises:
-        CheckpointError: the weights do not fit.
-        ImportError: transformers is not installed.
+    The tensors of SuperPoint itself in it are not used; without a configuration, that of the published weights is used.
+    CheckpointError if the weights do not fit; ImportError if transformers is not installed.
     """
     from transformers import LightGlueConfig, LightGlueForKeypointMatching
 

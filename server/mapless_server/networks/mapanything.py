@@ -320,16 +320,10 @@ class ViewTransformer(nn.Module):
         self.norm = LayerNorm(width, eps=BLOCK_EPS)
 
     def forward(self, tokens: Tensor, scale_token: Tensor, kept: int) -> tuple[list[Tensor], Tensor, Tensor]:
-        """Transforms the tokens of B scenes.
+        """Transforms the tokens (B, N, T, C) of all views of B scenes, and the learned scale token (C,).
 
-        Args:
-            tokens: (B, N, T, C) of all views.
-            scale_token: (C,) the learned token.
-            kept: number of views, the last ones, for which the last two blocks are computed.
-
-        Returns:
-            The normalized output (B, N, T, C) of the two blocks at the taps; of the last block (B, kept, T, C); and
-            that of the scale token (B, C).
+        Returns the normalized output (B, N, T, C) of the two blocks at the taps; of the last block (B, kept, T, C); and
+        that of the scale token (B, C). The last two blocks are computed for the last `kept` views.
         """
         scenes, views, count, width = tokens.shape
         x = torch.cat([tokens[:, :1] + self.view_pos_table, tokens[:, 1:]], dim=1)

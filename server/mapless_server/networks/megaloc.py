@@ -69,14 +69,9 @@ def transport(scores: Tensor, dustbin_score: Tensor) -> Tensor:
     """Masses (B, M, N) from each of N patches to each of M clusters, without those to the dustbin.
 
     Sinkhorn's iteration in logarithms: clusters and dustbin are scaled to their masses, then patches to theirs. Patches
-    come last, so the mass of each is exactly one; the masses of clusters are one only in the limit.
-
-    Args:
-        scores: (B, M, N) of cluster and patch, higher for a better fit.
-        dustbin_score: scalar, of the dustbin with any patch.
-
-    Raises:
-        ValueError: there are no more patches than clusters, so nothing would be left for the dustbin.
+    come last, so the mass of each is exactly one; the masses of clusters are one only in the limit. Scores (B, M, N)
+    are higher for a better fit; that of the dustbin is the same for any patch. ValueError if there are no more patches
+    than clusters, so that nothing would be left for the dustbin.
     """
     batch, clusters, patches = scores.shape
     if patches <= clusters:

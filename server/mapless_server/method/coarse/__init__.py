@@ -129,12 +129,9 @@ class Reconstructor(Protocol):
     def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
         """Reconstructs each query and its references; those of one bucket together, if the backend is batched.
 
-        Returns:
-            For each request, in order: the reconstruction, a rejection, or its own exception, such as too little memory
-            for this request alone. The other requests of a batch change an outcome by no more than rounding.
-
-        Raises:
-            Exception: of the batch as a whole; splitting the batch shows which request caused it.
+        Returns for each request, in order, the reconstruction, a rejection, or its own exception, such as too little
+        memory for this request alone. The other requests of a batch change an outcome by no more than rounding. An
+        exception of the batch as a whole is raised; splitting the batch shows which request caused it.
         """
         ...
 

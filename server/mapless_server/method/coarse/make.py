@@ -34,26 +34,17 @@ def make_reconstructor(
     query_rays: bool = True,
     answers_queries: bool = True,
 ) -> Reconstructor:
-    """Makes the backend that a setting names.
+    """Makes the backend that a setting names: one of `BACKENDS`, or `auto`, on "cpu" or a CUDA device.
 
     `auto` is a network if its weights are in the folder and there is a CUDA device, on which a query takes a fraction
-    of a second and not minutes as on a CPU; otherwise it is `geometric`, and the reason is logged.
+    of a second and not minutes as on a CPU; otherwise it is `geometric`, and the reason is logged. A network is
+    compiled for photographs of 4:3, landscape or portrait, with `compiled_views`, the query included, which takes
+    minutes; 0 compiles nothing, and other queries are computed uncompiled. For `query_rays` see NetworkOptions;
+    `answers_queries` says whether queries wait for it, so that a CPU is worth a warning.
 
-    Args:
-        backend: one of `BACKENDS`, or `auto`.
-        weights_dir: the weights folder.
-        device: "cpu" or a CUDA device.
-        options: options of a network's backend.
-        compiled_views: number of views, the query included, for which a network is compiled, which takes minutes; for
-            photographs of 4:3, landscape or portrait. 0 compiles nothing. Other queries are computed uncompiled.
-        query_rays: see NetworkOptions.
-        answers_queries: whether queries wait for it, so that a CPU is worth a warning.
-
-    Raises:
-        ValueError: unknown name.
-        WeightsMissing: the network's weights are not in the folder; the message names the command that fetches them.
-        CheckpointError: the weights do not fit the network.
-        ImportError: a package that networks need is not installed.
+    ValueError for an unknown name; WeightsMissing if the network's weights are not in the folder, with the command that
+    fetches them; CheckpointError if they do not fit the network; ImportError if a package that networks need is not
+    installed.
     """
     if backend not in (AUTO, *BACKENDS):
         raise ValueError(f"unknown backend {backend!r}; known: {', '.join((AUTO, *BACKENDS))}")

@@ -97,16 +97,10 @@ class NetworkReconstructor:
         """See Reconstructor.reconstruct_many: requests of the same grid and number of references are computed together.
 
         Each view is encoded once, also if several requests use it. If the device's memory does not suffice, cached
-        tokens are moved from the device, and the failed computation is tried once more.
-
-        Returns:
-            The outcomes; an outcome can be one of these exceptions:
-            ValueError: a view has no photograph.
-            torch.OutOfMemoryError: the memory does not suffice for this query alone.
-            RequestError: a reference's photograph cannot be read any more.
-
-        Raises:
-            torch.OutOfMemoryError: the memory does not suffice for so many queries.
+        tokens are moved from the device, and the failed computation is tried once more. An outcome can be ValueError if
+        a view has no photograph, torch.OutOfMemoryError if the memory does not suffice for this query alone, or
+        RequestError if a reference's photograph cannot be read any more. torch.OutOfMemoryError is raised if the memory
+        does not suffice for so many queries.
         """
         try:
             return self._reconstruct_many(requests)
@@ -289,19 +283,12 @@ def _on_device(tensor: Tensor, device: torch.device) -> Tensor:
 
 
 def condition_poses(world_from_references: Sequence[RigidTransform]) -> Array:
-    """Poses of the references and, last, a placeholder for the query's, relative to the first reference.
+    """Poses (K + 1, 4, 4) of the K references, at least one, and of a placeholder for the query, relative to the first.
 
     Pi3X normalizes by the mean distance of all views from the first, whether their poses are used or not. The
     placeholder is at the mean distance of the other references, so that it does not change that mean; its direction is
     arbitrary, since nothing else is computed from it. With a single reference, whose pose is not used, the placeholder
-    is the identity.
-
-    Args:
-        world_from_references: (K,), one at least.
-
-    Returns:
-        (K + 1, 4, 4), the first the identity. Differences of world coordinates, which may be large, are taken here, in
-        double precision.
+    is the identity. Differences of world coordinates, which may be large, are taken here, in double precision.
     """
     first = world_from_references[0]
     # Differences first: references at one place are exactly there, which MapAnything's scale depends on.

@@ -51,17 +51,10 @@ class FeatureExtractor(Protocol):
 
 
 def make_extractor(name: str, weights: Path | None = None, device: str = "cpu") -> FeatureExtractor:
-    """Makes the extractor of a kind of features.
+    """Makes the extractor of a kind of `FEATURES`, for networks with a file of weights and "cpu" or a CUDA device.
 
-    Args:
-        name: one of `FEATURES`.
-        weights: the file of the network's weights; None for `sift`.
-        device: "cpu" or a CUDA device, for networks.
-
-    Raises:
-        ValueError: unknown name, or weights missing.
-        CheckpointError: the weights do not fit.
-        ImportError: a package that the network needs is not installed.
+    ValueError for an unknown name, or missing weights; CheckpointError if they do not fit; ImportError if a package
+    that the network needs is not installed.
     """
     if name == "sift":
         return SiftExtractor()

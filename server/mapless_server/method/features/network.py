@@ -49,10 +49,7 @@ def array_of(tensor: torch.Tensor) -> NDArray[np.float32]:
 def strict_maxima(scores: torch.Tensor, window_px: int, threshold: float) -> torch.Tensor:
     """Finds pixels (N, 2), x and y, above the threshold and above all others of their window, which lies in the image.
 
-    Args:
-        scores: (H, W) map of scores.
-        window_px: side of the window, odd.
-        threshold: scores must be above it.
+    The scores are a map (H, W); the side of the window is odd.
     """
     margin = window_px // 2
     if min(scores.shape) < window_px:
@@ -75,9 +72,7 @@ def _on_both_sides(x: torch.Tensor, margin: int, axis: int) -> torch.Tensor:
 def peak_offsets(heights: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
     """Offsets (N, 2) from strict maxima to the peaks of parabolas through their neighbours, at most half a pixel.
 
-    Args:
-        heights: (H, W) map, for example of scores or logits.
-        pixels: (N, 2) maxima, x and y, not at the border.
+    The heights are a map (H, W), for example of scores or logits; the maxima, x and y, are not at the border.
     """
     return peaks(heights, pixels)[0]
 

@@ -35,12 +35,7 @@ SIGNIFICANT_SIGMAS = 4.0
 def check_mounting(estimate: RigEstimate, alone: Sequence[Answer]) -> RigEstimate | Rejection:
     """Checks a rig's pose against the poses of the photographs that are localized reliably alone.
 
-    Args:
-        estimate: the rig's pose.
-        alone: each photograph's own answer.
-
-    Returns:
-        The estimate; or a rejection GATE with the numbers of the photographs, if one of these loses its inliers.
+    Returns a rejection GATE with the numbers of the photographs, if one of these loses its inliers.
     """
     kept = {it.source.image: int(it.inliers.sum()) for it in estimate.matched}
     sure = {
@@ -62,8 +57,7 @@ def check_unit(
 ) -> SequenceEstimate | Rejection:
     """Checks the unit of a session that is said to be metric, by the length of the photographs' path without jumps.
 
-    Returns:
-        The estimate; or a rejection SCALE_UNRELIABLE with the estimated unit, if the two lengths differ significantly.
+    Returns a rejection SCALE_UNRELIABLE with the estimated unit, if the two lengths differ significantly.
     """
     poses = estimate.world_from_camera
     at_jump = {step for jump in estimate.jumps for step in range(jump.before, jump.after)}
@@ -99,10 +93,7 @@ def hinted_group(
 ) -> Rejection:
     """Adds a hint to the rejection of a group, if it has none yet.
 
-    Args:
-        rejection: the group's rejection.
-        images: each photograph's own answer, and the references that were used, in the order of its counts.
-        options: options of the hints.
+    Each image has its own answer, and the references that were used, in the order of its counts.
     """
     if rejection.hint is not None:
         return rejection

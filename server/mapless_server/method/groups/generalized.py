@@ -98,15 +98,10 @@ def scaled_ransac(
 ) -> Similarity | None:
     """Estimates the similarity `world_from_rig` by gp4ps in our own RANSAC; PoseLib has the solver, but no estimator.
 
-    Args:
-        cameras: the cameras, with `rig_from_camera` in any common unit.
-        options: options with the bound of inliers.
-        max_iterations: largest number of samples; fewer if a pose has many inliers.
-        max_matches: number of matches on which poses are scored; more are thinned evenly.
-
-    Returns:
-        The pose with the most inliers; None if there is none. A scale that is not above zero, or not determined because
-        all cameras are at one place, is no pose.
+    `rig_from_camera` of the cameras is in any common unit. Poses are scored on at most `max_matches`, thinned evenly;
+    fewer than `max_iterations` samples are taken if a pose has many inliers. Returns the pose with the most inliers;
+    None if there is none. A scale that is not above zero, or not determined because all cameras are at one place, is no
+    pose.
     """
     cameras = _bounded(cameras, max_matches)
     rays = np.concatenate([_rays(camera) for camera in cameras])

@@ -93,17 +93,9 @@ def adjust_jointly(
     options: JointOptions,
     priors: Mapping[int, Priors] | None = None,
 ) -> JointEstimate[S]:
-    """Refines the poses of a group.
+    """Refines the poses of a group, of the photographs that have matches; the initial poses if no match is used.
 
-    Args:
-        matched_images: the photographs that have matches.
-        matches: 2D-3D matches of each photograph; those with a too large initial error are not used.
-        state: the initial poses.
-        options: options of the adjustment.
-        priors: priors on the photographs' poses, by index; all are used.
-
-    Returns:
-        The refined poses; the initial ones if no match is used.
+    Matches with a too large initial error are not used; all priors, by the photographs' index, are.
     """
     problem = GroupProblem(matched_images, matches, state, options, priors)
     steps = MinimizeOptions(options.iterations, options.adjust.min_decrease)

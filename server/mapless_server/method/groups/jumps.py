@@ -102,17 +102,11 @@ def find_jumps(
     drift: DriftOptions,
     options: JumpOptions,
 ) -> Chain | None:
-    """Finds the chain of least cost.
+    """Finds the chain of least cost; None if there is no pose, or no unit of the session.
 
-    Args:
-        own: world_from_camera and its covariance (6, 6) of each photograph that is localized alone, by its index.
-        session_from_camera: tracked pose of every photograph.
-        scale: metres per unit of the session; None if it is unknown.
-        drift: noise of the steps.
-        options: options of the search.
-
-    Returns:
-        The chain; None if there is no pose, or no unit of the session.
+    `own` has world_from_camera and its covariance (6, 6) of each photograph that is localized alone, by its index;
+    `session_from_camera` the tracked pose of every photograph. The scale is metres per unit of the session, None if
+    unknown; `drift` the noise of the steps.
     """
     if not own:
         return None

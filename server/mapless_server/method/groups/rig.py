@@ -118,16 +118,10 @@ class RigState:
 def solve_rig(
     images: Sequence[GroupImage], rig_from_camera: Sequence[RigidTransform], options: RigOptions
 ) -> RigEstimate | Rejection:
-    """Estimates the pose of a rig.
+    """Estimates the pose of a rig from the photograph of each camera, with its own answer and metric pose in the rig.
 
-    Args:
-        images: the photograph of each camera, with its own answer.
-        rig_from_camera: metric pose of each camera in the rig.
-        options: options of the rig.
-
-    Returns:
-        The estimate, or a rejection: that of the image that reached the latest stage, if none has matches;
-            TOO_FEW_MATCHES; PNP_FAILED if no pose has four inliers; GATE.
+    A rejection is that of the image that reached the latest stage, if none has matches; TOO_FEW_MATCHES; PNP_FAILED if
+    no pose has four inliers; or GATE.
     """
     origin, matched_images = matched_images_of(images)
     if not matched_images:

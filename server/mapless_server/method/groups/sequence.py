@@ -71,19 +71,12 @@ def solve_sequence(
     estimate_scale: bool,
     options: SequenceOptions,
 ) -> SequenceEstimate | Rejection:
-    """Estimates the poses of a sequence.
+    """Estimates the poses of a sequence: frames in the order they were taken, with their own answers and tracked poses.
 
-    Args:
-        images: the frames in the order they were taken, with their own answers.
-        session_from_camera: the tracked pose of each.
-        estimate_scale: whether the unit of the session is unknown; else it is the metre.
-        options: options of the sequence.
-
-    Returns:
-        The estimate, or a rejection: that of the frame that reached the latest stage, if none has matches;
-            TOO_FEW_MATCHES; PNP_FAILED if no poses have four inliers; SCALE_UNRELIABLE if the scale is unknown and the
-            session moves too little to determine it, or jumps; GATE, also if the tracking jumps and the frames after it
-            are not localized.
+    If the scale is not to be estimated, the session's unit is the metre. A rejection is that of the frame that reached
+    the latest stage, if none has matches; TOO_FEW_MATCHES; PNP_FAILED if no poses have four inliers; SCALE_UNRELIABLE
+    if the scale is unknown and the session moves too little to determine it, or jumps; or GATE, also if the tracking
+    jumps and the frames after it are not localized.
     """
     origin, matched_images = matched_images_of(images)
     if not matched_images:

@@ -36,10 +36,8 @@ def trust_of_group(
 ) -> tuple[float, Rejection | None]:
     """Computes the trust, 0 to 1, and a rejection GATE if it is less than 1 - coverage.
 
-    Args:
-        matched: photographs with their joint poses; together they have at least four inliers.
-        options: options of the judge.
-        coverage: share of right answers to accept, above 0 and at most 1.
+    The photographs have joint poses, and together at least four inliers. The coverage is the share of right answers to
+    accept, above 0 and at most 1.
     """
     sources = [it.source for it in matched]
     inliers = [int(it.inliers.sum()) for it in matched]

@@ -55,22 +55,11 @@ def launch_on_device(
 ) -> Callable[[], Refined | Rejection]:
     """Launches the stages scale, structure and match on the device of the reconstruction, without waiting.
 
-    So all queries of a batch are prepared and launched while the network still computes.
-
-    Args:
-        reconstruction: query and references up to scale, its references in the order of `references`.
-        query: the query.
-        references: the references, with known poses.
-        correspondences: matches between the references, and of the query with them.
-        options: options of the stages; without those of structure and matches, only the scale is computed.
-
-    Returns:
-        A function that waits for the results, which are those of estimate_scale, build_structure and match_points. A
-        network output that is not finite is rejected with SCALE_UNRELIABLE and a warning in the log, both naming the
-        backend.
-
-    Raises:
-        ValueError: the reconstruction has another number of references.
+    So all queries of a batch are prepared and launched while the network still computes. Without options of structure
+    and matches, only the scale is computed. Returns a function that waits for the results, which are those of
+    estimate_scale, build_structure and match_points. A network output that is not finite is rejected with
+    SCALE_UNRELIABLE and a warning in the log, both naming the backend. ValueError if the reconstruction, whose
+    references are in the same order, has another number of them.
     """
     if len(reconstruction.reference_cameras) != len(references):
         raise ValueError(f"{len(reconstruction.reference_cameras)} reconstructed references of {len(references)}")

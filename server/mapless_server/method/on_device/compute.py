@@ -82,13 +82,9 @@ class Outputs:
 
 
 def compute(reconstruction: DeviceReconstruction, inputs: Inputs, query_camera: Camera, options: Options) -> Outputs:
-    """Computes scale, structure and matches.
+    """Computes scale, structure and matches, with all inputs on the device of the reconstruction.
 
-    Args:
-        reconstruction: query and references up to scale.
-        inputs: the other inputs, on its device.
-        query_camera: the query's camera, in the pixels of its keypoints.
-        options: options of the stages.
+    The query's camera is in the pixels of its keypoints.
     """
     predicted = _predict(reconstruction, inputs.cell)
     candidates = scale_candidates(inputs.known, predicted, options.scale)

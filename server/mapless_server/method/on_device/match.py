@@ -151,15 +151,8 @@ def best_by_group(
 ) -> tuple[Tensor, Tensor]:
     """Finds the candidate with the highest score in each group; of equal ones that with the smallest index.
 
-    Args:
-        group: (M,) the candidate's group; `group_count` for none.
-        candidate: (M,) index of the candidate.
-        score: (M,) the candidate's score.
-        group_count: number G of groups.
-        candidate_count: the index that stands for no candidate.
-
-    Returns:
-        The candidate (G,), and its score (G,).
+    Of M candidates: group (`group_count` G for none), index and score (M,). `candidate_count` stands for no candidate.
+    Returns candidate and score of each group, (G,).
     """
     best = score.new_full((group_count + 1,), -torch.inf).scatter_reduce(0, group, score, "amax")
     chosen = torch.where(score == best[group], candidate, candidate_count)

@@ -52,15 +52,10 @@ def ransac_with_gravity(
     inlier_px: float,
     options: GravityOptions | None = None,
 ) -> list[RigidTransform]:
-    """Finds the best hypotheses and refines them; none if no two matches give a pose.
+    """Finds the best hypotheses and refines them with all priors; none if no two matches give a pose.
 
-    Args:
-        camera: the pinhole camera.
-        x_in_world: (N, 3) points.
-        pixels: (N, 2) where they are seen.
-        priors: the priors, gravity among them. All are used in the refinement.
-        inlier_px: largest reprojection error of a right match.
-        options: options of the RANSAC.
+    The camera is a pinhole camera; points (N, 3) in the world are seen at the pixels (N, 2). `inlier_px` is the largest
+    reprojection error of a right match.
     """
     options = options or GravityOptions()
     gravity = priors.gravity
@@ -86,19 +81,12 @@ def ransac_with_gravity(
 
 
 def solve_pairs(gravity: GravityPrior, rays: Array, x_in_world: Array, pairs: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Poses that see two points along two rays, with the direction of gravity given.
+    """Poses that see two points along two rays, with the direction of gravity, down, given in both frames.
 
     PoseLib's solver (Kukelova et al., "Closed-form solutions to minimal absolute pose problems with known vertical
-    direction", ACCV 2010) takes both frames with their y axes along the vertical, both up or both down.
-
-    Args:
-        gravity: the direction down in both frames.
-        rays: (N, 3) viewing rays of unit length in the camera.
-        x_in_world: (N, 3) points.
-        pairs: (S, 2) indices of matches.
-
-    Returns:
-        Rotations (H, 3, 3) and translations (H, 3) of camera_from_world, none to two for each pair.
+    direction", ACCV 2010) takes both frames with their y axes along the vertical, both up or both down. Points (N, 3),
+    viewing rays (N, 3) of unit length in the camera, pairs (S, 2) of their indices. Returns rotations (H, 3, 3) and
+    translations (H, 3) of camera_from_world, none to two for each pair.
     """
     from_camera, from_world = _to_y(gravity.in_camera), _to_y(gravity.in_world)
     turned_rays, turned_points = rays @ from_camera.T, x_in_world @ from_world.T

@@ -80,13 +80,8 @@ def informed_pose(
 ) -> InformedPose | None:
     """Chooses between the pose from the photograph and those from priors; None if there is none.
 
-    Args:
-        camera: the pinhole camera.
-        x_in_world: (N, 3) points.
-        pixels: (N, 2) where they are seen.
-        found: world_from_camera from the photograph alone; None if there is none.
-        priors: the priors on the pose.
-        options: options of the estimation.
+    The camera is a pinhole camera; points (N, 3) in the world are seen at the pixels (N, 2). `found` is
+    world_from_camera from the photograph alone; None if there is none.
     """
     support = 0 if found is None else inlier_count(camera, x_in_world, pixels, found, options)
     others = [] if support >= options.enough_inliers else _from_priors(camera, x_in_world, pixels, priors, options)

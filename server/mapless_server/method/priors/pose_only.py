@@ -47,15 +47,10 @@ def refine_pose(
     priors: Priors,
     options: PoseOnlyOptions,
 ) -> RigidTransform:
-    """Minimizes the cost, starting from a pose.
+    """Minimizes the cost, starting from a pose; all priors are used.
 
-    Args:
-        camera: the pinhole camera.
-        x_in_world: (N, 3) points; those behind the camera at the start are not used.
-        pixels: (N, 2) where they are seen.
-        world_from_camera: the initial pose.
-        priors: the priors on the pose; all are used.
-        options: options of the refinement.
+    The camera is a pinhole camera; points (N, 3) in the world are seen at the pixels (N, 2), and those behind the
+    camera at the start are not used.
     """
     in_front = world_from_camera.inverse().apply(x_in_world)[:, 2] > 0
     problem = _Problem(camera, x_in_world[in_front], pixels[in_front], priors, options)

@@ -63,16 +63,8 @@ def solve_two_view(
 ) -> Support | None:
     """Finds the pose that most matches of both kinds support, with these matches; None if there is none.
 
-    Args:
-        query: the photograph.
-        references: two or more posed references.
-        correspondences: matches between all photographs.
-        known: poses world_from_query of other stages, which are candidates too.
-        origin: (3,) origin of their world, see `Support`.
-        structure_options: options of the structure stage.
-        match_options: options of the matching stage.
-        adjust_options: options of the adjustment.
-        options: options of this stage.
+    There are two or more references, and matches between all photographs. The poses world_from_query of other stages,
+    `known`, are candidates too; for `origin` (3,) of their world see `Support`.
     """
     structure = triangulated_structure(references, correspondences, structure_options)
     matches = vote(structure, [len(it.view.features) for it in references], correspondences)

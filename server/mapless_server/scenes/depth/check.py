@@ -78,8 +78,8 @@ def checked_depths(
 ) -> list[KeptDepth | None]:
     """Returns the part of each reference's predicted depths that is kept; None if nothing is.
 
-    The reconstruction, in the metric scale, is of the references and of the photograph whose pose was not given, but is
-    `world_from_query`; the correspondences are those of the references with one another.
+    The reconstruction is of the references and of the photograph whose pose, `world_from_query`, was not given; the
+    correspondences are those of the references with one another.
     """
     structure = triangulated_structure(
         references, correspondences, StructureOptions(min_parallax_deg=options.min_parallax_deg)
