@@ -30,28 +30,13 @@ MEMBERS = {
 KEYWORDS = {
     *("and", "as", "assert", "async", "auto", "await", "bool", "break", "case", "catch", "char", "checked", "const"),
     *("continue", "decimal", "default", "defer", "delete", "do", "double", "else", "enum", "event", "export", "extern"),
-    *(
-        "false",
-        "final",
-        "fixed",
-        "float",
-        "for",
-        "foreach",
-        "from",
-        "fun",
-        "func",
-        "global",
-        "go",
-        "goto",
-        "if",
-        "import",
-    ),
+    *("false", "final", "fixed", "float", "for", "foreach", "from", "fun", "func", "global", "go", "goto", "if"),
     *("in", "init", "inout", "int", "interface", "internal", "is", "lambda", "let", "lock", "long", "map", "module"),
     *("namespace", "native", "new", "none", "not", "null", "object", "operator", "or", "out", "package", "params"),
     *("pass", "private", "protected", "protocol", "public", "raise", "range", "ref", "register", "return", "select"),
     *("short", "signed", "sizeof", "static", "struct", "super", "switch", "template", "this", "throw", "true", "try"),
     *("type", "typedef", "typeof", "union", "unsigned", "using", "val", "var", "virtual", "void", "volatile", "when"),
-    *("where", "while", "with", "yield", "near", "far", "small", "unix", "linux", "major", "minor"),
+    *("import", "where", "while", "with", "yield", "near", "far", "small", "unix", "linux", "major", "minor"),
 }
 """Of the languages, and macros that system headers define."""
 

@@ -87,14 +87,8 @@ def test_the_client_alone_needs_neither_server_nor_torch(install: Callable[[str]
     programs = install("")
     run(programs / "mapless", "--help")
     installed = json.loads(run(*UV, "pip", "list", "-q", "--format=json", "-p", programs.parent))
-    assert {it["name"] for it in installed} == {
-        "googleapis-common-protos",
-        "grpcio",
-        "mapless",
-        "numpy",
-        "protobuf",
-        "typing-extensions",
-    }
+    needed = {"googleapis-common-protos", "grpcio", "mapless", "numpy", "protobuf", "typing-extensions"}
+    assert {it["name"] for it in installed} == needed
     message = run(programs / "mapless-server", "serve", code=1)
     assert message == "mapless-server: the Python package typer is not installed: pip install 'mapless[server]'\n"
 

@@ -85,16 +85,10 @@ def test_sides_that_are_not_multiples_of_a_patch_are_refused() -> None:
 def test_in_low_precision_only_the_main_residual_stays_float32() -> None:
     network = ruled_network("pi3")
     network.set_compute_type(torch.bfloat16)
+    parts = ("encoder.blocks.1", "decoder.2", "decoder.3", "point_decoder.blocks.1", "point_head", "camera_head")
     seen: dict[str, torch.dtype] = {}
     for name, module in network.named_modules():
-        if name in (
-            "encoder.blocks.1",
-            "decoder.2",
-            "decoder.3",
-            "point_decoder.blocks.1",
-            "point_head",
-            "camera_head",
-        ):
+        if name in parts:
             module.register_forward_hook(lambda _m, _i, out, name=name: seen.update({name: out.dtype}))
     given = some_images(3)
     low = reconstruct(network, given, 3)

@@ -95,20 +95,8 @@ def test_takes_the_references_of_a_pairs_file(chess: Path, tmp_path: Path) -> No
     wanted = ["seq-01/frame-000002.color.png", "seq-01/frame-000000.color.png", "seq-01/frame-000001.color.png"]
     queries = [f"seq-02/frame-{i:06d}.color.png" for i in range(4)]
     pairs.write_text("".join(f"{query} {reference}\n" for query in queries for reference in wanted))
-    done = run(
-        "evaluate",
-        chess,
-        "--protocol",
-        "dense",
-        "--pairs",
-        pairs,
-        "--max-queries",
-        1,
-        "--worst",
-        0,
-        "--output",
-        tmp_path / "out",
-    )
+    flags = ("--protocol", "dense", "--pairs", pairs, "--max-queries", 1, "--worst", 0)
+    done = run("evaluate", chess, *flags, "--output", tmp_path / "out")
     assert done.exit_code == 0, done.output
     with (tmp_path / "out" / "queries.csv").open(newline="") as stream:
         (query,) = csv.DictReader(stream)

@@ -343,16 +343,8 @@ def test_nothing_is_opened_for_writing_elsewhere(tmp_path: Path, search: Search)
     if strace is None or subprocess.run([strace, "-o", "/dev/null", "true"], capture_output=True).returncode:
         pytest.skip("needs strace, and to be allowed to use it")
     trace = tmp_path / "trace"
-    options = [
-        "-D",
-        "-f",
-        "-qq",
-        "-y",
-        "-s",
-        "4096",
-        "-e",
-        "trace=open,openat,creat,memfd_create,rename,renameat,renameat2,link",
-    ]
+    calls = "trace=open,openat,creat,memfd_create,rename,renameat,renameat2,link"
+    options = ["-D", "-f", "-qq", "-y", "-s", "4096", "-e", calls]
     with served(tmp_path / "server", prefix=[strace, *options, "-o", str(trace)]) as server:
         ask_everything(server.address)
     lines = [line for line in trace.read_text().splitlines() if not re.search(r" = -1 |resumed|unfinished", line)]

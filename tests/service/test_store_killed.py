@@ -268,13 +268,15 @@ def wait_for_disconnection(cluster: postgres.Cluster) -> None:
     raise AssertionError("the killed server's connections do not end")
 
 
-def kill_and_check(database: str, folder: Path, rounds: int) -> None:
+@pytest.mark.parametrize("rounds", [DATABASE_IS_KILLED_EVERY, pytest.param(200, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("database", DATABASES)
+def test_killed_at_random_moments(database: str, rounds: int, tmp_path: Path) -> None:
     moments = random.Random(20)
     ledger = Ledger()
-    with place_of_its_own(database, folder) as (place, cluster):
+    with place_of_its_own(database, tmp_path) as (place, cluster):
         with place.open() as store:
             store.create_scene(SCENE)
-        factory = WriterFactory(place.url if isinstance(place, Shared) else str(folder))
+        factory = WriterFactory(place.url if isinstance(place, Shared) else str(tmp_path))
         try:
             for number in range(rounds):
                 writer = factory.start(f"round{number}")
@@ -293,11 +295,6 @@ def kill_and_check(database: str, folder: Path, rounds: int) -> None:
             factory.end()
         assert ledger.acknowledged >= rounds
         assert faults_of(place) == ()
-
-
-@pytest.mark.parametrize("database", DATABASES)
-def test_killed_at_random_moments(database: str, tmp_path: Path) -> None:
-    kill_and_check(database, tmp_path, DATABASE_IS_KILLED_EVERY)
 
 
 def check_scenes(place: Place) -> None:
@@ -331,12 +328,6 @@ def test_killed_while_scenes_are_deleted(database: str, tmp_path: Path) -> None:
                 check_scenes(place)
         finally:
             factory.end()
-
-
-@pytest.mark.nightly
-@pytest.mark.parametrize("database", DATABASES)
-def test_killed_two_hundred_times(database: str, tmp_path: Path) -> None:
-    kill_and_check(database, tmp_path, 200)
 
 
 if __name__ == "__main__":

@@ -69,25 +69,10 @@ class TestFaults:
 
 
 class TestOpening:
-    @pytest.mark.parametrize(
-        ("version", "affected"),
-        [
-            ((3, 6, 23), False),
-            ((3, 7, 0), True),
-            ((3, 40, 1), True),
-            ((3, 44, 5), True),
-            ((3, 44, 6), False),
-            ((3, 45, 0), True),
-            ((3, 50, 6), True),
-            ((3, 50, 7), False),
-            ((3, 51, 0), True),
-            ((3, 51, 2), True),
-            ((3, 51, 3), False),
-            ((3, 53, 4), False),
-        ],
-    )
-    def test_versions_with_the_wal_reset_bug(self, version: tuple[int, int, int], affected: bool) -> None:
-        assert sqlite.has_wal_reset_bug(version) is affected
+    def test_versions_with_the_wal_reset_bug(self) -> None:
+        affected = [(3, 7, 0), (3, 40, 1), (3, 44, 5), (3, 45, 0), (3, 50, 6), (3, 51, 0), (3, 51, 2)]
+        fixed = [(3, 6, 23), (3, 44, 6), (3, 50, 7), (3, 51, 3), (3, 53, 4)]
+        assert [it for it in affected + fixed if sqlite.has_wal_reset_bug(it)] == affected
 
     def settings_in_use(self, store: Store) -> dict[str, object]:
         names = ("journal_mode", "synchronous", "foreign_keys", "busy_timeout", "trusted_schema", "cell_size_check")

@@ -125,17 +125,11 @@ class TestProtocol:
     @pytest.mark.parametrize(
         ("fields", "words"),
         [
-            ({"layout": "8scenes"}, "8scenes"),
             ({"protocols": ()}, "protocol"),
             ({"protocols": ("dense", "dense")}, "twice"),
-            ({"sparse": (10, -5)}, "-5"),
-            ({"variants": ("bset",)}, "bset"),
             ({"scales": ("guess",)}, "guess"),
             ({"k": 0}, "1 to 64"),
             ({"k": 65}, "65"),
-            ({"stride": 0}, "stride"),
-            ({"max_queries": -1}, "max-queries"),
-            ({"choice": "luck"}, "luck"),
         ],
     )
     def test_options_outside_their_bounds_are_refused(self, fields: dict[str, Any], words: str) -> None:

@@ -218,15 +218,3 @@ def test_a_malformed_file_is_named_with_its_line(tmp_path: Path, text: str, mess
         read_positions(file)
     with pytest.raises(ValueError, match="cannot be read"):
         read_positions(tmp_path / "none.csv")
-
-
-def test_options_that_do_not_fit_together_are_named() -> None:
-    with pytest.raises(ValueError, match="give one of --scale, --distance and --align"):
-        MetreOptions(scale=1.0, positions=Path("known.csv"))
-    for scale in (0.0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(ValueError, match="--scale is metres per unit"):
-            MetreOptions(scale=scale)
-    with pytest.raises(ValueError, match="must be above 0 m"):
-        KnownDistance("a", "b", -2.0)
-    with pytest.raises(ValueError, match="m from the origin"):
-        in_metres(dataset_of(centres()), MetreOptions(scale=1e9))
