@@ -194,6 +194,7 @@ class TestApplying:
         both = SceneAttributes(calibration=self.MEASURED, self_calibrations=(self.own(),))
         after = reported_radii(Accuracy(1.0, 2.0, 3.0, 4.0), self.COVARIANCE, SIFT, both, 0.3)
         assert (after.calibration, after.count, after.accuracy) == ("MEASURED", 20, Accuracy(2.0, 6.0, 1.5, 3.0))
+        np.testing.assert_array_equal(after.covariance, scaled_covariance(self.COVARIANCE, self.FACTORS))
 
     def test_the_covariance_has_the_calibrated_68_percent_radii(self) -> None:
         before = accuracy_from_covariance(self.COVARIANCE)
