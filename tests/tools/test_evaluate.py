@@ -48,14 +48,12 @@ class TestSplit:
         assert split.queries[0] == 3
         assert split.queries[-1] == 596
 
-    def test_rounds_half_to_even_as_numpy_does(self) -> None:
+    def test_small_ones_are_as_derived_by_hand(self) -> None:
+        """Half is rounded to even; each frame is left out once, or some; without room for a margin there is none."""
         assert split_frames(10, EvaluationOptions(reference_count=3, query_count=2)).references == (0, 4, 9)
-
-    def test_leaves_each_frame_out_once(self) -> None:
         assert split_frames(11, EvaluationOptions()) == Split(tuple(range(11)), tuple(range(11)))
-
-    def test_leaves_some_out_if_fewer_queries_are_wanted(self) -> None:
         assert split_frames(11, EvaluationOptions(query_count=3)).queries == (0, 5, 10)
+        assert split_frames(5, EvaluationOptions(2)) == Split((0, 4), (1, 2, 3))
 
     @given(frames=st.integers(2, 700), references=st.integers(2, 60), queries=st.integers(1, 80))
     def test_gives_existing_frames_and_no_query_among_references(
@@ -86,9 +84,6 @@ class TestSplit:
     def test_refuses_what_cannot_be_split(self, frames: int, options: EvaluationOptions, words: str) -> None:
         with pytest.raises(ValueError, match=words):
             split_frames(frames, options)
-
-    def test_takes_queries_to_the_ends_where_no_margin_fits(self) -> None:
-        assert split_frames(5, EvaluationOptions(2)) == Split((0, 4), (1, 2, 3))
 
 
 @pytest.mark.parametrize(
