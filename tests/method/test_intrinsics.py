@@ -19,8 +19,7 @@ from mapless_server.method.priors.known import NO_PRIORS
 from mapless_server.method.recalibrate import _with_errors
 from mapless_server.method.rejection import Advice, IntrinsicsParameter, Rejection, RejectionReason
 from mapless_server.method.results import PoseEstimate, Support
-from mapless_server.method.trust.intrinsics import intrinsics_checks, wrong_intrinsics
-from mapless_server.method.trust.wrong_camera import WrongCameraOptions, wrong_camera
+from mapless_server.method.trust.intrinsics import WrongCameraOptions, intrinsics_checks, wrong_camera, wrong_intrinsics
 from mapless_server.method.views import undistort_pixels
 
 LENSES = {

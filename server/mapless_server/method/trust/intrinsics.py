@@ -1,18 +1,31 @@
-"""Check of a photograph's intrinsics against its matches.
+"""Checks of a photograph's intrinsics against its matches, and against other cameras.
 
 Cropped, resized and undistorted photographs often come with the intrinsics of another image. The pose is then off, with
 small residuals: its motion absorbs most of such an error. What it does not absorb is in the normal equations of the
 adjustment (see `intrinsics`), with standard deviations that contain errors of points and reference poses. A parameter
 that is off by more than the prior and these standard deviations allow together is a reason to reject the pose, although
 it was estimated with the photograph's value: the camera's next photograph will have the same error.
+
+Intrinsics of another image, or half or double the focal length, are too far off for that: a pose then fits a part of
+the matches, at similar depths, and these alone do not contradict it. But with a camera that is nearer to the true one
+far more of all matches agree with one pose. So poses are computed with other focal lengths, and, where these are
+unusual, with the principal point in the centre and with square pixels. That costs a query nothing of which most matches
+agree already.
 """
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mapless.geometry import Fisheye
+from mapless.geometry import Array, Camera, Fisheye
 
 from ..intrinsics import ContradictionOptions, IntrinsicsEvidence
+from ..options import check_bounds
+from ..perturbation import reprojection_errors_px
+from ..pnp import PnpOptions, ransac
 from ..rejection import Advice, Hint, IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason
+from ..results import Support
 
 
 def intrinsics_checks(evidence: IntrinsicsEvidence, options: ContradictionOptions) -> tuple[IntrinsicsCheck, ...]:
@@ -89,3 +102,120 @@ def _advice(evidence: IntrinsicsEvidence, wrong: list[IntrinsicsCheck]) -> str:
         "Check the photograph's principal point: it is in pixels from the centre of the top-left one, x first, and "
         "moves when a photograph is cropped, resized or rotated."
     )
+
+
+@dataclass(frozen=True)
+class WrongCameraOptions:
+    """Options of the comparison with other cameras.
+
+    Attributes:
+        max_inlier_share: poses are computed with other cameras if no more of the matches agree with the pose. Of right
+            answers most have a larger share.
+        min_gain: the camera is wrong if this times as many matches agree with a pose of another one. Of photographs
+            with half, 1.5 times or twice the focal length 1.3 and more do; of 281 right ones of eleven scenes 1.14.
+        min_matches: fewer say nothing.
+        steps: number of focal lengths below and above the given one.
+        steps_per_octave: number of them from one focal length to its double.
+        unusual_principal_share: distance of the principal point from the centre, as a share of the width, from which
+            the centre is tried too.
+        unusual_aspect: share by which both focal lengths differ, from which square pixels are tried too.
+        pnp: options of the poses. Few matches suffice to compare shares.
+    """
+
+    max_inlier_share: float = 0.6
+    min_gain: float = 1.2
+    min_matches: int = 40
+    steps: int = 5
+    steps_per_octave: int = 4
+    unusual_principal_share: float = 0.1
+    unusual_aspect: float = 0.03
+    pnp: PnpOptions = field(default_factory=lambda: PnpOptions(min_iterations=30, max_iterations=300, max_matches=300))
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "max_inlier_share unusual_principal_share unusual_aspect", above=0, at_most=1)
+        check_bounds(self, "min_gain", at_least=1)
+        check_bounds(self, "min_matches steps steps_per_octave", at_least=1)
+
+
+def wrong_camera(
+    support: Support, evidence: IntrinsicsEvidence, best_reference: str, options: WrongCameraOptions
+) -> Rejection | None:
+    """A rejection that names what is wrong and the better value, if far more matches agree with another camera."""
+    assert support.estimate is not None
+    matches, given = support.matches, support.query.camera
+    share = support.estimate.inliers.mean() if len(matches) else 1.0
+    if len(matches) < options.min_matches or share > options.max_inlier_share:
+        return None
+    rows = np.linspace(0, len(matches) - 1, min(len(matches), options.pnp.max_matches)).astype(int)
+    x_in_world = support.structure.x_in_world[matches.point[rows]]
+    pixels = support.query.features.keypoints[matches.keypoint[rows]].astype(np.float64)
+    found, count = _best_camera(given, float(evidence.prior_sigma[0]), x_in_world, pixels, options)
+    own = int(support.estimate.inliers[rows].sum())
+    if count < options.min_gain * max(own, options.min_matches / 2):
+        return None
+    checks = tuple(_checks(evidence, given, found, options))
+    named = ", ".join(f"{it.parameter.field} {it.estimated:.0f} instead of {it.given:.0f}" for it in checks)
+    message = f"{own} of {len(rows)} matches agree with the pose, and {count} with one of {named}"
+    text = (
+        "Check the photograph's intrinsics: they belong to one image size, change with it when a photograph is "
+        "resized, and have another principal point when it is cropped."
+    )
+    hint = Hint("judge", Advice.CHECK_CALIBRATION, text, best_reference)
+    return Rejection(RejectionReason.GATE, message, hint, intrinsics_checks=checks)
+
+
+def _best_camera(
+    given: Camera, log_focal_sigma: float, x_in_world: Array, pixels: Array, options: WrongCameraOptions
+) -> tuple[Camera, int]:
+    """The camera of the pose that most matches agree with, and their number; half a step beside it is tried too."""
+
+    def agreeing(camera: Camera) -> int:
+        pose = ransac(camera, x_in_world, pixels, None, options.pnp)
+        if pose is None:
+            return 0
+        return int((reprojection_errors_px(camera, pose, x_in_world, pixels) < options.pnp.inlier_px).sum())
+
+    counts = [(agreeing(camera), camera) for camera in _other_cameras(given, log_focal_sigma, options)]
+    if not counts:
+        return given, 0
+    best = max(counts, key=lambda it: it[0])
+    half_step = 2 ** (0.5 / options.steps_per_octave)
+    beside = [_scaled(best[1], factor) for factor in (1 / half_step, half_step)]
+    count, camera = max([best, *((agreeing(it), it) for it in beside)], key=lambda it: it[0])
+    return camera, count
+
+
+def _other_cameras(given: Camera, log_focal_sigma: float, options: WrongCameraOptions) -> Iterator[Camera]:
+    """Cameras that the given intrinsics may be mistaken for, none of them within what their uncertainty allows."""
+    x, y = (given.width_px - 1) / 2, (given.height_px - 1) / 2
+    bases = [given]
+    if np.hypot(given.principal_x_px - x, given.principal_y_px - y) > options.unusual_principal_share * given.width_px:
+        bases.append(replace(given, principal_x_px=x, principal_y_px=y))
+    if abs(np.log(given.focal_x_px / given.focal_y_px)) > options.unusual_aspect:
+        bases += [replace(base, focal_x_px=base.focal_y_px) for base in bases]
+    for base in bases:
+        for step in range(-options.steps, options.steps + 1):
+            log_factor = np.log(2) * step / options.steps_per_octave
+            if abs(log_factor) > 3 * log_focal_sigma or (step == 0 and base is not given):
+                yield _scaled(base, float(np.exp(log_factor)))
+
+
+def _scaled(camera: Camera, factor: float) -> Camera:
+    return replace(camera, focal_x_px=factor * camera.focal_x_px, focal_y_px=factor * camera.focal_y_px)
+
+
+def _checks(
+    evidence: IntrinsicsEvidence, given: Camera, found: Camera, options: WrongCameraOptions
+) -> Iterator[IntrinsicsCheck]:
+    """What differs, in pixels of the photograph as it was sent; standard deviations are those of the steps tried."""
+    sent = evidence.sent
+    scale = sent.width_px / found.width_px
+    step_sigma = np.log(2) / options.steps_per_octave / np.sqrt(12)
+    focal = IntrinsicsParameter.FOCAL_LENGTH, given.focal_x_px, sent.focal_x_px, found.focal_x_px
+    x = IntrinsicsParameter.PRINCIPAL_X, given.principal_x_px, sent.principal_x_px, found.principal_x_px
+    y = IntrinsicsParameter.PRINCIPAL_Y, given.principal_y_px, sent.principal_y_px, found.principal_y_px
+    for (parameter, before, its_sent, after), prior_sigma in zip((focal, x, y), evidence.prior_sigma, strict=False):
+        if after != before:
+            unit = its_sent if parameter is IntrinsicsParameter.FOCAL_LENGTH else scale
+            sigma = scale * after * step_sigma if parameter is IntrinsicsParameter.FOCAL_LENGTH else sent.width_px / 20
+            yield IntrinsicsCheck(parameter, its_sent, scale * after, sigma, unit * prior_sigma, True, False)

@@ -30,8 +30,7 @@ from ..uncertainty.radii import accuracy_from_covariance
 from ..views import Matches
 from .ambiguity import AmbiguityOptions, find_rival
 from .evidence import AgreementOptions, Evidence, Votes, evidence_of, votes_of
-from .intrinsics import wrong_intrinsics
-from .wrong_camera import WrongCameraOptions, wrong_camera
+from .intrinsics import WrongCameraOptions, wrong_camera, wrong_intrinsics
 
 _RARE = (0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075)
 LEVELS = (*_RARE, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
