@@ -6,6 +6,8 @@ import ast
 import re
 import sys
 from collections.abc import Iterator
+from functools import cache
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -40,11 +42,16 @@ def modules_of(package: str) -> dict[str, Path]:
     return {".".join(path.relative_to(base).with_suffix("").parts).removesuffix(".__init__"): path for path in paths}
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
 def imports_of(
     module: str, path: Path, known: dict[str, Path], *, deferred: bool, typing: bool = True
 ) -> Iterator[str]:
     """The modules of `known` that a module imports; those in functions if `deferred`, for type checkers if `typing`."""
-    tree = ast.parse(path.read_text())
+    tree = parsed(path)
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     for node in ast.walk(tree) if deferred else _at_import(tree, typing):
         if isinstance(node, ast.Import):
@@ -70,6 +77,7 @@ def _at_import(node: ast.AST, typing: bool) -> Iterator[ast.AST]:
             yield from _at_import(child, typing)
 
 
+@cache
 def graph(*packages: str, deferred: bool) -> dict[str, set[str]]:
     """What each module imports; a package's own modules count as imported by those who import the package."""
     known = {name: path for package in packages for name, path in modules_of(package).items()}
@@ -80,33 +88,6 @@ def room_of(module: str) -> str:
     """`mapless_server.method.coarse.grids` is in the room `method`."""
     parts = module.split(".")
     return parts[1] if len(parts) > 1 else "__init__"
-
-
-def circles(edges: dict[str, set[str]]) -> list[list[str]]:
-    """The strongly connected components of more than one node (Tarjan 1972)."""
-    order: dict[str, int] = {}
-    low: dict[str, int] = {}
-    stack: list[str] = []
-    found: list[list[str]] = []
-
-    def visit(node: str) -> None:
-        order[node] = low[node] = len(order)
-        stack.append(node)
-        for following in edges.get(node, ()):
-            if following not in order:
-                visit(following)
-            if following in stack:
-                low[node] = min(low[node], low[following])
-        if low[node] == order[node]:
-            component = stack[stack.index(node) :]
-            del stack[stack.index(node) :]
-            if len(component) > 1:
-                found.append(sorted(component))
-
-    for node in edges:
-        if node not in order:
-            visit(node)
-    return found
 
 
 def test_rooms_are_those_of_the_ladder() -> None:
@@ -145,7 +126,7 @@ def test_server_and_client_import_no_tools() -> None:
 
 
 def test_no_module_is_in_a_circle_of_imports() -> None:
-    assert circles(graph("mapless", "mapless_server", "mapless_tools", deferred=True)) == []
+    TopologicalSorter(graph("mapless", "mapless_server", "mapless_tools", deferred=True)).prepare()
 
 
 def test_no_room_inside_method_is_in_a_circle() -> None:
@@ -157,13 +138,13 @@ def test_no_room_inside_method_is_in_a_circle() -> None:
             parts.setdefault(part, set()).update(
                 ".".join(other.split(".")[:3]) for other in others if room_of(other) == "method"
             )
-    assert circles({part: others - {part, "mapless_server.method"} for part, others in parts.items()}) == []
+    TopologicalSorter({part: others - {part, "mapless_server.method"} for part, others in parts.items()}).prepare()
 
 
 def test_the_list_of_the_method_is_complete_and_in_order() -> None:
     """Of its modules, as the docstring of the room has it; one on the same line may import the one before it."""
     known = modules_of("mapless_server")
-    text = ast.get_docstring(ast.parse(known["mapless_server.method"].read_text())) or ""
+    text = ast.get_docstring(parsed(known["mapless_server.method"])) or ""
     listed = [name for line in re.findall(r"^([a-z_, /]+?)  ", text, re.MULTILINE) for name in re.findall(r"\w+", line)]
     upward = []
     for module, others in graph("mapless_server", deferred=False).items():
@@ -179,7 +160,7 @@ def packages_of(room: str) -> set[str]:
     """What the modules of a room import from outside mapless: the first two parts of each name."""
     names: set[str] = set()
     for path in (ROOT / "server" / "mapless_server" / room).rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(parsed(path)):
             if isinstance(node, ast.Import):
                 names |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
