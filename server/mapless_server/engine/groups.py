@@ -19,12 +19,9 @@ MIN_FRAMES, MAX_FRAMES = 2, 16
 
 @dataclass(frozen=True, eq=False)
 class GroupResult:
-    """The results of a group's photographs, each localized alone.
+    """The results of a group's photographs, each localized alone, in the order of the queries.
 
-    Attributes:
-        results: in the order of the queries.
-        queued_s: time that each waited before its computation began.
-        seconds: time from the beginning of each computation to its end.
+    `queued_s` is the time that each waited before its computation began, `seconds` that of the computation.
     """
 
     results: tuple[Result, ...]
@@ -35,8 +32,7 @@ class GroupResult:
 class PhotoGroup:
     """The photographs of a call that are localized one by one.
 
-    Attributes:
-        records: the stages that each photograph has been through, also if one of them fails.
+    `records` are the stages that each photograph has been through, also if one of them fails.
     """
 
     def __init__(self, engine: Engine, queries: Sequence[Query], caller: Caller, list_name: str) -> None:

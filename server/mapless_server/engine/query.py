@@ -38,11 +38,8 @@ DEFAULT_REFERENCE_COUNT = 10
 class Tier:
     """Features, with the extractor and the pipeline that use them.
 
-    Attributes:
-        extractor: finds the features.
-        pipeline: its matcher caches matches of these features, so no other tier may have the same one. Tiers may
-            share a reconstructor.
-        uses_depths: whether its references are loaded with the depths stored with them.
+    The pipeline's matcher caches matches of these features, so no other tier may have the same one; tiers may share a
+    reconstructor. References of a tier that `uses_depths` are loaded with the depths stored with them.
     """
 
     extractor: FeatureExtractor
@@ -73,11 +70,9 @@ class Tier:
 
 @dataclass(frozen=True)
 class Caller:
-    """The caller of the engine.
+    """The caller of the engine: the tenant and its caller, among which the queue shares computing time.
 
-    Attributes:
-        flow: the tenant and its caller, among which the queue shares computing time.
-        deadline_s: time after which the answer is useless, by `time.monotonic`.
+    After `deadline_s`, by `time.monotonic`, the answer is useless.
     """
 
     flow: Flow
@@ -165,9 +160,7 @@ class Result:
 class Description:
     """What the store keeps of a photograph besides the photograph itself.
 
-    Attributes:
-        views: camera and features by the extractor's name, the first tier's first; without the pixels.
-        descriptors: global descriptors, by name.
+    Views, without pixels, are by the extractor's name, the first tier's first; descriptors by their own.
     """
 
     views: Mapping[str, View]

@@ -30,15 +30,11 @@ _ID = re.compile(r"[A-Za-z0-9_.-]{1,64}", re.ASCII)  # it is logged: no line bre
 
 @dataclass(frozen=True)
 class Call:
-    """A call, for its servicer.
+    """A call, for its servicer, with the record of its steps so far; times are by `time.monotonic`.
 
-    Attributes:
-        request_id: identifies it in the log; the caller's own if that is well-formed.
-        arrived_s: when its headers arrived, by `time.monotonic`; its message may arrive later.
-        deadline_s: when the servicer must have answered, by `time.monotonic`.
-        principal: the authenticated caller.
-        client: distinguishes callers: the id that the caller gives, else the address of its connection.
-        history: record of its steps so far.
+    The request id identifies it in the log; it is the caller's own if that is well-formed. The message may arrive later
+    than the headers, at `arrived_s`. `client` distinguishes callers: the id that the caller gives, else the address of
+    its connection.
     """
 
     request_id: str

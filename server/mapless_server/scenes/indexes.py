@@ -165,14 +165,10 @@ class SceneIndexes:
 
 
 class _CachedIndex:
-    """An index, and the lock of the thread that updates it.
+    """An index with its size when last counted, and the lock of the thread that updates it.
 
-    Attributes:
-        index: index of the scene.
-        counted_bytes: its size when it was last counted.
-        damaged_ids: ids of references that are not in the index; some may have been deleted.
-        undescribable: keys of references that were found damaged when they were to be described.
-        reported_ids: ids of references whose damage has been logged.
+    Damaged are the ids of references that are not in the index, of which some may have been deleted; undescribable the
+    keys of those found damaged when they were to be described; reported the ids whose damage has been logged.
     """
 
     def __init__(self, index: SceneIndex) -> None:

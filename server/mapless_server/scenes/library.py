@@ -77,8 +77,7 @@ class KeyedLocks:
 class ReferenceLibrary:
     """Loads references from the store; thread-safe.
 
-    Attributes:
-        locks: locks of what threads are computing, by the reference's key and the name of the extractor or descriptor.
+    `locks` are of what threads are computing, by the reference's key and the name of the extractor or descriptor.
     """
 
     def __init__(self, store: Store, depths: DepthFinder | None = None) -> None:

@@ -17,13 +17,9 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Matching:
-    """A way in which references are matched.
+    """A way in which references are matched, by the extractor's features and the matcher of the queries.
 
-    Attributes:
-        extractor: extractor of the features.
-        matcher: matcher of the queries.
-        wide: whether the matches are wide ones.
-        strong: whether they are those of `Matcher.pair_matching`.
+    Matches are wide ones, or those of `Matcher.pair_matching` if they are `strong`.
     """
 
     extractor: FeatureExtractor

@@ -48,11 +48,9 @@ class Abandoned(Exception):
 
 
 class Refused(Exception):
-    """A job is not admitted.
+    """A job is not admitted, with the reason, and the seconds after which another attempt may succeed.
 
-    Attributes:
-        reason: why it is not admitted.
-        retry_after_s: seconds after which another attempt may succeed; None if the same job is never admitted.
+    They are None if the same job is never admitted.
     """
 
     def __init__(self, reason: Refusal, message: str, retry_after_s: float | None = None) -> None:
@@ -121,10 +119,8 @@ class Fallback:
 class Next:
     """The job needs another step. From now on it ends with the fallback, if there is one, instead of expiring.
 
-    Attributes:
-        step: the next step.
-        fallback: also given at once if the step would end too late or cost too much.
-        alternative: a cheaper step, which is then tried before the fallback is given.
+    The fallback is also given at once if the step would end too late or cost too much; before that an alternative, a
+    cheaper step, is tried.
     """
 
     step: Step
@@ -164,12 +160,7 @@ class StageRecord:
 
 @dataclass(eq=False)
 class _Life:
-    """The part of a job that `Job.check` needs; payloads refer to it instead of the job, which is then freed early.
-
-    Attributes:
-        over: set at the job's end.
-        checked_s: see `Job.checked_s`.
-    """
+    """The part of a job that `Job.check` needs; payloads refer to it instead of the job, which is then freed early."""
 
     over: bool = False
     checked_s: float = -math.inf
@@ -249,13 +240,9 @@ class Job:
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Jobs of one stage and bucket that are computed together.
+    """Jobs, at least one, of one stage and bucket that are computed together.
 
-    Attributes:
-        stage: stage of all jobs.
-        jobs: the jobs, at least one.
-        start_s: time of its beginning, by the queue's clock.
-        number: its number, counted from 1.
+    The numbers of batches are counted from 1; `start_s` is by the queue's clock.
     """
 
     stage: Stage

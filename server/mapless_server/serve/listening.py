@@ -20,11 +20,7 @@ class AddressTaken(Exception):
 
 
 class GrpcServer:
-    """Receives the calls of the services.
-
-    Attributes:
-        address: "host:port".
-    """
+    """Receives the calls of the services at its address, "host:port"."""
 
     def __init__(
         self, settings: Settings, services: Services, credentials: grpc.ServerCredentials | None = None

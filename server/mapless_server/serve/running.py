@@ -39,11 +39,7 @@ _HEARTBEAT_LIMIT_S = 5.0
 
 
 class Listener(Protocol):
-    """Receives the calls of the services; bound to its address when it is made.
-
-    Attributes:
-        address: "host:port".
-    """
+    """Receives the calls of the services; bound to its address, "host:port", when it is made."""
 
     address: str
 
@@ -62,13 +58,9 @@ Listen = Callable[[Settings, Services, "grpc.ServerCredentials | None"], Listene
 
 @dataclass(frozen=True)
 class Running:
-    """A server that answers calls.
+    """A server that answers calls; addresses are "host:port", that of the metrics empty if they are not served.
 
-    Attributes:
-        address: "host:port".
-        metrics_address: "host:port" of the metrics; empty if they are not served.
-        engine: engine of the services.
-        failed: a future that is done after an unrecoverable failure, when nothing will be computed any more.
+    The future `failed` is done after an unrecoverable failure, when nothing will be computed any more.
     """
 
     address: str

@@ -65,8 +65,7 @@ class _Health(health.aio.HealthServicer):  # type: ignore[name-defined,misc]
 class Services:
     """All services of a server. They answer UNAVAILABLE until `open` sets the engine; `drain` ends them in order.
 
-    Attributes:
-        handlers: handlers by service and method, for the server that listens.
+    `handlers`, by service and method, are for the server that listens.
     """
 
     def __init__(

@@ -34,12 +34,9 @@ _MICROSECONDS = 1_000_000
 
 @dataclass(frozen=True)
 class CalibrationClaim:
-    """A scene that one server calibrates.
+    """A scene that one server calibrates for answers of a kind.
 
-    Attributes:
-        scene_key: key of the scene.
-        kind: kind of the answers.
-        until_us: when the claim ends; no other server's claim ends at the same microsecond.
+    No other server's claim ends at the same microsecond.
     """
 
     scene_key: SceneKey

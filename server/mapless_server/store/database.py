@@ -13,10 +13,8 @@ class StoreError(Exception):
 class Database(Protocol):
     """Transactions of one database; thread-safe. Raises RequestError for faults that a caller can act on.
 
-    Attributes:
-        is_shared: whether other processes may change it; then cached rows are valid for their generation only.
-        only_reads: whether all changes are refused.
-        name: name in messages.
+    If other processes may change it, it `is_shared`, and cached rows are valid for their generation only. A database
+    that `only_reads` refuses all changes. The name is for messages.
     """
 
     is_shared: bool

@@ -31,11 +31,9 @@ def depth_kind(network: str, weights_sha256: str) -> str:
 
 @dataclass(frozen=True)
 class FoundDepths:
-    """The depths stored with some references.
+    """The depths stored with some references, by the reference's key.
 
-    Attributes:
-        depths: depths by the key of the reference.
-        damaged: kinds and keys of damaged depths; others of the same reference are used.
+    Damaged are kinds and keys of damaged depths; others of the same reference are used.
     """
 
     depths: dict[str, KeptDepth]

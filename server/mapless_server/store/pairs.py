@@ -56,13 +56,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Claim:
-    """A reference whose pairs one server matches.
-
-    Attributes:
-        scene_key: key of its scene.
-        reference_id: its id, unique within the scene.
-        key: its key.
-    """
+    """A reference, with its id unique within the scene and its key, whose pairs one server matches."""
 
     scene_key: SceneKey
     reference_id: str

@@ -74,9 +74,8 @@ class _Resolved(NamedTuple):
 class StoreReader:
     """Reads scenes and references; each method sees one moment of the database.
 
-    Attributes:
-        observer: receives an event for every operation; None for no observer.
-        write_fault: why the last change could not be written, one of `UNWRITABLE`; empty if it could.
+    The observer, if there is one, receives an event for every operation. `write_fault` says why the last change could
+    not be written, one of `UNWRITABLE`; it is empty if it could.
     """
 
     def __init__(

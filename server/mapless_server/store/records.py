@@ -73,16 +73,11 @@ def calibration_kind(features: str, backend: str, server_version: str) -> str:
 class SceneAttributes:
     """Attributes of a scene; None where unknown.
 
-    Attributes:
-        datum: position of its world on the Earth.
-        down_in_world: unit vector in the direction of gravity; None for that of the datum, if there is one.
-        calibration: measured factors of the radii of answers.
-        arbitrary_unit: whether the unit of length is arbitrary instead of the metre.
-        self_calibrations: calibrations from its own references, one for each kind of answers; only filled for answers.
-
-    Raises:
-        ContradictingDown: datum and down_in_world do not belong to the same world.
-        DatumWithoutMetres: there is a datum, but the unit is arbitrary.
+    The datum is the position of its world on the Earth; `down_in_world` the unit vector in the direction of gravity,
+    None for that of the datum, if there is one. The calibration has measured factors of the radii of answers; the
+    self-calibrations, one for each kind of answers, are only filled for answers. ContradictingDown if datum and
+    down_in_world do not belong to the same world; DatumWithoutMetres if there is a datum, but the unit of length is
+    arbitrary instead of the metre.
     """
 
     datum: Datum | None = None
@@ -204,12 +199,9 @@ class DescribedReference:
 
 @dataclass(frozen=True, eq=False)
 class SceneSnapshot:
-    """References and the generation of their scene, read at one moment.
+    """References and the generation of their scene, read at one moment, in the order requested.
 
-    Attributes:
-        generation: generation of the scene.
-        references: references that have features of the requested extractor, in the order requested.
-        undescribed: references without such features, in the order requested.
+    Undescribed are those without features of the requested extractor.
     """
 
     generation: int
@@ -221,11 +213,8 @@ class SceneSnapshot:
 class IndexedReference:
     """The data of a reference that retrieval needs.
 
-    Attributes:
-        reference_id: its id, unique within the scene.
-        key: its key, never used again.
-        world_from_camera: its pose, metric; read-only arrays.
-        descriptor: the requested global descriptor, (D,), read-only, rounded to float16; None if there is none.
+    Its id within the scene, its key, which is never used again, its pose. The pose is metric; the requested global
+    descriptor (D,), rounded to float16, is None if there is none. Arrays are read-only.
     """
 
     reference_id: str

@@ -32,13 +32,9 @@ _DATABASE = "database"
 
 @dataclass(frozen=True)
 class Verification:
-    """The result of a verification.
+    """The result of a verification: the schema's version and the numbers of rows of scenes and their parts, by table.
 
-    Attributes:
-        version: version of the schema.
-        counts: number of rows of scenes, references and their parts, by table.
-        faults: one line for each fault; empty if nothing is damaged. Faults of the file as a whole begin with
-            "database: ".
+    There is one line for each fault; those of the file as a whole begin with "database: ".
     """
 
     version: int

@@ -33,11 +33,9 @@ _CACHED_COMPARISONS = 10
 
 @dataclass(frozen=True)
 class _Finding:
-    """The part of a first comparison that is cached; the comparison itself takes megabytes.
+    """The part of a first comparison that is cached, and whether its verdict is an alarm.
 
-    Attributes:
-        is_usable, offset_m, turn_deg, excess: values of the comparison; zeros if it is not usable.
-        is_alarm: whether its verdict is an alarm.
+    The comparison itself takes megabytes. Values are zeros if it is not usable.
     """
 
     is_usable: bool

@@ -65,13 +65,10 @@ _LEAST_OBSERVERS = 3
 
 @dataclass(frozen=True)
 class Change:
-    """The comparison of an image with its neighbours' points.
+    """The comparison of an image with its neighbours' points: those that it should show, and those it shows.
 
-    Attributes:
-        expected_count: points that the image should show.
-        found_count: those it shows.
-        changed_share: share of the judged cells that are in the largest connected region of changed cells.
-        is_alarm: whether that is a change of the scene.
+    `changed_share` is the share of the judged cells that are in the largest connected region of changed cells;
+    `is_alarm` whether that is a change of the scene.
     """
 
     expected_count: int

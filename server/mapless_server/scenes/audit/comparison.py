@@ -30,14 +30,9 @@ _INFLATION = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A reference compared with neighbours.
+    """A reference compared with neighbours: the points that are matched in it.
 
-    Attributes:
-        subject: the reference.
-        neighbourhood: the neighbours and their points.
-        points: points that are matched in the subject.
-        fits: fits by what they may change; empty with too few matches.
-        options: options of the audit.
+    Fits are by what they may change; there are none with too few matches.
     """
 
     subject: PosedView

@@ -33,10 +33,8 @@ class ReferenceGone(Exception):
 class ReferenceFinder:
     """Finds and loads references of a scene, by their names.
 
-    All poses that it takes and returns are in a world whose origin is the first reference's position.
-
-    Attributes:
-        origin: (3,) that position in the scene's world, metres.
+    All poses that it takes and returns are in a world whose origin is the first reference's position, `origin` (3,) in
+    the scene's world, metres.
     """
 
     def __init__(

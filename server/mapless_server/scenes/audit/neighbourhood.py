@@ -57,12 +57,9 @@ class PairMatches:
 
 @dataclass(frozen=True, eq=False)
 class Neighbourhood:
-    """Points that neighbours triangulate.
+    """Metric points that neighbours triangulate, and their tracks over the neighbours.
 
-    Attributes:
-        references: the neighbours.
-        structure: metric points and their tracks over the neighbours.
-        point_covariance: (P, 3, 3) square metres, world axes.
+    The covariances of the points (P, 3, 3) are in square metres, world axes.
     """
 
     references: tuple[PosedView, ...]

@@ -50,12 +50,8 @@ PROCESSED_SIDE_PX = 1024
 class AuditTools:
     """What audits need, for all scenes.
 
-    Attributes:
-        library: loads references.
-        indexes: indexes of all scenes.
-        descriptor: global descriptor of the indexes.
-        extractor: extractor of the first tier, whose features every reference has.
-        pairs: caches matches, for all calls together.
+    The extractor is the first tier's, whose features every reference has; `pairs` caches matches, for all calls
+    together.
     """
 
     library: ReferenceLibrary

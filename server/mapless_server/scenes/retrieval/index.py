@@ -68,11 +68,7 @@ class _Table:
 
 @dataclass(frozen=True, eq=False)
 class Entries:
-    """The references of a scene at one generation; not changed by later updates.
-
-    Attributes:
-        generation: generation of the scene.
-    """
+    """The references of a scene at one generation; not changed by later updates."""
 
     generation: int
     _table: _Table

@@ -46,8 +46,7 @@ class Sphere:
 class Ellipsoid:
     """The camera is likely within `REACH_SIGMA` standard deviations of `position` (3,), world, metres.
 
-    Attributes:
-        covariance: (3, 3).
+    Covariance (3, 3).
     """
 
     position: Array

@@ -97,12 +97,10 @@ class RankedReference:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """The references that were selected for a photograph.
+    """The references that were selected for a photograph of a scene's generation, in order.
 
-    Attributes:
-        references: in order, the most similar first except for those that see the same as an earlier one.
-        descriptor: name of the global descriptor that was compared; empty if the scene has no references.
-        generation: generation of the scene.
+    The most similar are first, except for those that see the same as an earlier one. `descriptor` is the name of the
+    global descriptor that was compared; empty if the scene has no references.
     """
 
     references: tuple[RankedReference, ...]

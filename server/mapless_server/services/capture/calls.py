@@ -54,15 +54,10 @@ _DIGEST_BYTES = 32
 
 @dataclass(frozen=True, eq=False)
 class CapturedReference:
-    """A reference that a photograph was compared with.
+    """A reference that a photograph was compared with; its pose is metric, its camera in pixels of its photograph.
 
-    Attributes:
-        reference_id: its id, unique within its scene.
-        key: its key, never used again; a reference that replaces it has another.
-        camera: its camera, in pixels of its photograph.
-        world_from_camera: its pose, metric.
-        image_sha256: name of its photograph's blob.
-        views: names of the blobs of its features, by the name of the extractor.
+    Its id is unique within its scene; its key is never used again, so that a reference that replaces it has another.
+    The photograph's blob is named by its SHA-256, the blobs of its features by name of the extractor.
     """
 
     reference_id: str
@@ -75,13 +70,10 @@ class CapturedReference:
 
 @dataclass(frozen=True, eq=False)
 class CapturedPart:
-    """What one photograph of a call was compared with.
+    """The named or ranked references that one photograph of a call was compared with, at a generation of the scene.
 
-    Attributes:
-        field: path of the photograph in the request, "image" or "images[2].image".
-        generation: generation of the scene when its references were read.
-        references: the references that were named or ranked.
-        choice: how they were chosen; None if the caller named them.
+    The field is the photograph's path in the request, "image" or "images[2].image"; the choice is None if the caller
+    named the references.
     """
 
     field: str

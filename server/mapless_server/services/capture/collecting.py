@@ -25,12 +25,8 @@ class ReferencesDeleted(Exception):
 class UsedReferences:
     """What a photograph was compared with, by key only, so that a queued call needs little memory.
 
-    Attributes:
-        field: path of the photograph in the request.
-        generation: generation of the scene when its references were read.
-        used: keys of the references that the answer was computed from.
-        wanted: keys, by id, of the references that were named or ranked.
-        choice: how they were chosen; None if the caller named them.
+    Used are the keys of the references that the answer was computed from; wanted the keys, by id, of those that were
+    named or ranked. Field, generation and choice are as of `CapturedPart`.
     """
 
     field: str

@@ -213,10 +213,9 @@ def _lock(folder: Path) -> int:
 
 
 class BlobLedger:
-    """The blobs of a folder by path, with the number of calls that need each; for use by one thread.
+    """The blobs of a folder by path, with their size on the disk and the number of calls that need each.
 
-    Attributes:
-        disk_bytes: their size on the disk.
+    For one thread.
     """
 
     def __init__(self) -> None:

@@ -44,11 +44,9 @@ _FUTURE_S = 60.0
 
 @dataclass(frozen=True)
 class Retention:
-    """Limits of a folder.
+    """Limits of a folder: the age at which a call is deleted, and the size of all files together.
 
-    Attributes:
-        keep_s: age at which a call is deleted, seconds.
-        max_bytes: largest size of all files together, in whole blocks of the disk.
+    The size is in whole blocks of the disk.
     """
 
     keep_s: float
@@ -62,15 +60,9 @@ class Retention:
 class CapturedEntry:
     """A captured call in the folder.
 
-    Attributes:
-        path: its file.
-        scene_key: its scene.
-        scene_created_us: when the scene was created, Unix microseconds; distinguishes scenes of one name.
-        references: id and key of each reference.
-        blobs: files of the blobs that it needs.
-        disk_bytes: size of its own file.
-        expiry_s: time of its deletion, Unix seconds.
-        expiry_monotonic_s: the same time by `time.monotonic`.
+    Its file and its size, its references' ids and keys, the blobs' files that it needs. The time of the scene's
+    creation, Unix microseconds, distinguishes scenes of one name. The call is deleted at `expiry_s`, Unix seconds;
+    `expiry_monotonic_s` is the same time by `time.monotonic`.
     """
 
     path: Path
@@ -88,11 +80,7 @@ class CapturedEntry:
 
 
 class CaptureFolder:
-    """The captured calls of one server.
-
-    Attributes:
-        path: path of the folder.
-    """
+    """The captured calls of one server."""
 
     def __init__(self, path: Path, retention: Retention, clock: Callable[[], float] = time.time) -> None:
         """Opens and locks the folder, creates it if it does not exist, and applies the limits to what is in it.

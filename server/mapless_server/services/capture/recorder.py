@@ -55,18 +55,9 @@ class CaptureObserver(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class QueuedCall:
-    """A call that waits to be written.
+    """A call that waits to be written, with both messages and their size, and the references of each photograph.
 
-    Attributes:
-        call: the call.
-        scene_id: its scene.
-        time_s: when it was answered, Unix seconds.
-        request: the message as it was received.
-        response: the message as it was sent.
-        size_bytes: size of both messages.
-        parts: the references of each photograph.
-        attributes: attributes of the scene.
-        tiers: all tiers of the server.
+    It was answered at `time_s`, Unix seconds; the tiers are all of the server.
     """
 
     call: Call
@@ -118,11 +109,7 @@ class RateLimitedLog:
 
 
 class Recorder:
-    """Captures the calls of one server.
-
-    Attributes:
-        folder: the folder of the calls.
-    """
+    """Captures the calls of one server in a folder."""
 
     def __init__(
         self,

@@ -23,11 +23,9 @@ from .radii import Conditions, ReportedRadii, reported_radii
 
 @dataclass(frozen=True, eq=False)
 class AnswerFrames:
-    """The frames in which a caller requests its answer, besides OpenCV's.
+    """The frames in which a caller requests its answer, besides OpenCV's: the axes of its camera.
 
-    Attributes:
-        axes: axes of the caller's camera.
-        session_from_camera: the device's pose at the time of capture, in these axes; None if the request has none.
+    `session_from_camera` is the device's pose at the time of capture, in these axes; None if the request has none.
     """
 
     axes: Axes

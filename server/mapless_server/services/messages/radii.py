@@ -18,12 +18,7 @@ _SELF_CALIBRATED = Variant.BEST.name
 
 @dataclass(frozen=True)
 class Factors:
-    """Factors of an answer's radii; 1 leaves them as they are.
-
-    Attributes:
-        position_68, position_95: factors of the position's radii.
-        rotation_68, rotation_95: factors of the rotation's radii.
-    """
+    """Factors of the radii of an answer's position and rotation; 1 leaves them as they are."""
 
     position_68: float = 1.0
     position_95: float = 1.0
@@ -59,11 +54,8 @@ class Factors:
 class Conditions:
     """What computed an answer; factors hold only for answers of the same conditions.
 
-    Attributes:
-        features: name of the local features, with their options: "sift-2048-1024px-0.02".
-        backend: backend of the coarse stage.
-        variant: form of the method, as `Diagnostics` names it: "BEST".
-        server_version: another version may report other radii.
+    Features have a name with their options, "sift-2048-1024px-0.02"; the variant is named as by `Diagnostics`, "BEST".
+    Another version of the server may report other radii.
     """
 
     features: str
