@@ -108,9 +108,9 @@ def solve_one_reference(
 ) -> Found | Rejection:
     """Estimates the pose of a query from its matches with a single reference.
 
-    TOO_FEW_MATCHES or PNP_FAILED if there is none. The reconstruction has predicted depths; the scale is metres per unit
-    of it, with the relative standard deviation;
-    `origin` (3,) is that of the reference's world in the caller's world.
+    TOO_FEW_MATCHES or PNP_FAILED if there is none. The reconstruction has predicted depths; the scale is metres per
+    unit of it, with the relative standard deviation; `origin` (3,) is that of the reference's world in the caller's
+    world.
     """
     (reference,), (matches,) = references, query_matches
     points = _predicted(reference, reconstruction, scale, matches)

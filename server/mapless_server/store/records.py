@@ -211,10 +211,10 @@ class SceneSnapshot:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class IndexedReference:
-    """The data of a reference that retrieval needs.
+    """The data of a reference that retrieval needs; arrays are read-only.
 
-    Its id within the scene, its key, which is never used again, its pose. The pose is metric; the requested global
-    descriptor (D,), rounded to float16, is None if there is none. Arrays are read-only.
+    The key is never used again. The pose is metric; the requested global descriptor (D,), rounded to float16, is None
+    if there is none.
     """
 
     reference_id: str

@@ -44,10 +44,7 @@ class Sphere:
 
 @dataclass(frozen=True, eq=False)
 class Ellipsoid:
-    """The camera is likely within `REACH_SIGMA` standard deviations of `position` (3,), world, metres.
-
-    Covariance (3, 3).
-    """
+    """The camera is likely within `REACH_SIGMA` standard deviations of `position` (3,), metres, in the world."""
 
     position: Array
     covariance: Array

@@ -213,10 +213,7 @@ def _lock(folder: Path) -> int:
 
 
 class BlobLedger:
-    """The blobs of a folder by path, with their size on the disk and the number of calls that need each.
-
-    For one thread.
-    """
+    """The blobs of a folder by path, their size on the disk and the number of calls that need each; for one thread."""
 
     def __init__(self) -> None:
         self.disk_bytes = 0

@@ -58,11 +58,10 @@ class Retention:
 
 @dataclass(frozen=True, eq=False)
 class CapturedEntry:
-    """A captured call in the folder.
+    """A captured call in the folder: its file and size, its references' ids and keys, the blobs that it needs.
 
-    Its file and its size, its references' ids and keys, the blobs' files that it needs. The time of the scene's
-    creation, Unix microseconds, distinguishes scenes of one name. The call is deleted at `expiry_s`, Unix seconds;
-    `expiry_monotonic_s` is the same time by `time.monotonic`.
+    The time of the scene's creation, Unix microseconds, distinguishes scenes of one name. The call is deleted at
+    `expiry_s`, Unix seconds; `expiry_monotonic_s` is the same time by `time.monotonic`.
     """
 
     path: Path
