@@ -4,19 +4,13 @@ The method works on reduced photographs without distortion. A pixel is converted
 photograph, and to a pixel by the camera that was sent: that undoes the reduction and distorts again in one step.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, normalize
 from mapless.v1 import localization_service_pb2 as pb
-
-if TYPE_CHECKING:
-    from mapless_server.method.results import Support
-    from mapless_server.method.views import View
+from mapless_server.method.results import Support
+from mapless_server.method.views import View
 
 MAX_MATCHES = 2000
 """About 100 KB of message, and more than can be seen in a picture."""
