@@ -39,6 +39,8 @@ MAX_ERROR_M = 0.1
 
 _LIMIT_S = 600.0  # networks may be compiled by the first photograph
 _CAMERA = Camera(640, 480, 520.0, 520.0, 319.5, 239.5)
+_REFERENCE_CAMERA = _CAMERA.resized(400, 300)
+"""Describing these costs half, and their keypoints still are as many as a query's."""
 _CENTRES_X_M = (-0.6, 0.0, 0.6)
 _FARTHEST = (0, 2)
 """Numbers of the two centres that are farthest apart."""
@@ -137,15 +139,15 @@ class _RenderedReferences:
 
 
 def _photograph(world_from_camera: RigidTransform) -> bytes:
-    _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(_render(world_from_camera), cv2.COLOR_RGB2BGR))
+    _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(_render(world_from_camera, _CAMERA), cv2.COLOR_RGB2BGR))
     return jpeg.tobytes()
 
 
 def _reference(extractor: FeatureExtractor, number: int) -> PosedView:
     name, world_from_camera = f"r{number}", _pose(_CENTRES_X_M[number])
-    pixels = _render(world_from_camera)
-    photograph = Photograph(lambda: hashlib.sha256(pixels.tobytes()).hexdigest(), _CAMERA, lambda: pixels)
-    view = replace(extractor.extract(pixels, _CAMERA), photograph=photograph)
+    pixels = _render(world_from_camera, _REFERENCE_CAMERA)
+    photograph = Photograph(lambda: hashlib.sha256(pixels.tobytes()).hexdigest(), _REFERENCE_CAMERA, lambda: pixels)
+    view = replace(extractor.extract(pixels, _REFERENCE_CAMERA), photograph=photograph)
     return PosedView(name, name, view, world_from_camera)
 
 
@@ -155,18 +157,18 @@ def _pose(x_m: float) -> RigidTransform:
     return RigidTransform(np.asarray(rotation, np.float64), np.array([x_m, 0.1 * x_m, 0.0]))
 
 
-def _render(world_from_camera: RigidTransform) -> NDArray[np.uint8]:
+def _render(world_from_camera: RigidTransform, camera: Camera) -> NDArray[np.uint8]:
     """The camera's image of the walls, (H, W, 3) RGB."""
-    canvas = np.zeros((_CAMERA.height_px, _CAMERA.width_px, 3), np.uint8)
+    canvas = np.zeros((camera.height_px, camera.width_px, 3), np.uint8)
     camera_from_world = world_from_camera.inverse()
     for seed, (distance_m, half_side_m) in enumerate(_WALLS):
         texture = _texture(seed)
         corners = half_side_m * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) + [0, 0, distance_m]
-        seen = _CAMERA.project(camera_from_world.apply(corners))
+        seen = camera.project(camera_from_world.apply(corners))
         end = _TEXTURE_PX - 1
         of_texture = np.array([[0, 0], [end, 0], [end, end], [0, end]], np.float32)
         homography = cv2.getPerspectiveTransform(of_texture, seen.astype(np.float32))
-        size = (_CAMERA.width_px, _CAMERA.height_px)
+        size = (camera.width_px, camera.height_px)
         picture = cv2.warpPerspective(texture, homography, size, flags=cv2.INTER_LINEAR)
         covers = cv2.warpPerspective(np.full(texture.shape[:2], 255, np.uint8), homography, size) > 127
         canvas[covers] = picture[covers]
