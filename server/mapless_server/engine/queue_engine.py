@@ -118,9 +118,9 @@ class QueueEngine:
     ) -> Job:
         """Makes the job of localizing a photograph, for `run`; its `records` list the stages that it has been through.
 
-        The references are those of the scene without another source. `on_coarse` is called on the event loop, before
-        the answer, with the first tier's localization before its refinement, if there is one; nothing has checked it.
-        It is called again if references are deleted while they are used. The answer does not depend on it.
+        The references are those of the scene, unless another source is given. `on_coarse` is called on the event loop,
+        before the answer, with the first tier's localization before its refinement, if there is one; nothing has
+        checked it. It is called again if references are deleted while they are used. The answer does not depend on it.
         """
         views = QueryViews(query.photo, self.options.image_limits)
         run = QueryRun(query, source or self.references, views, caller.deadline_s)

@@ -167,8 +167,8 @@ class SceneIndexes:
 class _CachedIndex:
     """An index with its size when last counted, and the lock of the thread that updates it.
 
-    Damaged are the ids of references that are not in the index, of which some may have been deleted; undescribable the
-    keys of those found damaged when they were to be described; reported the ids whose damage has been logged.
+    `damaged_ids` are of references that are not in the index, of which some may have been deleted; `undescribable` are
+    keys of references found damaged when they were to be described; of `reported_ids` the damage has been logged.
     """
 
     def __init__(self, index: SceneIndex) -> None:

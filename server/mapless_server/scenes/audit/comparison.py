@@ -32,7 +32,7 @@ _INFLATION = 2.0
 class Comparison:
     """A reference compared with neighbours: the points that are matched in it.
 
-    Fits are by what they may change; there are none with too few matches.
+    The fits are by what they may change; too few matches have none.
     """
 
     subject: PosedView

@@ -44,7 +44,7 @@ class Sphere:
 
 @dataclass(frozen=True, eq=False)
 class Ellipsoid:
-    """The camera is likely within `REACH_SIGMA` standard deviations of `position` (3,), metres, in the world."""
+    """The camera is likely within `REACH_SIGMA` standard deviations (covariance (3, 3)) of `position` (3,), world."""
 
     position: Array
     covariance: Array

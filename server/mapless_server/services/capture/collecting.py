@@ -25,8 +25,8 @@ class ReferencesDeleted(Exception):
 class UsedReferences:
     """What a photograph was compared with, by key only, so that a queued call needs little memory.
 
-    Used are the keys of the references that the answer was computed from; wanted the keys, by id, of those that were
-    named or ranked. Field, generation and choice are as of `CapturedPart`.
+    `used` are the keys of the references that the answer was computed from, `wanted` those, by id, of the references
+    that were named or ranked. Field, generation and choice are as of `CapturedPart`.
     """
 
     field: str

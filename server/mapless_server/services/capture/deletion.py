@@ -42,7 +42,7 @@ class StaleCalls:
         """Deletes these calls; a fault of one scene or file does not keep those of the others. Returns their number.
 
         Unavailable if the store cannot be read, and nothing more is found until it can; OSError if a file cannot be
-        deleted; any exception for which a scene cannot be read.
+        deleted; or the exception because of which a scene cannot be read.
         """
         entries = sorted(folder.entries(), key=lambda it: it.scene_key)
         by_scene = {key: list(calls) for key, calls in groupby(entries, lambda it: it.scene_key)}

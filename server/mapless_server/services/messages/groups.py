@@ -61,7 +61,7 @@ def queries_from_message(
 ) -> tuple[Query, ...]:
     """Converts the photographs of a request, in its field `list_name`, to queries of the tenant.
 
-    Their number has the least and largest value `bounds`. The scene's attributes may be empty unless `needs_attributes`
+    `bounds` are the least and the largest number of them. The scene's attributes may be empty unless `needs_attributes`
     is true for a photograph. FieldError and InvalidArgument name the wrong field, "images[2].intrinsics".
     """
     scene_id = wire.scene_id_from_name(request.scene, "scene")

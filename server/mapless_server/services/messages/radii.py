@@ -54,8 +54,8 @@ class Factors:
 class Conditions:
     """What computed an answer; factors hold only for answers of the same conditions.
 
-    Features have a name with their options, "sift-2048-1024px-0.02"; the variant is named as by `Diagnostics`, "BEST".
-    Another version of the server may report other radii.
+    The name of the features contains their options, "sift-2048-1024px-0.02"; the variant is named as by `Diagnostics`,
+    "BEST". Another version of the server may report other radii.
     """
 
     features: str
