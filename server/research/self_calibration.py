@@ -8,7 +8,7 @@ how many are within their radii, and how many right ones are accepted, generic a
 constants are tried on a grid, and chosen for each place by what the others say, so that none is tested on itself.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -30,24 +30,27 @@ from mapless_server.store import SelfCalibration
 
 from .places import KITCHEN, QUERIES, Measured, Pair, Place, answered, read_places, samples_of_command, spread
 
-SETTINGS: dict[str, tuple[int, ...]] = {
+SETTINGS: dict[str, tuple[int | None, ...]] = {
     KITCHEN: (30, 10, 5),
     "euroc-v101-drone": (20, 10, 5),
-    "tum-fr3-office": (6,),
-    "kitti-drive-a": (8,),
+    "tum-fr3-office": (None, 6),
+    "fountain-P11": (None,),
+    "herz-jesus-P8": (None,),
+    "kitti-drive-a": (None, 8),
     "office-lockers": (20, 10),
     "statue-of-liberty-internet": (20, 10),
     "meeting-room": (10, 5),
     "studio-flat": (10, 5),
     "fox-portrait": (10, 5),
 }
-"""Folders and numbers of references."""
+"""Folders and numbers of references; None: all but the photograph that is asked, in scenes small enough for that."""
 
 K, SAMPLE = 10, 40
 COVERAGE = 0.95
-GRID = tuple(
+Constants = tuple[float, FitOptions]
+GRID: tuple[Constants, ...] = tuple(
     (growth, FitOptions(factor_log=factor, noise_share=noise))
-    for growth, factor, noise in product((0.0, 0.15, 0.3, 0.45), (0.4, 0.8), (0.05, 0.3, 0.6))
+    for growth, factor, noise in product((0.0, 0.1, 0.2, 0.3), (0.4, 0.8), (0.05, 0.3, 0.6))
 )
 """Exponents of the gap, and the priors of factor and noise."""
 
@@ -71,13 +74,21 @@ def collect(data: Path, features: str, extractor: FeatureExtractor) -> Iterator[
     for name, counts in SETTINGS.items():
         place = read_places(data, [name], extractor)[name]
         indices = sorted(place.views)
-        for count in counts:
-            references = spread(indices, count)
-            queries = spread([i for i in indices[1:-1] if i not in references], QUERIES)
+        for setting, references, queries in (it for count in counts for it in _settings(indices, count)):
+            scene = f"{name}:{setting}"
             for is_reference, asked in ((True, spread(references, SAMPLE)), (False, queries)):
-                pairs = [_pair(place, f"{name}:{count}", i, references, features) for i in asked]
+                pairs = [_pair(place, scene, i, references, features) for i in asked]
                 for i, it in zip(asked, answered(pairs, LocalizeOptions(coverage=1.0), features), strict=True):
-                    yield Sample(f"{name}:{count}", features, is_reference, it.right, _result(place, i, it))
+                    yield Sample(scene, features, is_reference, it.right, _result(place, i, it))
+
+
+def _settings(indices: Sequence[int], count: int | None) -> Iterator[tuple[str, list[int], list[int]]]:
+    """Names, references and queries; a query is no reference of those that calibrate for it."""
+    if count is None:
+        yield from ((f"without {query}", [i for i in indices if i != query], [query]) for query in indices)
+    else:
+        references = spread(indices, count)
+        yield str(count), references, spread([i for i in indices[1:-1] if i not in references], QUERIES)
 
 
 def _pair(place: Place, title: str, index: int, references: Sequence[int], features: str) -> Pair:
@@ -102,6 +113,11 @@ class Tested:
     features: str
     ratios: Array
     accepted: NDArray[np.bool_]
+
+    @property
+    def place(self) -> str:
+        """The folder."""
+        return self.scene.partition(":")[0]
 
     @property
     def loss(self) -> float:
@@ -141,34 +157,34 @@ def _ratios(it: LeftOut, calibration: SelfCalibration) -> tuple[float, ...]:
     )
 
 
-def choose(samples: Sequence[Sample]) -> tuple[float, FitOptions]:
-    """The growth and options with the lowest loss, every place counting alike."""
-    return min(GRID, key=lambda it: loss(test(samples, *it)))
+def choose(tried: Mapping[Constants, Sequence[Tested]], left_out: str = "") -> Constants:
+    """The constants with the lowest loss, every other place counting alike."""
+    return min(tried, key=lambda it: loss([tested for tested in tried[it] if tested.place != left_out]))
 
 
 def loss(tested: Sequence[Tested]) -> float:
     """Mean loss, every place counting alike."""
     places: dict[str, list[float]] = {}
     for it in tested:
-        places.setdefault(it.scene.partition(":")[0], []).append(it.loss)
+        places.setdefault(it.place, []).append(it.loss)
     return float(np.mean([np.mean(it) for it in places.values()]))
 
 
-def left_out_places(samples: Sequence[Sample]) -> Iterator[str]:
-    """Lines of a table: each place with the options that the others choose, beside the generic radii."""
+def left_out_places(generic: Sequence[Tested], tried: Mapping[Constants, Sequence[Tested]]) -> Iterator[str]:
+    """Lines of a table: each place with the constants that the others choose, beside the generic radii."""
     yield "| scene | features | answers | generic: position, rotation 68 %, 95 %, accepted | self | chosen |"
     yield "|---|---|---|---|---|---|"
-    for place in dict.fromkeys(it.scene.partition(":")[0] for it in samples):
-        own = [it for it in samples if it.scene.partition(":")[0] == place]
-        growth, options = choose([it for it in samples if it not in own])
-        for generic, calibrated in zip(test(own, 0.0, None), test(own, growth, options), strict=True):
-            chosen = f"{growth:g}, {options.factor_log:g}, {options.noise_share:g}"
-            cells = " | ".join(map(_cells, (generic, calibrated)))
-            yield f"| {generic.scene} | {generic.features} | {len(generic.ratios)} | {cells} | {chosen} |"
+    for place, features in dict.fromkeys((it.place, it.features) for it in generic):
+        growth, options = chosen = choose(tried, place)
+        both = [[it for it in own if (it.place, it.features) == (place, features)] for own in (generic, tried[chosen])]
+        cells = f"{sum(len(it.ratios) for it in both[0])} | {' | '.join(map(_cells, both))}"
+        yield f"| {place} | {features} | {cells} | {growth:g}, {options.factor_log:g}, {options.noise_share:g} |"
 
 
-def _cells(it: Tested) -> str:
-    return ", ".join(f"{100 * share:.0f}" for share in (*(it.ratios <= 1).mean(axis=0), it.accepted.mean()))
+def _cells(tested: Sequence[Tested]) -> str:
+    inside = np.concatenate([it.ratios <= 1 for it in tested]).mean(axis=0)
+    accepted = np.concatenate([it.accepted for it in tested]).mean()
+    return ", ".join(f"{100 * share:.0f}" for share in (*inside, accepted))
 
 
 def _read(content: dict[str, Any]) -> Sample:
@@ -181,9 +197,10 @@ def _read(content: dict[str, Any]) -> Sample:
 def main() -> None:
     """Localizes, chooses and prints."""
     samples = samples_of_command(__doc__, collect, _read)
-    growth, options = choose(samples)
+    tried = {it: test(samples, *it) for it in GRID}
+    growth, options = choose(tried)
     print(f"growth = {growth:g}, factor_log = {options.factor_log:g}, noise_share = {options.noise_share:g}\n")
-    print("\n".join(left_out_places(samples)))
+    print("\n".join(left_out_places(test(samples, 0.0, None), tried)))
 
 
 if __name__ == "__main__":

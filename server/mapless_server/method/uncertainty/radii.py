@@ -15,7 +15,7 @@ TAIL_95 = 1.47
 """Factor on the radius of 95 %, for heavy tails; the covariance is right at 68 %. From `research.radii`."""
 
 
-SELF_TAIL_95 = 1.25
+SELF_TAIL_95 = 1.3
 """The same for answers of a scene that is calibrated: the other one has to cover that scenes differ."""
 
 TAIL_PRIOR = 5.0
@@ -76,7 +76,7 @@ USUAL_GAP = 0.1
 LEAST_GAP, LARGEST_GAP = 0.03, 0.5
 """Beyond these, radii do not change with the gap."""
 
-SMALLEST_GAP = 0.003
+SMALLEST_GAP = 0.01
 """Below, the ratio of errors to radii does not change either: references that are left out of a film of a hall are at
 0.05, its photographs at 0.01 of what they see, and their ratios differ by 1.6."""
 
