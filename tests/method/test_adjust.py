@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from support.compare import assert_jacobian, assert_pose_close, pose_error
-from support.planted import NOISE, disturbed, drifted, stages, true_structure
+from support.planted import NOISE, disturbed, drifted, stages, true_correspondences, true_structure
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
@@ -254,6 +254,47 @@ def test_a_rough_pose_converges_to_the_planted_one() -> None:
     adjusted = adjust_pose(scene.query, scene.references, structure, matches, estimate, AdjustOptions())
     assert_pose_close(adjusted.world_from_camera, scene.world_from_query, metres=1e-4, degrees=1e-3)
     assert np.median(adjusted.errors_px) < 0.01
+
+
+# Keypoints that the query shares with references, without a point
+
+
+def with_few_points(case: str, count: int, wrong_share: float = 0.0) -> tuple[PoseEstimate, PoseEstimate, Array]:
+    """Estimates without and with the query's matches, where so many points are triangulated, and the true errors."""
+    scene = make_scene(random_for(case), MANY_POINTS)
+    structure, matches, estimate = stages(scene, scene.references)
+    few = np.arange(len(structure.x_in_world)) < count
+    structure = replace(structure, x_in_world=structure.x_in_world[few], tracks=structure.tracks.select(few))
+    kept = few[matches.point]
+    matches = PointMatches(matches.point[kept], matches.keypoint[kept], matches.guided[kept], 0.0)
+    estimate = replace(estimate, inliers=estimate.inliers[kept], errors_px=estimate.errors_px[kept])
+    random = random_for(case, "wrong")
+    query_matches = []
+    for found in true_correspondences(scene).query_matches:
+        wrong = found[random.random(len(found)) < wrong_share, 1]
+        found[np.isin(found[:, 1], wrong), 1] = random.permutation(wrong)
+        query_matches.append(found)
+    given = scene.query, scene.references, structure, matches, estimate, AdjustOptions()
+    before, after = adjust_pose(*given), adjust_pose(*given, query_matches=query_matches)
+    errors = [pose_error(it.world_from_camera, scene.world_from_query) for it in (before, after)]
+    return before, after, np.array(errors)
+
+
+@pytest.mark.parametrize("wrong_share", [0.0, 0.4])
+def test_keypoints_without_a_point_make_a_pose_from_few_points_better(wrong_share: float) -> None:
+    errors = np.mean([with_few_points(f"few {seed}", 12, wrong_share)[2] for seed in range(6)], axis=0)
+    assert (errors[1] < 0.6 * errors[0]).all()
+
+
+def test_keypoints_without_a_point_are_no_inliers_of_the_answer() -> None:
+    before, after, _ = with_few_points("inliers", 12)
+    assert len(after.inliers) == len(after.errors_px) == len(before.inliers)
+    assert np.trace(after.covariance[:3, :3]) < np.trace(before.covariance[:3, :3])
+
+
+def test_few_keypoints_without_a_point_change_nothing() -> None:
+    before, after, _ = with_few_points("most", 230)
+    np.testing.assert_array_equal(after.world_from_camera.matrix(), before.world_from_camera.matrix())
 
 
 def test_matches_with_large_errors_are_not_used() -> None:

@@ -4,6 +4,11 @@ The paper fixes the points before it solves for the query, and never moves the r
 points too, and reference poses are never exact: they have noise, and errors of the lens model add to it. So here all
 are adjusted together (see `pose_problem`).
 
+Where references are few and far apart, most keypoints that the query shares with one of them are in no other: no point
+can be triangulated without the query. With the query's pose one can, and after its elimination it is an equation of
+the pose, the epipolar one of both keypoints (see `two_view`). Where these are many they are adjusted with the others.
+Whether the pose is accepted is decided without them.
+
 The query's intrinsics stay as given: where they are right, poses are twice as accurate without these four unknowns.
 What the photograph says of their errors follows from the same normal equations, and the pose's covariance contains them
 (see `intrinsics`). A parameter that the photograph contradicts is estimated with the pose (see `recalibrate`).
@@ -18,12 +23,15 @@ import numpy as np
 from mapless.geometry import Array
 
 from .options import IntrinsicsSigma
+from .perturbation import reprojection_errors_px
 from .pose_problem import AdjustOptions, adjusted_estimate, errors_of_pose, optimum, pose_problem, shares_camera
 from .priors.known import NO_PRIORS, Priors
-from .recalibrate import recalibrated
+from .recalibrate import Solved, is_suspicious, recalibrated
 from .results import MetricScale, PointMatches, PoseEstimate, PoseStage, Structure, Support
+from .structure import query_tracks, with_query_points
+from .tracks import Tracks
 from .uncertainty.covariance import scale_covariance
-from .views import PosedView, View
+from .views import Matches, PosedView, View
 
 SHARED_CAMERA = 0.03
 """Share of the intrinsics' usual errors that differ between photographs of one camera. What they share is in the
@@ -40,6 +48,7 @@ def adjust_pose(
     options: AdjustOptions,
     priors: Priors = NO_PRIORS,
     intrinsics: IntrinsicsSigma | None = None,
+    query_matches: Sequence[Matches] = (),
 ) -> PoseEstimate:
     """Refines an estimate together with its points and, within their noise, the references.
 
@@ -53,13 +62,15 @@ def adjust_pose(
         priors: on the query's pose. Each is checked against the pose from the photograph alone; only consistent ones
             are used.
         intrinsics: standard deviations of the query's intrinsics; None for the defaults.
+        query_matches: matches of the query with each reference; where many belong to no point, they are used too.
 
     Returns:
         The estimate with a refined pose and its covariance; unchanged if the adjustment fails.
     """
 
     def adjusted(start: PoseEstimate, active: Priors) -> PoseEstimate | None:
-        return _adjusted(query, references, structure, matches, start, options, active, intrinsics)
+        given = query, references, structure, matches, start, options, active, intrinsics
+        return _adjusted(*given, query_matches)
 
     # If no prior is used, the answer is bit-identical to the one without priors.
     without_priors = estimate.without_priors or estimate
@@ -81,20 +92,85 @@ def _adjusted(
     options: AdjustOptions,
     priors: Priors,
     intrinsics: IntrinsicsSigma | None,
+    query_matches: Sequence[Matches],
 ) -> PoseEstimate | None:
-    """Returns the estimate at the optimum with priors; None if it diverges or has too few matches."""
-    used = np.flatnonzero(estimate.errors_px < options.max_error_px)
+    """Returns the estimate at the optimum with priors; None if it diverges or has too few matches.
+
+    Points of the query's own are chosen at its pose, with whatever error the intrinsics give it, so they hide this
+    error: the intrinsics are judged without them, and estimated without them.
+    """
+    terms = intrinsics_terms(query, references, intrinsics)
+
+    def solved(start: PoseEstimate, tracks: Tracks | None = None) -> tuple[PoseEstimate, Solved] | None:
+        return _at_optimum(query, references, structure, matches, start, options, priors, terms, tracks)
+
+    def sharpened(found: PoseEstimate) -> PoseEstimate:
+        return replace(found, covariance=priors.sharpened(found.covariance, found.world_from_camera))
+
+    own = _own_tracks(query, references, structure, matches, estimate, options, query_matches)
+    first = solved(estimate, own) if own and estimate.inliers.mean() >= options.agreeing_share else None
+    if first and not is_suspicious(first[0], options):
+        return sharpened(first[0])
+    plain = solved(estimate)
+    if plain is None:
+        return None
+    found, where = plain
+    better = recalibrated(query, references, structure, matches, found, options, priors, terms[2], where)
+    if better is found and own:
+        more, _ = first or solved(found, own) or plain
+        better = replace(more, intrinsics=found.intrinsics)
+    return sharpened(better)
+
+
+def _own_tracks(
+    query: View,
+    references: Sequence[PosedView],
+    structure: Structure,
+    matches: PointMatches,
+    estimate: PoseEstimate,
+    options: AdjustOptions,
+    query_matches: Sequence[Matches],
+) -> Tracks | None:
+    """Tracks of the query's keypoints that match references but no point; None if these are few."""
+    free = np.ones(len(query.features), bool)
+    free[matches.keypoint] = False
+    tracks = query_tracks(references, structure, query_matches, free)
+    is_many = tracks.point_count > 0 and tracks.point_count >= options.min_added_share * estimate.inliers.sum()
+    return tracks if is_many else None
+
+
+def _at_optimum(
+    query: View,
+    references: Sequence[PosedView],
+    structure: Structure,
+    matches: PointMatches,
+    estimate: PoseEstimate,
+    options: AdjustOptions,
+    priors: Priors,
+    terms: tuple[View, Array, Array, Array],
+    own: Tracks | None,
+) -> tuple[PoseEstimate, Solved] | None:
+    """The estimate at the optimum, with points of the query's own tracks, and where it was found."""
+    given, pose = len(matches), estimate.world_from_camera
+    if own:
+        structure, matches = with_query_points(query, references, structure, matches, own, pose, options.query_points)
+    added = slice(given, None)
+    x_in_world, pixels = structure.x_in_world[matches.point[added]], query.features.keypoints[matches.keypoint[added]]
+    errors_px = reprojection_errors_px(query.camera, pose, x_in_world, pixels.astype(np.float64))
+    errors_px = np.concatenate([estimate.errors_px, errors_px])
+    start_inliers = np.concatenate([estimate.inliers, np.ones(len(matches) - given, bool)])
+    used = np.flatnonzero(errors_px < options.max_error_px)
     if len(used) < 3:  # two equations each, for six unknowns
         return None
-    problem, start = pose_problem(query, references, structure, matches, used, estimate.world_from_camera, options)
+    problem, start = pose_problem(query, references, structure, matches, used, pose, options)
     with_priors = problem.replaced(priors=priors, prior_weight=options.error_inflation**2)
     bundle = optimum(with_priors, start, options)
-    terms = intrinsics_terms(query, references, intrinsics)
-    found = adjusted_estimate(query, structure, matches, used, estimate, problem, bundle, options, terms)
-    if found and found.intrinsics:
-        solved = problem, bundle, used
-        found = recalibrated(query, references, structure, matches, found, options, priors, terms[2], solved)
-    return found and replace(found, covariance=priors.sharpened(found.covariance, found.world_from_camera))
+    before = replace(estimate, inliers=start_inliers, errors_px=errors_px)
+    found = adjusted_estimate(query, structure, matches, used, before, problem, bundle, options, terms)
+    if found is None:
+        return None
+    found = replace(found, inliers=found.inliers[:given], errors_px=found.errors_px[:given])
+    return found, (problem, bundle, used)
 
 
 def intrinsics_terms(

@@ -142,7 +142,7 @@ def _with_single(
     structure: Structure, references: Sequence[PosedView], correspondences: Correspondences, known: _KnownDepths
 ) -> Structure:
     """Adds a point for each matched keypoint that has a depth and observes no point."""
-    tracks, count = structure.tracks, len(structure.x_in_world)
+    tracks = structure.tracks
     matched = zip(correspondences.query_matches, known.offsets[:-1], strict=True)
     rows = np.unique(np.concatenate([pairs[:, 1] + start for pairs, start in matched]))
     rows = np.setdiff1d(rows[np.isfinite(known.depth[rows])], known.offsets[tracks.view] + tracks.keypoint)
@@ -150,14 +150,5 @@ def _with_single(
         return structure
     view = np.searchsorted(known.offsets, rows, side="right") - 1
     points = known.centre[rows] + known.ray[rows] * known.depth[rows, None]
-    assert structure.planes is not None
-    return replace(
-        structure,
-        x_in_world=np.concatenate([structure.x_in_world, points]),
-        tracks=Tracks(
-            np.concatenate([tracks.point, count + np.arange(len(rows))]),
-            np.concatenate([tracks.view, view]),
-            np.concatenate([tracks.keypoint, rows - known.offsets[view]]),
-        ),
-        planes=structure.planes.and_last(known.planes(rows)),
-    )
+    single = Tracks(np.arange(len(rows)), view, rows - known.offsets[view])
+    return structure.and_last(points, single, known.planes(rows))

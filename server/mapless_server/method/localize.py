@@ -123,7 +123,8 @@ def solve(coarse: Coarse, counts_agreement: bool = False) -> Answer:
     sigma = prepared.options.intrinsics
     if prepared.options.variant is Variant.BEST:
         with stage("adjust"):
-            estimate = adjust_pose(query, references, structure, matches, estimate, options.adjust, priors, sigma)
+            given = query, references, structure, matches, estimate, options.adjust, priors, sigma
+            estimate = adjust_pose(*given, query_matches)
     support = replace(support, estimate=estimate, query=estimate.view or query)
     with stage("uncertainty"):
         predicted = not prepared.structure_options.optimize

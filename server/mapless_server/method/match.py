@@ -6,7 +6,7 @@ search only adds to them.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,12 +68,7 @@ def match_points(
     ):
         world_from_query = prior_pose
     found = search(query, references, structure, world_from_query, known, options)
-    return PointMatches(
-        np.concatenate([known.point, found.point]),
-        np.concatenate([known.keypoint, found.keypoint]),
-        np.concatenate([known.guided, found.guided]),
-        options.radius_px,
-    )
+    return replace(known.and_last(found.point, found.keypoint, found.guided), radius_px=options.radius_px)
 
 
 def _inlier_count(

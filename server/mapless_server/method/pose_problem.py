@@ -22,7 +22,7 @@ from .options import check_bounds
 from .perturbation import reprojection_errors_px, world_jacobian
 from .pose_errors import PoseErrorOptions, most_probable, pose_errors
 from .results import PointMatches, PoseEstimate, PoseStage, Structure
-from .structure import tracks_with_query
+from .structure import StructureOptions, tracks_with_query
 from .uncertainty.covariance import UncertaintyOptions, dispersed_covariance
 from .uncertainty.dispersion import disperse
 from .views import PosedView, View
@@ -54,6 +54,10 @@ class AdjustOptions:
             0.3, one pose of six aroused suspicion; of the others this finds four.
         contradiction: when this estimate is used.
         rounds: how often, at most, the query's keypoints are corrected by an estimated parameter.
+        min_added_share: keypoints that the query shares with references, and no point has, are adjusted too where there
+            are so many for each inlier. Fewer do not help: errors of 600 photographs of ten places are 0.84 times as
+            large where there are more, and 1.03 times where there are fewer.
+        query_points: options of triangulating these.
         pose_errors: options of the errors of the references' poses.
         uncertainty: options of the answer's covariance.
     """
@@ -71,13 +75,15 @@ class AdjustOptions:
     contradiction: ContradictionOptions = field(default_factory=ContradictionOptions)
     agreeing_share: float = 0.6
     rounds: int = 4
+    min_added_share: float = 0.4
+    query_points: StructureOptions = field(default_factory=StructureOptions)
     pose_errors: PoseErrorOptions = field(default_factory=PoseErrorOptions)
     uncertainty: UncertaintyOptions = field(default_factory=UncertaintyOptions)
 
     def __post_init__(self) -> None:
         check_bounds(self, "inlier_px min_kept_share loss_scale_sigma max_error_px agreeing_share", above=0)
         check_bounds(self, "iterations min_decrease", above=0)
-        check_bounds(self, "min_motion_sigma", at_least=0)
+        check_bounds(self, "min_motion_sigma min_added_share", at_least=0)
         check_bounds(self, "least_curvature", above=0, at_most=1)
         check_bounds(self, "rounds", at_least=2)  # the last one only reads the photograph again
 

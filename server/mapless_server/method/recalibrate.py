@@ -52,7 +52,7 @@ def recalibrated(
     """
     held, untried = usual, np.ones(4, bool)
     wide = np.maximum(usual, WIDE_SIGMA * np.array([1, query.camera.width_px, query.camera.width_px, 1]))
-    if _contradicted(found, options.suspicion, untried) is None and found.inliers.mean() >= options.agreeing_share:
+    if not is_suspicious(found, options):
         return found
     # With all estimated, the wrong ones stand out: an error that is held looks like errors of the others.
     given = query, references, structure, matches
@@ -69,6 +69,14 @@ def recalibrated(
         elif better.intrinsics.contradicted(options.suspicion)[list(worst)].any():
             found = _doubted(found, better.intrinsics, worst, shares_camera(query, references))
     return found
+
+
+def is_suspicious(found: PoseEstimate, options: AdjustOptions) -> bool:
+    """Whether the photograph may contradict its intrinsics: one seems wrong, or few matches agree."""
+    if found.intrinsics is None:
+        return False
+    is_wrong = _contradicted(found, options.suspicion, np.ones(4, bool)) is not None
+    return is_wrong or bool(found.inliers.mean() < options.agreeing_share)
 
 
 def _doubted(

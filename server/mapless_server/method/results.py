@@ -161,6 +161,19 @@ class Structure:
         moved = Tracks(point[rows], view[rows], tracks.keypoint[rows])
         return Structure(self.x_in_world[points] + offset, moved, self.noise)
 
+    def and_last(self, x_in_world: Array, tracks: Tracks, planes: DepthPlanes | None = None) -> Structure:
+        """Appends points (Q, 3) with their tracks; without `planes`, none of these is near a plane."""
+        count, added = len(self.x_in_world), len(x_in_world)
+        both = Tracks(
+            np.concatenate([self.tracks.point, count + tracks.point]),
+            np.concatenate([self.tracks.view, tracks.view]),
+            np.concatenate([self.tracks.keypoint, tracks.keypoint]),
+        )
+        if self.planes is not None:
+            none = DepthPlanes(np.zeros((added, 3)), np.zeros(added), np.zeros(added))
+            planes = self.planes.and_last(planes or none)
+        return Structure(np.concatenate([self.x_in_world, x_in_world]), both, self.noise, planes)
+
 
 @dataclass(frozen=True, eq=False)
 class PointMatches:
@@ -180,6 +193,18 @@ class PointMatches:
 
     def __len__(self) -> int:
         return len(self.point)
+
+    def and_last(
+        self, point: NDArray[np.intp], keypoint: NDArray[np.intp], guided: NDArray[np.bool_] | None = None
+    ) -> PointMatches:
+        """Appends matches, by default of the whole image."""
+        guided = np.zeros(len(point), bool) if guided is None else guided
+        return PointMatches(
+            np.concatenate([self.point, point]),
+            np.concatenate([self.keypoint, keypoint]),
+            np.concatenate([self.guided, guided]),
+            self.radius_px,
+        )
 
 
 class PoseStage(str, Enum):

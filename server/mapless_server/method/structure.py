@@ -17,7 +17,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array
+from mapless.geometry import Array, RigidTransform
 
 from .arrays import AnyArray, columns, length, namespace, take
 from .correspond import Correspondences
@@ -32,9 +32,9 @@ from .observations import (
     triangulate,
 )
 from .options import check_bounds
-from .results import KeypointNoise, MetricScale, Structure
+from .results import KeypointNoise, MetricScale, PointMatches, Structure
 from .tracks import Tracks, build_tracks, keypoint_depths, keypoint_offsets, keypoint_rays
-from .views import Matches, PosedView, Reconstruction
+from .views import Matches, PosedView, Reconstruction, View
 
 ENTRY_BYTES = 2048
 """Of a cached structure besides its arrays: objects, and the keys of ten references. Many have no points at all."""
@@ -245,6 +245,52 @@ def predicted_points(
     depth = keypoint_depths(reconstruction, references)
     points: Array = back_project(centre[first], ray[first], scale.metres_per_unit * depth[first])
     return points
+
+
+def query_tracks(
+    references: Sequence[PosedView],
+    structure: Structure,
+    query_matches: Sequence[Matches],
+    free: NDArray[np.bool_],
+) -> Tracks:
+    """Builds tracks of the query's free keypoints and the references' keypoints that they match and no point has.
+
+    The query is the last view; `free` is (N,) over its keypoints.
+    """
+    offsets, tracks, pairs = keypoint_offsets(references), structure.tracks, {}
+    is_observed = np.zeros(offsets[-1], bool)
+    is_observed[offsets[tracks.view] + tracks.keypoint] = True
+    for view, matches in enumerate(query_matches):
+        unused = free[matches[:, 0]] & ~is_observed[offsets[view] + matches[:, 1]]
+        pairs[view, len(references)] = matches[unused][:, ::-1]
+    return build_tracks(pairs, [*np.diff(offsets), len(free)])
+
+
+def with_query_points(
+    query: View,
+    references: Sequence[PosedView],
+    structure: Structure,
+    matches: PointMatches,
+    tracks: Tracks,
+    world_from_query: RigidTransform,
+    options: StructureOptions,
+) -> tuple[Structure, PointMatches]:
+    """Adds the points of `query_tracks`, triangulated with the query at a pose, and the query's matches with them.
+
+    Most are observed by a single reference; those that do not fit the pose, or have too little parallax, are left out.
+    """
+    observations = observe(tracks, [*references, PosedView("", "", query, world_from_query)], structure.noise)
+    refined = refine_points(observations, triangulate(observations), replace(options, model_noise=False))
+    found = refined.observations.tracks
+    assert isinstance(found, Tracks)
+    chosen = np.zeros(found.point_count, bool)
+    chosen[found.point[found.view == len(references)]] = True
+    chosen &= refined.trusted
+    found, count = found.select(chosen), len(structure.x_in_world)
+    is_query = found.view == len(references)
+    seen = Tracks(found.point[~is_query], found.view[~is_query], found.keypoint[~is_query])
+    added = count + found.point[is_query]
+    return structure.and_last(refined.x_in_world[chosen], seen), matches.and_last(added, found.keypoint[is_query])
 
 
 def tracks_with_query(

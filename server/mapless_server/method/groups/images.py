@@ -97,12 +97,8 @@ class MatchedImage:
     def matches_at(self, world_from_camera: RigidTransform) -> PointMatches:
         """Returns the tracked matches and those of a guided search from a pose."""
         found = search(self.query, self.references, self.structure, world_from_camera, self.tracked, self.match)
-        return PointMatches(
-            np.concatenate([self.tracked.point, found.point]),
-            np.concatenate([self.tracked.keypoint, found.keypoint]),
-            np.concatenate([self.tracked.guided, found.guided]),
-            self.match.radius_px,
-        )
+        matches = self.tracked.and_last(found.point, found.keypoint, found.guided)
+        return replace(matches, radius_px=self.match.radius_px)
 
 
 @dataclass(frozen=True, eq=False)

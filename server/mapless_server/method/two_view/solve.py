@@ -139,16 +139,12 @@ class _Problem:
     def adjusted(self, start: _Solution) -> _Solution | None:
         """Adjusts over the inliers of both kinds; None if that fails."""
         used = start.support.inliers & (start.parallax_deg >= self.options.min_parallax_deg)
-        structure = _with_points(self.structure, start.support, used)
-        added = np.arange(used.sum(), dtype=np.intp) + len(self.structure.x_in_world)
-        matches = PointMatches(
-            np.concatenate([self.matches.point, added]),
-            np.concatenate([self.matches.keypoint, start.support.keypoint[used]]),
-            np.concatenate([self.matches.guided, np.zeros(len(added), bool)]),
-            self.matches.radius_px,
-        )
+        support, rows = start.support, np.arange(used.sum(), dtype=np.intp)
+        single = Tracks(rows, support.reference[used], support.reference_keypoint[used])
+        structure = self.structure.and_last(support.x_in_world[used], single)
+        matches = self.matches.and_last(rows + len(self.structure.x_in_world), support.keypoint[used])
         errors_px = np.concatenate([start.errors_px, start.support.errors_px[used]])
-        inliers = np.concatenate([start.inliers, np.ones(len(added), bool)])
+        inliers = np.concatenate([start.inliers, np.ones(len(rows), bool)])
         before = PoseEstimate(start.world_from_query, PoseStage.REFINED, inliers, errors_px, np.eye(6))
         estimate = adjust_pose(self.evidence.query, self.evidence.references, structure, matches, before, self.adjust)
         if not estimate.is_adjusted:
@@ -156,18 +152,3 @@ class _Problem:
         found = self.at(estimate.world_from_camera)
         kept = replace(estimate, inliers=found.inliers, errors_px=found.errors_px)
         return replace(found, estimate=kept)
-
-
-def _with_points(structure: Structure, support: TwoViewSupport, used: NDArray[np.bool_]) -> Structure:
-    """Returns the structure with the points of two-view matches added, each observed by one reference."""
-    tracks, points = structure.tracks, support.x_in_world[used]
-    added = np.arange(len(points), dtype=np.intp) + len(structure.x_in_world)
-    return replace(
-        structure,
-        x_in_world=np.concatenate([structure.x_in_world, points]),
-        tracks=Tracks(
-            np.concatenate([tracks.point, added]),
-            np.concatenate([tracks.view, support.reference[used]]),
-            np.concatenate([tracks.keypoint, support.reference_keypoint[used]]),
-        ),
-    )
