@@ -105,6 +105,24 @@ def test_matches_with_one_reference_only_ask_for_another() -> None:
     assert NAMES[1] in outcome.hint.message
 
 
+@pytest.mark.parametrize(
+    ("matches", "tried", "advice"),
+    [
+        ((800, 955, 700, 0, 0, 0), 2, Advice.CHECK_CALIBRATION),
+        ((800, 955, 700, 0, 0, 0), 100, Advice.ADD_REFERENCES),
+        ((0, 955, 90, 0, 0, 0), 2, Advice.ADD_REFERENCES),
+    ],
+)
+def test_poses_are_doubted_where_two_references_share_much(
+    matches: tuple[int, ...], tried: int, advice: Advice
+) -> None:
+    rejection = Rejection(RejectionReason.LOW_OVERLAP, "planted", tried=tried)
+    outcome = hinted(Answer(rejection, reference_match_counts=matches), view_of(2048), SCENE.references).outcome
+    assert isinstance(outcome, Rejection)
+    assert outcome.hint is not None
+    assert outcome.hint.advice is advice
+
+
 def test_a_prior_that_leaves_no_reference_is_to_be_checked() -> None:
     reason = RejectionReason.NO_USABLE_REFERENCES
     assert hint_of(reason, references=(), has_prior=True).advice is Advice.CHECK_PRIOR

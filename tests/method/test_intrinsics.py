@@ -281,9 +281,15 @@ FOCAL, X, Y, _ = IntrinsicsParameter
 
 
 def rejection_of(
-    focal: float = 1.0, principal: float = 1.0, focal_x: float = 1.0, outliers: float = 0.0, sigma: float | None = None
+    focal: float = 1.0,
+    principal: float = 1.0,
+    focal_x: float = 1.0,
+    outliers: float = 0.0,
+    sigma: float | None = None,
+    doubted: float = 0.0,
+    max_inlier_share: float = 0.6,
 ) -> tuple[Rejection | None, Camera]:
-    """Of a photograph with intrinsics that are wrong by these factors; and the true camera."""
+    """Of a photograph with intrinsics that are wrong by these factors, and seem so by `doubted` standard deviations."""
     scene = make_scene(random_for("wrong camera"))
     random, true = random_for("outliers"), scene.query.camera
     keypoints = scene.query.features.keypoints.copy()
@@ -302,8 +308,9 @@ def rejection_of(
     support = Support(query, scene.references, structure, matches, estimate, np.zeros(3))
     usual = (IntrinsicsSigma() if sigma is None else IntrinsicsSigma(focal_share=sigma)).of(given)
     zero = np.zeros(4)
-    evidence = IntrinsicsEvidence(given, given, zero, usual, usual, np.zeros((4, 4)), np.zeros((6, 4)), zero)
-    return wrong_camera(support, evidence, "a", WrongCameraOptions()), true
+    value = np.array([doubted * np.hypot(usual[0], usual[0]), 0, 0, 0])
+    evidence = IntrinsicsEvidence(given, given, value, usual, usual, np.zeros((4, 4)), np.zeros((6, 4)), zero)
+    return wrong_camera(support, evidence, "a", WrongCameraOptions(max_inlier_share)), true
 
 
 @pytest.mark.parametrize(
@@ -326,6 +333,11 @@ def test_a_planted_gross_error_is_named_with_its_value(
     (focal,) = (it for it in rejection.intrinsics_checks if it.parameter is FOCAL)
     assert focal.estimated == pytest.approx(true.focal_x_px, rel=0.1)
     assert f"focal_x_px {focal.estimated:.0f} instead of {focal.given:.0f}" in rejection.message
+
+
+@pytest.mark.parametrize(("doubted", "is_named"), [(2.9, False), (3.1, True)])
+def test_many_inliers_do_not_clear_a_doubted_camera(doubted: float, is_named: bool) -> None:
+    assert (rejection_of(focal=2.0, doubted=doubted, max_inlier_share=0.01)[0] is not None) == is_named
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.5, 0.8])

@@ -55,6 +55,7 @@ class _Case:
         rejection: the query's rejection.
         features: number of features of the photograph.
         matches: number of matches with the best reference.
+        second: number of matches with the second best reference.
         inliers: number of inliers among all 2D-3D matches.
         tried: number of 2D-3D matches; None if there are none yet.
         best: name of the reference with most matches; None if none has any.
@@ -65,6 +66,7 @@ class _Case:
     rejection: Rejection
     features: int
     matches: int
+    second: int
     inliers: int
     tried: int | None
     best: str | None
@@ -89,10 +91,12 @@ def hinted(
     estimate = answer.support.estimate if answer.support else None
     matches = answer.reference_match_counts
     best = int(np.argmax(matches)) if any(matches) else None
+    most, second = sorted((*matches, 0, 0), reverse=True)[:2]
     case = _Case(
         rejection,
         len(query.features),
-        max(matches, default=0),
+        most,
+        second,
         0 if estimate is None else int(estimate.inliers.sum()),
         rejection.tried if answer.support is None else len(answer.support.matches),
         None if best is None else references[best].name,
@@ -153,6 +157,15 @@ def _of_overlap(case: _Case, options: HintOptions) -> tuple[Advice, str]:
             f"Use references that show what the photograph shows: {shared}, no more than chance gives.",
         )
     if case.matches >= options.many_matches and case.tried is not None and case.tried < case.matches / 4:
+        # Even if what two references show were independent, they would have so many of the features in common.
+        if case.tried < case.matches * case.second / case.features / 4 and case.second >= options.many_matches:
+            return (
+                Advice.CHECK_CALIBRATION,
+                f"Check the references' poses, for which `mapless-server audit` helps: world_from_camera (not its "
+                f"inverse), with OpenCV's axes. The two best references share {case.matches} and {case.second} of the "
+                f"photograph's {case.features} features, but only {case.tried} have a point that fits their poses. If "
+                "the two show different things, add references from a step aside.",
+            )
         return (
             Advice.ADD_REFERENCES,
             f"Add references that show the same as {case.best} from a step aside: {shared}, but of the photograph's "

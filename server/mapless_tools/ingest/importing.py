@@ -26,7 +26,7 @@ from .check import check_frames, implausible_depth
 from .existing import NO_METRES, KnownReferences, WrongUnit, open_scene
 from .formats import ReadOptions, read_dataset
 from .metres import MetreOptions, in_metres
-from .report import ImportReport, print_report, to_json, verdict_lines
+from .report import WRONG_POSES, ImportReport, print_report, to_json, verdict_lines
 from .upload import Uploader, UploadOptions
 
 
@@ -98,7 +98,7 @@ def run_import(
             _warn(report, contradictions([frame.world_from_camera for frame in frames], _attributes(dataset)))
             refuse_wrong_images(report)
         elif report.verdict is not None and report.verdict.is_wrong:
-            report.stopped = "nothing is stored while the poses do not fit the photographs; --skip-check does it anyhow"
+            report.stopped = WRONG_POSES
         else:
             _store(report, options.upload, settings, connection)
     return report.went_well

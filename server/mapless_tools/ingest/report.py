@@ -11,6 +11,7 @@ from mapless_tools.dataset import Dataset, Frame, Refusal
 
 from .check import Verdict
 
+WRONG_POSES = "nothing is stored while the poses do not fit the photographs; --skip-check stores them all the same"
 SHOWN = 20
 ALREADY_THERE = "already there"
 
@@ -89,6 +90,9 @@ def verdict_lines(verdict: Verdict, frames: Sequence[Frame]) -> list[str]:
 def print_report(report: ImportReport, console: Console) -> None:
     """Prints the report, with at most SHOWN reasons of a kind."""
     _print_reasons("refused", report.refused, console)
+    if report.is_dry and report.verdict is not None and report.verdict.is_wrong:
+        console.print(WRONG_POSES, markup=False, highlight=False)
+        return
     if report.is_dry:
         good = len(report.chosen) - (len(report.refused) - len(report.dataset.refused))
         summary = f"{good} references could be imported, {len(report.refused)} are refused"

@@ -61,7 +61,7 @@ _W_FIRST = _reordered((1, 2, 3, 0))
 _W_LAST = _reordered((3, 0, 1, 2))
 
 CONVENTIONS: Mapping[str, Correction] = {
-    "the camera axes are OpenGL's (x right, y up, z back)": _OPENGL,
+    "the camera axes are OpenGL's (x right, y up, z back) where the format has OpenCV's, or the reverse": _OPENGL,
     "the poses are camera_from_world, not world_from_camera": RigidTransform.inverse,
     "the poses are camera_from_world with OpenGL's camera axes": lambda pose: _OPENGL(pose.inverse()),
     "the quaternions are w x y z and were read as x y z w": _W_FIRST,
