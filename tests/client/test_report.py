@@ -1,17 +1,14 @@
 """The report of an answer: it needs nothing else, runs nothing, and what it draws lies where it belongs."""
 
-from __future__ import annotations
-
 import base64
 import re
-from collections import Counter
-from dataclasses import dataclass, field, replace
-from html.parser import HTMLParser
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from support.html import Page
 from support.images import encode, textured, with_exif_orientation
 from support.planted_answers import CAMERA, NOW, debug, diagnostics, localized, rejected, truth
 
@@ -23,49 +20,11 @@ from mapless.report.plan import _fit, ellipse_in_plane
 from mapless.results import Reference
 
 PHOTO = encode(".jpg", textured(640, 480))
-VOID = {"meta", "input"}
 ALLOWED = re.findall(
     r"\w+",
     "html head meta title style body header p h1 h2 h3 b span div section figure figcaption svg defs "
     "image use rect path g circle ellipse text table thead tbody tr th td input label footer ",
 )
-
-
-@dataclass
-class Page(HTMLParser):
-    """What a browser makes of a page: its elements and their attributes, its text, and whether all is closed."""
-
-    tags: Counter[str] = field(default_factory=Counter)
-    attributes: list[tuple[str, str, str]] = field(default_factory=list)
-    words: list[str] = field(default_factory=list)
-    open: list[str] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        super().__init__()
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags[tag] += 1
-        self.attributes += [(tag, name, value or "") for name, value in attrs]
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags[tag] += 1
-        self.attributes += [(tag, name, value or "") for name, value in attrs]
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.words.append(data)
-
-    @staticmethod
-    def of(html: str) -> Page:
-        page = Page()
-        page.feed(html)
-        page.close()
-        assert not page.open
-        return page
 
 
 def reference(name: str, image: bytes | None = PHOTO) -> Reference:
@@ -92,7 +51,7 @@ def test_the_page_has_no_external_resources_and_no_scripts(
     answer: LocalizationResult | Rejected, references: tuple[Reference, ...]
 ) -> None:
     html = report_html(answer, PHOTO, CAMERA, references)
-    page = Page.of(html)
+    page = Page(html)
     assert set(page.tags) <= set(ALLOWED)
     for tag, name, value in page.attributes:
         assert not name.startswith("on"), tag
@@ -118,13 +77,13 @@ def test_names_and_messages_are_text_whatever_they_hold() -> None:
         hypotheses=(Hypothesis(truth(), 3, names),),
         debug=debug(),
     )
-    page = Page.of(report_html(hostile, PHOTO, CAMERA, references, HOSTILE))
+    page = Page(report_html(hostile, PHOTO, CAMERA, references, HOSTILE))
     harmless = replace(hostile, diagnostics=replace(uses, stage_s={"pnp": 1.0}))
-    assert page.tags == Page.of(report_html(harmless, PHOTO, CAMERA, references, "a")).tags
+    assert page.tags == Page(report_html(harmless, PHOTO, CAMERA, references, "a")).tags
     assert page.tags["script"] == page.tags["img"] == 0
     assert sum("onerror=alert(1)" in words for words in page.words) >= 8
     checks = (PriorCheck(HOSTILE, 1.0, 1, True, True),)
-    assert Page.of(report_html(localized(prior_checks=checks, pose_stage=HOSTILE), PHOTO, CAMERA)).tags["script"] == 0
+    assert Page(report_html(localized(prior_checks=checks, pose_stage=HOSTILE), PHOTO, CAMERA)).tags["script"] == 0
 
 
 def numbers_of(html: str, kind: str) -> Array:
@@ -179,7 +138,7 @@ def test_the_ellipse_holds_95_percent() -> None:
 
 
 def test_a_rejection_has_its_reason_and_hint() -> None:
-    text = " ".join(Page.of(report_html(rejected(), PHOTO, CAMERA, BOTH)).words)
+    text = " ".join(Page(report_html(rejected(), PHOTO, CAMERA, BOTH)).words)
     assert "Not localized" in text
     assert "only 3 matches" in text
     assert "LOW_OVERLAP" in text

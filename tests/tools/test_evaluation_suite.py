@@ -6,13 +6,13 @@ import math
 import xml.etree.ElementTree as ElementTree
 from contextlib import nullcontext
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from support.evaluations import query_result
+from support.html import Page
 from support.images import textured
 
 from mapless import Internal
@@ -471,26 +471,6 @@ class TestFiles:
         assert commit_of(tmp_path) == ""
 
 
-class _Balance(HTMLParser):
-    """Whether every element that is opened is closed, in order; and which addresses are asked for."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.addresses: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
-        if tag not in ("meta", "img"):
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """An element of a chart that holds nothing; its addresses are places in the page."""
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-
 class TestPage:
     def test_is_whole_and_needs_nothing_else(self) -> None:
         measured = suite({"chess": 0.01, "fire": math.inf}, replace(OPTIONS, max_queries=5))
@@ -499,12 +479,11 @@ class TestPage:
         run = measured.runs[-1]
         shown = [WorstQuery(run, run.results[0], data_uri(textured(96, 64)), "r0", 9, 4)]
         text = page(measured, shown)
-        parser = _Balance()
-        parser.feed(text)
-        assert parser.open == []
-        assert all(address.startswith("data:image/jpeg") for address in parser.addresses)
-        assert len(parser.addresses) == 1
-        assert "<script" not in text
+        found = Page(text)
+        addresses = [value for _, name, value in found.attributes if name in ("src", "href", "xlink:href")]
+        (image,) = [value for value in addresses if not value.startswith("#")]
+        assert image.startswith("data:image/jpeg")
+        assert not found.tags["script"]
         for words in (
             "abc1234",
             "f" * 64,
@@ -523,6 +502,4 @@ class TestPage:
 
     def test_nothing_measured_is_still_a_report(self) -> None:
         measured = replace(suite({"chess": 0.01}), runs=(), failures=(Failure("chess", "no server"),))
-        parser = _Balance()
-        parser.feed(page(measured, []))
-        assert parser.open == []
+        Page(page(measured, []))
