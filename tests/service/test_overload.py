@@ -7,7 +7,6 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,10 @@ import numpy as np
 import pytest
 from support.servers import (
     CAMERA,
+    COARSE_X_M,
     PHOTO,
     RunningServer,
+    Staged,
     StandInMethod,
     localize_request,
     make_scene,
@@ -31,8 +32,7 @@ from mapless import Client, ConnectOptions, DeadlineExceeded, LocalizationResult
 from mapless.errors import from_rpc_error
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.engine.stages import Method
-from mapless_server.method.answer import Answer, Localization
-from mapless_server.method.results import PoseStage
+from mapless_server.method.answer import Answer
 
 COST_S = 0.04
 WORKERS = 2
@@ -137,61 +137,30 @@ def test_a_modest_caller_is_served_while_another_floods(tmp_path: Path) -> None:
             assert it.exception(30) is None
 
 
-class Refining:
-    """A method that has a coarse pose at once and takes its time to refine it.
-
-    Attributes:
-        seconds: for that.
-        began: how often.
-    """
-
-    def __init__(self, seconds: float) -> None:
-        self.seconds = seconds
-        self.began = 0
-        self._stand_in = StandInMethod()
-        self._stand_in.gate.set()
-
-    def method(self) -> Method:
-        return replace(whole(self._refine), coarse_answer=self._coarse_answer)
-
-    def _refine(self, *asked: Any) -> Answer:
-        self.began += 1
-        end_s = time.monotonic() + self.seconds
-        while time.monotonic() < end_s:
-            asked[-1]()  # the queue is full
-            time.sleep(0.005)
-        return self._stand_in(*asked)
-
-    def _coarse_answer(self, coarse: Any) -> Answer:
-        answer = whole(self._stand_in).refine(coarse)
-        found = answer.outcome
-        assert isinstance(found, Localization)
-        return replace(answer, outcome=replace(found, pose_stage=PoseStage.COARSE, covariance=None, inlier_count=0))
-
-
 def test_the_coarse_pose_is_answered_if_refining_has_no_time(tmp_path: Path) -> None:
-    refining = Refining(60.0)
-    with overloaded(tmp_path, refining.method()) as server, Client(server.address) as client:
+    staged = Staged()
+    with overloaded(tmp_path, staged.method()) as server, Client(server.address) as client:
         make_scene(client)
         coarse = client.localize(PHOTO, CAMERA, "s", allow_coarse=True, timeout_s=2.0)
         assert isinstance(coarse, LocalizationResult)
         assert (coarse.pose_stage, coarse.covariance, coarse.accuracy) == ("COARSE", None, None)
-        np.testing.assert_allclose(coarse.world_from_camera.matrix(), pose(0).matrix(), atol=1e-9)
+        np.testing.assert_allclose(coarse.world_from_camera.matrix(), pose(COARSE_X_M).matrix(), atol=1e-9)
         with pytest.raises(DeadlineExceeded):
             client.localize(PHOTO, CAMERA, "s", timeout_s=2.0)
-        assert refining.began == 2
+        assert [staged.refining.acquire(blocking=False) for _ in range(3)] == [True, True, False]
         for outcome in ("degraded", "expired"):
             wait_until(lambda: server.value("mapless_jobs_terminated_total", outcome=outcome) == 1)  # noqa: B023
 
 
 def test_a_stage_predicted_to_be_late_is_not_begun(tmp_path: Path) -> None:
-    refining = Refining(1.0)
-    with overloaded(tmp_path, refining.method()) as server, Client(server.address) as client:
+    staged = Staged()
+    with overloaded(tmp_path, staged.method()) as server, Client(server.address) as client:
         make_scene(client)
+        threading.Timer(1.0, staged.gate.set).start()
         full = client.localize(PHOTO, CAMERA, "s", allow_coarse=True, timeout_s=20.0)
         assert isinstance(full, LocalizationResult)
         assert full.pose_stage == "REFINED"
         coarse = client.localize(PHOTO, CAMERA, "s", allow_coarse=True, timeout_s=0.8)
         assert isinstance(coarse, LocalizationResult)
         assert coarse.pose_stage == "COARSE"
-        assert refining.began == 1
+        assert [staged.refining.acquire(blocking=False) for _ in range(2)] == [True, False]

@@ -5,7 +5,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -27,9 +27,11 @@ from mapless_server.engine.stages import Method
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
+from mapless_server.method.rejection import Rejection
 from mapless_server.method.results import MetricScale, PoseStage, ScaleStage
 from mapless_server.method.views import Features, PosedView, View
 from mapless_server.observability.metrics import Metrics
+from mapless_server.scheduling import Abandoned
 from mapless_server.security import RateLimiter
 from mapless_server.serve.assembly import MakeEngine, engine_options, engine_over, make_engine
 from mapless_server.serve.running import Running, running_server
@@ -171,6 +173,65 @@ def whole(localize: Callable[..., Answer]) -> Method:
         """Neither a coarse answer nor what a photograph without a pose could give."""
 
     return Method(prepare, cast(Any, list), cast(Any, refine), nothing, nothing)
+
+
+COARSE_X_M = 7.0
+"""Where the stand-in's coarse pose is; the refined one is the first reference's, at 0 m."""
+
+
+@dataclass
+class Staged:
+    """A method with a coarse pose at once, which refines when it is let.
+
+    Attributes:
+        gate: refining ends when it is open.
+        refining: released by each that begins.
+        given_up: released by each that is ended because its caller has left.
+        coarse: the coarse pose; None if there is none.
+        outcome: refined; None for the first reference's pose.
+        trust: of that pose.
+    """
+
+    gate: threading.Event = field(default_factory=threading.Event)
+    refining: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
+    given_up: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
+    coarse: RigidTransform | None = field(default_factory=lambda: pose(COARSE_X_M))
+    outcome: Rejection | None = None
+    trust: float = 0.9
+
+    def __post_init__(self) -> None:
+        self._stand_in = StandInMethod(trust=self.trust)
+        self._stand_in.gate.set()
+
+    def reset(self) -> None:
+        """As it was at first."""
+        self.gate.clear()
+        for counted in (self.refining, self.given_up):
+            while counted.acquire(blocking=False):
+                pass
+        self.coarse, self.outcome, self.trust = pose(COARSE_X_M), None, 0.9
+
+    def method(self) -> Method:
+        return replace(whole(self._refine), coarse_answer=self._coarse_answer)
+
+    def _refine(self, *asked: Any) -> Answer:
+        self.refining.release()
+        try:
+            while not self.gate.wait(0.005):
+                asked[-1]()
+        except Abandoned:
+            self.given_up.release()
+            raise
+        self._stand_in.trust = self.trust
+        answer = self._stand_in(*asked)
+        return answer if self.outcome is None else replace(answer, outcome=self.outcome)
+
+    def _coarse_answer(self, coarse: Any) -> Answer | None:
+        if self.coarse is None:
+            return None
+        answer = whole(self._stand_in).refine(coarse)
+        found = Localization(self.coarse, None, PoseStage.COARSE, 0, 0, 0.0)
+        return replace(answer, outcome=found, stage_seconds={"coarse": 0.1})
 
 
 @dataclass
