@@ -15,7 +15,7 @@ from typing import Any
 import grpc
 import pytest
 from support.certificates import DAY, authority, signed
-from support.servers import RunningServer, make_scene, serving
+from support.servers import CAMERA, PHOTO, RunningServer, make_scene, serving
 
 from mapless import Client
 from mapless.__main__ import main
@@ -162,3 +162,17 @@ def test_a_scene_that_is_misspelled(capsys: pytest.CaptureFixture[str], plain: R
         found = findings(capsys, plain.address, "--scene", "hal")
         client.delete_scene("hall")
     assert_stops(found, "query", "there is no scene 'hal'; did you mean 'hall'?")
+
+
+def test_a_server_that_stops(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    with serving(tmp_path) as server, Client(server.address) as client, ThreadPoolExecutor(1) as thread:
+        make_scene(client)
+        with server.method.held():
+            running = thread.submit(client.localize, PHOTO, CAMERA, "s")
+            assert server.method.started.acquire(timeout=20)
+            server.stop()
+            while client.is_serving():
+                time.sleep(0.02)
+            found = findings(capsys, server.address)
+        assert running.result(20)
+    assert_stops(found, "services", "not serving: the server, ", "it stops")

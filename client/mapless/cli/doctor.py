@@ -165,8 +165,17 @@ def _check_services(session: _Session) -> _Result:
     silent = [name for name, is_serving in states.items() if not is_serving]
     if not silent:
         return OK, "serving", ""
-    advice = "wait while it starts or drains; if it is ReferenceService alone, the store cannot be written: see the log"
+    advice = _advice_of_silent(session) if "the server" in silent else "the store cannot be written: see the log"
     return WRONG, f"not serving: {', '.join(silent)}", advice
+
+
+def _advice_of_silent(session: _Session) -> str:
+    """Makes a call, whose error says whether the server starts or stops."""
+    try:
+        _check_token(session)
+    except MaplessError as error:
+        return _ADVICE.get(error.reason, "wait while it starts or stops")
+    return "it stops soon, and answers until then: use another server"
 
 
 def _check_token(session: _Session) -> _Result:
@@ -294,5 +303,7 @@ _ADVICE = {
     "TOKEN_INVALID": _TOKENS,
     "TOKEN_EXPIRED": _TOKENS,
     "ROLE_TOO_LOW": "use a token of the role localize or write",
+    "STARTING": "it starts: wait until it is ready, some seconds",
+    "DRAINING": "it stops, and answers only the calls that it has: use another server, or start it again",
 }
 """By the reason of an error."""
