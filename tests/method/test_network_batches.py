@@ -87,18 +87,14 @@ def test_another_grid_misses_the_cache() -> None:
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_queries_of_a_batch_equal_single_ones(name: str) -> None:
-    requests = [
-        small_request(3, 1),
-        small_request(2, 2),
-        small_request(3, 3),
-        small_request(3, 4, size=(72, 96)),
-        small_request(3, 5),
-    ]
+    mixed = [small_request(3, 1), small_request(2, 2), small_request(3, 3), small_request(3, 4, size=(72, 96))]
+    _, references = small_request(3)
+    common = [(small_request(1, seed)[0], references) for seed in (1, 2, 3, 4)]
     runner = small_runner(name)
-    together = NetworkReconstructor(runner, OPTIONS).reconstruct_many([Request(*request) for request in requests])
-    for request, outcome in zip(requests, together, strict=True):
-        alone = reconstruct_one(NetworkReconstructor(runner, OPTIONS), *request)
-        assert_close(outcome, alone)
+    for options, requests in ((OPTIONS, [*mixed, small_request(3, 5)]), (UNCACHED, common)):
+        together = NetworkReconstructor(runner, options).reconstruct_many([Request(*request) for request in requests])
+        for request, outcome in zip(requests, together, strict=True):
+            assert_close(outcome, reconstruct_one(NetworkReconstructor(runner, options), *request))
 
 
 @pytest.mark.parametrize("cache", [OPTIONS.cache, TokenCacheOptions(0, 0)], ids=["kept", "not kept"])
@@ -110,17 +106,6 @@ def test_each_view_of_a_batch_is_encoded_once(cache: TokenCacheOptions) -> None:
     assert [greys_of(outcome) for outcome in outcomes] == [[i, 50, 100, 150] for i in (1, 2, 3, 4)]
     assert sum(runner.encoded) == 3 + 4
     assert runner.batches == [4]
-
-
-@pytest.mark.parametrize("name", NETWORKS)
-def test_queries_with_common_references_equal_single_ones(name: str) -> None:
-    _, references = small_request(3)
-    queries = [small_request(1, seed)[0] for seed in (1, 2, 3, 4)]
-    runner = small_runner(name)
-    together = NetworkReconstructor(runner, UNCACHED).reconstruct_many([Request(q, references) for q in queries])
-    for query, outcome in zip(queries, together, strict=True):
-        alone = reconstruct_one(NetworkReconstructor(runner, UNCACHED), query, references)
-        assert_close(outcome, alone)
 
 
 def test_queries_of_one_bucket_are_one_batch_of_the_network() -> None:

@@ -18,7 +18,6 @@ import grpc
 import pytest
 import yaml  # type: ignore[import-untyped]
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
-from support import envoys
 from support.certificates import authority, signed
 from support.clients import FAILING_CALLS, Recording, assert_fails_alike, hosted
 from support.documents import blocks
@@ -105,26 +104,22 @@ def test_the_deployed_configuration_is_valid_and_up_to_date(tmp_path: Path) -> N
     assert "deprecated" not in said.stderr.lower()
 
 
-def test_servers_may_have_certificates_as_the_readme_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_servers_may_have_certificates_as_the_readme_says(tmp_path: Path) -> None:
     by = authority("servers")
     signed(by, "server").write(tmp_path / "tls.crt", tmp_path / "tls.key")
     (tmp_path / "ca.crt").write_bytes(by.certificate_pem)
     (block,) = blocks(ENVOY.parent / "README.md", "yaml")
     said = block.replace("/etc/mapless/servers", str(tmp_path)).replace("mapless-headless", "localhost")
-    configure = envoys.configured
 
-    def configured_with_it(*arguments: Any) -> Path:
-        path = configure(*arguments)
-        config = yaml.safe_load(path.read_text())
+    def with_it(text: str) -> str:
+        config = yaml.safe_load(text)
         for cluster in config["static_resources"]["clusters"][:2]:
             cluster |= yaml.safe_load(said)
-        path.write_text(yaml.safe_dump(config))
-        return path
+        return str(yaml.safe_dump(config))
 
-    monkeypatch.setattr(envoys, "configured", configured_with_it)
     with (
         serving(tmp_path / "server", tls_certificate=tmp_path / "tls.crt", tls_key=tmp_path / "tls.key") as server,
-        gateway(tmp_path / "gateway", [server.address]) as running,
+        gateway(tmp_path / "gateway", [server.address], with_it) as running,
         Client(running.address, running.options) as client,
     ):
         client.create_scene("s")
@@ -297,22 +292,13 @@ class Page:
         return pb.LocalizeResponse.FromString(body[5 : 5 + size]), body[5 + size + 5 :].decode(), answered
 
 
-def test_a_page_of_a_listed_origin_localizes_by_grpc_web(
-    fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    configure = envoys.configured
+def test_a_page_of_a_listed_origin_localizes_by_grpc_web(fleet: Fleet, tmp_path: Path) -> None:
+    def with_origin(text: str) -> str:
+        config = text.replace("allow_origin_string_match: []", f"allow_origin_string_match: [{{exact: {ORIGIN}}}]")
+        assert ORIGIN in config
+        return config
 
-    def with_origin(*arguments: Any) -> Path:
-        path = configure(*arguments)
-        text = path.read_text().replace(
-            "allow_origin_string_match: []", f"allow_origin_string_match: [{{exact: {ORIGIN}}}]"
-        )
-        assert ORIGIN in text
-        path.write_text(text)
-        return path
-
-    monkeypatch.setattr(envoys, "configured", with_origin)
-    with gateway(tmp_path, [server.address for server in fleet.servers]) as running:
+    with gateway(tmp_path, [server.address for server in fleet.servers], with_origin) as running:
         page = Page(running)
         assert page.may_call()
         answer, trailers, headers = page.localizes()

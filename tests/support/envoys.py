@@ -5,7 +5,7 @@ often health is asked for, so that tests need not wait.
 """
 
 import subprocess
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -110,11 +110,15 @@ def _endpoint(address: str) -> Json:
 
 
 @contextmanager
-def gateway(folder: Path, servers: Sequence[str]) -> Iterator[Gateway]:
-    """An Envoy in front of the servers, that has found them healthy; it is gone when the block is left."""
+def gateway(folder: Path, servers: Sequence[str], change: Callable[[str], str] = str) -> Iterator[Gateway]:
+    """An Envoy in front of the servers, with a changed configuration, that has found them healthy.
+
+    It is gone when the block is left.
+    """
     folder.mkdir(exist_ok=True)
     by = authority()
     path = configured(folder, by, servers, HEALTH_INTERVAL_S)
+    path.write_text(change(path.read_text()))
     where = folder / "administration"
     command = [program(), "--config-path", str(path), "--concurrency", "1", "--disable-hot-restart"]
     command += ["--admin-address-path", str(where), "--log-level", "warning"]
