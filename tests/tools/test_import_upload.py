@@ -129,16 +129,6 @@ def test_large_photographs_go_in_smaller_messages(tmp_path: Path) -> None:
     assert server.messages == [["r000"], ["r001"], ["r002"], ["r003"]]
 
 
-def test_a_second_run_stores_nothing_and_reports_it(tmp_path: Path) -> None:
-    frames = frames_in(tmp_path)
-    server = Server()
-    upload(server, frames)
-    messages = len(server.messages)
-    report = upload(server, frames)
-    assert report.went_well
-    assert (len(report.skipped), report.added, len(server.messages)) == (20, [], messages)
-
-
 def test_a_difference_to_what_is_stored_is_refused_with_detail(tmp_path: Path) -> None:
     frames = frames_in(tmp_path, 4)
     server = Server()
@@ -170,6 +160,7 @@ def test_the_same_photo_with_almost_the_same_pose_is_skipped(
     turned = RigidTransform(moved.rotation @ rotation_from_vector([np.radians(turned_deg), 0, 0]), moved.translation)
     report = upload(server, [replace(far, world_from_camera=turned)])
     assert (len(report.skipped), len(report.refused)) == ((1, 0) if is_same else (0, 1))
+    assert (report.went_well, report.added, len(server.messages)) == (is_same, [], 1)
 
 
 def test_what_is_refused_is_not_counted_as_stored(tmp_path: Path) -> None:
@@ -225,21 +216,14 @@ def test_an_unnamed_refusal_is_located_by_sending_parts(tmp_path: Path, error: M
     assert (len(report.added), report.stopped) == (9, "")
 
 
-def test_a_busy_server_is_waited_for_as_long_as_it_asks(tmp_path: Path) -> None:
-    def fault(message: Sequence[NewReference], call: int) -> MaplessError | None:
-        busy = ResourceExhausted("RESOURCE_EXHAUSTED", "busy", reason="OVERLOADED", retry_after_s=0.05)
-        return busy if call <= 3 else None
+BUSY = ResourceExhausted("RESOURCE_EXHAUSTED", "busy", reason="OVERLOADED", retry_after_s=0.05)
 
-    server = Server(fault)
+
+@pytest.mark.parametrize(("error", "times"), [(BUSY, 3), (Unavailable("UNAVAILABLE", "starting"), 1)])
+def test_a_busy_or_absent_server_is_waited_for(tmp_path: Path, error: MaplessError, times: int) -> None:
+    server = Server(lambda references, call: error if call <= times else None)
     assert upload(server, frames_in(tmp_path, 4)).went_well
-    assert len(server.messages) == 4
-
-
-def test_a_server_that_goes_away_is_waited_for(tmp_path: Path) -> None:
-    def fault(message: Sequence[NewReference], call: int) -> MaplessError | None:
-        return Unavailable("UNAVAILABLE", "starting") if call == 1 else None
-
-    assert upload(Server(fault), frames_in(tmp_path, 4)).went_well
+    assert len(server.messages) == times + 1
 
 
 @pytest.mark.parametrize("kind", [Unavailable, DeadlineExceeded])
