@@ -259,7 +259,7 @@ def test_references_added_by_another_caller_are_skipped(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("error", "message"),
     [
-        (ResourceExhausted("RESOURCE_EXHAUSTED", "disk", reason="STORE_FULL", retry_after_s=1.0), "the store is full"),
+        (ResourceExhausted("RESOURCE_EXHAUSTED", "disk", reason="STORE_FULL", retry_after_s=1.0), "disk: free space"),
         (Unavailable("UNAVAILABLE", "no route"), "cannot be reached: no route"),
         (ResourceExhausted("RESOURCE_EXHAUSTED", "busy", retry_after_s=0.2), "stays too busy"),
         (PermissionDenied("PERMISSION_DENIED", "may not write"), "may not write"),

@@ -157,7 +157,7 @@ class Uploader:
                 left = self._without_guilty(left, error)
             except ResourceExhausted as error:
                 if error.reason == STORE_FULL:
-                    self._end(f"the store is full: {error.message}")
+                    self._end(f"{error.message}: free space, then import again")
                 if error.retry_after_s is None:
                     left = self._halves(left, error)
                 elif not waiting.for_busy(error.retry_after_s):
