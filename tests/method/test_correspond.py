@@ -76,8 +76,9 @@ def test_products_of_whole_numbers_are_those_of_floats(n: int, m: int) -> None:
     )
     first.descriptors[0] = second.descriptors[-1] = 127
     a, b = (it.descriptors.astype(np.float32) for it in (first, second))
-    expected = a @ b.T * nearest._inverse_lengths(second) * nearest._inverse_lengths(first)[:, None]
-    assert np.concatenate([*nearest.cosine_blocks(first, second)]).tobytes() == expected.tobytes()
+    expected = a @ b.T * second.inverse_lengths * first.inverse_lengths[:, None]
+    blocks = [block.copy() for block in nearest.cosine_blocks(first, second)]
+    assert np.concatenate(blocks).tobytes() == expected.tobytes()
     plain = first.unit_descriptors() @ second.unit_descriptors().T
     for either in (False, True):
         matches = mutual_matches(first, second, 0.99, either)

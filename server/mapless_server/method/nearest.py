@@ -1,6 +1,7 @@
 """Two photographs: nearest neighbours of their descriptors, and the epipolar lines that their matches must lie on."""
 
 import sys
+from collections import deque
 from collections.abc import Iterator
 from functools import cache
 from typing import Any
@@ -13,7 +14,8 @@ from mapless.geometry import Array, cross_matrix
 from .views import Features, Matches, PosedView
 
 _ROWS_AT_ONCE = 128
-"""With 2,000 columns a block of cosines has 1 MB, as the second-level cache of a core."""
+_FLOAT_ROWS_AT_ONCE = 256
+"""With 2,000 columns a block of 128 rows has 1 MB, as the second-level cache of a core; BLAS is slower with so few."""
 
 
 def mutual_matches(first: Features, second: Features, ratio: float, either: bool = False) -> Matches:
@@ -24,7 +26,9 @@ def mutual_matches(first: Features, second: Features, ratio: float, either: bool
     if len(first) < 2 or len(second) < 2:
         return np.empty((0, 2), np.int32)
     if either:
-        return best_of_both(np.concatenate([*cosine_blocks(first, second)]), ratio, either=True)
+        similarity = np.empty((len(first), len(second)), np.float32)
+        deque(cosine_blocks(first, second, similarity), 0)
+        return best_of_both(similarity, ratio, either=True)
     nearest, best, second_best = np.empty(len(first), np.intp), *np.empty((2, len(first)), np.float32)
     best_of_column, begin = np.full(len(second), -np.inf, np.float32), 0
     for cosines in cosine_blocks(first, second):
@@ -40,23 +44,35 @@ def mutual_matches(first: Features, second: Features, ratio: float, either: bool
     return np.stack([keep, nearest[keep]], axis=1).astype(np.int32)
 
 
-def cosine_blocks(first: Features, second: Features) -> Iterator[NDArray[np.float32]]:
-    """Yields the matrix (N, M) of cosines in blocks of rows.
+def cosine_blocks(
+    first: Features, second: Features, whole: NDArray[np.float32] | None = None
+) -> Iterator[NDArray[np.float32]]:
+    """Yields the matrix of cosines (N, M) in blocks of rows: of `whole` (N, M), or each overwritten by the next.
 
     Descriptors of int8 are multiplied as integers if torch is loaded and the processor has instructions for that, in
     half to four fifths of the time of float32. A block fits into the processor's cache.
     """
     torch = sys.modules.get("torch")
     is_whole = first.descriptors.dtype == second.descriptors.dtype == np.int8
-    if torch is None or not is_whole or not _multiplies_exactly(torch):
-        yield first.unit_descriptors() @ second.unit_descriptors().T
+    exact = torch is not None and is_whole and _multiplies_exactly(torch)
+    rows = _ROWS_AT_ONCE if exact else _FLOAT_ROWS_AT_ONCE
+    block = np.empty((min(rows, len(first)), len(second)), np.float32)
+    starts = range(0, len(first), rows)
+    blocks = (whole[i : i + rows] if whole is not None else block[: len(first) - i] for i in starts)
+    if torch is None or not exact:
+        ours, theirs = first.unit_descriptors(), second.unit_descriptors().T
+        for i, cosines in zip(starts, blocks, strict=True):
+            yield np.matmul(ours[i : i + rows], theirs, out=cosines)
         return
     a, b = torch.tensor(first.descriptors), torch.tensor(second.descriptors).T
-    inverse, other_inverse = (torch.from_numpy(_inverse_lengths(it)) for it in (first, second))
-    for i in range(0, len(a), _ROWS_AT_ONCE):
-        block = slice(i, i + _ROWS_AT_ONCE)
-        cosines = torch._int_mm(a[block], b) * other_inverse
-        yield cosines.mul_(inverse[block, None]).numpy()
+    inverse, other_inverse = (torch.from_numpy(it.inverse_lengths) for it in (first, second))
+    products = torch.empty(block.shape, dtype=torch.int32)
+    for i, cosines in zip(starts, blocks, strict=True):
+        part = products[: len(cosines)]
+        torch._int_mm(a[i : i + rows], b, out=part)
+        # Converted first: the product of a whole and a floating-point number takes longer.
+        torch.from_numpy(cosines).copy_(part).mul_(other_inverse).mul_(inverse[i : i + rows, None])
+        yield cosines
 
 
 @cache
@@ -66,12 +82,6 @@ def _multiplies_exactly(torch: Any) -> bool:
         return False
     largest = torch.full((_ROWS_AT_ONCE, 64), 127, dtype=torch.int8)
     return bool((torch._int_mm(largest, largest.T) == 64 * 127**2).all())
-
-
-def _inverse_lengths(features: Features) -> NDArray[np.float32]:
-    """Inverse lengths (N,) of descriptors of integers."""
-    numbers = features.descriptors.astype(np.float32)
-    return np.asarray(1 / np.sqrt(np.maximum(np.einsum("nd,nd->n", numbers, numbers), 1)), np.float32)
 
 
 def best_of_both(

@@ -51,6 +51,12 @@ class Features:
         """The features 0, step, 2 step, ..."""
         return Features(self.keypoints[::step], self.descriptors[::step], self.sizes_px[::step])
 
+    @cached_property
+    def inverse_lengths(self) -> NDArray[np.float32]:
+        """Inverse lengths (N,) of descriptors of int8."""
+        numbers = self.descriptors.astype(np.float32)
+        return np.asarray(1 / np.sqrt(np.maximum(np.einsum("nd,nd->n", numbers, numbers), 1)), np.float32)
+
     def unit_descriptors(self, rows: NDArray[np.intp] | slice = slice(None)) -> NDArray[np.float32]:
         """Converts some descriptors, or all, to (R, D) float32 of unit length, so that a product is a cosine.
 
