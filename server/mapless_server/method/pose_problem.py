@@ -55,8 +55,8 @@ class AdjustOptions:
         contradiction: when this estimate is used.
         rounds: how often, at most, the query's keypoints are corrected by an estimated parameter.
         min_added_share: keypoints that the query shares with references, and no point has, are adjusted too where there
-            are so many for each inlier. Fewer do not help: errors of 600 photographs of ten places are 0.84 times as
-            large where there are more, and 1.03 times where there are fewer.
+            are so many for each inlier. Errors of 613 photographs of ten places are 0.86 times as large with them;
+            where there were fewer, those of 152 are 1.06 times as large.
         query_points: options of triangulating these.
         pose_errors: options of the errors of the references' poses.
         uncertainty: options of the answer's covariance.
