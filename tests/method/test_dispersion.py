@@ -39,7 +39,8 @@ def dense(problem: BundleProblem, state: Bundle, left_out: int | None = None) ->
             jacobian[:, o, cameras + 3 * point : cameras + 3 * point + 3] = by_point[:, :, o]
     rows = jacobian.reshape(-1, jacobian.shape[2])
     weights = np.tile(weight, 2)
-    matrix, gradient = rows.T @ (weights[:, None] * rows), rows.T @ (weights * residual.ravel())
+    curvature = weights**2  # on average over the directions of a residual
+    matrix, gradient = rows.T @ (curvature[:, None] * rows), rows.T @ (weights * residual.ravel())
     matrix[cameras:, cameras:] += 1e-7 * np.diag(np.diag(matrix)[cameras:])
     crossed = scipy.linalg.solve(matrix[cameras:, cameras:], matrix[cameras:, :cameras], assume_a="pos").T
     matrix, gradient = (

@@ -22,8 +22,8 @@ from mapless_server.method.uncertainty.covariance import UncertaintyOptions, dis
 from mapless_server.method.uncertainty.dispersion import Dispersion
 
 POSITION, ROTATION = slice(0, 3), slice(3, 6)
-PLAIN = UncertaintyOptions(position_factor=1.0, rotation_factor=1.0, gap_growth=0.0, lone_variance=0.0)
-"""What is derived, without what was measured on photographs."""
+PLAIN = UncertaintyOptions(gap_growth=0.0, lone_variance=0.0)
+"""Without what grows with the gap and with lone references, which planted noise does not have."""
 PLAIN_ADJUST = AdjustOptions(uncertainty=PLAIN)
 FEW = SceneOptions(point_count=120, reference_count=4, distractor_count=0)
 UNSCALED = metric_scale(Similarity(1.0, np.eye(3), np.zeros(3)), RigidTransform(np.eye(3), np.zeros(3)))
@@ -145,8 +145,11 @@ def test_factors_multiply_standard_deviations() -> None:
     scene = make_scene(random_for("factors"), FEW)
     structure, _, estimate = stages(scene, scene.references)
     support = support_of(scene, structure, estimate)
-    factors = AdjustOptions(uncertainty=replace(PLAIN, position_factor=2.0, rotation_factor=3.0))
-    plain, factored = (with_covariance(support, UNSCALED, options) for options in (PLAIN_ADJUST, factors))
+    options = [
+        AdjustOptions(uncertainty=replace(PLAIN, position_factor=position, rotation_factor=rotation))
+        for position, rotation in ((1.0, 1.0), (2.0, 3.0))
+    ]
+    plain, factored = (with_covariance(support, UNSCALED, it) for it in options)
     assert plain.intrinsics
     factor = np.repeat([2.0, 3.0], 3)
     of_intrinsics = plain.intrinsics.pose_covariance  # without factors

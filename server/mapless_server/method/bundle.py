@@ -324,10 +324,11 @@ class ViewColumns:
         loss_scale_sigma: float,
         least_curvature: float = 1.0,
         linearized: tuple[Array, Array, Array] | None = None,
+        weight: Array | None = None,
     ) -> NormalEquations:
         """The normal equations of the observations alone, for a Cauchy loss of this scale.
 
-        `linearized` is the result of the method of that name, if it is known.
+        `linearized` is the result of the method of that name, if it is known, and `weight` (O,) replaces the loss's.
 
         With `least_curvature` below 1 derivatives J become (I - (1 - c) r r^T / |r|^2) J and residuals r become r / c,
         which leaves the gradient as it is. For a weight w the loss curves by w (2 w - 1) along r. But c^2 is least at
@@ -335,7 +336,7 @@ class ViewColumns:
         """
         residual, by_point, by_pose = linearized or self.linearized(bundle)
         squared, last, by_intrinsics = (residual**2).sum(axis=0), self.parts[-1], self.by_intrinsics
-        weight = cauchy_weight(squared, loss_scale_sigma)
+        weight = cauchy_weight(squared, loss_scale_sigma) if weight is None else weight
         if least_curvature < 1:
             shrink = np.sqrt(1 - 4 * (1 - least_curvature) * weight * (1 - weight))
             along = residual * ((1 - shrink) / np.maximum(squared, 1e-12))

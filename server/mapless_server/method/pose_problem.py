@@ -71,7 +71,7 @@ class AdjustOptions:
     min_decrease: float = 1e-5
     min_motion_sigma: float = 0.25
     least_curvature: float = 0.5
-    suspicion: ContradictionOptions = field(default_factory=lambda: ContradictionOptions(2.0, 0.06, 0.06, 0.15))
+    suspicion: ContradictionOptions = field(default_factory=lambda: ContradictionOptions(2.0, 0.12, 0.12, 0.3))
     contradiction: ContradictionOptions = field(default_factory=ContradictionOptions)
     agreeing_share: float = 0.6
     rounds: int = 4

@@ -13,7 +13,13 @@ parts cross each other (Cameron, Gelbach and Miller, Robust inference with multi
                   C_p = sum_c (s_c - mean) (s_c - mean)^T.
 
 Both are of the pose as it is estimated: by the normal equations of the adjustment at its optimum (see `bundle`), where
-the references may move and far ones are held less, and of which each q_(i) is one Gauss-Newton step.
+the references may move and far ones are held less, and of which each q_(i) is one Newton step.
+
+The step needs the curvature of the loss, which is less than its weight w: where a part of the data is left out, residuals
+grow and lose weight, so the pose moves farther than with weights that stay. Cauchy's loss curves by w across a residual
+and by w (2 w - 1) along it (Triggs et al. 2000), on average over the directions by w^2. So the equations are those of
+weighted least squares with weights w^2 and residuals r / w, which have the same gradient. With weights w radii were too
+small where residuals are heavy-tailed: errors by radii varied more between scenes, and within them.
 
 Let F F^T be what eliminating the points subtracts from the normal equations, F_p = E_p L_p^-T of point p, whose
 information is L_p L_p^T; and l_p = L_p^-1 h_p, of its gradient. An observation with residual r, weight w and derivative
@@ -100,8 +106,10 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
             them.
     """
     seen, bundle, thinning = _thinned(problem.by_view, bundle, max_matches)
-    residual, _, by_pose = linearized = seen.linearized(bundle)
-    equations = seen.equations(bundle, problem.loss_scale_sigma, linearized=linearized)
+    residual, by_point, by_pose = seen.linearized(bundle)
+    weight = cauchy_weight((residual**2).sum(axis=0), problem.loss_scale_sigma)
+    residual, weight = residual / weight, weight**2
+    equations = seen.equations(bundle, problem.loss_scale_sigma, 1.0, (residual, by_point, by_pose), weight)
     data, gradient, points = equations.reduced(DAMPING)
     query, posed = problem.query_rows, slice(problem.query_rows.stop)
     prior, prior_gradient = np.zeros_like(data), np.zeros_like(gradient)
@@ -111,7 +119,6 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
     to_pose = _rows_of_pose((data + prior)[posed, posed])
     if to_pose is None:
         return None
-    weight = cauchy_weight((residual**2).sum(axis=0), problem.loss_scale_sigma)
 
     gain, misfit = _whitened(seen, residual, weight, points)
     cross = points.cross.reshape(len(data), 3, -1)
