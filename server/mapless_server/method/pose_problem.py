@@ -48,8 +48,9 @@ class AdjustOptions:
             several of these. In a kitchen three steps are made, and poses differ from those of forty by 0.07 standard
             deviations.
         least_curvature: see `BundleProblem`. With 1 it takes one or two steps more; less than 0.5 saves none.
-        suspicion: when the intrinsics are estimated with the pose. A large error leaves few inliers, of which those
-            with other errors are missing.
+        suspicion: when an error of the intrinsics counts in full in the covariance.
+        trial: when it is tried to estimate the intrinsics with the pose. A large error makes residuals large, where the
+            loss hardly curves: by the intrinsics as given it is determined less than where it is estimated.
         agreeing_share: or when fewer of the matches are inliers. In a kitchen with five references, where k1 was off by
             0.3, one pose of six aroused suspicion; of the others this finds four.
         contradiction: when this estimate is used.
@@ -71,7 +72,8 @@ class AdjustOptions:
     min_decrease: float = 1e-5
     min_motion_sigma: float = 0.25
     least_curvature: float = 0.5
-    suspicion: ContradictionOptions = field(default_factory=lambda: ContradictionOptions(2.0, 0.12, 0.12, 0.3))
+    suspicion: ContradictionOptions = field(default_factory=lambda: ContradictionOptions(2.0, 0.06, 0.06, 0.15))
+    trial: ContradictionOptions = field(default_factory=lambda: ContradictionOptions(2.0, 0.12, 0.12, 0.3))
     contradiction: ContradictionOptions = field(default_factory=ContradictionOptions)
     agreeing_share: float = 0.6
     rounds: int = 4

@@ -75,7 +75,7 @@ def is_suspicious(found: PoseEstimate, options: AdjustOptions) -> bool:
     """Whether the photograph may contradict its intrinsics: one seems wrong, or few matches agree."""
     if found.intrinsics is None:
         return False
-    is_wrong = _contradicted(found, options.suspicion, np.ones(4, bool)) is not None
+    is_wrong = _contradicted(found, options.trial, np.ones(4, bool)) is not None
     return is_wrong or bool(found.inliers.mean() < options.agreeing_share)
 
 
