@@ -15,11 +15,11 @@ parts cross each other (Cameron, Gelbach and Miller, Robust inference with multi
 Both are of the pose as it is estimated: by the normal equations of the adjustment at its optimum (see `bundle`), where
 the references may move and far ones are held less, and of which each q_(i) is one Newton step.
 
-The step needs the curvature of the loss, which is less than its weight w: without a part of the data residuals of the
+The step needs the curvature of the loss, which is less than its weight w: without a part of the data, residuals of the
 others grow and lose weight, so the pose moves farther than with weights that stay. Cauchy's loss curves by w across a
 residual and by w (2 w - 1) along it (Triggs et al. 2000), on average over the directions by w^2. So the equations are
-those of weighted least squares with weights w^2 and residuals r / w, which have the same gradient. With weights w, radii
-were too small where residuals have heavy tails: errors by radii varied more, between scenes and within them.
+those of weighted least squares with weights w^2 and residuals r / w, with the same gradient. With weights w radii were
+too small where residuals have heavy tails: errors by radii varied more, between scenes and within them.
 
 Let F F^T be what eliminating the points subtracts from the normal equations, F_p = E_p L_p^-T of point p, whose
 information is L_p L_p^T; and l_p = L_p^-1 h_p, of its gradient. An observation with residual r, weight w and derivative
