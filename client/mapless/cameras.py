@@ -1,5 +1,6 @@
 """Reads cameras and poses from the interface's JSON, from four numbers, or from a folder's cameras.json."""
 
+import json
 import re
 from collections.abc import Mapping
 from dataclasses import fields
@@ -55,7 +56,7 @@ def read_camera(source: str | Path, photo: str | Path | None = None) -> Camera:
 
 
 def read_pose(source: str | Path) -> RigidTransform:
-    """Reads a pose: JSON (a file or text) in the form of RigidTransform, or a 4x4 or 3x4 matrix.
+    """Reads a pose: JSON (a file or text) in the form of RigidTransform, a 4x4 or 3x4 matrix, or an answer with a pose.
 
     ValueError, for what is no valid pose, names the file and the field; OSError, if the file cannot be read.
     """
@@ -64,8 +65,19 @@ def read_pose(source: str | Path) -> RigidTransform:
     content = text if is_inline else Path(text).read_text("utf-8-sig", errors="replace")
     if content.lstrip().startswith("["):
         return _pose_from_matrix(content, "pose" if is_inline else text)
+    if (pose := _pose_of_answer(content)) is not None:
+        return read_pose(json.dumps(pose))
     required = ("rotation", "translation_m")
     return read_message(str(source), geometry_pb2.RigidTransform(), required, wire.transform_from_message, "pose")
+
+
+def _pose_of_answer(content: str) -> Any:
+    """The pose of an answer as `mapless localize` prints it; None if the text is something else."""
+    try:
+        answer = read_json(content)
+    except ValueError:
+        return None
+    return answer.get("world_from_camera") if isinstance(answer, dict) else None
 
 
 def _pose_from_matrix(content: str, name: str) -> RigidTransform:

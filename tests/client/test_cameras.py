@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 from google.protobuf import json_format
 from support.images import encode
+from support.planted_answers import localized, rejected
 
 from mapless import Camera, RadialTangential, read_camera, read_cameras, read_pose, wire
+from mapless.cli.output import plain
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless.pixels import size_of_image
 
@@ -28,6 +30,14 @@ def test_a_camera_and_a_pose_as_the_interface_writes_them(tmp_path: Path) -> Non
     pose = RigidTransform(rotation_from_vector([0.1, 0.2, 0.3]), np.array([1.0, 2.0, 3.0]))
     read = read_pose(json_format.MessageToJson(wire.transform_to_message(pose)))
     np.testing.assert_allclose(read.matrix(), pose.matrix(), atol=1e-12)
+
+
+def test_the_pose_of_a_printed_answer(tmp_path: Path) -> None:
+    file = tmp_path / "answer.json"
+    file.write_text(json.dumps(plain(localized())))
+    np.testing.assert_allclose(read_pose(file).matrix(), localized().world_from_camera.matrix(), atol=1e-12)
+    with pytest.raises(ValueError, match="reason is no field"):
+        read_pose(json.dumps(plain(rejected())))
 
 
 def test_four_numbers_take_the_size_of_the_photograph(tmp_path: Path) -> None:

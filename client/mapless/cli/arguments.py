@@ -36,6 +36,7 @@ POSE is a JSON file likewise, RigidTransform:
   {"rotation": {"x": 0, "y": 0, "z": 0, "w": 1}, "translation_m": {"x": 0, "y": 0, "z": 1.5}}
 or its matrix, 4x4 or 3x4:
   [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1.5], [0, 0, 0, 1]]
+or the JSON of an answer that has a pose.
 """
 
 
