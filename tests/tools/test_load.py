@@ -27,6 +27,7 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.images import ImageLimits, decode_image
 from mapless_tools.charts import write_figure
 from mapless_tools.load.calls import (
+    REGULAR_JITTER,
     CallRecord,
     Fate,
     Kind,
@@ -37,6 +38,7 @@ from mapless_tools.load.calls import (
     latencies,
     plan_calls,
     poisson_times,
+    regular_times,
 )
 from mapless_tools.load.charts import LATENCIES, RATES, draw_load
 from mapless_tools.load.no_op import CAMERA, padded_photo
@@ -74,6 +76,15 @@ def record(fate: Fate = Fate.ANSWERED, at_s: float = 0.0, took_s: float = 0.1, s
 
 
 # Arrivals
+
+
+def test_regular_arrivals_are_at_equal_intervals_but_for_the_jitter() -> None:
+    times = regular_times(4.0, 100.0, np.random.default_rng(7))
+    assert len(times) == 400
+    assert times[0] >= 0
+    assert times[-1] < 100.5
+    assert np.abs(np.diff(times) - 0.25).max() <= 2 * REGULAR_JITTER * 0.25
+    assert np.std(np.diff(times)) > 0.01
 
 
 def test_arrivals_are_a_poisson_process_of_the_rate() -> None:
@@ -454,8 +465,9 @@ def planted_result(slowest_refusal_s: float = 0.004) -> PipelineResult:
     ]
     ramp = [step("2 at a time", None, calls(80, 0), scraped)]
     unloaded = step("unloaded", None, calls(80, 0), scraped)
+    regular = step("70 %, regular", 5.6, calls(56, 0), scraped)
     hammered = step("hammering", None, calls(70, 900), scraped)
-    return PipelineResult("a planted place", options, unloaded, ramp, 8.0, steps, hammered)
+    return PipelineResult("a planted place", options, unloaded, ramp, 8.0, steps, regular, hammered)
 
 
 def test_a_good_server_meets_bars_and_slow_refusals_miss_one() -> None:

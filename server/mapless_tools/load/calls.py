@@ -1,12 +1,12 @@
 """Calls: when, by which client and of what kind they are made, planned beforehand, and how they ended.
 
-Several clients call independently of one another and of the answers (open loop), as many robots do; so each one's calls
-are a Poisson process. In a closed loop a client calls again when it has its answer, so a slow server gets fewer calls
-and seems better than it is.
+Several clients call independently of one another and of the answers (open loop): at random, so that each one's calls
+are a Poisson process, or at equal intervals, as robots do. In a closed loop a client calls again when it has its
+answer, so a slow server gets fewer calls and seems better than it is.
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -71,6 +71,10 @@ class PlannedCall:
     deadline_s: float | None = None
 
 
+REGULAR_JITTER = 0.1
+"""Largest deviation of a regular call from its time, as a share of the interval: exposure, encoding, the network."""
+
+
 def poisson_times(rate_per_s: float, duration_s: float, random: np.random.Generator) -> Array:
     """Times of a Poisson process in [0, duration), seconds, ascending."""
     if not (rate_per_s > 0 and duration_s > 0):
@@ -80,8 +84,25 @@ def poisson_times(rate_per_s: float, duration_s: float, random: np.random.Genera
     return np.sort(random.uniform(0.0, duration_s, count))
 
 
+def regular_times(rate_per_s: float, duration_s: float, random: np.random.Generator) -> Array:
+    """Times of a robot's photographs: at equal intervals from any time on, each off by up to a tenth of an interval."""
+    count = int(rate_per_s * duration_s)
+    jitter = random.uniform(-REGULAR_JITTER, REGULAR_JITTER, count)
+    return np.sort((np.arange(count) + random.uniform() + jitter).clip(min=0)) / rate_per_s
+
+
+Times = Callable[[float, float, np.random.Generator], Array]
+"""Times of a client's calls, seconds, of a rate, a duration and random numbers."""
+
+
 def plan_calls(
-    rate_per_s: float, duration_s: float, clients: int, requests: Requests, mix: Mix, seed: int
+    rate_per_s: float,
+    duration_s: float,
+    clients: int,
+    requests: Requests,
+    mix: Mix,
+    seed: int,
+    times: Times = poisson_times,
 ) -> list[PlannedCall]:
     """The calls of several clients, `rate_per_s` together, in order of time; the same for the same seed."""
     if clients < 1:
@@ -92,7 +113,7 @@ def plan_calls(
     calls = [
         _planned(float(at_s), client, requests, mix, random)
         for client in range(clients)
-        for at_s in poisson_times(rate_per_s / clients, duration_s, random)
+        for at_s in times(rate_per_s / clients, duration_s, random)
     ]
     return sorted(calls, key=lambda call: call.at_s)
 

@@ -13,7 +13,7 @@ from mapless_tools.child import CONNECT, child_server
 from mapless_tools.demo import Place
 from mapless_tools.progress import Progress
 
-from .calls import CallRecord, Fate, Mix, Requests, plan_calls
+from .calls import CallRecord, Fate, Mix, Requests, Times, plan_calls, poisson_times
 from .requests import requests_for, store_references
 from .sender import Target, send_open_loop
 from .step import Step, closed_loop_step, run_step
@@ -95,9 +95,11 @@ async def open_step(
     mix: Mix | None = None,
     requests: Requests | None = None,
     beside: Callable[[], AbstractAsyncContextManager[object]] = nullcontext,
+    times: Times = poisson_times,
 ) -> Step:
-    """Runs a step of Poisson arrivals, of the server's requests or of others; `beside` runs meanwhile."""
-    plan = plan_calls(rate_per_s, seconds, len(target.methods), requests or server.requests, mix or Mix(), seed)
+    """Runs a step of arrivals that no answer influences; the requests are the server's or others."""
+    asked = requests or server.requests
+    plan = plan_calls(rate_per_s, seconds, len(target.methods), asked, mix or Mix(), seed, times)
 
     async def send() -> list[CallRecord]:
         async with beside():

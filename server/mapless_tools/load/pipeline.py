@@ -11,7 +11,7 @@ from mapless_server.settings import available_cores
 from mapless_tools.demo import Place
 from mapless_tools.progress import Progress
 
-from .calls import Fate
+from .calls import Fate, regular_times
 from .driving import LoadedServer, find_saturation, open_step, server_with_scene
 from .report import Check, loop_lag_check, trend_check
 from .requests import METHOD, read_answer
@@ -66,7 +66,8 @@ class PipelineOptions:
 class PipelineResult:
     """What was measured: sequential calls, 2, 4 and more concurrent ones, and the options' shares of saturation.
 
-    Saturation is the largest rate of answers of the ramp. At the end all callers hammer.
+    Saturation is the largest rate of answers of the ramp. `regular` is the comfortable share of it from clients that
+    call at equal intervals, as robots do. At the end all callers hammer.
     """
 
     scene: str
@@ -75,12 +76,13 @@ class PipelineResult:
     ramp: Sequence[Step]
     saturation_per_s: float
     steps: Sequence[Step]
+    regular: Step
     hammered: Step
 
     @property
     def all_steps(self) -> list[Step]:
         """All steps in order."""
-        return [self.unloaded, *self.ramp, *self.steps, self.hammered]
+        return [self.unloaded, *self.ramp, *self.steps, self.regular, self.hammered]
 
     def at(self, share: float) -> Step | None:
         """The step at a share of saturation; None if it was not measured."""
@@ -105,7 +107,8 @@ def pipeline_checks(result: PipelineResult) -> list[Check]:
     checks = [
         _ideal_check("unloaded", result.saturation_per_s, result.unloaded.cpu_s_per_answer, cores),
         _ideal_check("at saturation", result.saturation_per_s, best.cpu_s_per_answer, cores),
-        _comfort_check(result),
+        _comfort_check("Poisson arrivals", result.unloaded, result.at(COMFORTABLE)),
+        _comfort_check("regular arrivals", result.unloaded, result.regular),
         *_overload_checks(result),
         _hammering_check(result),
     ]
@@ -131,6 +134,7 @@ def pipeline_json(result: PipelineResult) -> dict[str, Any]:
             {"share_of_saturation": share, **step.as_json()}
             for share, step in zip(result.options.shares, result.steps, strict=True)
         ],
+        "regular": result.regular.as_json(),
         "hammered": result.hammered.as_json(),
     }
 
@@ -156,11 +160,16 @@ async def _measure(place: Place, server: LoadedServer, options: PipelineOptions,
                     seed=options.seed + number,
                 )
             )
+        regular_s, regular_per_s = COMFORTABLE_STEPS * options.step_s, COMFORTABLE * saturation_per_s
+        asked: dict[str, Any] = {"settle_s": options.settle_s, "seed": options.seed, "times": regular_times}
+        name = f"{100 * COMFORTABLE:.0f} %, regular"
+        progress(name, 0, 1)
+        regular = await open_step(name, server, target, regular_per_s, regular_s, **asked)
         progress("hammering", 0, 1)
         hammered = await closed_loop_step(
             "hammering", server.under_load, target, server.requests.good, HAMMERING, options.step_s, False
         )
-    return PipelineResult(place.title, options, unloaded, ramp, saturation_per_s, steps, hammered)
+    return PipelineResult(place.title, options, unloaded, ramp, saturation_per_s, steps, regular, hammered)
 
 
 def _ideal_check(where: str, saturation_per_s: float, cpu_s: float, cores: int) -> Check:
@@ -173,10 +182,10 @@ def _ideal_check(where: str, saturation_per_s: float, cpu_s: float, cores: int) 
     )
 
 
-def _comfort_check(result: PipelineResult) -> Check:
-    figure = f"p99 at {100 * COMFORTABLE:.0f} % load"
+def _comfort_check(arrivals: str, unloaded: Step, step: Step | None) -> Check:
+    figure = f"p99 at {100 * COMFORTABLE:.0f} % load, {arrivals}"
     bar = f"at most {MAX_P99_OVER_UNLOADED_P50:g} times the unloaded p50"
-    step, p50_ms = result.at(COMFORTABLE), result.unloaded.account.answers.p50_ms
+    p50_ms = unloaded.account.answers.p50_ms
     if step is None or p50_ms is None or step.account.answers.p99_ms is None:
         return Check(figure, "-", bar, None)
     p99_ms, count = step.account.answers.p99_ms, step.account.answers.count
