@@ -273,6 +273,16 @@ class TestOrder:
         assert toy.take("host").jobs == (second,)
         assert not first.is_over
 
+    def test_steps_of_a_quantum_leave_no_thread_idle(self) -> None:
+        toy = Toy()
+        toy.scheduler.costs.forget()
+        toy.learn("describe", "toy", 0.001, "short")
+        for client in ("long", "long too"):
+            toy.learn("prepare", "toy", OPTIONS.quantum_s, client)
+            toy.admit(client=client)
+        toy.admit(client="short", stage="describe")
+        assert [toy.take("host").stage.name for _ in range(2)] == ["prepare", "prepare"]
+
     def test_a_batch_is_of_one_bucket_and_as_large_as_what_waits(self) -> None:
         toy = Toy(WorkQueueOptions(max_queued_s=1000))
         for i in range(8):

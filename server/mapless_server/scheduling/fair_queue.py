@@ -70,25 +70,25 @@ class FairQueue(Generic[J]):
         cost_s = self._accounts[flow].jobs.pop(job)
         self._cost_s -= cost_s
         self._forget_if_settled(flow)
-        debtors = [it for it, account in self._accounts.items() if not account.jobs]
-        if len(debtors) > MAX_DEBTORS:  # callers come and go without end
-            self._accounts[debtors[0]].credit_s = 0.0
-            self._forget_if_settled(debtors[0])
+        if len(self._accounts) > len(self._flow_of) + MAX_DEBTORS:  # callers come and go without end
+            debtor = next(it for it, account in self._accounts.items() if not account.jobs)
+            self._accounts[debtor].credit_s = 0.0
+            self._forget_if_settled(debtor)
         return cost_s
 
     def pop(self, is_allowed: Callable[[J], bool] = lambda _: True) -> J:
         """Removes the next of the allowed jobs and charges its caller; raises IndexError if none waits."""
-        firsts = ((flow, next(filter(is_allowed, it.jobs), None)) for flow, it in self._accounts.items())
-        first_of = {flow: job for flow, job in firsts if job is not None}
-        if not first_of:
-            raise IndexError("nothing waits")
         while True:
             for flow in list(self._accounts):
-                if flow in first_of and self._accounts[flow].credit_s > 0:
-                    return self._charge(first_of[flow])
+                account = self._accounts[flow]
+                if account.credit_s > 0 and (job := next(filter(is_allowed, account.jobs), None)) is not None:
+                    return self._charge(job)
                 self._begin_turn(flow, 1)
             # All are in debt: skip the rounds in which no caller would be served.
-            idle_rounds = min(int(-self._accounts[it].credit_s / self._share_s(it)) for it in first_of)
+            waiting = [flow for flow, account in self._accounts.items() if any(map(is_allowed, account.jobs))]
+            if not waiting:
+                raise IndexError("nothing waits")
+            idle_rounds = min(int(-self._accounts[it].credit_s / self._share_s(it)) for it in waiting)
             for flow in list(self._accounts):
                 self._begin_turn(flow, max(0, idle_rounds))
 

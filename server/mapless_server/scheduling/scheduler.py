@@ -66,7 +66,7 @@ class _Lane:
         free: number of idle threads.
         passed_over: batches since the first stage that has waiting jobs was served.
         busy_s: sum of the threads' computing times so far.
-        computing_s: predicted times of the steps that are computed, by number of the batch.
+        long: numbers of the batches that are computed of which a step is predicted to take more than a quantum.
         arrivals: of the last jobs that have come to wait: caller, predicted time with later stages, time of arrival.
     """
 
@@ -75,19 +75,22 @@ class _Lane:
     free: int
     passed_over: int = 0
     busy_s: float = 0.0
-    computing_s: dict[int, float] = field(default_factory=dict)
+    long: set[int] = field(default_factory=set)
     arrivals: deque[tuple[Flow, float, float]] = field(default_factory=lambda: deque(maxlen=_ARRIVALS))
 
-    def allows(self, flow: Flow, seconds: float, now_s: float) -> bool:
-        """Whether a thread may compute a caller's step of this time.
+    @property
+    def has_one_left(self) -> bool:
+        """Whether all threads but one compute long steps."""
+        return len(self.long) >= self.threads - 1 > 0
 
-        It may not if all others compute such steps, and much shorter jobs are likely to come meanwhile, which would
-        wait for their ends. They are likely if one of another caller has come within as long a time.
+    def expects_shorter(self, flow: Flow, seconds: float, now_s: float) -> bool:
+        """Whether much shorter jobs are likely to come while a caller's step of this time is computed.
+
+        They are if one of another caller has come within as long a time.
         """
-        short_s = seconds / _MUCH_SHORTER
-        others_are_long = sum(it > short_s for it in self.computing_s.values()) >= self.threads - 1 > 0
-        return not others_are_long or not any(
-            its_s <= short_s and now_s - came_s <= seconds and other != flow for other, its_s, came_s in self.arrivals
+        return any(
+            _MUCH_SHORTER * its_s <= seconds and now_s - came_s <= seconds and other != flow
+            for other, its_s, came_s in self.arrivals
         )
 
 
@@ -245,7 +248,10 @@ class Scheduler:
             return None
 
         def is_allowed(job: Job) -> bool:
-            return lane.allows(job.flow, self._step_s(job, now_s), now_s)
+            if not lane.has_one_left:
+                return True
+            step_s = self._step_s(job, now_s)
+            return step_s <= self._options.quantum_s or not lane.expects_shorter(job.flow, step_s, now_s)
 
         waiting = [stage for stage in lane.stages if any(map(is_allowed, self._queues[stage.name]))]
         if not waiting:
@@ -262,7 +268,8 @@ class Scheduler:
         self._running[stage.name] += len(jobs)
         self._report_load(stage)
         batch = Batch(stage, jobs, now_s, next(self._batch_number))
-        lane.computing_s[batch.number] = self._step_s(jobs[0], now_s)
+        if self._step_s(jobs[0], now_s) > self._options.quantum_s:
+            lane.long.add(batch.number)
         return batch
 
     def finish(self, batch: Batch, results: Sequence[StageResult], now_s: float) -> None:
@@ -271,7 +278,7 @@ class Scheduler:
         lane = self._lanes[stage.lane]
         lane.free += 1
         lane.busy_s += seconds
-        del lane.computing_s[batch.number]
+        lane.long.discard(batch.number)
         self._running[stage.name] -= len(batch.jobs)
         bucket = batch.jobs[0].step.bucket
         self._observer.computed(stage.name, bucket, len(batch.jobs), seconds)
@@ -356,7 +363,8 @@ class Scheduler:
 
     def _remember(self, flow: Flow, step: Step) -> None:
         """Keeps the first step of a caller's last job, without its payload, for `check_room`."""
-        self._first_steps[flow, step.stage] = replace(step, payload=None)
+        if (known := self._first_steps.get((flow, step.stage))) is None or known.kind != step.kind:
+            self._first_steps[flow, step.stage] = replace(step, payload=None)
         self._first_steps.move_to_end((flow, step.stage))
         if len(self._first_steps) > MAX_OF_CALLERS:
             self._first_steps.popitem(last=False)
