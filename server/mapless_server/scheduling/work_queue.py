@@ -221,7 +221,7 @@ class WorkQueue:
                     condition.notify_all()
 
     async def _run_timer(self) -> None:
-        """Ends due jobs and detects hanging threads, until the queue is closed."""
+        """Ends due jobs, detects hanging threads, and wakes those that may compute more, until the queue is closed."""
         try:
             while True:
                 self._wakes_timer.clear()
@@ -231,6 +231,7 @@ class WorkQueue:
                     self._check_for_stalls(now_s)
                     due_s = self._scheduler.next_due_s
                     self._timer_at_s = min(math.inf if due_s is None else due_s, now_s + self._options.heartbeat_s)
+                    self._notify()  # steps that were held back for shorter ones, which may not have come
                 timer = asyncio.get_running_loop().call_later(max(0.0, self._timer_at_s - now_s), self._wakes_timer.set)
                 await self._wakes_timer.wait()
                 timer.cancel()
