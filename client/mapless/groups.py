@@ -186,10 +186,6 @@ class SequenceLocalization:
             f"{it.rotation_deg:.3g} deg"
             for it in self.jumps
         ]
-        if len(self.jumps) == len(self.images) - 1 > 1:
-            jumps.append(
-                "  warning   the tracking contradicts every photograph: check unit, axes and direction of its poses"
-            )
         return "\n".join([f"sequence {_support(self)}", *last, *jumps])
 
 

@@ -19,7 +19,7 @@ from mapless.cli.localize import priors
 from mapless.cli.output import line, plain
 from mapless.errors import Internal
 from mapless.geometry import Camera, Fisheye, RigidTransform, Similarity
-from mapless.groups import GroupRejected, ImageReport, RigLocalization, SequenceLocalization, TrackingJump
+from mapless.groups import GroupRejected, RigLocalization, SequenceLocalization, TrackingJump
 from mapless.priors import Priors
 from mapless.requests import read_image
 from mapless.v1 import localization_service_pb2 as pb
@@ -128,9 +128,6 @@ def test_text_of_a_group_is_its_pose_or_its_reason() -> None:
         *lines(answer)[1:3],
         "  jump      between photographs 3 and 4: 0.25 m, 2 deg",
     ]
-    report = ImageReport(90, 100, None, diagnostics())
-    assert "warning" not in str(replace(moved, images=(report,) * 3))
-    assert str(replace(moved, images=(report,) * 3, jumps=moved.jumps * 2)).endswith("axes and direction of its poses")
     assert str(GroupRejected("GATE", "No.", (), rejected().hint)).splitlines() == lines(
         replace(rejected(), reason="GATE", message="No.")
     )

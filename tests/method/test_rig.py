@@ -12,8 +12,9 @@ from support.scenes import SceneOptions, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
 from mapless_server.method.answer import Answer, Localization
-from mapless_server.method.groups.checks import check_mounting, check_unit, hinted_group
+from mapless_server.method.groups.checks import check_mounting, check_tracking, check_unit, hinted_group
 from mapless_server.method.groups.images import rejection_without_matches
+from mapless_server.method.groups.jumps import Jump
 from mapless_server.method.groups.rig import RigEstimate, RigOptions, RigState, solve_rig
 from mapless_server.method.groups.sequence import SequenceEstimate
 from mapless_server.method.perturbation import rotation_vector
@@ -221,6 +222,17 @@ def test_a_walk_of_another_length_is_rejected_with_its_unit(unit_m: float) -> No
 def test_drift_and_uncertain_lengths_are_accepted(drift: float, sigma_m: float) -> None:
     estimate = walk(0.5, sigma_m)
     assert check_unit(estimate, walk(0.5 * drift).world_from_camera) is estimate
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 4])
+def test_tracking_that_jumps_between_all_photographs_is_wrong(count: int) -> None:
+    estimate = replace(walk(0.5), jumps=tuple(Jump(i, i + 1, 50.0, 1.0) for i in range(count)))
+    found = check_tracking(estimate, walk(50.0).world_from_camera)
+    if count < 4:
+        assert found is estimate
+        return
+    assert isinstance(found, Rejection)
+    assert "between all 5 of them: the session's path is 200.00 long, that of the photographs 2.00 m" in found.message
 
 
 SCENE = make_scene(random_for("group hints"))

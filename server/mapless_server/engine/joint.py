@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from mapless.geometry import RigidTransform
-from mapless_server.method.groups.checks import check_mounting, check_unit, hinted_group
+from mapless_server.method.groups.checks import check_mounting, check_tracking, check_unit, hinted_group
 from mapless_server.method.groups.images import GroupImage
 from mapless_server.method.groups.rig import RigEstimate, RigOptions, solve_rig
 from mapless_server.method.groups.sequence import SequenceEstimate, solve_sequence
@@ -37,6 +37,8 @@ def pose_sequence(
     """Estimates the poses of a sequence's frames, in order, in OpenCV's axes."""
     options = SequenceOptions(coverage=queries[0].options.coverage)
     found = solve_sequence(_images(queries, results), session_from_camera, estimate_scale, options)
+    if not isinstance(found, Rejection):
+        found = check_tracking(found, session_from_camera)
     if not isinstance(found, Rejection) and not estimate_scale:
         found = check_unit(found, session_from_camera)
     if isinstance(found, Rejection):

@@ -7,6 +7,7 @@ against it is the inliers that other photographs lose, and the length of the pat
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -31,6 +32,9 @@ UNIT_TOLERANCE = 1.25
 SIGNIFICANT_SIGMAS = 4.0
 """Least difference of the path's lengths, in standard deviations."""
 
+ALL_JUMPS = 3
+"""Where so many steps or more are all jumps, the tracked poses are wrong; fewer may be jumps of a device."""
+
 
 def check_mounting(estimate: RigEstimate, alone: Sequence[Answer]) -> RigEstimate | Rejection:
     """Checks a rig's pose against the poses of the photographs that are localized reliably alone.
@@ -49,6 +53,26 @@ def check_mounting(estimate: RigEstimate, alone: Sequence[Answer]) -> RigEstimat
     counts = ", ".join(f"{kept.get(image, 0)} of {sure[image]} in images[{image}]" for image in against)
     message = f"the joint pose keeps too few of the inliers that photographs have alone: {counts}"
     advice = "Check rig_from_camera of these images, and that all were taken at one moment."
+    return Rejection(RejectionReason.GATE, message, Hint(STAGE, Advice.CHECK_CALIBRATION, advice))
+
+
+def check_tracking(
+    estimate: SequenceEstimate, session_from_camera: Sequence[RigidTransform]
+) -> SequenceEstimate | Rejection:
+    """Checks that the session agrees with the photographs somewhere.
+
+    It does not in wrong axes, inverse, or in a unit that is wrong by far. Returns a rejection GATE if all of
+    `ALL_JUMPS` steps or more are jumps.
+    """
+    poses = estimate.world_from_camera
+    if len(estimate.jumps) < max(len(poses) - 1, ALL_JUMPS):
+        return estimate
+    tracked, shown_m = (sum(_distance(*ends) for ends in pairwise(it)) for it in (session_from_camera, poses))
+    message = (
+        f"the tracked poses contradict the photographs between all {len(poses)} of them: the session's path is "
+        f"{tracked:.2f} long, that of the photographs {shown_m:.2f} m"
+    )
+    advice = "Check session_from_camera: metres, the axes of the request, and the camera's pose, not its inverse."
     return Rejection(RejectionReason.GATE, message, Hint(STAGE, Advice.CHECK_CALIBRATION, advice))
 
 
