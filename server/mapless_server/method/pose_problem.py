@@ -7,6 +7,7 @@ covariance C, by which neighbours move together and far references are held less
 references' observations (see `pose_errors`). The points are eliminated (see `bundle`).
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -50,7 +51,7 @@ class AdjustOptions:
         least_curvature: see `BundleProblem`. With 1 it takes one or two steps more; less than 0.5 saves none.
         suspicion: when an error of the intrinsics counts in full in the covariance.
         trial: when it is tried to estimate the intrinsics with the pose. A large error makes residuals large, where the
-            loss hardly curves: by the intrinsics as given it is determined less than where it is estimated.
+            loss hardly curves: with the intrinsics as given it seems undetermined, and is not where it is estimated.
         agreeing_share: or when fewer of the matches are inliers. In a kitchen with five references, where k1 was off by
             0.3, one pose of six aroused suspicion; of the others this finds four.
         contradiction: when this estimate is used.
@@ -73,7 +74,7 @@ class AdjustOptions:
     min_motion_sigma: float = 0.25
     least_curvature: float = 0.5
     suspicion: ContradictionOptions = field(default_factory=lambda: ContradictionOptions(2.0, 0.06, 0.06, 0.15))
-    trial: ContradictionOptions = field(default_factory=lambda: ContradictionOptions(2.0, 0.12, 0.12, 0.3))
+    trial: ContradictionOptions = field(default_factory=lambda: ContradictionOptions(2.0, *[math.inf] * 3))
     contradiction: ContradictionOptions = field(default_factory=ContradictionOptions)
     agreeing_share: float = 0.6
     rounds: int = 4
