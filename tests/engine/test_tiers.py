@@ -194,8 +194,10 @@ class TestTwoPlaces:
         results = {"there": Result(there, CHEAP, (), 1, CAMERA), "elsewhere": Result(elsewhere, CHEAP, (), 1, CAMERA)}
         assert of_two_places(results["there"], results["elsewhere"], OPTIONS) is results[chosen]
 
-    def test_two_poses_are_ambiguous_if_more_is_seen_elsewhere(self) -> None:
-        there, elsewhere = found(localized(), 0.0, 100), found(localized(30.0, inliers=150), 30.0, 150)
+    @pytest.mark.parametrize(("x_m", "turn_deg"), [(30.0, 0.0), (0.0, 180.0)])
+    def test_two_poses_are_ambiguous_if_more_is_seen_elsewhere(self, x_m: float, turn_deg: float) -> None:
+        there = found(localized(), 0.0, 100)
+        elsewhere = found(localized(x_m, inliers=150, turn_deg=turn_deg), x_m, 150)
         results = [Result(it, CHEAP, (), 1, CAMERA) for it in (there, elsewhere)]
         outcome = of_two_places(results[0], results[1], OPTIONS).answer.outcome
         assert isinstance(outcome, Rejection)

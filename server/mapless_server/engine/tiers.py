@@ -133,15 +133,18 @@ def of_two_places(narrowed: Result, elsewhere: Result, options: EscalationOption
             return elsewhere
         return elsewhere if _apart_m(other[0], second) <= max(other[2], _same_m(elsewhere, options)) else narrowed
     apart_m = _apart_m(first.world_from_camera, second)
-    if apart_m <= _same_m(elsewhere, options) or second.inlier_count < options.clearly_more * first.inlier_count:
+    apart_deg = rotation_angle_deg(first.world_from_camera.rotation.T @ second.world_from_camera.rotation)
+    same_deg = max(options.same_rotation_deg, sum(_claim(it).rotation_95_deg for it in (first, second)))
+    is_same = apart_m <= _same_m(elsewhere, options) and apart_deg <= same_deg
+    if is_same or second.inlier_count < options.clearly_more * first.inlier_count:
         return narrowed
     poses = [
         Hypothesis(it.world_from_camera, it.inlier_count, tuple(used.name for used in of.references))
         for it, of in ((second, elsewhere), (first, narrowed))
     ]
     message = (
-        f"two poses {apart_m:.2f} m apart explain the photograph: the one where the prior says with "
-        f"{first.inlier_count} inliers, the other with {second.inlier_count}"
+        f"two poses {apart_m:.2f} m and {apart_deg:.0f} degrees apart explain the photograph: the one where the prior "
+        f"says with {first.inlier_count} inliers, the other with {second.inlier_count}"
     )
     hint = Hint("judge", Advice.CHECK_PRIOR, "Check the prior: references elsewhere show more of the photograph.", None)
     rejection = Rejection(RejectionReason.AMBIGUOUS, message, hint, hypotheses=(poses[0], poses[1]))
