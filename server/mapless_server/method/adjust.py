@@ -7,7 +7,7 @@ are adjusted together (see `pose_problem`).
 Where references are few and far apart, most keypoints that the query shares with one of them are in no other: no point
 can be triangulated without the query. With the query's pose one can, and after its elimination it is an equation of
 the pose, the epipolar one of both keypoints (see `two_view`). Where these are many they are adjusted with the others.
-Whether the pose is accepted is decided without them.
+They are no inliers: whether the pose is accepted depends on them only by its radius, which they make smaller.
 
 The query's intrinsics stay as given: where they are right, poses are twice as accurate without these four unknowns.
 What the photograph says of their errors follows from the same normal equations, and the pose's covariance contains them
@@ -96,8 +96,8 @@ def _adjusted(
 ) -> PoseEstimate | None:
     """Returns the estimate at the optimum with priors; None if it diverges or has too few matches.
 
-    Points of the query's own are chosen at its pose, with whatever error the intrinsics give it, so they hide this
-    error: the intrinsics are judged without them, and estimated without them.
+    Points of the query's own are chosen at its pose, with whatever error the intrinsics give it, so they hide a part
+    of this error: intrinsics that seem wrong with them are judged, and estimated, without them.
     """
     terms = intrinsics_terms(query, references, intrinsics)
 
