@@ -66,18 +66,22 @@ def read_pose(source: str | Path) -> RigidTransform:
     if content.lstrip().startswith("["):
         return _pose_from_matrix(content, "pose" if is_inline else text)
     if (pose := _pose_of_answer(content)) is not None:
-        return read_pose(json.dumps(pose))
+        try:
+            return read_pose(json.dumps(pose))
+        except ValueError as error:
+            raise ValueError(str(error) if is_inline else f"{text}: {error}") from None
     required = ("rotation", "translation_m")
     return read_message(str(source), geometry_pb2.RigidTransform(), required, wire.transform_from_message, "pose")
 
 
-def _pose_of_answer(content: str) -> Any:
+def _pose_of_answer(content: str) -> dict[str, Any] | None:
     """The pose of an answer as `mapless localize` prints it; None if the text is something else."""
     try:
         answer = read_json(content)
     except ValueError:
         return None
-    return answer.get("world_from_camera") if isinstance(answer, dict) else None
+    pose = answer.get("world_from_camera") if isinstance(answer, dict) else None
+    return pose if isinstance(pose, dict) else None
 
 
 def _pose_from_matrix(content: str, name: str) -> RigidTransform:

@@ -38,6 +38,11 @@ def test_the_pose_of_a_printed_answer(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_pose(file).matrix(), localized().world_from_camera.matrix(), atol=1e-12)
     with pytest.raises(ValueError, match="reason is no field"):
         read_pose(json.dumps(plain(rejected())))
+    with pytest.raises(ValueError, match="world_from_camera is no field"):
+        read_pose('{"world_from_camera": "there.json"}')
+    file.write_text('{"world_from_camera": {"rotation": {"w": 1}}}')
+    with pytest.raises(ValueError, match=r"answer.json: .*translation_m"):
+        read_pose(file)
 
 
 def test_four_numbers_take_the_size_of_the_photograph(tmp_path: Path) -> None:
