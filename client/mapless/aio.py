@@ -26,6 +26,7 @@ from .exchange import Attempt, Exchange, Methods, Pages, Pause, Reader, attempts
 from .options import ConnectOptions
 from .requests import NewReference
 from .results import Reference
+from .v1 import reference_service_pb2 as pb
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -144,9 +145,10 @@ class Client:
     ) -> list[Reference]:
         """Stores many references, as `mapless.Client.add_references` does; `references` is read in another thread."""
         stored: list[Reference] = []
+        there: dict[str, pb.Reference] = {}
         batches = reference_calls.batches(scene, references, self.options)
         while batch := await asyncio.to_thread(next, batches, None):
-            stored += await self.run(reference_calls.add_batch(scene, batch, timeout_s))
+            stored += await self.run(reference_calls.add_batch(scene, batch, timeout_s, there))
             if on_progress is not None:
                 on_progress(len(stored))
         return stored

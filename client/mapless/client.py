@@ -20,6 +20,7 @@ from .exchange import Attempt, Exchange, Methods, Pages, Pause, Reader, attempts
 from .options import ConnectOptions
 from .requests import NewReference
 from .results import Reference
+from .v1 import reference_service_pb2 as pb
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -137,17 +138,20 @@ class Client:
         """Stores many references, in as many messages as needed.
 
         A message is stored whole or not at all. When one fails, the references of earlier messages remain stored:
-        list the scene to see which.
+        call this again with all of them. Those that the scene has already, with the same photograph, intrinsics and
+        pose, are not stored again, and are returned and counted like the others; AlreadyExists names one that the scene
+        has with another photograph, intrinsics or pose.
 
         Args:
             scene: the scene.
             references: the references; files are read when they are sent.
-            on_progress: called with the number stored so far after each message.
+            on_progress: called with the number stored so far, with those that were there, after each message.
             timeout_s: deadline of each message; None for `upload_timeout_s`.
         """
         stored: list[Reference] = []
+        there: dict[str, pb.Reference] = {}
         for batch in reference_calls.batches(scene, references, self.options):
-            stored += self.run(reference_calls.add_batch(scene, batch, timeout_s))
+            stored += self.run(reference_calls.add_batch(scene, batch, timeout_s, there))
             if on_progress is not None:
                 on_progress(len(stored))
         return stored

@@ -105,32 +105,50 @@ def stored(request: pb.CreateReferenceRequest) -> pb.Reference:
     return reference
 
 
-def test_a_batch_is_found_by_one_call() -> None:
+def added(wanted: list[pb.CreateReferenceRequest], answers: list[Any]) -> Played:
+    return Played(references.add_batch("a", wanted, 10.0, {}), answers, ConnectOptions())
+
+
+@pytest.mark.parametrize("first", [[], [GONE]], ids=["earlier upload", "lost answer"])
+def test_a_batch_that_is_there_is_found_by_one_call(first: list[Any]) -> None:
     wanted = requests(32)
-    page = pb.ListReferencesResponse(references=map(stored, wanted))
-    played = Played(references.add_batch("a", wanted, 10.0), [GONE, TAKEN, page], ConnectOptions())
+    played = added(wanted, [*first, TAKEN, pb.ListReferencesResponse(references=map(stored, wanted))])
     assert [it.reference_id for it in played.result] == [it.reference_id for it in wanted]
-    assert methods(played) == ["BatchCreateReferences"] * 2 + ["ListReferences"]
+    assert methods(played) == ["BatchCreateReferences"] * (len(first) + 1) + ["ListReferences"]
 
 
-def test_items_of_a_large_scene_are_looked_up_one_by_one() -> None:
-    wanted = requests(3)
-    page = pb.ListReferencesResponse(references=map(stored, wanted[:1]), next_page_token="more")
-    singles = [pb.GetReferenceResponse(reference=stored(it)) for it in wanted[1:]]
-    played = Played(references.add_batch("a", wanted, None), [GONE, TAKEN, page, *singles], ConnectOptions())
-    assert [it.reference_id for it in played.result] == ["r00", "r01", "r02"]
-    absent = Played(references.add_batch("a", wanted, None), [GONE, TAKEN, page, ABSENT], ConnectOptions())
-    assert absent.result is TAKEN
+def test_only_what_the_scene_lacks_is_sent_again() -> None:
+    wanted = requests(4)
+    pages = [
+        pb.ListReferencesResponse(references=[stored(wanted[1])], next_page_token="more"),
+        pb.ListReferencesResponse(references=[stored(wanted[3])]),
+    ]
+    lacked = [wanted[0], wanted[2]]
+    played = added(wanted, [TAKEN, *pages, pb.BatchCreateReferencesResponse(references=map(stored, lacked))])
+    assert [it.reference_id for it in played.result] == ["r00", "r01", "r02", "r03"]
+    request = played.calls[-1].request
+    assert isinstance(request, pb.BatchCreateReferencesRequest)
+    assert list(request.requests) == lacked
 
 
-def test_a_batch_with_another_clients_item_is_not_repeated() -> None:
+@pytest.mark.parametrize("what", ["photograph", "intrinsics", "pose"])
+def test_a_different_reference_of_the_same_name_is_named(what: str) -> None:
     wanted = requests(3)
     there = [stored(it) for it in wanted]
-    there[2].image_sha256 = "0" * 64
-    for found in (there, there[:2]):
-        page = pb.ListReferencesResponse(references=found)
-        played = Played(references.add_batch("a", wanted, None), [GONE, TAKEN, page], ConnectOptions())
-        assert played.result is TAKEN
+    if what == "photograph":
+        there[2].image_sha256 = "0" * 64
+    elif what == "intrinsics":
+        there[2].intrinsics.focal_x_px += 1
+    else:
+        there[2].world_from_camera.translation_m.x += 1e-6
+    error = added(wanted, [TAKEN, pb.ListReferencesResponse(references=there)]).result
+    assert isinstance(error, AlreadyExists)
+    assert error.resource == "scenes/a/references/r02"
+    assert error.message == f"reference 'r02' exists already, with another {what}"
+
+
+def test_a_taken_name_that_is_not_listed_is_an_error() -> None:
+    assert added(requests(3), [TAKEN, pb.ListReferencesResponse()]).result is TAKEN
 
 
 def a_pose_that_is_none() -> Any:
@@ -212,5 +230,4 @@ def test_a_lookup_that_breaks_its_contract_is_a_server_error() -> None:
     there = stored(requests(1)[0])
     there.world_from_camera.CopyFrom(a_pose_that_is_none())
     page = pb.ListReferencesResponse(references=[there])
-    played = Played(references.add_batch("a", requests(1), None), [GONE, TAKEN, page], ConnectOptions())
-    assert isinstance(played.result, Internal)
+    assert isinstance(added(requests(1), [TAKEN, page]).result, Internal)

@@ -146,6 +146,19 @@ def test_a_change_whose_answer_was_lost_is_made_once(server: RunningServer, conn
 
 
 @both
+def test_an_interrupted_upload_goes_on(server: RunningServer, connect: Connect, scene: str) -> None:
+    wanted = [NewReference(f"n{i}", PHOTO, CAMERA, pose(i)) for i in range(5)]
+    counts: list[int] = []
+    with connect(server.address, ConnectOptions(batch_count=2)) as client:
+        client.add_references(scene, wanted[:3])
+        stored = client.add_references(scene, wanted, on_progress=counts.append)
+        assert ([it.reference_id for it in stored], counts) == ([it.reference_id for it in wanted], [2, 4, 5])
+        moved = replace(wanted[3], world_from_camera=pose(0.5))
+        with pytest.raises(AlreadyExists, match="reference 'n3' exists already, with another pose"):
+            client.add_references(scene, [*wanted[:3], moved])
+
+
+@both
 def test_another_clients_resource_is_not_taken_for_ones_own(
     server: RunningServer, connect: Connect, scene: str
 ) -> None:

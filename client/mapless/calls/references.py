@@ -1,12 +1,12 @@
 """Scenes and references: create, get, update, list, delete; retrieval, audit and coverage."""
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from numpy.typing import ArrayLike
 
 from .. import wire
-from ..errors import MaplessError
+from ..errors import AlreadyExists, MaplessError
 from ..exchange import Call, Exchange, Pages
 from ..geodesy import Datum
 from ..geometry import Camera, RigidTransform
@@ -137,28 +137,45 @@ def add_reference(scene: str, reference: NewReference, *, timeout_s: float | Non
 
 
 def add_batch(
-    scene: str, requests: Sequence[pb.CreateReferenceRequest], timeout_s: float | None
+    scene: str,
+    requests: Sequence[pb.CreateReferenceRequest],
+    timeout_s: float | None,
+    there: dict[str, pb.Reference],
 ) -> Exchange[list[Reference]]:
-    """Stores the references of one message: either all of them or none."""
+    """Stores the references of one message that the scene does not have: either all of them or none.
 
-    def found(error: MaplessError) -> Exchange[pb.BatchCreateReferencesResponse]:
-        stored = yield from repeats.stored_references(request, error)
-        return pb.BatchCreateReferencesResponse(references=stored)
-
-    request = pb.BatchCreateReferencesRequest(scene=scene_name(scene), requests=requests)
+    `there` are references that the scene is known to have, by name; they are listed into it if the server rejects a
+    message because of one. AlreadyExists for one with the name of another photograph, camera or pose.
+    """
+    names = [reference_name(scene, it.reference_id) for it in requests]
+    _check_equal(requests, names, there)
+    new = [it for it, name in zip(requests, names, strict=True) if name not in there]
+    request = pb.BatchCreateReferencesRequest(scene=scene_name(scene), requests=new)
+    call = Call(
+        f"{SERVICE}/BatchCreateReferences", request, pb.BatchCreateReferencesResponse, timeout_s, is_upload=True
+    )
     try:
-        response = yield Call(
-            f"{SERVICE}/BatchCreateReferences",
-            request,
-            pb.BatchCreateReferencesResponse,
-            timeout_s,
-            is_upload=True,
-            on_repeat=found,
-        )
+        response = (yield call) if new else pb.BatchCreateReferencesResponse()
+    except AlreadyExists:  # an earlier upload, or an attempt whose answer was lost, has stored some
+        there |= yield from repeats.listed_references(scene_name(scene), timeout_s)
+        if not any(reference_name(scene, it.reference_id) in there for it in new):
+            raise
+        return (yield from add_batch(scene, requests, timeout_s, there))
     except MaplessError as error:
-        _name_reference(error, requests)
+        _name_reference(error, new)
         raise
-    return [reference_from_message(reference, response.warnings) for reference in response.references]
+    added = {it.name: reference_from_message(it, response.warnings) for it in response.references}
+    return [added[name] if name in added else reference_from_message(there[name]) for name in names]
+
+
+def _check_equal(
+    requests: Sequence[pb.CreateReferenceRequest], names: Sequence[str], there: Mapping[str, pb.Reference]
+) -> None:
+    """Raises AlreadyExists for a reference whose name another one has."""
+    for request, name in zip(requests, names, strict=True):
+        if what := name in there and repeats.difference(request.reference, there[name]):
+            message = f"reference {shown(request.reference_id)} exists already, with another {what}"
+            raise AlreadyExists("ALREADY_EXISTS", message, resource=name)
 
 
 def _name_reference(error: MaplessError, requests: Sequence[pb.CreateReferenceRequest]) -> None:

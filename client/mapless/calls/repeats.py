@@ -12,7 +12,7 @@ from .. import wire
 from ..errors import MaplessError, NotFound
 from ..exchange import Call, Exchange
 from ..geometry import Array
-from ..names import scene_name
+from ..names import reference_name, scene_name
 from ..scenes import datum_from_message, direction_from_message
 from ..v1 import reference_service_pb2 as pb
 
@@ -44,48 +44,37 @@ def stored_reference(wanted: pb.CreateReferenceRequest, error: MaplessError) -> 
     """Returns the stored reference if it equals the wanted one; else raises the error."""
     if error.code != "ALREADY_EXISTS":
         raise error
-    get = pb.GetReferenceRequest(name=_name(wanted))
+    get = pb.GetReferenceRequest(name=reference_name(wanted.scene, wanted.reference_id))
     try:
         there: pb.Reference = (yield Call(f"{SERVICE}/GetReference", get, pb.GetReferenceResponse)).reference
-    except NotFound:  # of a batch, another reference exists
+    except NotFound:  # another client has deleted it
         raise error from None
-    if not _is_same(wanted.reference, there):
+    if difference(wanted.reference, there):
         raise error
     return there
 
 
-def stored_references(wanted: pb.BatchCreateReferencesRequest, error: MaplessError) -> Exchange[list[pb.Reference]]:
-    """Returns the stored references in the request's order if all equal the wanted ones; else raises the error.
-
-    One call lists all references of most scenes. In a larger scene, references on later pages are fetched one by one.
-    """
-    if error.code != "ALREADY_EXISTS":
-        raise error
-    request = pb.ListReferencesRequest(scene=wanted.scene, page_size=_PAGE_SIZE)
-    page = yield Call(f"{SERVICE}/ListReferences", request, pb.ListReferencesResponse)
-    listed: dict[str, pb.Reference] = {it.name: it for it in page.references}
-    stored = []
-    for one in wanted.requests:
-        there = listed.get(_name(one))
-        if there is None and page.next_page_token:
-            there = yield from stored_reference(one, error)
-        if there is None or not _is_same(one.reference, there):
-            raise error
-        stored.append(there)
-    return stored
+def listed_references(scene: str, timeout_s: float | None) -> Exchange[dict[str, pb.Reference]]:
+    """Lists all references of a scene, by name."""
+    listed: dict[str, pb.Reference] = {}
+    token = ""
+    while True:
+        request = pb.ListReferencesRequest(scene=scene, page_size=_PAGE_SIZE, page_token=token)
+        page = yield Call(f"{SERVICE}/ListReferences", request, pb.ListReferencesResponse, timeout_s)
+        listed |= {it.name: it for it in page.references}
+        token = page.next_page_token
+        if not token:
+            return listed
 
 
-def _name(wanted: pb.CreateReferenceRequest) -> str:
-    return f"{wanted.scene}/references/{wanted.reference_id}"
-
-
-def _is_same(wanted: pb.Reference, stored: pb.Reference) -> bool:
+def difference(wanted: pb.Reference, stored: pb.Reference) -> str:
+    """What distinguishes two references of one name: "photograph", "intrinsics", "pose"; empty if they are equal."""
+    if stored.image_sha256 != hashlib.sha256(wanted.image).hexdigest():
+        return "photograph"
+    if stored.intrinsics != wanted.intrinsics:
+        return "intrinsics"
     ours, theirs = (wire.transform_from_message(it.world_from_camera, "").matrix() for it in (wanted, stored))
-    return (
-        stored.image_sha256 == hashlib.sha256(wanted.image).hexdigest()
-        and stored.intrinsics == wanted.intrinsics
-        and np.allclose(ours, theirs, rtol=0, atol=_SAME)
-    )
+    return "" if np.allclose(ours, theirs, rtol=0, atol=_SAME) else "pose"
 
 
 def _of_world(message: Any) -> Array:
