@@ -14,7 +14,9 @@ from support.images import encode, textured
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import TRACK, Caller, Photo, Query, Result, Tier
+from mapless_server.engine.stages import QueryStages
 from mapless_server.engine.tracking import can_track
+from mapless_server.errors import DataLoss
 from mapless_server.method.answer import Localization
 from mapless_server.method.features import SiftExtractor
 from mapless_server.method.options import LocalizeOptions, Variant
@@ -146,6 +148,15 @@ def test_a_prior_of_another_place_gives_the_answer_without_it(localize: Localize
     assert found.prior_checks[0].conflict
     free = localized(localize(NO_PRIORS, TWO_PLACES))
     np.testing.assert_allclose(found.world_from_camera.matrix(), free.world_from_camera.matrix(), atol=1e-9)
+
+
+def test_a_search_elsewhere_that_fails_costs_no_answer(localize: Localize, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> bool:
+        raise DataLoss("damaged")
+
+    monkeypatch.setattr(QueryStages, "_may_be_elsewhere", fails)
+    assert isinstance(localize(prior(TRUE.shifted(AWAY_M)), TWO_PLACES).answer.outcome, Rejection)
+    localized(localize(Priors(position=PositionPrior(TRUE.translation, np.eye(3)))))
 
 
 def test_what_leaves_the_references_open_is_not_tracked() -> None:

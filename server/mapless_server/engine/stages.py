@@ -368,11 +368,13 @@ class QueryStages:
         if run.narrowed is not None:
             assert run.best is not None
             better = of_two_places(run.best, result, self._escalation)
+            if better not in (run.best, result):  # two places: stronger features would search only one of them
+                return Done(replace(better, stage_seconds=result.stage_seconds), _ending(better))
             query = run.narrowed if better is run.best else query
             result = replace(better, stage_seconds=result.stage_seconds)
         elif run.best is not None:
             result = replace(better_of(run.best, result, self._escalation), stage_seconds=result.stage_seconds)
-        elif self._may_be_elsewhere(run, answer):
+        elif self._searches_elsewhere(run, answer):
             return self._again(run, _without_likely(query), run.tier, result)
         if run.tier + 1 < len(self._tiers) and is_doubtful(result.answer, self._doubt_in(run)):
             return self._again(run, query, run.tier + 1, result)
@@ -387,6 +389,16 @@ class QueryStages:
             query, run.source, run.views, run.deadline_s, run.on_coarse, tier, best, now_s, give_up_s, narrowed
         )
         return self._next(again, again.first_step)
+
+    def _searches_elsewhere(self, run: QueryRun, answer: Answer) -> bool:
+        """`_may_be_elsewhere`, except that its failure does not cost the answer that there is."""
+        try:
+            return self._may_be_elsewhere(run, answer)
+        except Exception as error:
+            if isinstance(error, Abandoned) or failure_of(error) is Failure.DEVICE_LOST:
+                raise
+            log.warning("references elsewhere could not be compared; the first answer is given", exc_info=error)
+            return False
 
     def _may_be_elsewhere(self, run: QueryRun, answer: Answer) -> bool:
         """Whether soft priors may have led to the wrong references.
