@@ -10,10 +10,26 @@ from hypothesis import strategies as st
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_server.engine.query import Result, Tier
-from mapless_server.engine.tiers import UNRECOVERABLE, EscalationOptions, better_of, is_doubtful, of_two_places
+from mapless_server.engine.tiers import (
+    UNRECOVERABLE,
+    EscalationOptions,
+    better_of,
+    is_doubtful,
+    of_two_places,
+    place_of_priors,
+)
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.rejection import IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason
+from mapless_server.method.priors.known import PositionPrior, Priors
+from mapless_server.method.rejection import (
+    Advice,
+    Hint,
+    Hypothesis,
+    IntrinsicsCheck,
+    IntrinsicsParameter,
+    Rejection,
+    RejectionReason,
+)
 from mapless_server.method.results import (
     KeypointNoise,
     PointMatches,
@@ -203,3 +219,15 @@ class TestTwoPlaces:
         assert isinstance(outcome, Rejection)
         assert outcome.reason is RejectionReason.AMBIGUOUS
         assert [it.inlier_count for it in outcome.hypotheses] == [150, 100]
+
+    @pytest.mark.parametrize(("inliers", "decides"), [(101, True), (100, False)])
+    def test_priors_do_not_decide_against_clearly_more_inliers(self, inliers: int, decides: bool) -> None:
+        here, there = (RigidTransform(np.eye(3), np.array([x_m, 0.0, 0.0])) for x_m in (0.0, 6.0))
+        hypotheses = Hypothesis(there, 150, ("there",)), Hypothesis(here, inliers, ("here",))
+        outcome = Rejection(RejectionReason.AMBIGUOUS, "planted", hypotheses=hypotheses)
+        place = place_of_priors(outcome, Priors(position=PositionPrior(np.zeros(3), 0.05**2 * np.eye(3))), OPTIONS)
+        if decides:
+            assert place is hypotheses[1]
+        else:
+            assert isinstance(place, Hint)
+            assert (place.advice, "the other place" in place.message) == (Advice.CHECK_PRIOR, True)

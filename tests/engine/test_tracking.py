@@ -22,7 +22,7 @@ from mapless_server.method.features import SiftExtractor
 from mapless_server.method.options import LocalizeOptions, Variant
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.priors.known import NO_PRIORS, HeadingPrior, PosePrior, PositionPrior, Priors
-from mapless_server.method.rejection import Rejection
+from mapless_server.method.rejection import Advice, Rejection, RejectionReason
 from mapless_server.method.uncertainty.radii import accuracy_from_covariance
 from mapless_server.scenes import Narrowing
 from mapless_server.scheduling import Flow
@@ -31,14 +31,15 @@ from mapless_server.serve.assembly import engine_over
 from mapless_server.store import NewReference, Store
 
 SCENE, COPIED, TWO_PLACES = SceneKey("corner"), SceneKey("copies"), SceneKey("places")
-TRUE = pose(2.0, -1.5)
-COPY_M, AWAY_M = np.array([5.0, 0.0, 0.0]), np.array([100.0, 0.0, 0.0])
+TRUE, IDENTITY = pose(2.0, -1.5), RigidTransform(np.eye(3), np.zeros(3))
+COPY = RigidTransform(rotation_from_vector([0.0, 0.7, 0.0]), np.array([5.0, 0.0, 0.0]))
+AWAY_M = np.array([100.0, 0.0, 0.0])
 SIGMA_M, SIGMA_DEG = 0.05, 1.5
 Localize = Callable[..., Result]
 
 
-def prior(at: RigidTransform = TRUE, sigma_deg: float = SIGMA_DEG) -> Priors:
-    deviations = [SIGMA_M] * 3 + [np.radians(sigma_deg)] * 3
+def prior(at: RigidTransform = TRUE, sigma_deg: float = SIGMA_DEG, sigma_m: float = SIGMA_M) -> Priors:
+    deviations = [sigma_m] * 3 + [np.radians(sigma_deg)] * 3
     return Priors(pose=PosePrior(at, np.diag(np.square(deviations))))
 
 
@@ -55,7 +56,7 @@ def query(priors: Priors = NO_PRIORS, scene: SceneKey = SCENE, image: bytes = b"
 
 @pytest.fixture(scope="module")
 def localize(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Localize]:
-    """A scene of a corner, one in which a copy of it stands 5 m aside, and one with another place 100 m away."""
+    """A scene of a corner, one in which a turned copy of it stands 5 m aside, and one with another place 100 m away."""
     caller = Caller(Flow("tenant", "client"), time.monotonic() + 600)
     folder: Path = tmp_path_factory.mktemp("store")
     poses = [pose(angle, height) for angle in (-15, -5, 5, 15) for height in (-1.8, -1.2)]
@@ -65,19 +66,19 @@ def localize(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Localize]:
         photos = [Photo(photograph(it), CAMERA, "image") for it in poses]
         described = loop.run_until_complete(engine.describe(photos, caller))
 
-        def added(scene: SceneKey, offsets: Sequence[np.ndarray]) -> None:
+        def added(scene: SceneKey, places: Sequence[RigidTransform]) -> None:
             store.create_scene(scene)
-            for k, offset in enumerate(offsets):
+            for k, place in enumerate(places):
                 shown = zip(photos, poses, described, strict=True)
                 references = [
-                    NewReference(f"{k}-{i}", photo.image, CAMERA, at.shifted(offset), found.views, found.descriptors)
+                    NewReference(f"{k}-{i}", photo.image, CAMERA, place.compose(at), found.views, found.descriptors)
                     for i, (photo, at, found) in enumerate(shown)
                 ]
                 store.add_references(scene, references)
 
-        added(SCENE, [np.zeros(3)])
-        added(COPIED, [np.zeros(3), COPY_M])
-        added(TWO_PLACES, [np.zeros(3)])
+        added(SCENE, [IDENTITY])
+        added(COPIED, [IDENTITY, COPY])
+        added(TWO_PLACES, [IDENTITY])
         others = [Photo(encode(".png", textured(512, 384, seed=i)), CAMERA, "image") for i in range(4)]
         away = zip(others, poses[::2], loop.run_until_complete(engine.describe(others, caller)), strict=True)
         store.add_references(
@@ -127,11 +128,34 @@ def test_a_wrong_prior_gives_the_answer_without_it(localize: Localize, metres: f
 
 
 @pytest.mark.parametrize("copy", [0, 1])
-def test_a_prior_at_one_of_two_copies_does_not_decide(localize: Localize, copy: int) -> None:
-    for priors in (NO_PRIORS, prior(TRUE.shifted(copy * COPY_M))):
-        result = localize(priors, COPIED)
-        assert isinstance(result.answer.outcome, Rejection)
-        assert (TRACK in result.stage_seconds) == bool(priors)
+def test_a_tight_prior_decides_between_two_copies(localize: Localize, copy: int) -> None:
+    true = COPY.compose(TRUE) if copy else TRUE
+    for sigma_m in (SIGMA_M, 1e-3):
+        result = localize(prior(true, sigma_m=sigma_m), COPIED)
+        metres, degrees = pose_error(localized(result).world_from_camera, true)
+        assert (metres < 0.02, degrees < 0.3) == (True, True)
+        assert {it.name.rpartition("/")[2][0] for it in result.references} == {str(copy)}
+        assert not localized(result).prior_checks[0].conflict
+
+
+@pytest.mark.parametrize(
+    ("priors", "advice", "said"),
+    [
+        (NO_PRIORS, Advice.TELL_PLACES_APART, "Give a prior"),
+        (prior(TRUE.shifted([0, -1.0, 0])), Advice.CHECK_PRIOR, "neither of the two places."),
+        (prior(TRUE.shifted([0, -0.33, 0])), Advice.CHECK_PRIOR, "neither of the two places well"),
+        (prior(sigma_m=5.0, sigma_deg=15.0), Advice.TELL_PLACES_APART, "fits both"),
+    ],
+    ids=["none", "neither", "hardly one", "both"],
+)
+def test_a_prior_of_both_or_neither_copy_leaves_two(
+    localize: Localize, priors: Priors, advice: Advice, said: str
+) -> None:
+    outcome = localize(priors, COPIED).answer.outcome
+    assert isinstance(outcome, Rejection)
+    assert outcome.reason is RejectionReason.AMBIGUOUS
+    assert outcome.hint is not None
+    assert (outcome.hint.advice, said in outcome.hint.message) == (advice, True)
 
 
 @pytest.mark.parametrize(

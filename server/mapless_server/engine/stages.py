@@ -20,7 +20,7 @@ from mapless_server.method.groups.images import tracked_support
 from mapless_server.method.hints import hinted
 from mapless_server.method.options import StageContext
 from mapless_server.method.pipeline import Coarse, Pipeline, Prepared
-from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.rejection import Hint, Hypothesis, Rejection, RejectionReason
 from mapless_server.method.results import Support
 from mapless_server.method.trust.judge import trust_in_scene
 from mapless_server.method.views import Matches, PosedView, View
@@ -34,7 +34,7 @@ from . import tracking
 from .failures import failure_of
 from .query import TRACK, UNFINISHED, Query, Result, Tier
 from .references import QueryViews, ReferenceSource
-from .tiers import EscalationOptions, better_of, is_doubtful, of_two_places
+from .tiers import EscalationOptions, better_of, is_doubtful, of_two_places, place_of_priors
 
 log = logging.getLogger(__name__)
 
@@ -87,6 +87,7 @@ class QueryRun:
         start_s: when this tier began, by `time.monotonic`.
         give_up_s: time after which `best` is the answer, if this tier has none by then.
         narrowed: the query with the soft priors' choice of references, if references elsewhere are now searched.
+        ambiguous: the rejection as ambiguous, if the references of the place that the priors decided for are now used.
         listings: how often the scene was listed in this tier.
         context: cancels and times this tier's stages; from here on set by the stage `prepare`.
         references: the references that are used, in order.
@@ -111,6 +112,7 @@ class QueryRun:
     start_s: float = field(default_factory=time.monotonic)
     give_up_s: float = math.inf
     narrowed: Query | None = None
+    ambiguous: Result | None = None
     listings: int = 1
     context: StageContext = field(default_factory=StageContext)
     references: tuple[PosedView, ...] = ()
@@ -135,6 +137,11 @@ class QueryRun:
     def tracks(self) -> bool:
         """Whether this tier begins with the references near the prior."""
         return self.best is None and tracking.can_track(self.query)
+
+    @property
+    def earlier(self) -> Result | None:
+        """The result if this computation comes to none."""
+        return self.best or self.ambiguous
 
     @property
     def first_step(self) -> Step:
@@ -176,7 +183,7 @@ class QueryStages:
             is_outdated = isinstance(error, NotFound) and error.field != "scene" and not run.query.reference_ids
             if is_outdated and run.listings < MAX_LISTINGS:
                 return self._next(run, replace(run, listings=run.listings + 1, view=None).first_step)
-            if run.best is None:
+            if run.earlier is None:
                 return _emptied() if is_outdated else error
             # A failed attempt at a better answer must not cost the first answer.
             if not isinstance(error, FeaturesMissing):
@@ -351,7 +358,7 @@ class QueryStages:
 
     def _coarse_result(self, run: QueryRun, part: Coarse) -> Result | None:
         """The first tier's coarse result, if the caller may want it and computation goes on."""
-        if run.best is not None or not (run.query.allow_coarse or run.on_coarse is not None):
+        if run.earlier is not None or not (run.query.allow_coarse or run.on_coarse is not None):
             return None
         coarse = self._method.coarse_answer(part)
         return None if coarse is None or not _is_finite(coarse) else self._result(run, coarse)
@@ -364,7 +371,12 @@ class QueryStages:
 
     def _conclude(self, run: QueryRun, answer: Answer) -> StageResult:
         """Ends a search: returns the better of two answers, or searches elsewhere or in a stronger tier for another."""
+        place = place_of_priors(answer.outcome, run.query.priors, self._escalation)
+        if isinstance(place, Hint) and isinstance(answer.outcome, Rejection):
+            answer = replace(answer, outcome=replace(answer.outcome, hint=place))
         result, query = self._result(run, answer), run.query
+        if isinstance(place, Hypothesis) and len(place.references) < len(run.references):
+            return self._at_place(run, place, result)
         if run.narrowed is not None:
             assert run.best is not None
             better = of_two_places(run.best, result, self._escalation)
@@ -380,13 +392,25 @@ class QueryStages:
             return self._again(run, query, run.tier + 1, result)
         return Done(result, _ending(result))
 
+    def _at_place(self, run: QueryRun, place: Hypothesis, ambiguous: Result) -> StageResult:
+        """Computes the pose from the references of one place alone."""
+        kept = [i for i, it in enumerate(run.references) if it.name in place.references]
+        matches = None if run.query_matches is None else tuple(run.query_matches[i] for i in kept)
+        references, give_up_s = tuple(run.references[i] for i in kept), min(run.give_up_s, self._give_up_s(run))
+        return self._matched_further(
+            replace(run, references=references, query_matches=matches, ambiguous=ambiguous, give_up_s=give_up_s)
+        )
+
+    def _give_up_s(self, run: QueryRun) -> float:
+        now_s = time.monotonic()
+        return now_s + self._escalation.time_share * (run.deadline_s - now_s)
+
     def _again(self, run: QueryRun, query: Query, tier: int, best: Result) -> StageResult:
         """Starts another search; if it finds nothing better in time, the best result so far is returned."""
-        now_s = time.monotonic()
-        give_up_s = now_s + self._escalation.time_share * (run.deadline_s - now_s)
+        begin_s, give_up_s = time.monotonic(), self._give_up_s(run)
         narrowed = run.query if tier == run.tier else None
         again = QueryRun(
-            query, run.source, run.views, run.deadline_s, run.on_coarse, tier, best, now_s, give_up_s, narrowed
+            query, run.source, run.views, run.deadline_s, run.on_coarse, tier, best, begin_s, give_up_s, narrowed
         )
         return self._next(again, again.first_step)
 
@@ -434,14 +458,14 @@ class QueryStages:
 
     def _next(self, run: QueryRun, step: Step, alternative: Step | None = None) -> Next:
         """Goes on to a step; an earlier tier's answer is returned in time if neither step leads to a better one."""
-        if run.best is None:
+        if run.earlier is None:
             return Next(step)
         return Next(step, Fallback(lambda: self._unfinished(run), run.give_up_s), alternative)
 
     def _unfinished(self, run: QueryRun) -> Done:
-        assert run.best is not None
+        assert run.earlier is not None
         unfinished = {f"{self._tiers[run.tier].features}{UNFINISHED}": time.monotonic() - run.start_s}
-        result = replace(run.best, stage_seconds=run.best.stage_seconds | unfinished)
+        result = replace(run.earlier, stage_seconds=run.earlier.stage_seconds | unfinished)
         return Done(result, _ending(result))
 
     def _result(self, run: QueryRun, answer: Answer) -> Result:

@@ -13,6 +13,7 @@ import numpy as np
 from mapless.geometry import RigidTransform, rotation_angle_deg
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.options import check_bounds
+from mapless_server.method.priors.known import Priors
 from mapless_server.method.rejection import Advice, Hint, Hypothesis, Rejection, RejectionReason
 from mapless_server.method.uncertainty.radii import Accuracy, accuracy_from_covariance
 
@@ -38,7 +39,8 @@ class EscalationOptions:
             LightGlue two were further from a rejected one of EdgePoint2, with over twice its inliers; of nine wrong
             ones all were, seven of them with less than 1.5 times its inliers.
         clearly_more: if two poses contradict each other, that of the stronger features is accepted if it has this many
-            times the inliers of the other; so is one that contradicts a rejected pose where the soft priors are.
+            times the inliers of the other; so is one that contradicts a rejected pose where the soft priors are. Priors
+            do not decide for a place if another one has this many times its inliers.
         time_share: share of the remaining time that a stronger tier may take. After that the first answer is returned,
             since a doubtful answer is better than none; the rest of the time suffices to send it.
         rematch_share: share of a tier's time after which it stops matching the photograph again by a slow network (see
@@ -149,6 +151,40 @@ def of_two_places(narrowed: Result, elsewhere: Result, options: EscalationOption
     hint = Hint("judge", Advice.CHECK_PRIOR, "Check the prior: references elsewhere show more of the photograph.", None)
     rejection = Rejection(RejectionReason.AMBIGUOUS, message, hint, hypotheses=(poses[0], poses[1]))
     return replace(elsewhere, answer=replace(elsewhere.answer, outcome=rejection))
+
+
+def place_of_priors(
+    outcome: Localization | Rejection, priors: Priors, options: EscalationOptions
+) -> Hypothesis | Hint | None:
+    """Which of the two places that explain a photograph is the one of its priors, or a hint why they do not decide.
+
+    They decide if all of them agree with one hypothesis and one is in conflict with the other, unless the other has
+    clearly more inliers. None without priors or two places.
+    """
+    if not isinstance(outcome, Rejection) or len(outcome.hypotheses) != 2 or outcome.hint is not None or not priors:
+        return None
+    # Hypotheses are not adjusted: they are known as well as poses of one place agree, at two standard deviations.
+    sigmas = [options.same_position_m / 2] * 3 + [math.radians(options.same_rotation_deg) / 2] * 3
+    covariance = np.diag(np.square(sigmas))
+    checks = [priors.check(it.world_from_camera, covariance) for it in outcome.hypotheses]
+    excluded = [any(check.conflict for check in of_one) for of_one in checks]
+    best = next(iter(outcome.hypotheses[0].references), None)
+    if all(excluded):
+        message = "Check the prior: it fits neither of the two places."
+        return Hint("judge", Advice.CHECK_PRIOR, message, best)
+    if not any(excluded):
+        message = (
+            "Take a photograph that shows where the two places differ, or give a prior with smaller standard "
+            "deviations: the one given fits both; if there is one place only, check the references' poses."
+        )
+        return Hint("judge", Advice.TELL_PLACES_APART, message, best)
+    place, other = outcome.hypotheses[:: -1 if excluded[0] else 1]
+    if not all(check.is_likely for check in checks[excluded.index(False)]):
+        return Hint("judge", Advice.CHECK_PRIOR, "Check the prior: it fits neither of the two places well.", best)
+    if other.inlier_count >= options.clearly_more * place.inlier_count:
+        message = "Check the prior: the photograph shows more of the other place."
+        return Hint("judge", Advice.CHECK_PRIOR, message, best)
+    return place
 
 
 def _inlier_count(result: Result) -> int:

@@ -29,6 +29,9 @@ from ..perturbation import rotation_vector
 CONFLICT_PROBABILITY = 1e-4
 """Probability that a consistent prior is taken for one in conflict."""
 
+LIKELY_PROBABILITY = 0.01
+"""Probability that a consistent prior is not likely, where one of two poses is to be chosen by it."""
+
 MIN_RELATIVE_INFORMATION = 0.1
 """A prior with a smaller share of the photograph's information is not used: it could lower no standard deviation by
 more than 5 %, and its error may exceed its own standard deviation."""
@@ -237,6 +240,11 @@ class PriorCheck:
     degrees_of_freedom: int
     conflict: bool
     used: bool
+
+    @property
+    def is_likely(self) -> bool:
+        """Whether it agrees well: m^2 is below the quantile of `LIKELY_PROBABILITY`."""
+        return self.mahalanobis**2 <= float(chdtri(self.degrees_of_freedom, LIKELY_PROBABILITY))
 
 
 @dataclass(frozen=True, eq=False)
