@@ -101,6 +101,14 @@ def test_photographs_with_few_or_no_features_have_no_matches(n: int, m: int) -> 
     assert mutual_matches(first, second, 0.9).shape == (0, 2)
 
 
+@pytest.mark.parametrize("wide", [False, True])
+def test_one_photograph_at_two_poses_does_not_match_itself(wide: bool) -> None:
+    reference = make_scene(random_for("copied photograph")).references[0]
+    pose = reference.world_from_camera.shifted(np.array([6.0, 0.0, 0.0]))
+    copied = replace(reference, key="copy", world_from_camera=pose)
+    assert Matcher().match_references(reference, copied, wide).shape == (0, 2)
+
+
 # Epipolar lines
 
 

@@ -470,10 +470,14 @@ class Matcher:
         return self._filtered(first, second, self.pair_matching.match_one(first.view, second.view, pause))
 
     def _filtered(self, first: PosedView, second: PosedView, matches: Matches) -> Matches:
+        if _is_one_photograph(first, second):
+            return matches[:0]
         return matches[epipolar_distance_px(first, second, matches) < self.options.epipolar_px]
 
     def _widened(self, first: PosedView, second: PosedView, strict: Matches) -> Matches:
         """Returns the strict matches, and matches along the epipolar lines of the other keypoints."""
+        if _is_one_photograph(first, second):
+            return strict
         similarity = first.view.features.unit_descriptors() @ second.view.features.unit_descriptors().T
         similarity[epipolar_distances_px(first, second) >= self.options.epipolar_px] = -1.0
         added = best_of_both(similarity, self.options.wide_ratio, self.options.wide_similarity)
@@ -492,6 +496,15 @@ class _Key(NamedTuple):
     @classmethod
     def of(cls, pair: tuple[PosedView, PosedView], wide: bool, strong: bool) -> "_Key":
         return cls(pair[0].key, pair[1].key, wide, strong)
+
+
+def _is_one_photograph(first: PosedView, second: PosedView) -> bool:
+    """Whether two references are one photograph at two poses, of two places that are copies of each other.
+
+    Its matches with itself say nothing of the place, but satisfy the epipolar constraint of poses that are only shifted
+    against each other: points at infinity, with which any position agrees.
+    """
+    return np.array_equal(first.view.features.keypoints, second.view.features.keypoints)
 
 
 def in_order(first: PosedView, second: PosedView) -> tuple[PosedView, PosedView]:
