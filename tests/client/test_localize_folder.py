@@ -40,9 +40,11 @@ Fault = Callable[[str, grpc.ServicerContext], "pb.LocalizeResponse | None"]
 
 @dataclass
 class FewAtATime(LocalizationServiceServicer):
-    """Takes so many calls at a time, and refuses the others until there is room."""
+    """Takes so many calls at a time, and refuses the others until there is room, the first when so many have come."""
 
     room: int = COUNT
+    first: int = 1
+    came: int = 0
     fault: Fault = lambda name, context: None
     address: str = ""
     running: int = 0
@@ -53,7 +55,10 @@ class FewAtATime(LocalizationServiceServicer):
     def Localize(self, request: pb.LocalizeRequest, context: grpc.ServicerContext) -> pb.LocalizeResponse:  # noqa: N802
         name = request.image.decode()
         with self.changed:
+            self.came += 1
+            self.changed.notify_all()
             if self.running == self.room:
+                self.changed.wait_for(lambda: self.came >= self.first, 20)
                 self.refused[name] += 1
                 self.changed.notify_all()
                 refuse(context)
@@ -110,7 +115,7 @@ def test_refused_photographs_do_not_wait_behind_new_ones(
     server: FewAtATime, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Of four at a time one is taken, and answered when each of the others was refused and has come again."""
-    server.room = 1
+    server.room, server.first = 1, 4  # a refusal before would make the client send fewer at a time
 
     def until_all_came_again(name: str, context: grpc.ServicerContext) -> None:
         if not server.answered:
