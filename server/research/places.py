@@ -140,12 +140,12 @@ class Measured:
 
 
 def read_places(data: Path, names: Iterable[str], extractor: FeatureExtractor | None = None) -> dict[str, Place]:
-    """The scenes of some folders, with SIFT features by default; of long sequences evenly spread frames."""
+    """The scenes of some folders, as `read_place` does it."""
     return {name: read_place(data / name, extractor) for name in names}
 
 
 def read_place(folder: Path, extractor: FeatureExtractor | None = None, wanted: Sequence[int] | None = None) -> Place:
-    """The scene of a folder; `wanted` are indices of frames, by default every so many-th."""
+    """The scene of a folder, with SIFT features by default; `wanted` are indices of frames, else evenly spread ones."""
     extractor, dataset = extractor or make_extractor("sift"), read_folder(folder)
     frames = dataset.frames
     indices = range(0, len(frames), max(1, len(frames) // FRAMES)) if wanted is None else wanted

@@ -54,9 +54,9 @@ class OneReferenceOptions:
             lens or of the depths of one surface.
         rotation_factor: factor on standard deviations of the rotation. Poses from several references needed it with a
             covariance of this form; with one reference it is not measured.
-        scores: quantiles, at `LEVELS`, of the scores of right answers (see `score_of`), from `research.one_reference`:
-            of 138 pairs of photographs of nine places, each of which counts alike, with depths triangulated from other
-            photographs, an error of 3 % common to all of them and of 5 % of each.
+        scores: quantiles, at `LEVELS`, of the scores of right answers (see `score_of`), of 138 pairs of photographs of
+            nine places, each of which counts alike, with depths triangulated from other photographs, an error of 3 %
+            common to all of them and of 5 % of each.
     """
 
     first_sigma_px: float = 1.5
