@@ -134,6 +134,9 @@ def _read_address(process: subprocess.Popen[str], where: str) -> str:
         for line in process.stdout:
             if line.startswith(_ANNOUNCEMENT):
                 return line.removeprefix(_ANNOUNCEMENT).strip()
+        was_late = deadline.finished.is_set()
     finally:
         deadline.cancel()
+    if was_late:
+        raise ServerFailed(f"the server was not ready within {START_TIMEOUT_S:g} s; is the machine busy?")
     raise ServerFailed(f"the server did not start (exit code {process.wait()}); its own message is {where}")
