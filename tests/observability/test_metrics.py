@@ -23,7 +23,7 @@ from mapless_server.method.rejection import RejectionReason
 from mapless_server.observability import exporter
 from mapless_server.observability.event_loop import watch_event_loop
 from mapless_server.observability.exporter import MAX_CONNECTIONS, MetricsServer
-from mapless_server.observability.metrics import LOCALIZED, STAGES, Metrics
+from mapless_server.observability.metrics import COUNTED, LOCALIZED, STAGES, Metrics
 from mapless_server.scheduling import Ending, Refusal
 
 LOCALIZE = "/mapless.v1.LocalizationService/Localize"
@@ -137,7 +137,7 @@ def count_everything(metrics: Metrics) -> None:
     metrics.stored("load_references", 0.002)
     metrics.store_failed()
     metrics.ran_out_of_memory()
-    metrics.failed_fatally()
+    metrics.count("fatal")
     metrics.set_serving(True)
     metrics.warmed_up(3.0)
     metrics.built("1.2.3", "pi3x", "aliked", "ab" * 32)
@@ -185,14 +185,14 @@ EVENTS: list[tuple[str, dict[str, str], Callable[[Metrics], None]]] = [
         for it in Ending
     ),
     *(("answers", {"outcome": it}, partial(Metrics.answered, outcome=it)) for it in OUTCOMES),
-    ("background_failures", {}, Metrics.matching_failed),
-    ("calibration_failures", {}, Metrics.calibration_failed),
-    ("depth_failures", {}, Metrics.depth_failed),
-    ("depth_failures", {}, Metrics.depth_lookup_failed),
-    ("fatal", {}, Metrics.failed_fatally),
+    *((name, {}, partial(Metrics.count, name=name)) for name, (_, label, _) in COUNTED.items() if not label),
+    *(
+        (name, {label: value}, partial(Metrics.count, name=name, result=value))
+        for name, (_, label, values) in COUNTED.items()
+        for value in values
+    ),
     ("gpu_oom", {}, Metrics.ran_out_of_memory),
     ("store_errors", {}, Metrics.store_failed),
-    ("stored_pairs_failures", {}, Metrics.pair_lookup_failed),
 ]
 
 
@@ -313,7 +313,7 @@ def test_unknown_or_infinite_quality_is_not_counted(metrics: Metrics) -> None:
 
 def test_two_servers_in_one_process_count_separately() -> None:
     first, second = Metrics(), Metrics()
-    first.failed_fatally()
+    first.count("fatal")
     assert samples_of(first)["mapless_fatal_total", frozenset()] == 1
     assert samples_of(second)["mapless_fatal_total", frozenset()] == 0
 
@@ -366,7 +366,7 @@ def metrics_threads() -> list[threading.Thread]:
 
 
 def test_the_port_serves_what_the_registry_has(metrics: Metrics, server: MetricsServer) -> None:
-    metrics.failed_fatally()
+    metrics.count("fatal")
     assert "\nmapless_fatal_total 1.0\n" in scrape(server.port)
 
 

@@ -29,7 +29,7 @@ from mapless_server.scenes import background
 from mapless_server.scenes.background import BackgroundMatching, BackgroundOptions
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
-from mapless_server.scenes.pair_observer import PairObserver
+from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.scenes.stored_pairs import Matching, PairFinder
 from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, Store, matching_use, pairs
@@ -41,30 +41,25 @@ PLANTED = make_scene(random_for("background"), SceneOptions(reference_count=5, p
 
 
 @dataclass
-class Counts(PairObserver):
+class Counts(BackgroundObserver):
     """What an observer was notified of."""
 
     found: Counter[str] = field(default_factory=Counter)
     made: int = 0
     failures: int = 0
     lookup_failures: int = 0
-    waiting: int | None = None
+    waits: int | None = None
 
-    def pairs_looked_up(self, stored: int, absent: int, damaged: int) -> None:
-        self.found.update(stored=stored, absent=absent, damaged=damaged)
+    def count(self, name: str, amount: float = 1.0, result: str = "") -> None:
+        assert amount >= 0
+        if name == "stored_pairs":
+            self.found[result] += round(amount)
+        self.made += round(amount) if name == "background_pairs" else 0
+        self.failures += name == "background_failures"
+        self.lookup_failures += name == "stored_pairs_failures"
 
-    def pair_lookup_failed(self) -> None:
-        self.lookup_failures += 1
-
-    def pairs_made(self, count: int, cpu_seconds: float) -> None:
-        assert cpu_seconds >= 0
-        self.made += count
-
-    def matching_failed(self) -> None:
-        self.failures += 1
-
-    def references_wait(self, count: int) -> None:
-        self.waiting = count
+    def waiting(self, name: str, count: int) -> None:
+        self.waits = count
 
 
 def new(i: int, planted: SyntheticScene = PLANTED) -> NewReference:
@@ -161,7 +156,7 @@ class TestResults:
         for pair, matches in expected.reference_pairs.items():
             np.testing.assert_array_equal(found.reference_pairs[pair], matches)
             assert found.reference_pairs[pair].dtype == matches.dtype
-        assert (server.counts.made, server.counts.waiting, server.counts.failures) == (20, 0, 0)
+        assert (server.counts.made, server.counts.waits, server.counts.failures) == (20, 0, 0)
 
     def test_wide_pairs_begin_with_the_stored_strict_ones(self, store: Store, compared: Counter[int]) -> None:
         server = Server(store)
@@ -254,7 +249,7 @@ class TestStrongPairs:
     def test_nearest_neighbours_that_find_enough_suffice(self, store: Store) -> None:
         server = Server(store, strong=True, strong_matching=NeverCalled(), enough_matches=1)
         server.background.match_waiting()
-        assert (server.counts.made, server.counts.waiting, server.counts.failures) == (20, 0, 0)
+        assert (server.counts.made, server.counts.waits, server.counts.failures) == (20, 0, 0)
         assert min(len(it) for it in server.stored().values() if it is not None) >= 1
 
     def test_they_are_fewer_and_under_names_of_their_own(self, store: Store) -> None:
@@ -305,7 +300,7 @@ class TestDamage:
             server.background.match_waiting()
         assert server.counts.failures == 1
         assert server.counts.made == 6
-        assert server.counts.waiting == 1
+        assert server.counts.waits == 1
         assert "reference r3 of scene s could not be matched, next time in 30 s" in caplog.text
         server.background.match_waiting()
         assert server.counts.failures == 1
@@ -315,7 +310,7 @@ class TestDamage:
         store.delete_reference(SCENE, "r3")
         store.add_references(SCENE, [new(3)])
         server.background.match_waiting()
-        assert (server.counts.made, server.counts.waiting) == (10, 0)
+        assert (server.counts.made, server.counts.waits) == (10, 0)
 
     def test_a_query_does_without_a_store_that_fails(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
         server = Server(store)
@@ -376,12 +371,12 @@ class TestFailures:
             patch.setattr(server.matcher, "match_pair", fail)
             server.background.match_waiting()
             # The first reference has none before it.
-            assert (server.counts.failures, server.counts.made, server.counts.waiting) == (4, 0, 4)
+            assert (server.counts.failures, server.counts.made, server.counts.waits) == (4, 0, 4)
         server.background.match_waiting()
         assert server.counts.made == 0
         let_pass(monkeypatch, pairs.FIRST_RETRY_S + 1)
         server.background.match_waiting()
-        assert (server.counts.failures, server.counts.made, server.counts.waiting) == (4, 10, 0)
+        assert (server.counts.failures, server.counts.made, server.counts.waits) == (4, 10, 0)
 
     def test_the_thread_outlives_a_store_that_is_away(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
         server = Server(store, BackgroundOptions(poll_s=0.01, longest_poll_s=0.02))
@@ -431,15 +426,15 @@ class TestSharing:
         with pytest.raises(Killed):
             killed.background.match_waiting()
         server.background.match_waiting()
-        assert server.counts.waiting == 1
+        assert server.counts.waits == 1
         let_pass(monkeypatch, pairs.CLAIM_S + 1)
         server.background.match_waiting()
-        assert server.counts.waiting == 0
+        assert server.counts.waits == 0
         assert len(server.stored()) == 10
 
 
 class TestPriority:
-    @pytest.mark.parametrize(("owner", "step", "most"), [("matcher", "match_pair", 2), ("background", "_load", 0)])
+    @pytest.mark.parametrize(("owner", "step", "most"), [("matcher", "match_pair", 2), ("library", "load", 0)])
     def test_a_busy_server_matches_little(
         self, store: Store, monkeypatch: pytest.MonkeyPatch, owner: str, step: str, most: int
     ) -> None:
@@ -447,13 +442,14 @@ class TestPriority:
         is_busy = threading.Event()
         options = BackgroundOptions(poll_s=0.01, busy_share=1e-6, quiet_s=0.01)
         server = Server(store, options, lambda: not is_busy.is_set())
-        usual = getattr(getattr(server, owner), step)
+        place: Any = ReferenceLibrary if owner == "library" else server.matcher
+        usual = getattr(place, step)
 
         def then_busy(*arguments: Any) -> Any:
             is_busy.set()
             return usual(*arguments)
 
-        monkeypatch.setattr(getattr(server, owner), step, then_busy)
+        monkeypatch.setattr(place, step, then_busy)
         server.background.start()
         try:
             wait_until(is_busy.is_set)
@@ -488,7 +484,7 @@ class TestPriority:
         monkeypatch.setattr(server.background, "_nearest", lambda *_: pytest.fail("references were chosen"))
         server.background.start()
         try:
-            wait_until(lambda: server.counts.waiting is not None)  # counted after the first claim
+            wait_until(lambda: server.counts.waits is not None)  # counted after the first claim
             assert not threading.Event().wait(0.1)
         finally:
             server.background.close()
@@ -501,7 +497,7 @@ class TestPriority:
         server = Server(store, options, lambda: next(looks, True))
         server.background.start()
         try:
-            wait_until(lambda: server.counts.waiting is not None)
+            wait_until(lambda: server.counts.waits is not None)
             assert not threading.Event().wait(0.2)
         finally:
             server.background.close()
@@ -533,12 +529,12 @@ class TestPriority:
         claimed = second.background._claim()
         assert claimed is not None
         first.background._count_waiting()
-        assert first.counts.waiting == 5
+        assert first.counts.waits == 5
         with closing(ReferenceLibrary(store)) as library:
             second.background._match_claimed(library, *claimed)
         second.background.match_waiting()
         first.background.match_waiting()
-        assert first.counts.waiting == 0
+        assert first.counts.waits == 0
 
     def test_what_is_made_before_the_claim_ends_is_stored(
         self, store: Store, monkeypatch: pytest.MonkeyPatch, compared: Counter[int]

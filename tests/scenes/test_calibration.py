@@ -25,7 +25,7 @@ from mapless_server.scenes.calibration.calibrator import Calibrator, CalibratorO
 from mapless_server.scenes.calibration.fit import FitOptions, LeftOut, fit, lens_contradictions
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import Closed, ReferenceLibrary
-from mapless_server.scenes.pair_observer import PairObserver
+from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, SelfCalibration, Store, calibration_kind, calibrations
 
@@ -132,22 +132,20 @@ class TestFit:
 
 
 @dataclass
-class Counts(PairObserver):
+class Counts(BackgroundObserver):
     """What an observer was notified of."""
 
     calibrated: int = 0
     failures: int = 0
-    waiting: int | None = None
+    waits: int | None = None
 
-    def scene_calibrated(self, cpu_seconds: float) -> None:
-        assert cpu_seconds >= 0
-        self.calibrated += 1
+    def count(self, name: str, amount: float = 1.0, result: str = "") -> None:
+        assert amount >= 0
+        self.calibrated += name == "calibrations"
+        self.failures += name == "calibration_failures"
 
-    def calibration_failed(self) -> None:
-        self.failures += 1
-
-    def scenes_wait(self, count: int) -> None:
-        self.waiting = count
+    def waiting(self, name: str, count: int) -> None:
+        self.waits = count
 
 
 class Server:
@@ -277,7 +275,7 @@ class TestServers:
         assert first.counts.calibrated + second.counts.calibrated == 2
         assert found is not None
         assert found.generation == store.get_generation(SCENE)
-        assert first.counts.waiting == 0
+        assert first.counts.waits == 0
 
     def test_that_are_closed_leave_the_scene_to_others(self, store: Store) -> None:
         add(store, REFERENCES[:4])
@@ -317,7 +315,7 @@ class TestServers:
         with monkeypatch.context() as patch:
             patch.setattr(server.calibrator, "calibrate", fail)
             server.run()
-        assert (server.counts.failures, server.counts.calibrated, server.counts.waiting) == (1, 0, 1)
+        assert (server.counts.failures, server.counts.calibrated, server.counts.waits) == (1, 0, 1)
         server.run()
         assert server.counts.calibrated == 0  # not before 30 s
         now_us = calibrations._now_us

@@ -16,7 +16,7 @@ from mapless_server.scenes.depth.finder import DepthFinder
 from mapless_server.scenes.depth.maker import DepthMakerOptions
 from mapless_server.scenes.depth.scene_depths import SceneDepths
 from mapless_server.scenes.library import Closed, ReferenceLibrary
-from mapless_server.scenes.pair_observer import PairObserver
+from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import SceneKey
 from mapless_server.store import Store, pairs
 from mapless_server.store.depths import depth_kind, load_depths
@@ -29,20 +29,15 @@ DEPTH = KeptDepth(CAMERA, np.full((6, 8), 2.0, np.float32), 0.02)
 
 
 @dataclass
-class Counting(PairObserver):
+class Counting(BackgroundObserver):
     events: list[tuple[object, ...]] = field(default_factory=list)
 
-    def depths_looked_up(self, stored: int, absent: int, damaged: int) -> None:
+    def count(self, name: str, amount: float = 1.0, result: str = "") -> None:
+        if name != "depth_seconds":
+            self.events.append((name, round(amount), result))
+
+    def looked_up(self, name: str, stored: int, absent: int, damaged: int) -> None:
         self.events.append(("looked up", stored, absent, damaged))
-
-    def depth_lookup_failed(self) -> None:
-        self.events.append(("lookup failed",))
-
-    def depths_made(self, kept: int, dropped: int, seconds: float) -> None:
-        self.events.append(("made", kept, dropped))
-
-    def depth_failed(self) -> None:
-        self.events.append(("failed",))
 
 
 class StubMaker:
@@ -118,7 +113,7 @@ def test_each_reference_is_made_once(store: Store) -> None:
     it.run()
     assert sorted(it.maker.asked) == ["a", "b", "c"]
     assert it.kept() == {"a", "b", "c"}
-    assert it.events == [("made", 1, 0)] * 3
+    assert it.events == [("depths", 1, "kept"), ("depths", 0, "dropped")] * 3
 
 
 def test_what_a_neighbours_run_has_made_is_not_made_again(store: Store) -> None:
@@ -143,7 +138,7 @@ def test_a_failure_is_tried_again_later(store: Store, error: Exception, monkeypa
     it.run()
     assert it.kept() == {"a", "c"}
     assert it.maker.asked.count("b") == 1
-    assert it.events.count(("failed",)) == 1
+    assert it.events.count(("depth_failures", 1, "")) == 1
     it.maker._answers.clear()
     now_us = pairs._now_us
     monkeypatch.setattr(pairs, "_now_us", lambda: now_us() + round(1e6 * (FIRST_RETRY_S + 1)))
@@ -154,7 +149,7 @@ def test_a_failure_is_tried_again_later(store: Store, error: Exception, monkeypa
 def test_a_deleted_reference_is_no_failure(store: Store) -> None:
     it = work(store, {"b": NotFound("gone")})
     it.run()
-    assert ("failed",) not in it.events
+    assert ("depth_failures", 1, "") not in it.events
 
 
 @pytest.mark.parametrize("is_abandoned", [False, True])
@@ -179,7 +174,7 @@ def test_the_end_of_the_server_stores_nothing_more(store: Store, is_abandoned: b
 def test_a_server_without_a_maker_uses_depths_of_others(store: Store) -> None:
     it = work(store)
     it.run()
-    user = SceneDepths(store, it.finder, None, PairObserver())
+    user = SceneDepths(store, it.finder, None, BackgroundObserver())
     assert not user.make_next(lambda: None)
     assert user.kinds == [StubMaker.kind]
 
@@ -226,7 +221,7 @@ class TestFinder:
         found = it.finder.with_depths(references, EXTRACTOR)
         assert [view.key for view in found] == [view.key for view in references]
         assert all(view.depths is None for view in found)
-        assert it.events[-1] == ("lookup failed",)
+        assert it.events[-1] == ("depth_failures", 1, "")
 
 
 @pytest.mark.parametrize(("name", "value"), [("neighbours", 1), ("shortlist", 0)])

@@ -27,6 +27,7 @@ from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.errors import DataLoss, NotFound, Unavailable
 from mapless_server.method.views import Features, PosedView, View
 from mapless_server.rpc import Call
+from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import Principal, SceneKey, key_of
 from mapless_server.services.capture import deletion as deletion_module
 from mapless_server.services.capture import recorder as recorder_module
@@ -46,17 +47,17 @@ from mapless_server.store.reader import StoreReader
 
 
 @dataclass
-class Counts:
+class Counts(BackgroundObserver):
     """Counts what is captured and what is not."""
 
     kept: int = 0
     dropped: Counter[str] = field(default_factory=Counter)
 
-    def captured(self) -> None:
-        self.kept += 1
-
-    def capture_dropped(self, reason: str) -> None:
-        self.dropped[reason] += 1
+    def count(self, name: str, amount: float = 1.0, result: str = "") -> None:
+        if name == "captured":
+            self.kept += 1
+        else:
+            self.dropped[result] += 1
 
 
 def captured_in(folder: Path) -> list[Path]:

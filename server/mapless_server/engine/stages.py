@@ -24,9 +24,9 @@ from mapless_server.method.rejection import Hint, Hypothesis, Rejection, Rejecti
 from mapless_server.method.results import Support
 from mapless_server.method.trust.judge import trust_in_scene
 from mapless_server.method.views import Matches, PosedView, View
-from mapless_server.scenes import Choice, Narrowing, RankOptions, Selection
+from mapless_server.scenes import Choice, Narrowing, Selection
 from mapless_server.scenes.library import FeaturesMissing, Loaded, load_usable
-from mapless_server.scenes.retrieval.ranking import spread_choice
+from mapless_server.scenes.retrieval.ranking import THINNED_LATER, spread_choice
 from mapless_server.scheduling import Abandoned, Done, Ending, Failure, Fallback, Job, Next, StageResult, Step
 from mapless_server.store import SceneAttributes
 
@@ -43,9 +43,6 @@ PREPARE, COARSE, REFINE = "prepare", "coarse", "refine"
 SHORTLIST = 2
 """So many times the references wanted are matched with a sample of the photograph, and the best of them used (see
 BENCHMARKS.md)."""
-
-THINNED_LATER = RankOptions(nearby_weight=1.0)
-"""References near one another are thinned out by their matches, which show better what each is worth."""
 
 MAX_LISTINGS = 3
 """When a reference is deleted while it is used, the scene is listed again; more often than this it is being emptied."""

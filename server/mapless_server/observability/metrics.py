@@ -18,7 +18,7 @@ from prometheus_client.metrics_core import Metric
 
 from mapless.v1 import localization_service_pb2, reference_service_pb2
 from mapless_server.method.rejection import RejectionReason
-from mapless_server.scenes.pair_observer import PairObserver
+from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.scheduling import Ending, Observer, Refusal
 from mapless_server.security import ENDLESS_METHODS
 
@@ -27,11 +27,41 @@ from .scraped import Scraped
 STAGES = ("prepare", "coarse", "refine", "join", "describe", "retrieve", "audit", "coverage")
 """Stages of the queue."""
 
-LOOKED_UP = ("stored", "absent", "damaged")
-"""What a query finds of a pair of references in the store."""
+_LOOKED_UP = ("result", ("stored", "absent", "damaged"))
+_ALONE = ("", ())
 
-CAPTURE_DROPS = ("queue", "size", "disk", "deleted", "store", "fault")
-"""Reasons for which a call was not captured."""
+COUNTED: Mapping[str, tuple[str, str, tuple[str, ...]]] = {
+    "stored_pairs": ("Pairs of references that queries looked for, by result.", *_LOOKED_UP),
+    "stored_pairs_failures": ("Queries that could not look for stored pairs.", *_ALONE),
+    "background_pairs": ("Pairs of references matched in the background.", *_ALONE),
+    "background_cpu_seconds": (
+        "Processor time of the background matching's own thread, without that of the threads of BLAS and torch.",
+        *_ALONE,
+    ),
+    "background_failures": ("Failures of matching references in the background; each is tried again.", *_ALONE),
+    "stored_depths": ("Depths of references that queries looked for.", *_LOOKED_UP),
+    "depths": ("Depths of references that a network predicted, kept or dropped.", "result", ("kept", "dropped")),
+    "depth_seconds": ("Time that this took.", *_ALONE),
+    "depth_failures": ("Failures of making depths, or of looking for them; each is tried again.", *_ALONE),
+    "calibrations": ("Scenes that were calibrated from their references.", *_ALONE),
+    "calibration_cpu_seconds": ("Processor time of that, counted as the background matching's.", *_ALONE),
+    "calibration_failures": ("Failures of calibrating a scene from its references; each is tried again.", *_ALONE),
+    "fatal": ("Faults that end the process.", *_ALONE),
+    "captured": ("Calls that were captured.", *_ALONE),
+    "capture_dropped": (
+        "Calls that were to be captured and were not.",
+        "reason",
+        ("queue", "size", "disk", "deleted", "store", "fault"),
+    ),
+}
+"""What other rooms count by name: the counter's text, its label, and the label's values."""
+
+WAITING = {
+    "background_waiting": "References that wait to be matched in the background, as last counted.",
+    "depth_waiting": "References that wait for a network to predict their depth, as last counted.",
+    "calibration_waiting": "Scenes that changed since they were calibrated, as last counted.",
+}
+"""What they set by name."""
 
 LOCALIZED = "localized"
 """The outcome of an answer that is a pose."""
@@ -101,7 +131,7 @@ class _Children(Generic[M]):
         return child
 
 
-class Metrics(Observer, PairObserver):
+class Metrics(Observer, BackgroundObserver):
     """The metrics of one server. Implements also `rpc.guard.CallObserver`; never raises.
 
     Attributes:
@@ -238,79 +268,18 @@ class Metrics(Observer, PairObserver):
         """An operation of the store failed by a fault that is not the caller's."""
         self._store_errors.inc()
 
-    def pairs_looked_up(self, stored: int, absent: int, damaged: int) -> None:
-        """A query looked for pairs of references; it matches those itself that are absent or damaged."""
-        for result, count in zip(LOOKED_UP, (stored, absent, damaged), strict=True):
-            self._looked_up(result).inc(count)
+    def count(self, name: str, amount: float = 1.0, result: str = "") -> None:
+        """Adds to one of the counters of `COUNTED`."""
+        counter = self._counted[name]
+        (counter.labels(result) if result else counter).inc(max(0.0, amount))
 
-    def pair_lookup_failed(self) -> None:
-        """A query could not look for pairs of references."""
-        self._lookup_failures.inc()
-
-    def pairs_made(self, count: int, cpu_seconds: float) -> None:
-        """Pairs of a reference were matched in the background and stored."""
-        self._background_pairs.inc(count)
-        self._background_seconds.inc(max(0.0, cpu_seconds))
-
-    def matching_failed(self) -> None:
-        """Matching a reference in the background failed."""
-        self._background_failures.inc()
-
-    def references_wait(self, count: int) -> None:
-        """Sets how many references wait to be matched in the background."""
-        self._background_waiting.set(count)
-
-    def depths_looked_up(self, stored: int, absent: int, damaged: int) -> None:
-        """A query looked for the depths of references."""
-        for result, count in zip(LOOKED_UP, (stored, absent, damaged), strict=True):
-            self._depth_lookups(result).inc(count)
-
-    def depth_lookup_failed(self) -> None:
-        """A query could not look for the depths of references."""
-        self._depth_failures.inc()
-
-    def depths_made(self, kept: int, dropped: int, seconds: float) -> None:
-        """A network has predicted the depths of references, and some of them were kept."""
-        self._depths("kept").inc(kept)
-        self._depths("dropped").inc(dropped)
-        self._depth_seconds.inc(seconds)
-
-    def depth_failed(self) -> None:
-        """Making the depth of a reference failed."""
-        self._depth_failures.inc()
-
-    def depths_wait(self, count: int) -> None:
-        """Sets how many references wait for a network to predict their depth."""
-        self._depth_waiting.set(count)
-
-    def scene_calibrated(self, cpu_seconds: float) -> None:
-        """References of a scene were localized against the others, and the calibration was stored."""
-        self._calibrations.inc()
-        self._calibration_seconds.inc(max(0.0, cpu_seconds))
-
-    def calibration_failed(self) -> None:
-        """Calibrating a scene from its references failed."""
-        self._calibration_failures.inc()
-
-    def scenes_wait(self, count: int) -> None:
-        """Sets how many scenes have changed since they were calibrated from their references."""
-        self._calibration_waiting.set(count)
+    def waiting(self, name: str, count: int) -> None:
+        """Sets one of the gauges of `WAITING`."""
+        self._waiting[name].set(count)
 
     def ran_out_of_memory(self) -> None:
         """The device had no memory left for a batch."""
         self._oom.inc()
-
-    def failed_fatally(self) -> None:
-        """A failure ends the process."""
-        self._fatal.inc()
-
-    def captured(self) -> None:
-        """A call was captured."""
-        self._captured.inc()
-
-    def capture_dropped(self, reason: str) -> None:
-        """A call was to be captured and was not."""
-        self._capture_dropped(reason).inc()
 
     def watch_captures(self, read: Callable[[], int]) -> None:
         """Registers a function that returns the size of captured calls on the disk, bytes, called at every scrape."""
@@ -408,54 +377,17 @@ class Metrics(Observer, PairObserver):
         stored = histogram("mapless_store_op_seconds", "Time of the store's operations.", STAGE_BUCKETS, ["op"])
         self._store_seconds = _Children(stored)
         self._store_errors = counter("mapless_store_errors", "Operations of the store that failed by a fault of ours.")
-        looked_up = counter(
-            "mapless_stored_pairs", "Pairs of references that queries looked for, by result.", ["result"]
-        )
-        self._looked_up = _Children(looked_up, [(result,) for result in LOOKED_UP])
-        self._lookup_failures = counter(
-            "mapless_stored_pairs_failures", "Queries that could not look for stored pairs."
-        )
-        self._background_pairs = counter("mapless_background_pairs", "Pairs of references matched in the background.")
-        self._background_seconds = counter(
-            "mapless_background_cpu_seconds",
-            "Processor time of the background matching's own thread, without that of the threads of BLAS and torch.",
-        )
-        self._background_failures = counter(
-            "mapless_background_failures", "Failures of matching references in the background; each is tried again."
-        )
-        self._background_waiting = gauge(
-            "mapless_background_waiting", "References that wait to be matched in the background, as last counted."
-        )
-        depth_lookups = counter("mapless_stored_depths", "Depths of references that queries looked for.", ["result"])
-        self._depth_lookups = _Children(depth_lookups, [(result,) for result in LOOKED_UP])
-        depths = counter(
-            "mapless_depths", "Depths of references that a network predicted, kept or dropped.", ["result"]
-        )
-        self._depths = _Children(depths, [("kept",), ("dropped",)])
-        self._depth_seconds = counter("mapless_depth_seconds", "Time that this took.")
-        self._depth_failures = counter(
-            "mapless_depth_failures", "Failures of making depths, or of looking for them; each is tried again."
-        )
-        self._depth_waiting = gauge(
-            "mapless_depth_waiting", "References that wait for a network to predict their depth, as last counted."
-        )
-        self._calibrations = counter("mapless_calibrations", "Scenes that were calibrated from their references.")
-        self._calibration_seconds = counter(
-            "mapless_calibration_cpu_seconds", "Processor time of that, counted as the background matching's."
-        )
-        self._calibration_failures = counter(
-            "mapless_calibration_failures", "Failures of calibrating a scene from its references; each is tried again."
-        )
-        self._calibration_waiting = gauge(
-            "mapless_calibration_waiting", "Scenes that changed since they were calibrated, as last counted."
-        )
+        self._counted = {
+            name: counter(f"mapless_{name}", text, [label] if label else ())
+            for name, (text, label, _) in COUNTED.items()
+        }
+        for name, (_, _, values) in COUNTED.items():
+            for value in values:
+                self._counted[name].labels(value)
+        self._waiting = {name: gauge(f"mapless_{name}", text) for name, text in WAITING.items()}
         self._oom = counter("mapless_gpu_oom", "Batches that the device had no memory for.")
-        self._fatal = counter("mapless_fatal", "Faults that end the process.")
         self._capture_enabled = gauge("mapless_capture_enabled", "1 if calls are captured, with photographs, else 0.")
         self._capture_bytes = gauge("mapless_capture_bytes", "What captured calls take on the disk.")
-        self._captured = counter("mapless_captured", "Calls that were captured.")
-        dropped = counter("mapless_capture_dropped", "Calls that were to be captured and were not.", ["reason"])
-        self._capture_dropped = _Children(dropped, [(reason,) for reason in CAPTURE_DROPS])
         self._serving = gauge("mapless_health_serving", "1 if health reports SERVING, else 0.")
         self._warm_up = gauge("mapless_warmup_seconds", "Time of the warm-up; 0 if there was none.")
         blocks = gauge("mapless_python_allocated_blocks", "Pieces of memory that Python's objects hold.")

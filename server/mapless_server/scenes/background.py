@@ -10,7 +10,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -27,15 +27,12 @@ from mapless_server.store.pairs import CLAIM_S, Claim, Pair, PairStore, Progress
 from .calibration.calibrations import SceneCalibrations
 from .depth.scene_depths import SceneDepths
 from .indexes import SceneIndexes
-from .library import Closed, ReferenceLibrary, load_usable
-from .pair_observer import PairObserver
-from .retrieval.ranking import RankOptions, Selection, rank_references
+from .library import Closed, ReferenceLibrary
+from .observer import BackgroundObserver
+from .retrieval.ranking import rank_beside
 from .stored_pairs import Matching, PairFinder
 
 log = logging.getLogger(__name__)
-
-_AS_QUERIES_CHOOSE = RankOptions(nearby_weight=1.0)
-"""That of `engine.stages`: references near one another are not thinned out before they are matched."""
 
 _CACHE_BYTES = 64 * 2**20
 """Features that are kept from one reference to the next, of about 60; in addition to what queries have in memory."""
@@ -87,7 +84,7 @@ class BackgroundMatching:
         indexes: SceneIndexes,
         matchings: Mapping[Matching, PairFinder],
         is_idle: Callable[[], bool],
-        observer: PairObserver,
+        observer: BackgroundObserver,
         options: BackgroundOptions | None = None,
         calibrations: SceneCalibrations | None = None,
         depths: SceneDepths | None = None,
@@ -199,20 +196,15 @@ class BackgroundMatching:
     def _run(self, work: Callable[[], None]) -> None:
         poll_s = self.options.poll_s
         while not self._closing.wait(poll_s):
-            has_failed = self._fails(work)
-            poll_s = min(2 * poll_s, self.options.longest_poll_s) if has_failed else self.options.poll_s
-
-    def _fails(self, work: Callable[[], None]) -> bool:
-        """Calls `work` and returns whether the store failed."""
-        try:
-            work()
-        except Closed:
-            return False
-        except Exception as error:
-            self._observer.matching_failed()
-            log.warning("matching references in the background failed, and is tried again: %s", error)
-            return True
-        return False
+            next_s, poll_s = min(2 * poll_s, self.options.longest_poll_s), self.options.poll_s
+            try:
+                work()
+            except Closed:
+                return
+            except Exception as error:
+                poll_s = next_s
+                self._observer.count("background_failures")
+                log.warning("matching references in the background failed, and is tried again: %s", error)
 
     def _claim(self) -> tuple[Matching, Claim] | None:
         self.maintain()
@@ -224,7 +216,7 @@ class BackgroundMatching:
 
     def _count_waiting(self) -> None:
         self._waiting_count = max(self._pairs.count_waiting(it.name) for it in self._matchings)
-        self._observer.references_wait(self._waiting_count)
+        self._observer.waiting("background_waiting", self._waiting_count)
         self._counted_s = time.monotonic()
 
     def _match_claimed(self, library: ReferenceLibrary, matching: Matching, claim: Claim) -> None:
@@ -240,7 +232,7 @@ class BackgroundMatching:
             return
         except Exception as error:
             wait_s = self._pairs.postpone(matching.name, claim)
-            self._observer.matching_failed()
+            self._observer.count("background_failures")
             message = "reference %s of scene %s could not be matched, next time in %.0f s: %s"
             is_expected = isinstance(error, DataLoss)
             log.warning(
@@ -248,7 +240,8 @@ class BackgroundMatching:
             )
             return
         self._pairs.add(matching.name, claim, made, is_complete)
-        self._observer.pairs_made(len(made), time.thread_time() - begin_s)
+        self._observer.count("background_pairs", len(made))
+        self._observer.count("background_cpu_seconds", time.thread_time() - begin_s)
 
     def _match(
         self, library: ReferenceLibrary, matching: Matching, claim: Claim, until_s: float
@@ -261,7 +254,8 @@ class BackgroundMatching:
         if not wanted:
             return made, True
         self._let_callers_first()
-        (subject,) = self._load(library, matching, claim, [claim.reference_id])
+        context = StageContext(self._check)
+        _, (subject,) = library.load(claim.scene_key, [claim.reference_id], matching.extractor, context)
         if subject.key != claim.key:
             raise NotFound("the reference was replaced")
         for reference_id in wanted:
@@ -270,8 +264,9 @@ class BackgroundMatching:
             if self._closing.is_set() or (made and time.monotonic() > until_s):
                 return made, False
             try:
-                others = self._load_usable(library, matching, claim, reference_id)
-                for other in others:
+                for other in self._indexes.load_existing(
+                    library, claim.scene_key, [reference_id], matching.extractor, context
+                ):
                     self._let_callers_first()
                     made |= self._match_pair(matching, *in_order(subject, other))
             except Closed:
@@ -291,39 +286,14 @@ class BackgroundMatching:
         In a scene whose references were added at once, half of them precede the claimed one on average.
         """
         entries = self._indexes.entries(claim.scene_key, StageContext(self._check))
-        (row,) = entries.rows([claim.reference_id]) if claim.reference_id in entries else (None,)
-        if row is None:
+        if claim.reference_id not in entries:
             if not self._indexes.is_damaged(claim.scene_key, claim.reference_id):
                 raise NotFound("the reference was deleted")
             raise DataLoss(f"reference {claim.reference_id!r} is damaged in the store; delete it and add it again")
         count = self.options.strong_pairs if matching.strong else self.options.pairs
-        selection = Selection(2 * count + 1, options=_AS_QUERIES_CHOOSE)
-        id_of = {it.key: it.reference_id for it in rank_references(entries, entries.vector(row), selection)}
-        id_of.pop(claim.key, None)
+        id_of = {it.key: it.reference_id for it in rank_beside(entries, claim.reference_id, 2 * count)}
         missing = self._pairs.list_missing(matching.name, claim, list(id_of), count)
         return [id_of[key] for key in missing]
-
-    def _load(
-        self, library: ReferenceLibrary, matching: Matching, claim: Claim, reference_ids: Sequence[str]
-    ) -> tuple[PosedView, ...]:
-        return library.load(claim.scene_key, reference_ids, matching.extractor, StageContext(self._check))[1]
-
-    def _load_usable(
-        self, library: ReferenceLibrary, matching: Matching, claim: Claim, reference_id: str
-    ) -> tuple[PosedView, ...]:
-        """Loads a reference; empty if it is damaged or deleted, which is not a failure of the claimed one."""
-        context = StageContext(self._check)
-
-        def report(damaged_id: str, error: Exception) -> None:
-            if isinstance(error, DataLoss):
-                self._indexes.report_damaged(claim.scene_key, damaged_id, error)
-
-        return load_usable(
-            lambda ids: library.load(claim.scene_key, ids, matching.extractor, context),
-            [reference_id],
-            (DataLoss, NotFound),
-            report,
-        )[1]
 
     def _check(self) -> None:
         if self._closing.is_set():

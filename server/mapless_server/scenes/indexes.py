@@ -5,15 +5,16 @@ from __future__ import annotations
 import logging
 import threading
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
-from mapless_server.errors import DataLoss, NotFound
+from mapless_server.errors import DataLoss, NotFound, RequestError
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import StageContext
+from mapless_server.method.views import PosedView
 from mapless_server.security import SceneKey
 from mapless_server.store import Store
 
-from .library import ReferenceLibrary
+from .library import Loaded, ReferenceLibrary, load_usable
 from .retrieval.descriptor import GlobalDescriptor, Vector
 from .retrieval.index import Entries, SceneIndex
 
@@ -96,6 +97,25 @@ class SceneIndexes:
             if cached is not None:
                 cached.reported_ids.add(reference_id)
             log.error("reference %s of scene %s is not used: %s", reference_id, scene_key, error)
+
+    def load_existing(
+        self,
+        library: ReferenceLibrary,
+        scene_key: SceneKey,
+        reference_ids: Sequence[str],
+        extractor: FeatureExtractor,
+        context: StageContext,
+    ) -> tuple[PosedView, ...]:
+        """Loads those of the references that exist and are not damaged, in order; reports the damaged ones."""
+
+        def report(reference_id: str, error: RequestError) -> None:
+            if isinstance(error, DataLoss):
+                self.report_damaged(scene_key, reference_id, error)
+
+        def load(some: Sequence[str]) -> Loaded:
+            return library.load(scene_key, some, extractor, context)
+
+        return load_usable(load, reference_ids, (DataLoss, NotFound), report)[1]
 
     def _describe(
         self, scene_key: SceneKey, cached: _CachedIndex, reference_id: str, key: str, context: StageContext

@@ -10,7 +10,7 @@ from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.views import Matches, PosedView
 from mapless_server.store.pairs import Pair, PairStore
 
-from .pair_observer import PairObserver
+from .observer import BackgroundObserver
 
 log = logging.getLogger(__name__)
 
@@ -64,7 +64,7 @@ def matching_name(extractor: str, rule: str) -> str:
 class PairFinder:
     """Implements `method.correspond.StoredPairs` for the matcher of one extractor's features."""
 
-    def __init__(self, pairs: PairStore, extractor: str, observer: PairObserver) -> None:
+    def __init__(self, pairs: PairStore, extractor: str, observer: BackgroundObserver) -> None:
         """`extractor` is the name of the features that are matched."""
         self._pairs = pairs
         self._extractor = extractor
@@ -78,10 +78,11 @@ class PairFinder:
             found, damaged_count = self._read(matching_name(self._extractor, matching), pairs)
         except Exception as error:  # the query can do without
             log.warning("stored matches cannot be read, and are made by the query: %s", error)
-            self._observer.pair_lookup_failed()
+            self._observer.count("stored_pairs_failures")
             return [None] * len(pairs)
         stored_count = sum(matches is not None for matches in found)
-        self._observer.pairs_looked_up(stored_count, len(pairs) - stored_count - damaged_count, damaged_count)
+        absent_count = len(pairs) - stored_count - damaged_count
+        self._observer.looked_up("stored_pairs", stored_count, absent_count, damaged_count)
         return found
 
     def find_one(self, name: str, first: PosedView, second: PosedView) -> Matches | None:

@@ -35,7 +35,7 @@ from mapless_server.scenes.depth.maker import DepthMaker
 from mapless_server.scenes.depth.scene_depths import SceneDepths
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
-from mapless_server.scenes.pair_observer import PairObserver
+from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.scenes.retrieval.vlad import VladDescriptor
 from mapless_server.scenes.stored_pairs import Matching, PairFinder
 from mapless_server.scheduling import Observer, Quota, WorkQueueOptions
@@ -133,7 +133,7 @@ def engine_over(
     quota: Quota | None = None,
     method: Method | None = None,
     descriptor: GlobalDescriptor | None = None,
-    pair_observer: PairObserver | None = None,
+    pair_observer: BackgroundObserver | None = None,
     depth_network: Reconstructor | None = None,
 ) -> QueueEngine:
     """Makes an engine over tiers, the cheapest first, and the references in memory that it uses.
@@ -146,7 +146,7 @@ def engine_over(
     extractors = [tier.extractor for tier in tiers]
     first = extractors[0]
     descriptor = descriptor or VladDescriptor.of(first)
-    observed = pair_observer or PairObserver()
+    observed = pair_observer or BackgroundObserver()
     depths = None
     if depth_network is not None or any(tier.uses_depths for tier in tiers):
         kind = None if depth_network is None else depth_kind(depth_network.name, depth_network.weights_sha256)
@@ -169,7 +169,7 @@ def _background_matching(
     store: Store,
     indexes: SceneIndexes,
     engine: QueueEngine,
-    observer: PairObserver,
+    observer: BackgroundObserver,
     made: SceneDepths | None,
     depths: DepthFinder | None,
 ) -> BackgroundMatching:

@@ -204,7 +204,7 @@ async def _warm_up(settings: Settings, engine: QueueEngine, metrics: Metrics) ->
 
 def _on_fatal(fatal: Fatal, failed: asyncio.Future[Fatal], metrics: Metrics) -> None:
     if not failed.done():
-        metrics.failed_fatally()
+        metrics.count("fatal")
         log.critical("the server ends after an unrecoverable failure: %s", fatal)
         failed.set_result(fatal)
 

@@ -8,14 +8,14 @@ from typing import TypeVar
 import numpy as np
 
 from mapless.names import parse_reference_name, reference_name
-from mapless_server.errors import DataLoss, NotFound, RequestError, Unavailable
+from mapless_server.errors import DataLoss, NotFound, Unavailable
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import StageContext
 from mapless_server.method.views import PosedView
 from mapless_server.security import SceneKey, scene_id_of
 
 from ..indexes import SceneIndexes
-from ..library import Loaded, ReferenceLibrary, load_usable
+from ..library import ReferenceLibrary
 from ..retrieval.descriptor import GlobalDescriptor
 from ..retrieval.index import Entries, Rows
 from ..retrieval.ranking import RankOptions, Selection, rank_references
@@ -109,7 +109,8 @@ class SceneAuditor:
         entries = self._read()
         name = self._name(reference_id)
         try:
-            self._load_exactly([reference_id])
+            tools, context = self._tools, StageContext(self._check)
+            tools.library.load(self._scene_key, [reference_id], tools.extractor, context)
         except DataLoss:
             return ReferenceAudit(name, AuditVerdict.UNVERIFIABLE, DAMAGED)
         except NotFound as error:
@@ -150,23 +151,16 @@ class SceneAuditor:
     def _name(self, reference_id: str) -> str:
         return reference_name(scene_id_of(self._scene_key), reference_id)
 
-    def _load_exactly(self, reference_ids: Sequence[str]) -> Loaded:
-        tools = self._tools
-        return tools.library.load(self._scene_key, reference_ids, tools.extractor, StageContext(self._check))
-
     def _load(self, names: Sequence[str]) -> Sequence[PosedView]:
         """Loads the references of these names that exist and are not damaged."""
         reference_ids = [parse_reference_name(name)[1] for name in names]
         try:
-            return load_usable(self._load_exactly, reference_ids, (DataLoss, NotFound), self._report)[1]
+            tools, context = self._tools, StageContext(self._check)
+            return tools.indexes.load_existing(tools.library, self._scene_key, reference_ids, tools.extractor, context)
         except NotFound as error:  # another one was deleted between the two readings
             if error.field == "scene":
                 raise
             raise ReferenceGone(str(error)) from error
-
-    def _report(self, reference_id: str, error: RequestError) -> None:
-        if isinstance(error, DataLoss):
-            self._tools.indexes.report_damaged(self._scene_key, reference_id, error)
 
     def _similar(self, name: str, count: int) -> Sequence[str]:
         references = self._load([name])

@@ -22,7 +22,7 @@ from mapless_server.store.calibrations import (
 
 from ..depth.finder import DepthFinder
 from ..library import Closed, ReferenceLibrary
-from ..pair_observer import PairObserver
+from ..observer import BackgroundObserver
 from .calibrator import Calibrator
 
 log = logging.getLogger(__name__)
@@ -43,7 +43,7 @@ class SceneCalibrations:
     """Calibrates the scenes of a store; for use by one thread."""
 
     def __init__(
-        self, store: Store, calibrator: Calibrator, observer: PairObserver, depths: DepthFinder | None = None
+        self, store: Store, calibrator: Calibrator, observer: BackgroundObserver, depths: DepthFinder | None = None
     ) -> None:
         """The `observer` receives the events; `depths` are those that queries use."""
         self._depths = depths
@@ -63,7 +63,7 @@ class SceneCalibrations:
         """
         database = self._store.database
         claim = claim_scene(database, self.kind)
-        self._observer.scenes_wait(count_waiting(database, self.kind))
+        self._observer.waiting("calibration_waiting", count_waiting(database, self.kind))
         if claim is None:
             return False
         with suppress(_Lost, NotFound):
@@ -101,7 +101,8 @@ class SceneCalibrations:
             return
         cpu_s = time.thread_time() - begin_s
         if add(self._store, held[0], found, max(LEAST_WAIT_S, WAIT_BY_CPU * cpu_s)):
-            self._observer.scene_calibrated(cpu_s)
+            self._observer.count("calibrations")
+            self._observer.count("calibration_cpu_seconds", cpu_s)
             log.info("scene %s is calibrated from %d of its references", claim.scene_key, found.answer_count)
 
     def _localize_references(self, claim: CalibrationClaim, pause: Callable[[], None]) -> SelfCalibration:
@@ -112,6 +113,6 @@ class SceneCalibrations:
 
     def _report_failure(self, claim: CalibrationClaim, error: Exception) -> None:
         wait_s = postpone(self._store.database, claim)
-        self._observer.calibration_failed()
+        self._observer.count("calibration_failures")
         message = "scene %s could not be calibrated from its references, next time in %.0f s: %s"
         log.warning(message, claim.scene_key, wait_s, error, exc_info=None if isinstance(error, DataLoss) else error)

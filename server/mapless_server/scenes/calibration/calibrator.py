@@ -4,13 +4,13 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain, zip_longest
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from mapless.geometry import rotation_angle_deg
-from mapless_server.errors import DataLoss, NotFound, RequestError
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.localize import prepare, refine
@@ -18,20 +18,16 @@ from mapless_server.method.options import LocalizeOptions, StageContext, check_b
 from mapless_server.method.pipeline import Pipeline, reconstruct
 from mapless_server.method.uncertainty.radii import accuracy_from_covariance, viewpoint_gap
 from mapless_server.method.views import PosedView
-from mapless_server.scenes.retrieval.ranking import spread_choice
 from mapless_server.security import SceneKey
 from mapless_server.store import SelfCalibration
 
 from ..indexes import SceneIndexes
-from ..library import ReferenceLibrary, load_usable
+from ..library import ReferenceLibrary
 from ..retrieval.index import Entries
-from ..retrieval.ranking import RankOptions, Selection, rank_references
+from ..retrieval.ranking import rank_beside, spread_choice
 from .fit import LeftOut, fit, lens_contradictions
 
 log = logging.getLogger(__name__)
-
-_AS_QUERIES_CHOOSE = RankOptions(nearby_weight=1.0)
-"""That of `engine.stages`."""
 
 
 @dataclass(frozen=True)
@@ -119,15 +115,13 @@ class Calibrator:
         context: StageContext,
     ) -> LeftOut | None:
         """Localizes one reference; None if it has too few others, or is deleted or damaged."""
-        loaded = self._load(scene_key, library, [reference_id], context)
+        load = partial(self._indexes.load_existing, library, scene_key, extractor=self._extractor, context=context)
+        loaded = load(reference_ids=[reference_id])
         if not loaded:
             return None
-        (subject,), (row,) = loaded, entries.rows([reference_id])
-        count = self.options.reference_count
-        selection = Selection(self.options.shortlist * count + 1, options=_AS_QUERIES_CHOOSE)
-        ranked = rank_references(entries, entries.vector(row), selection)
-        wanted = [it.reference_id for it in ranked if it.key != subject.key]
-        others = [it for it in self._load(scene_key, library, wanted, context) if not _is_copy(it, subject)]
+        (subject,), count = loaded, self.options.reference_count
+        wanted = [it.reference_id for it in rank_beside(entries, reference_id, self.options.shortlist * count)]
+        others = [it for it in load(reference_ids=wanted) if not _is_copy(it, subject)]
         if len(others) < 2:
             return None
         context.check()
@@ -143,22 +137,6 @@ class Calibrator:
         if isinstance(coarse, Exception):
             raise coarse
         return left_out(subject, coarse if isinstance(coarse, Answer) else refine(coarse))
-
-    def _load(
-        self, scene_key: SceneKey, library: ReferenceLibrary, reference_ids: Sequence[str], context: StageContext
-    ) -> tuple[PosedView, ...]:
-        """Loads those of the references that exist and are not damaged."""
-
-        def report(damaged_id: str, error: RequestError) -> None:
-            if isinstance(error, DataLoss):
-                self._indexes.report_damaged(scene_key, damaged_id, error)
-
-        return load_usable(
-            lambda ids: library.load(scene_key, ids, self._extractor, context),
-            reference_ids,
-            (DataLoss, NotFound),
-            report,
-        )[1]
 
 
 def left_out(subject: PosedView, answer: Answer) -> LeftOut | None:

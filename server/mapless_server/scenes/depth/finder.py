@@ -10,7 +10,7 @@ from mapless_server.store import LruCache
 from mapless_server.store.database import Database
 from mapless_server.store.depths import load_depths
 
-from ..pair_observer import PairObserver
+from ..observer import BackgroundObserver
 
 log = logging.getLogger(__name__)
 
@@ -21,7 +21,7 @@ _CACHE_BYTES = 32 * 2**20
 class DepthFinder:
     """Adds stored depths to loaded references; thread-safe."""
 
-    def __init__(self, database: Database, observer: PairObserver, kind: str | None = None) -> None:
+    def __init__(self, database: Database, observer: BackgroundObserver, kind: str | None = None) -> None:
         """`kind` is that of the depths; None for any kind of the present version, made by any server."""
         self._database = database
         self._observer = observer
@@ -39,7 +39,7 @@ class DepthFinder:
                 found |= self._read(missing, extractor)
             except Exception as error:  # the query can do without
                 log.warning("kept depths cannot be read, and are not used: %s", error)
-                self._observer.depth_lookup_failed()
+                self._observer.count("depth_failures")
         return tuple(it if found[it.key] is None else replace(it, depths=found[it.key]) for it in references)
 
     def _read(self, references: Sequence[PosedView], extractor: str) -> dict[str, KeypointDepths]:
@@ -52,7 +52,8 @@ class DepthFinder:
         for key, depths in found.items():
             self._cache.put((key, extractor), depths, depths.depth.nbytes)
         damaged_count = len({key for _, key in stored.damaged} - found.keys())
-        self._observer.depths_looked_up(len(found), len(references) - len(found) - damaged_count, damaged_count)
+        absent_count = len(references) - len(found) - damaged_count
+        self._observer.looked_up("stored_depths", len(found), absent_count, damaged_count)
         return found
 
     def take_damaged(self) -> frozenset[tuple[str, str]]:

@@ -1,9 +1,9 @@
 """Predicts depths of a reference and its neighbours by a network."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from mapless_server.errors import DataLoss, NotFound, RequestError
+from mapless_server.errors import NotFound
 from mapless_server.method.coarse import Reconstructor, Request, Triangulation
 from mapless_server.method.correspond import Matcher
 from mapless_server.method.features import FeatureExtractor
@@ -15,12 +15,9 @@ from mapless_server.security import SceneKey
 from mapless_server.store.depths import depth_kind
 
 from ..indexes import SceneIndexes
-from ..library import ReferenceLibrary, load_usable
-from ..retrieval.ranking import RankOptions, Selection, rank_references, spread_choice
+from ..library import ReferenceLibrary
+from ..retrieval.ranking import rank_beside, spread_choice
 from .check import DepthCheckOptions, checked_depths
-
-_AS_QUERIES_CHOOSE = RankOptions(nearby_weight=1.0)
-"""That of `engine.stages`."""
 
 
 @dataclass(frozen=True)
@@ -113,27 +110,11 @@ class DepthMaker:
         entries = self._indexes.entries(scene_key, context)
         if reference_id not in entries:
             raise NotFound("the reference was deleted")
-        (row,) = entries.rows([reference_id])
         count = self.options.neighbours
-        selection = Selection(self.options.shortlist * count + 1, options=_AS_QUERIES_CHOOSE)
-        ranked = rank_references(entries, entries.vector(row), selection)
-        wanted = [it.reference_id for it in ranked if it.key != subject.key]
-        others = self._load_usable(scene_key, library, wanted, context)
+        wanted = [it.reference_id for it in rank_beside(entries, reference_id, self.options.shortlist * count)]
+        others = self._indexes.load_existing(library, scene_key, wanted, self._extractor, context)
         matches = [self._matcher.match_references(subject, other) for other in others]
         context.check()
         sharing = [i for i, found in enumerate(matches) if len(found) >= self.options.check.min_points]
         centres = [others[i].world_from_camera.translation for i in sharing]
         return [others[sharing[i]] for i in spread_choice([len(matches[i]) for i in sharing], centres, count)]
-
-    def _load_usable(
-        self, scene_key: SceneKey, library: ReferenceLibrary, wanted: Sequence[str], context: StageContext
-    ) -> tuple[PosedView, ...]:
-        """Loads those of the references that exist and are not damaged."""
-
-        def report(damaged_id: str, error: RequestError) -> None:
-            if isinstance(error, DataLoss):
-                self._indexes.report_damaged(scene_key, damaged_id, error)
-
-        return load_usable(
-            lambda ids: library.load(scene_key, ids, self._extractor, context), wanted, (DataLoss, NotFound), report
-        )[1]

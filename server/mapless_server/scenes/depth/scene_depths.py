@@ -11,7 +11,7 @@ from mapless_server.store.depths import discard_depths, keep_depths, list_kinds,
 from mapless_server.store.pairs import Claim, PairStore, Progress
 
 from ..library import Closed, ReferenceLibrary
-from ..pair_observer import PairObserver
+from ..observer import BackgroundObserver
 from .finder import DepthFinder
 from .maker import DepthMaker
 
@@ -26,7 +26,9 @@ _CACHE_BYTES = 32 * 2**20
 class SceneDepths:
     """Makes depths for the references of a store; for use by one thread."""
 
-    def __init__(self, store: Store, finder: DepthFinder, maker: DepthMaker | None, observer: PairObserver) -> None:
+    def __init__(
+        self, store: Store, finder: DepthFinder, maker: DepthMaker | None, observer: BackgroundObserver
+    ) -> None:
         """Without a maker, depths of other servers are used, but none are made."""
         self._store = store
         self._finder = finder
@@ -60,7 +62,7 @@ class SceneDepths:
             return False
         kind = self._maker.kind
         claim = self._claims.claim(kind, self._progress)
-        self._observer.depths_wait(self._claims.count_waiting(kind))
+        self._observer.waiting("depth_waiting", self._claims.count_waiting(kind))
         if claim is None:
             return False
         # The network has seen a reference already as the neighbour of another one.
@@ -87,7 +89,7 @@ class SceneDepths:
             return
         except Exception as error:
             wait_s = self._claims.postpone(maker.kind, claim)
-            self._observer.depth_failed()
+            self._observer.count("depth_failures")
             message = "no depth could be made for reference %s of scene %s, next time in %.0f s: %s"
             expected = None if isinstance(error, DataLoss) else error
             log.warning(message, claim.reference_id, claim.scene_key, wait_s, error, exc_info=expected)
@@ -95,6 +97,8 @@ class SceneDepths:
         depths = {key: depth for key, depth in made.items() if depth is not None}
         keep_depths(self._store.database, maker.kind, depths)
         self._claims.add(maker.kind, claim, {}, is_complete=True)
-        self._observer.depths_made(len(depths), len(made) - len(depths), time.monotonic() - begin_s)
+        self._observer.count("depths", len(depths), "kept")
+        self._observer.count("depths", len(made) - len(depths), "dropped")
+        self._observer.count("depth_seconds", time.monotonic() - begin_s)
         if claim.key not in depths:
             log.info("no depth is kept of reference %s of scene %s", claim.reference_id, claim.scene_key)

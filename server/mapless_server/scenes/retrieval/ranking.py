@@ -59,6 +59,10 @@ class RankOptions:
         check_bounds(self, "per_place pool smallest_pool", at_least=1)
 
 
+THINNED_LATER = RankOptions(nearby_weight=1.0)
+"""References near one another are thinned out by their matches, which show better what each is worth."""
+
+
 @dataclass(frozen=True, eq=False)
 class Selection:
     """Which references to select.
@@ -137,6 +141,13 @@ def rank_references(entries: Entries, vector: Vector | None, selection: Selectio
     return [_ranked(entries, int(rows[i]), float(similarity[i])) for i in chosen]
 
 
+def rank_beside(entries: Entries, reference_id: str, count: int) -> list[RankedReference]:
+    """The other references that a query from the place of one of the entries would choose, in the order of choice."""
+    (row,) = entries.rows([reference_id])
+    ranked = rank_references(entries, entries.vector(row), Selection(count + 1, options=THINNED_LATER))
+    return [it for it in ranked if it.reference_id != reference_id]
+
+
 TURN_DEG = 15.0
 """A reference that looks so far elsewhere counts as twice as far away."""
 
@@ -165,8 +176,7 @@ def nearest_references(entries: Entries, prior: PosePrior, count: int) -> list[R
     pool = _best(-unlikeness, max(RankOptions().pool * count, RankOptions().smallest_pool))
     pool = pool[np.isfinite(unlikeness[pool])]
     near = rows[pool]
-    options = RankOptions(nearby_weight=1.0)
-    order = spread(-unlikeness[pool], entries.centres(near), entries.axes(near), count, math.inf, options)
+    order = spread(-unlikeness[pool], entries.centres(near), entries.axes(near), count, math.inf, THINNED_LATER)
     chosen = near[order]
     extent_m = float(np.linalg.norm(entries.centres(chosen) - at.translation, axis=1).max(initial=0.0))
     if max(sigma_m, float(np.linalg.norm(at.translation - pose.translation))) > extent_m:

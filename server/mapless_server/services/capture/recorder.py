@@ -10,7 +10,6 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 from google.protobuf.message import Message
 
@@ -18,6 +17,7 @@ from mapless.names import parse_scene_name
 from mapless_server.engine.query import Query, Result, Tier
 from mapless_server.errors import DataLoss, NotFound, Unavailable
 from mapless_server.rpc import Call
+from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import key_of
 from mapless_server.store import SceneAttributes, Store, time_us
 
@@ -38,19 +38,6 @@ CLOSING_LIMIT_S = 5.0
 """For writing the queued calls when the server stops."""
 LOG_PERIOD_S = 60.0
 """Time in which the log has one line at most of each kind of fault: a fault may occur at every call."""
-
-
-class CaptureObserver(Protocol):
-    """Counts what is captured; called from any thread, so it must return at once and never raise."""
-
-    def captured(self) -> None:
-        """Counts a call that was written."""
-
-    def capture_dropped(self, reason: str) -> None:
-        """Counts a call that was not captured: "queue", "size", "disk", "deleted", "store" or "fault".
-
-        The reason is "queue" if too many calls were queued, or if the call was still queued when the server stopped.
-        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +102,7 @@ class Recorder:
         self,
         folder: CaptureFolder,
         store: Store,
-        observer: CaptureObserver,
+        observer: BackgroundObserver,
         circumstances: Callable[[Sequence[Tier]], Mapping[str, str]] = lambda _: {},
         tenants: frozenset[str] = frozenset(),
     ) -> None:
@@ -221,7 +208,7 @@ class Recorder:
             return
         try:
             if self._add(queued):
-                self._observer.captured()
+                self._observer.count("captured")
             else:
                 self._drop("size")
         except OSError as error:
@@ -268,5 +255,5 @@ class Recorder:
         return call, blobs
 
     def _drop(self, reason: str) -> None:
-        self._observer.capture_dropped(reason)
+        self._observer.count("capture_dropped", 1, reason)
         self._log.dropped(reason)
