@@ -46,7 +46,7 @@ OUTSIDE: dict[str, list[tuple[str, Any]]] = {
     "method.uncertainty.covariance.UncertaintyOptions": [("region_factor", -0.1), ("rotation_factor", 0.0)]
     + [("max_matches", 0), ("position_factor", 0.0)],
     "scenes.audit.coverage.CoverageOptions": [("least_matches", 100.0)],
-    "scenes.audit.options.AuditOptions": [("position_tolerance_m", 0.0)],
+    "scenes.audit.comparison.AuditOptions": [("position_tolerance_m", 0.0)],
     "scenes.audit.neighbourhood.VisibilityOptions": [("max_scale", 1.0)],
     "scenes.retrieval.ranking.RankOptions": [("apart_m", -1.0), ("apart_deg", 181.0), ("nearby_weight", 1.5)]
     + [("nearby_weight", NAN), ("same_place_m", -1.0), ("per_place", 0), ("pool", 0), ("smallest_pool", 0)],

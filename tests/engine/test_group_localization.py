@@ -16,9 +16,8 @@ from support.servers import CAMERA
 
 from mapless_server.engine.groups import PhotoGroup
 from mapless_server.engine.interface import EngineOptions
-from mapless_server.engine.query import Caller, Photo, Query, Result
+from mapless_server.engine.query import PREPARE, Caller, Photo, Query, Result
 from mapless_server.engine.queue_engine import JOIN, QueueEngine
-from mapless_server.engine.stages import PREPARE
 from mapless_server.errors import DeadlineExceeded, Overloaded, RequestError
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.rpc import Call

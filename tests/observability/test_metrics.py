@@ -502,8 +502,9 @@ def test_the_port_listens_on_ipv6(metrics: Metrics) -> None:
 # The event loop
 
 
-class Heard:
+class Heard(Metrics):
     def __init__(self) -> None:
+        super().__init__()
         self.lags_s: list[float] = []
         self.beats = 0
 

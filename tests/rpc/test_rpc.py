@@ -21,7 +21,7 @@ from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server.errors import NotFound, Overloaded, PermissionDenied, RequestError, Unauthenticated, Unavailable
-from mapless_server.observability.tracing import MAX_STEPS, TracedStep
+from mapless_server.observability.tracing import MAX_STEPS, CallSpan, TracedStep, Tracer
 from mapless_server.rpc import CallGuard, pace, receiving
 from mapless_server.rpc.call import ANSWER_MARGIN_SHARE, Call
 from mapless_server.rpc.receiving import OpenMethods, Receiver
@@ -38,7 +38,7 @@ Answer = Callable[[Any, Call], Awaitable[Any]]
 
 
 @dataclass
-class Counted:
+class Counted(Tracer, CallSpan):
     """Counts and traces of calls."""
 
     trace_id: str = ""

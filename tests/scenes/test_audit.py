@@ -12,9 +12,9 @@ from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.method.views import Features, PosedView
 from mapless_server.scenes import AuditVerdict, ReferenceAudit
 from mapless_server.scenes.audit.auditor import Auditor
+from mapless_server.scenes.audit.comparison import AuditOptions
 from mapless_server.scenes.audit.finder import ReferenceGone
 from mapless_server.scenes.audit.neighbourhood import PairMatches
-from mapless_server.scenes.audit.options import AuditOptions
 from mapless_server.scenes.audit.resection import with_focal
 
 SCENE = SceneOptions(point_count=250, reference_count=6, baseline_m=0.4, noise_px=0.3, distractor_count=40)

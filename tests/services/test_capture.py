@@ -34,7 +34,7 @@ from mapless_server.services.capture.calls import (
 )
 from mapless_server.services.capture.files import write_whole
 from mapless_server.services.capture.folder import CapturedEntry, CaptureFolder, Retention
-from mapless_server.services.capture.opening import open_recorder
+from mapless_server.services.capture.recorder import open_recorder
 from mapless_server.settings import ConfigError, load_settings
 from mapless_server.store import SceneAttributes, Store
 from mapless_tools.replay.report import Selection

@@ -8,9 +8,9 @@ from mapless.names import parse_reference_name
 from mapless_server.method.views import PosedView
 from mapless_server.scenes import ReferenceAudit
 from mapless_server.scenes.audit.auditor import Auditor
+from mapless_server.scenes.audit.comparison import AuditOptions
 from mapless_server.scenes.audit.finder import ReferenceFinder
 from mapless_server.scenes.audit.neighbourhood import PairMatches
-from mapless_server.scenes.audit.options import AuditOptions
 from mapless_server.scenes.retrieval.index import Entries, SceneIndex
 from mapless_server.store import IndexedReference, SceneChanges
 

@@ -20,7 +20,6 @@ if TYPE_CHECKING:  # services need not load what computes
     from mapless_server.method.rejection import Rejection
     from mapless_server.scenes import Choice, Coverage, Narrowing, ReferenceAudit, Viewpoint
     from mapless_server.security import SceneKey
-    from mapless_server.store import SceneAttributes
 
     from .query import Caller, Description, Photo, Query, Result, Tier
 
@@ -129,12 +128,6 @@ class Engine(Protocol):
 
     async def check_coverage(self, scene_key: SceneKey, view: Viewpoint, caller: Caller) -> tuple[int, Coverage]:
         """Predicts whether a photograph would be localized at a viewpoint; also returns the scene's generation."""
-        ...
-
-    def contradictions(
-        self, poses: Sequence[RigidTransform], attributes: SceneAttributes, added: Sequence[RigidTransform] = ()
-    ) -> list[str]:
-        """Contradictions of a scene's attributes and the poses of its and of added references, one sentence each."""
         ...
 
     def forget_references(self, keys: Collection[str]) -> None:

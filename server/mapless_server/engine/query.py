@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from mapless_server.scheduling import Flow
     from mapless_server.security import SceneKey
 
+PREPARE, COARSE, REFINE = "prepare", "coarse", "refine"
+"""The stages of a query."""
+
 POSE_PRIOR = "pose-prior"
 """`Choice.descriptor` of references that were chosen by a pose prior, not by similarity."""
 

@@ -15,7 +15,6 @@ from mapless_server.method.options import StageContext
 from mapless_server.method.rejection import Rejection
 from mapless_server.scenes import Choice, Coverage, Narrowing, ReferenceAudit, Selection, Viewpoint
 from mapless_server.scenes.background import BackgroundMatching
-from mapless_server.scenes.plausibility import contradictions
 from mapless_server.scheduling import (
     ComputeItem,
     Expired,
@@ -34,14 +33,13 @@ from mapless_server.scheduling import (
     compute_items,
 )
 from mapless_server.security import SceneKey
-from mapless_server.store import SceneAttributes
 
 from . import joint
 from .failures import failure_of
 from .interface import EngineOptions
-from .query import Caller, Description, Photo, Query, Result, Tier
-from .references import QueryViews, References, ReferenceSource
-from .stages import COARSE, PREPARE, REFINE, Method, QueryRun, QueryStages
+from .query import COARSE, PREPARE, REFINE, Caller, Description, Photo, Query, Result, Tier
+from .references import QueryRun, QueryViews, References, ReferenceSource
+from .stages import Method, QueryStages
 
 ItemT = TypeVar("ItemT")
 Joined = TypeVar("Joined")
@@ -275,12 +273,6 @@ class QueueEngine:
             if len(refusals) == jobs:  # else those that were admitted have done it all
                 raise refusals[0]
         return work.results
-
-    def contradictions(
-        self, poses: Sequence[RigidTransform], attributes: SceneAttributes, added: Sequence[RigidTransform] = ()
-    ) -> list[str]:
-        """Contradictions of a scene's attributes and the poses of its and of added references, one sentence each."""
-        return contradictions(poses, attributes, added)
 
     def forget_references(self, keys: Collection[str]) -> None:
         """Frees the memory of deleted references."""

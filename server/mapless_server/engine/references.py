@@ -2,25 +2,36 @@
 
 import hashlib
 import math
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, Protocol
 
 from mapless.names import reference_name
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import StageContext
-from mapless_server.method.views import Photograph, View, reduce_image
-from mapless_server.scenes import Choice, GlobalDescriptor, Selection, rank_references
+from mapless_server.method.views import Matches, Photograph, PosedView, View, reduce_image
+from mapless_server.scenes import Choice, GlobalDescriptor, Narrowing, Selection, rank_references
 from mapless_server.scenes.audit.scene_auditor import AuditTools, SceneAuditor
 from mapless_server.scenes.indexes import SceneIndexes
-from mapless_server.scenes.library import Loaded, ReferenceLibrary
-from mapless_server.scenes.retrieval.ranking import nearest_references
+from mapless_server.scenes.library import Loaded, ReferenceLibrary, load_usable
+from mapless_server.scenes.retrieval.ranking import THINNED_LATER, nearest_references
+from mapless_server.scheduling import Step
 from mapless_server.security import SceneKey, scene_id_of
 from mapless_server.store import SceneAttributes
 
-from .query import POSE_PRIOR, Description, Photo
+from .query import POSE_PRIOR, PREPARE, Description, Photo, Query, Result, Tier
+from .tracking import can_track
+
+SHORTLIST = 2
+"""So many times the references wanted are matched with a sample of the photograph, and the best of them used (see
+BENCHMARKS.md)."""
+
+_COUNTS = (2, 5, 10, 20, 64)
+"""Queries with about as many references cost about as much."""
 
 
 class QueryViews:
@@ -95,6 +106,102 @@ class ReferenceSource(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class QueryRun:
+    """The state of a query between its stages, in one tier.
+
+    Attributes:
+        query: the query.
+        source: source of the references.
+        views: the photograph.
+        deadline_s: time after which the answer is useless, by `time.monotonic`.
+        on_coarse: called with the first tier's coarse result as soon as there is one, in the computing thread.
+        tier: index of the tier that computes.
+        best: best result so far; None in the first search of the first tier.
+        start_s: when this tier began, by `time.monotonic`.
+        give_up_s: time after which `best` is the answer, if this tier has none by then.
+        narrowed: the query with the soft priors' choice of references, if references elsewhere are now searched.
+        ambiguous: the rejection as ambiguous, if the references of the place that the priors decided for are now used.
+        listings: how often the scene was listed in this tier.
+        context: cancels and times this tier's stages; from here on set by the stage `prepare`.
+        references: the references that are used, in order.
+        generation: generation of the scene when they were read.
+        attributes: attributes of the scene.
+        view: the photograph with this tier's features; None until the tier's first step has found them.
+        choice: how the references were chosen; None if the caller named them.
+        query_matches: matches of the photograph with each reference, if references were chosen by these or are matched
+            one by one.
+        unmatched: indices of the references that the photograph is still to be matched with again (`Matcher.rematch`),
+            each in a step of its own, so that a busy server computes for other callers in between.
+        part: the method's intermediate result between two stages.
+    """
+
+    query: Query
+    source: ReferenceSource
+    views: QueryViews
+    deadline_s: float
+    on_coarse: Callable[[Result], object] | None = None
+    tier: int = 0
+    best: Result | None = None
+    start_s: float = field(default_factory=time.monotonic)
+    give_up_s: float = math.inf
+    narrowed: Query | None = None
+    ambiguous: Result | None = None
+    listings: int = 1
+    context: StageContext = field(default_factory=StageContext)
+    references: tuple[PosedView, ...] = ()
+    generation: int = 0
+    attributes: SceneAttributes = field(default_factory=SceneAttributes)
+    view: View | None = None
+    choice: Choice | None = None
+    query_matches: tuple[Matches, ...] | None = None
+    unmatched: tuple[int, ...] = ()
+    part: Any = None
+
+    @property
+    def kind(self) -> str:
+        """Kind of the query's jobs; jobs of one kind take about the same time."""
+        if self.tracks:
+            return "tracked"
+        ids = self.query.reference_ids
+        count = next((count for count in _COUNTS if len(ids) <= count), _COUNTS[-1])
+        return f"tier {self.tier}, {'chosen' if self.query.chooses else f'up to {count}'}"
+
+    @property
+    def tracks(self) -> bool:
+        """Whether this tier begins with the references near the prior."""
+        return self.best is None and can_track(self.query)
+
+    @property
+    def earlier(self) -> Result | None:
+        """The result if this computation comes to none."""
+        return self.best or self.ambiguous
+
+    @property
+    def first_step(self) -> Step:
+        """The first step of the query in its tier."""
+        return Step(PREPARE, self.kind, self.kind, self)
+
+    def choose(self, narrowing: Narrowing) -> Choice:
+        """Chooses the shortlist of references within limits and likely values of the pose."""
+        query = self.query
+        selection = Selection(SHORTLIST * query.reference_count, narrowing, query.reference_ids, THINNED_LATER)
+        return self.source.choose(query.scene_key, self.views, selection, self.context)
+
+    def load(self, reference_ids: Sequence[str], tier: Tier) -> Loaded:
+        """Loads references with the tier's features."""
+        # Only the first tier waits for its references' features: before a stronger one there is an answer.
+        waits = self.best is None
+        return self.source.load(self.query.scene_key, reference_ids, tier.extractor, self.context, waits)
+
+    def load_chosen(self, reference_ids: Sequence[str], tier: Tier) -> Loaded:
+        """Loads chosen references without damaged ones; a damaged reference that the caller named is an error."""
+        if self.query.reference_ids:
+            return self.load(reference_ids, tier)
+        report = partial(self.source.report_damaged, self.query.scene_key)
+        return load_usable(lambda some: self.load(some, tier), reference_ids, (DataLoss,), report)
+
+
 class References:
     """The references of all scenes: loaded, chosen, described, audited. Safe to use from several threads."""
 
@@ -110,27 +217,14 @@ class References:
         """Raises ValueError unless the descriptor is computed from the first extractor's features."""
         if descriptor.extractor not in (None, extractors[0].name):
             raise ValueError(f"{descriptor.name} is made of {descriptor.extractor}, not of {extractors[0].name}")
+        self.load, self.attributes = library.load, library.attributes
+        self.report_damaged = indexes.report_damaged
         self._library = library
         self._indexes = indexes
         self._descriptor = descriptor
         self._extractors = extractors
         self._audit_tools = audit_tools
         self._limits = limits
-
-    def load(
-        self,
-        scene_key: SceneKey,
-        reference_ids: Sequence[str],
-        extractor: FeatureExtractor,
-        context: StageContext,
-        waits: bool = True,
-    ) -> Loaded:
-        """See `ReferenceLibrary.load`."""
-        return self._library.load(scene_key, reference_ids, extractor, context, waits)
-
-    def attributes(self, scene_key: SceneKey) -> SceneAttributes:
-        """Returns the attributes of a scene."""
-        return self._library.attributes(scene_key)
 
     def choose(
         self,
@@ -165,10 +259,6 @@ class References:
             vector = self._descriptor.describe(view)
             ranked = rank_references(entries, vector, selection)
         return Choice(tuple(ranked), self._descriptor.name, entries.generation)
-
-    def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
-        """Logs that a chosen reference is not used because it is damaged; once while the scene is in memory."""
-        self._indexes.report_damaged(scene_key, reference_id, error)
 
     def describe(self, photo: Photo, check: Callable[[], None]) -> Description:
         """Computes all that the store keeps of a photograph, every tier's features; InvalidArgument if it is bad."""

@@ -8,11 +8,10 @@ import logging
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, replace
 from typing import Any
 
-from mapless_server.errors import DataLoss, NotFound, Unavailable
+from mapless_server.errors import NotFound, Unavailable
 from mapless_server.method import localize as method
 from mapless_server.method import pipeline
 from mapless_server.method.answer import Answer, Localization
@@ -23,35 +22,24 @@ from mapless_server.method.pipeline import Coarse, Pipeline, Prepared
 from mapless_server.method.rejection import Hint, Hypothesis, Rejection, RejectionReason
 from mapless_server.method.results import Support
 from mapless_server.method.trust.judge import trust_in_scene
-from mapless_server.method.views import Matches, PosedView, View
-from mapless_server.scenes import Choice, Narrowing, Selection
-from mapless_server.scenes.library import FeaturesMissing, Loaded, load_usable
-from mapless_server.scenes.retrieval.ranking import THINNED_LATER, spread_choice
+from mapless_server.scenes import Selection
+from mapless_server.scenes.library import FeaturesMissing
+from mapless_server.scenes.retrieval.ranking import spread_choice
 from mapless_server.scheduling import Abandoned, Done, Ending, Failure, Fallback, Job, Next, StageResult, Step
-from mapless_server.store import SceneAttributes
 
 from . import tracking
 from .failures import failure_of
-from .query import TRACK, UNFINISHED, Query, Result, Tier
-from .references import QueryViews, ReferenceSource
+from .query import COARSE, PREPARE, REFINE, TRACK, UNFINISHED, Query, Result, Tier
+from .references import QueryRun
 from .tiers import EscalationOptions, better_of, is_doubtful, of_two_places, place_of_priors
 
 log = logging.getLogger(__name__)
-
-PREPARE, COARSE, REFINE = "prepare", "coarse", "refine"
-
-SHORTLIST = 2
-"""So many times the references wanted are matched with a sample of the photograph, and the best of them used (see
-BENCHMARKS.md)."""
 
 MAX_LISTINGS = 3
 """When a reference is deleted while it is used, the scene is listed again; more often than this it is being emptied."""
 
 ANSWER_MARGIN_S = 0.05
 """Before the deadline, for an answer that exists to reach its caller."""
-
-_COUNTS = (2, 5, 10, 20, 64)
-"""Queries with about as many references cost about as much."""
 
 
 @dataclass(frozen=True)
@@ -67,83 +55,6 @@ class Method:
     coarse_answer: Callable[[Coarse], Answer | None] = pipeline.coarse_answer
     tracked_support: Callable[[Prepared], Support | None] = tracked_support
     track: Callable[..., Answer] = tracking.track
-
-
-@dataclass(frozen=True, eq=False)
-class QueryRun:
-    """The state of a query between its stages, in one tier.
-
-    Attributes:
-        query: the query.
-        source: source of the references.
-        views: the photograph.
-        deadline_s: time after which the answer is useless, by `time.monotonic`.
-        on_coarse: called with the first tier's coarse result as soon as there is one, in the computing thread.
-        tier: index of the tier that computes.
-        best: best result so far; None in the first search of the first tier.
-        start_s: when this tier began, by `time.monotonic`.
-        give_up_s: time after which `best` is the answer, if this tier has none by then.
-        narrowed: the query with the soft priors' choice of references, if references elsewhere are now searched.
-        ambiguous: the rejection as ambiguous, if the references of the place that the priors decided for are now used.
-        listings: how often the scene was listed in this tier.
-        context: cancels and times this tier's stages; from here on set by the stage `prepare`.
-        references: the references that are used, in order.
-        generation: generation of the scene when they were read.
-        attributes: attributes of the scene.
-        view: the photograph with this tier's features; None until the tier's first step has found them.
-        choice: how the references were chosen; None if the caller named them.
-        query_matches: matches of the photograph with each reference, if references were chosen by these or are matched
-            one by one.
-        unmatched: indices of the references that the photograph is still to be matched with again (`Matcher.rematch`),
-            each in a step of its own, so that a busy server computes for other callers in between.
-        part: the method's intermediate result between two stages.
-    """
-
-    query: Query
-    source: ReferenceSource
-    views: QueryViews
-    deadline_s: float
-    on_coarse: Callable[[Result], object] | None = None
-    tier: int = 0
-    best: Result | None = None
-    start_s: float = field(default_factory=time.monotonic)
-    give_up_s: float = math.inf
-    narrowed: Query | None = None
-    ambiguous: Result | None = None
-    listings: int = 1
-    context: StageContext = field(default_factory=StageContext)
-    references: tuple[PosedView, ...] = ()
-    generation: int = 0
-    attributes: SceneAttributes = field(default_factory=SceneAttributes)
-    view: View | None = None
-    choice: Choice | None = None
-    query_matches: tuple[Matches, ...] | None = None
-    unmatched: tuple[int, ...] = ()
-    part: Any = None
-
-    @property
-    def kind(self) -> str:
-        """Kind of the query's jobs; jobs of one kind take about the same time."""
-        if self.tracks:
-            return "tracked"
-        ids = self.query.reference_ids
-        count = next((count for count in _COUNTS if len(ids) <= count), _COUNTS[-1])
-        return f"tier {self.tier}, {'chosen' if self.query.chooses else f'up to {count}'}"
-
-    @property
-    def tracks(self) -> bool:
-        """Whether this tier begins with the references near the prior."""
-        return self.best is None and tracking.can_track(self.query)
-
-    @property
-    def earlier(self) -> Result | None:
-        """The result if this computation comes to none."""
-        return self.best or self.ambiguous
-
-    @property
-    def first_step(self) -> Step:
-        """The first step of the query in its tier."""
-        return Step(PREPARE, self.kind, self.kind, self)
 
 
 class QueryStages:
@@ -181,7 +92,11 @@ class QueryStages:
             if is_outdated and run.listings < MAX_LISTINGS:
                 return self._next(run, replace(run, listings=run.listings + 1, view=None).first_step)
             if run.earlier is None:
-                return _emptied() if is_outdated else error
+                if not is_outdated:
+                    return error
+                return Unavailable(
+                    "the scene's references are being deleted", reason="SCENE_CHANGED", retry_after_s=1.0
+                )
             # A failed attempt at a better answer must not cost the first answer.
             if not isinstance(error, FeaturesMissing):
                 name = self._tiers[run.tier].features
@@ -275,19 +190,18 @@ class QueryStages:
             near = run.source.choose(query.scene_key, run.views, selection, context)
         if len(near.references) < 2:
             return None
-        generation, references = self._load_chosen(run, [it.reference_id for it in near.references], tier)
+        generation, references = run.load_chosen([it.reference_id for it in near.references], tier)
         views = run.views.reduced(tracking.MAX_PIXELS, context)
         tier = tracking.tracking_tier(tier)
         view, pipeline = views.view(tier.extractor, context), _pipeline_in(run, tier)
         answer = self._method.track(view, references, pipeline, query.options, context, query.priors)
         if not tracking.suffices(answer, pipeline.options.weak_inliers, self._doubt_in(run)):
             return None
-        alike = run.source.choose(
-            query.scene_key, views, Selection(query.reference_count, query.narrowing.limits), context
-        )
+        selection = Selection(query.reference_count, query.narrowing.limits)
+        alike = run.source.choose(query.scene_key, views, selection, context)
         others = [it.reference_id for it in tracking.elsewhere(near, alike)]
         with context.stage(TRACK):
-            rivals = self._load_chosen(run, others, tier)[1] if others else ()
+            rivals = run.load_chosen(others, tier)[1] if others else ()
             if tracking.is_contradicted(answer, view, rivals, pipeline.matcher):
                 return None
         tracked = replace(run, generation=generation, references=references, view=view, choice=near)
@@ -297,15 +211,15 @@ class QueryStages:
     def _with_named(self, run: QueryRun, tier: Tier) -> QueryRun:
         """Loads the references that the caller named."""
         # References come first: a wrong name is found before the photograph is described.
-        generation, references = self._load(run, run.query.reference_ids, tier)
+        generation, references = run.load(run.query.reference_ids, tier)
         view = run.views.view(tier.extractor, run.context)
         return replace(run, generation=generation, references=references, view=view)
 
     def _with_chosen(self, run: QueryRun, tier: Tier) -> QueryRun:
         """Chooses, among the references that resemble the photograph most, those with the most matches."""
         query, context = run.query, run.context
-        choice = self._choose(run, query.narrowing)
-        generation, shortlist = self._load_chosen(run, [it.reference_id for it in choice.references], tier)
+        choice = run.choose(query.narrowing)
+        generation, shortlist = run.load_chosen([it.reference_id for it in choice.references], tier)
         view = run.views.view(tier.extractor, context)
 
         def choose(indices: Sequence[int], match_counts: Sequence[int]) -> list[int]:
@@ -315,27 +229,9 @@ class QueryStages:
         with context.stage("shortlist"):
             matcher = tier.pipeline.matcher
             matches = matcher.match_best(view, shortlist, query.reference_count, choose, context.check)
-        references, query_matches = tuple(shortlist[i] for i in matches), tuple(matches.values())
-        return replace(
-            run, generation=generation, references=references, view=view, choice=choice, query_matches=query_matches
-        )
-
-    def _choose(self, run: QueryRun, narrowing: Narrowing) -> Choice:
-        query = run.query
-        selection = Selection(SHORTLIST * query.reference_count, narrowing, query.reference_ids, THINNED_LATER)
-        return run.source.choose(query.scene_key, run.views, selection, run.context)
-
-    def _load_chosen(self, run: QueryRun, reference_ids: Sequence[str], tier: Tier) -> Loaded:
-        """Loads chosen references without damaged ones; a damaged reference that the caller named is an error."""
-        if run.query.reference_ids:
-            return self._load(run, reference_ids, tier)
-        report = partial(run.source.report_damaged, run.query.scene_key)
-        return load_usable(lambda some: self._load(run, some, tier), reference_ids, (DataLoss,), report)
-
-    def _load(self, run: QueryRun, reference_ids: Sequence[str], tier: Tier) -> Loaded:
-        # Only the first tier waits for its references' features: before a stronger one there is an answer.
-        waits = run.best is None
-        return run.source.load(run.query.scene_key, reference_ids, tier.extractor, run.context, waits)
+        chosen, query_matches = tuple(shortlist[i] for i in matches), tuple(matches.values())
+        found = replace(run, generation=generation, references=chosen, view=view, choice=choice)
+        return replace(found, query_matches=query_matches)
 
     def _after_coarse(self, run: QueryRun, part: Coarse | Answer | Exception) -> StageResult:
         if isinstance(part, Exception):
@@ -343,22 +239,18 @@ class QueryStages:
         if isinstance(part, Answer):
             return self._conclude(run, part)
         step = Step(REFINE, run.kind, run.kind, replace(run, part=part))
-        coarse = self._coarse_result(run, part)
-        if coarse is None:
+        if run.earlier is not None or not (run.query.allow_coarse or run.on_coarse is not None):
             return self._next(run, step)
+        answer = self._method.coarse_answer(part)
+        if answer is None or not _is_finite(answer):
+            return self._next(run, step)
+        coarse = self._result(run, answer)
         if run.on_coarse is not None and isinstance(coarse.answer.outcome, Localization):
             run.on_coarse(coarse)
         if not run.query.allow_coarse:
             return self._next(run, step)
         done = Done(coarse, Ending.DEGRADED)
         return Next(step, Fallback(lambda: done, run.deadline_s - ANSWER_MARGIN_S))
-
-    def _coarse_result(self, run: QueryRun, part: Coarse) -> Result | None:
-        """The first tier's coarse result, if the caller may want it and computation goes on."""
-        if run.earlier is not None or not (run.query.allow_coarse or run.on_coarse is not None):
-            return None
-        coarse = self._method.coarse_answer(part)
-        return None if coarse is None or not _is_finite(coarse) else self._result(run, coarse)
 
     def _refine(self, run: QueryRun) -> StageResult:
         answer = self._method.refine(run.part)
@@ -384,7 +276,7 @@ class QueryStages:
         elif run.best is not None:
             result = replace(better_of(run.best, result, self._escalation), stage_seconds=result.stage_seconds)
         elif self._searches_elsewhere(run, answer):
-            return self._again(run, _without_likely(query), run.tier, result)
+            return self._again(run, replace(query, narrowing=query.narrowing.limits), run.tier, result)
         if run.tier + 1 < len(self._tiers) and is_doubtful(result.answer, self._doubt_in(run)):
             return self._again(run, query, run.tier + 1, result)
         return Done(result, _ending(result))
@@ -432,7 +324,7 @@ class QueryStages:
         if run.choice is None or query.is_part or is_excluded or not query.narrowing.has_likely:
             return False
         with run.context.stage("retrieval"):
-            alike = self._choose(run, query.narrowing.limits).references
+            alike = run.choose(query.narrowing.limits).references
         inside = {it.reference_id for it in run.choice.references}
         if not alike or alike[0].reference_id in inside:
             return False
@@ -442,7 +334,7 @@ class QueryStages:
         tier = self._tiers[run.tier]
         others = [it.reference_id for it in alike if it.reference_id not in inside][: tracking.OTHERS]
         with run.context.stage("correspond"):
-            rivals = self._load_chosen(run, others, tier)[1]
+            rivals = run.load_chosen(others, tier)[1]
             return tracking.is_contradicted(answer, run.view, rivals, tier.pipeline.matcher)
 
     def _doubt_in(self, run: QueryRun) -> EscalationOptions:
@@ -471,7 +363,9 @@ class QueryStages:
             raise ArithmeticError(f"the method's answer is not finite: {answer.outcome}, {answer.scale}")
         assert run.view is not None
         tier, narrowing = self._tiers[run.tier], run.query.narrowing
-        answer = _checked_against(narrowing, answer)
+        outcome = answer.outcome
+        if isinstance(outcome, Localization) and (beyond := narrowing.contradiction(outcome.world_from_camera)):
+            answer = replace(answer, outcome=Rejection(RejectionReason.PRIOR_CONFLICT, beyond))
         if isinstance(answer.outcome, Rejection):
             answer = hinted(answer, run.view, run.references, _is_searched(run) and not narrowing.is_empty)
         prefix = "" if run.best is None else f"{tier.features}/"
@@ -488,17 +382,9 @@ def _pipeline_in(run: QueryRun, tier: Tier) -> Pipeline:
     return tier.pipeline.with_trust(calibration.trust_quantiles if calibration else ())
 
 
-def _without_likely(query: Query) -> Query:
-    return replace(query, narrowing=query.narrowing.limits)
-
-
 def _is_searched(run: QueryRun) -> bool:
     """Whether the scene has references to choose from."""
     return run.choice is not None and bool(run.choice.descriptor)
-
-
-def _emptied() -> Unavailable:
-    return Unavailable("the scene's references are being deleted", reason="SCENE_CHANGED", retry_after_s=1.0)
 
 
 def _ending(result: Result) -> Ending:
@@ -512,13 +398,3 @@ def _is_finite(answer: Answer) -> bool:
         covariance = [] if outcome.covariance is None else outcome.covariance.ravel().tolist()
         numbers += [*outcome.world_from_camera.matrix().ravel(), *covariance, outcome.reprojection_error_px]
     return all(map(math.isfinite, numbers))
-
-
-def _checked_against(narrowing: Narrowing, answer: Answer) -> Answer:
-    """Rejects the answer if its pose is beyond a hard prior."""
-    if not isinstance(answer.outcome, Localization):
-        return answer
-    contradiction = narrowing.contradiction(answer.outcome.world_from_camera)
-    if not contradiction:
-        return answer
-    return replace(answer, outcome=Rejection(RejectionReason.PRIOR_CONFLICT, contradiction))

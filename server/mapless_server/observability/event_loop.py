@@ -4,7 +4,8 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable
-from typing import Protocol
+
+from .metrics import Metrics
 
 log = logging.getLogger(__name__)
 
@@ -14,24 +15,14 @@ WARN_S = 1.0
 """Less is usual where other processes take the processors; the metric has all."""
 
 
-class LoopObserver(Protocol):
-    """Receives the measurements."""
-
-    def loop_lagged(self, seconds: float) -> None:
-        """A timer ran this much late."""
-
-    def beat(self) -> None:
-        """The loop and the scheduler are alive."""
-
-
-async def watch_event_loop(observer: LoopObserver, is_alive: Callable[[], bool] = lambda: True) -> None:
+async def watch_event_loop(metrics: Metrics, is_alive: Callable[[], bool] = lambda: True) -> None:
     """Measures until it is cancelled, and calls `beat` as long as the scheduler is alive."""
     while True:
         due_s = time.monotonic() + TICK_S
         await asyncio.sleep(TICK_S)
         lag_s = max(0.0, time.monotonic() - due_s)
-        observer.loop_lagged(lag_s)
+        metrics.loop_lagged(lag_s)
         if lag_s > WARN_S:
             log.warning("the event loop was blocked", extra={"lag_ms": round(1000 * lag_s)})
         if is_alive():
-            observer.beat()
+            metrics.beat()

@@ -21,10 +21,12 @@ from collections import OrderedDict
 from collections.abc import Iterable
 from contextlib import suppress
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
 from prometheus_client import CollectorRegistry, make_wsgi_app
+
+from .metrics import Metrics
 
 if TYPE_CHECKING:
     from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
@@ -42,20 +44,10 @@ LIVE_LIMIT_S = 60.0
 _POLL_S = 0.2
 
 
-class State(Protocol):
-    """State of the server, which the threads of this port read: what health reports, and the last heartbeat.
-
-    The heartbeat's time is that of `time.monotonic`; None while the server starts.
-    """
-
-    is_serving: bool
-    beaten_s: float | None
-
-
 class MetricsServer:
     """Serves a registry and the probes until it is closed."""
 
-    def __init__(self, registry: CollectorRegistry, host: str, port: int, state: State) -> None:
+    def __init__(self, registry: CollectorRegistry, host: str, port: int, state: Metrics) -> None:
         """Begins to listen and to serve; port 0 for any free one. OSError if the address cannot be listened on."""
         self._server = _HttpServer(host, port)
         self._server.set_app(_application(registry, state))
@@ -71,7 +63,7 @@ class MetricsServer:
         self._server.server_close()
 
 
-def _application(registry: CollectorRegistry, state: State) -> WSGIApplication:
+def _application(registry: CollectorRegistry, state: Metrics) -> WSGIApplication:
     metrics: WSGIApplication = make_wsgi_app(registry)
 
     def beats_within(limit_s: float) -> bool:

@@ -17,7 +17,7 @@ from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapProp
 from mapless_server import __version__
 
 from .logs import plain
-from .tracing import Metadata, TracedStep
+from .tracing import CallSpan, Metadata, TracedStep, Tracer
 
 EXPORT_LIMIT_S = 5.0
 """Time that a collector may take for a batch, retries included."""
@@ -40,7 +40,7 @@ def make_otlp_tracer(endpoint: str) -> "OtlpTracer":
     return OtlpTracer(OTLPSpanExporter(endpoint=endpoint, insecure=is_insecure, timeout=EXPORT_LIMIT_S))
 
 
-class OtlpTracer:
+class OtlpTracer(Tracer):
     """Implements Tracer. Buffers at most 2048 spans, and drops further ones."""
 
     def __init__(self, exporter: SpanExporter) -> None:
@@ -96,7 +96,7 @@ class OtlpTracer:
         )
 
 
-class _OtlpSpan:
+class _OtlpSpan(CallSpan):
     def __init__(self, tracer: OtlpTracer, span: Span) -> None:
         self._tracer = tracer
         self._span = span

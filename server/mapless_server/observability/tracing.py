@@ -1,11 +1,7 @@
-"""The record of one call, for its line in the log and its trace; and the interface of a tracer.
-
-`NoTracer` traces nothing; `otlp` has the tracer that sends.
-"""
+"""The record of one call, for its line in the log and its trace; and what `otlp`, which sends traces, implements."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 MAX_STEPS = 128
 """Steps in one trace; an upload of a thousand photographs only adds up the times of further ones."""
@@ -68,42 +64,22 @@ Metadata = Sequence[tuple[str, str | bytes]]
 """The keys and values that a caller sends beside its message."""
 
 
-class CallSpan(Protocol):
-    """The trace of one call."""
+class CallSpan:
+    """The trace of one call; this one is nowhere."""
 
-    @property
-    def trace_id(self) -> str:
-        """32 hexadecimal digits; empty if the call is not traced."""
+    trace_id = ""
+    """32 hexadecimal digits; empty if the call is not traced."""
 
     def end(self, code: str, steps: Sequence[TracedStep], attributes: Mapping[str, object]) -> None:
         """Ends the span with a gRPC status; called once."""
 
 
-class Tracer(Protocol):
-    """Traces calls; called on the event loop, so its methods return at once and never raise."""
+class Tracer:
+    """Traces calls; called on the event loop, so its methods return at once and never raise. This one traces none."""
 
     def begin(self, method: str, metadata: Metadata, start_s: float) -> CallSpan:
         """Begins the span of a call of "/package.Service/Method", at a time of `time.monotonic`."""
+        return CallSpan()
 
     def close(self, limit_s: float) -> None:
         """Sends the remaining spans and ends; takes at most `limit_s`."""
-
-
-class _NoSpan:
-    trace_id = ""
-
-    def end(self, code: str, steps: Sequence[TracedStep], attributes: Mapping[str, object]) -> None:
-        pass
-
-
-class NoTracer:
-    """Traces nothing."""
-
-    _span = _NoSpan()
-
-    def begin(self, method: str, metadata: Metadata, start_s: float) -> CallSpan:
-        """Implements Tracer."""
-        return self._span
-
-    def close(self, limit_s: float) -> None:
-        """Implements Tracer."""

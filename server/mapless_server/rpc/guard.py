@@ -15,7 +15,7 @@ from google.protobuf.message import DecodeError
 from mapless.wire import FieldError
 from mapless_server.errors import DeadlineExceeded, InvalidArgument, RequestError, Unavailable
 from mapless_server.observability.logs import as_extra
-from mapless_server.observability.tracing import CallSpan, Metadata, NoTracer, Tracer
+from mapless_server.observability.tracing import CallSpan, Metadata, Tracer
 from mapless_server.scheduling import Flow
 from mapless_server.security import ENDLESS_METHODS, OPEN_METHODS, Principal
 
@@ -87,7 +87,7 @@ class CallGuard:
         self._authenticate = authenticate
         self._check_admission = check_admission
         self._observer = observer
-        self._tracer = tracer or NoTracer()
+        self._tracer = tracer or Tracer()
         self._active = 0
         self._idle = asyncio.Event()
         self._idle.set()

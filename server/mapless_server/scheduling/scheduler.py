@@ -6,10 +6,10 @@ A state machine without threads, waiting or a clock: times are passed in, so tha
 import heapq
 import itertools
 import weakref
-from collections import Counter, OrderedDict, deque
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, Protocol
 
 from .admission import MAX_OF_CALLERS, Admission, CostModel, Ledger
@@ -17,12 +17,14 @@ from .fair_queue import FairQueue
 from .jobs import (
     Abandoned,
     Batch,
+    BatchLimit,
     Done,
     Ending,
     Expired,
     Fallback,
     Flow,
     Job,
+    Lane,
     Next,
     Refusal,
     Refused,
@@ -35,10 +37,6 @@ from .observer import Observer
 from .options import WorkQueueOptions
 
 _TRY_ONE_IN = 8
-
-_ARRIVALS = 16
-_MUCH_SHORTER = 4
-"""A job that takes so many times less than the steps of others does not wait for them, if a lane has two threads."""
 
 _ENDED_TIMERS = 16
 """Timers of ended jobs that are kept in any case, so that they are not swept out too often."""
@@ -54,76 +52,6 @@ class Quota(Protocol):
     def settle(self, tenant: str, predicted_s: float, actual_s: float, now_s: float) -> None:
         """Replaces booked computing time by the time used."""
         ...
-
-
-@dataclass
-class _Lane:
-    """A group of threads.
-
-    Attributes:
-        threads: number of threads.
-        stages: the stages that they compute, in the order in which jobs go through them.
-        free: number of idle threads.
-        passed_over: batches since the first stage that has waiting jobs was served.
-        busy_s: sum of the threads' computing times so far.
-        long: numbers of the batches that are computed of which a step is predicted to take more than a quantum.
-        arrivals: of the last jobs that have come to wait: caller, predicted time with later stages, time of arrival.
-    """
-
-    threads: int
-    stages: list[Stage]
-    free: int
-    passed_over: int = 0
-    busy_s: float = 0.0
-    long: set[int] = field(default_factory=set)
-    arrivals: deque[tuple[Flow, float, float]] = field(default_factory=lambda: deque(maxlen=_ARRIVALS))
-
-    @property
-    def has_one_left(self) -> bool:
-        """Whether all threads but one compute long steps."""
-        return len(self.long) >= self.threads - 1 > 0
-
-    def expects_shorter(self, flow: Flow, seconds: float, now_s: float) -> bool:
-        """Whether much shorter jobs are likely to come while a caller's step of this time is computed.
-
-        They are if one of another caller has come within as long a time.
-        """
-        return any(
-            _MUCH_SHORTER * its_s <= seconds and now_s - came_s <= seconds and other != flow
-            for other, its_s, came_s in self.arrivals
-        )
-
-
-_TRY_LARGER_AFTER = 64
-"""Batches of the size that a bucket is limited to, before a larger one is tried; twice as many after each trial."""
-
-
-@dataclass
-class _BatchLimit:
-    """The number of jobs of a bucket that fit in memory together.
-
-    Attributes:
-        size: the number.
-        batches: batches of this size that have fitted since it changed.
-        trials: how often a larger size was tried.
-        fits: the size before the last trial, which had fitted; 0 before any, or if something has failed since.
-    """
-
-    size: int
-    batches: int = 0
-    trials: int = 0
-    fits: int = 0
-
-    def fitted(self, size: int) -> None:
-        """Counts a batch; raises the limit by one when it has been kept for long enough."""
-        self.batches += size == self.size
-        if self.batches >= _TRY_LARGER_AFTER << min(self.trials, 10):
-            self.size, self.batches, self.trials, self.fits = self.size + 1, 0, self.trials + 1, self.size
-
-    def failed(self, size: int) -> None:
-        """Lowers the limit, since a batch did not fit: to the size before the trial, otherwise to half of the batch."""
-        lower = self.fits if 0 < self.fits < size else size // 2
-        self.size, self.batches, self.fits = max(1, min(lower, self.size)), 0, 0
 
 
 class Scheduler:
@@ -157,10 +85,9 @@ class Scheduler:
         self._queues: dict[str, FairQueue[Job]] = {stage.name: FairQueue(options.quantum_s) for stage in stages}
         self._running: Counter[str] = Counter()
         self._lanes = {
-            name: _Lane(count, [stage for stage in stages if stage.lane == name], count)
-            for name, count in lanes.items()
+            name: Lane(count, [stage for stage in stages if stage.lane == name], count) for name, count in lanes.items()
         }
-        self._limits: dict[tuple[str, str], _BatchLimit] = {}
+        self._limits: dict[tuple[str, str], BatchLimit] = {}
         self._declined: Counter[tuple[str, str]] = Counter()
         self._first_steps: OrderedDict[tuple[Flow, str], Step] = OrderedDict()
         self._ledger = Ledger()
@@ -328,7 +255,7 @@ class Scheduler:
 
         After some batches that fit one more is tried, since another program may have had the memory.
         """
-        self._limits.setdefault((stage, bucket), _BatchLimit(failed)).failed(failed)
+        self._limits.setdefault((stage, bucket), BatchLimit(failed)).failed(failed)
 
     def drain(self) -> None:
         """Admits nothing from now on."""

@@ -15,13 +15,13 @@ from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.observability.event_loop import watch_event_loop
 from mapless_server.observability.exporter import MetricsServer
 from mapless_server.observability.metrics import Metrics
-from mapless_server.observability.tracing import NoTracer, Tracer
+from mapless_server.observability.tracing import Tracer
 from mapless_server.scheduling import Fatal
 from mapless_server.security import SecurityError
 from mapless_server.security.protection import Protection
 from mapless_server.security.reloading import keep_fresh
 from mapless_server.services.capture.calls import CaptureError
-from mapless_server.services.capture.opening import open_recorder
+from mapless_server.services.capture.recorder import open_recorder
 from mapless_server.services.handlers import Services
 from mapless_server.settings import Settings
 from mapless_server.store import Store
@@ -145,7 +145,7 @@ async def _stop_serving(services: Services, failed: asyncio.Future[Fatal]) -> No
 
 def _make_tracer(settings: Settings) -> Tracer:
     if not settings.otlp_endpoint:
-        return NoTracer()
+        return Tracer()
     try:
         from mapless_server.observability.otlp import make_otlp_tracer
 

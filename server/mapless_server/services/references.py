@@ -109,12 +109,14 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         self, scene: SceneRecord, count: int, call: Call, added: Sequence[RigidTransform] = ()
     ) -> list[str]:
         """Returns and logs contradictions of the scene's attributes and poses of its first and of added references."""
+        from mapless_server.scenes.plausibility import contradictions  # services do not load what computes
+
         try:
             references = self._store.list_references(scene.scene_key, count, "")
         except DataLoss as error:
             return [f"the scene was not compared with its references: {error}"]
         poses = [it.world_from_camera for it in references]
-        found = self._engine().contradictions(poses, scene.attributes, added)
+        found = contradictions(poses, scene.attributes, added)
         if found:
             call.note(contradictions=found)
         return found

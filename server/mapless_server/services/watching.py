@@ -10,7 +10,6 @@ dictionary.
 import asyncio
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from mapless.v1 import geometry_pb2 as geometry_pb
 from mapless.v1 import localization_service_pb2 as pb
@@ -25,13 +24,8 @@ QUEUE_LENGTH = 3
 """Answers that wait for a watcher; a slow reader misses the oldest."""
 
 
-@dataclass(frozen=True, eq=False)
-class WatchedAnswer:
-    """An answered query: its photograph as it was sent, its camera, and the answer with its matches."""
-
-    image: bytes
-    intrinsics: geometry_pb.CameraIntrinsics
-    answer: pb.LocalizeResponse
+_Watched = tuple[bytes, geometry_pb.CameraIntrinsics, pb.LocalizeResponse]
+"""A photograph as it was sent, its camera, and the answer with its matches."""
 
 
 class Watcher:
@@ -41,12 +35,12 @@ class Watcher:
         """Calls `unregister` when closed; messages above the limit are sent without their photograph."""
         self._unregister = unregister
         self._max_message_bytes = max_message_bytes
-        self._waiting: deque[WatchedAnswer] = deque(maxlen=QUEUE_LENGTH)
+        self._waiting: deque[_Watched] = deque(maxlen=QUEUE_LENGTH)
         self._missed_count = 0
         self._has_ended = False
         self._changed = asyncio.Event()
 
-    def put(self, watched: WatchedAnswer) -> None:
+    def put(self, watched: _Watched) -> None:
         """Adds an answer; drops the oldest one if too many wait."""
         if len(self._waiting) == QUEUE_LENGTH:
             self._missed_count += 1
@@ -68,11 +62,9 @@ class Watcher:
             await self._changed.wait()
         if self._has_ended:
             raise Unavailable("the server is stopping", reason="DRAINING", retry_after_s=1.0)
-        watched = self._waiting.popleft()
+        image, intrinsics, answer = self._waiting.popleft()
         missed, self._missed_count = self._missed_count, 0
-        message = pb.WatchQueriesResponse(
-            image=watched.image, intrinsics=watched.intrinsics, answer=watched.answer, missed_count=missed
-        )
+        message = pb.WatchQueriesResponse(image=image, intrinsics=intrinsics, answer=answer, missed_count=missed)
         if message.ByteSize() > self._max_message_bytes:  # a photograph nearly as large as a message may be
             message.ClearField("image")
         return message
@@ -109,7 +101,7 @@ class Watchers:
         # A copy, since a field of a message keeps the whole message in memory, with its image.
         intrinsics = geometry_pb.CameraIntrinsics()
         intrinsics.CopyFrom(request.intrinsics)
-        watched = WatchedAnswer(request.image, intrinsics, answer)
+        watched = request.image, intrinsics, answer
         for watcher in watchers:
             watcher.put(watched)
 

@@ -16,9 +16,9 @@ from mapless.geometry import RigidTransform
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.engine.interface import Engine, EngineOptions
 from mapless_server.engine.joint import pose_rig, pose_sequence
-from mapless_server.engine.query import UNFINISHED, Caller, Query, Result, Tier
-from mapless_server.engine.references import QueryViews
-from mapless_server.engine.stages import COARSE, PREPARE, REFINE, Method, QueryRun, QueryStages
+from mapless_server.engine.query import COARSE, PREPARE, REFINE, UNFINISHED, Caller, Query, Result, Tier
+from mapless_server.engine.references import QueryRun, QueryViews
+from mapless_server.engine.stages import Method, QueryStages
 from mapless_server.method.answer import Answer
 from mapless_server.method.groups.rig import RigEstimate
 from mapless_server.method.groups.sequence import SequenceEstimate

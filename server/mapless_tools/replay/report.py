@@ -12,7 +12,7 @@ from mapless_server.networks.weights import WeightsError, WeightsMissing
 from mapless_server.serve.assembly import engine_options, make_tiers, what_is_missing
 from mapless_server.services.capture.calls import CapturedCall, CaptureError, decode_call
 from mapless_server.services.capture.files import calls_of, check_format
-from mapless_server.services.capture.opening import circumstances_of
+from mapless_server.services.capture.recorder import circumstances_of
 from mapless_server.settings import Settings
 
 from .comparing import Change, changed, compare, outcome_of, stage_seconds

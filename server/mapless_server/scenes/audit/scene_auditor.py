@@ -20,10 +20,10 @@ from ..retrieval.descriptor import GlobalDescriptor
 from ..retrieval.index import Entries, Rows
 from ..retrieval.ranking import RankOptions, Selection, rank_references
 from .auditor import Auditor
+from .comparison import AuditOptions
 from .coverage import check_coverage
 from .finder import ReferenceFinder, ReferenceGone
 from .neighbourhood import PairMatches
-from .options import AuditOptions
 from .verdict import AuditVerdict, Coverage, ReferenceAudit, Viewpoint
 
 ResultT = TypeVar("ResultT")

@@ -2,6 +2,5 @@
 
 May import what `services` may. Begin with `recorder`, which takes answered calls from the services and writes them in
 its own thread. `calls` is the file of one call and `folder` the folder with its limits of time and size; `collecting`
-reads a call's references from the store; `deletion` deletes calls when their time or their scene is over; `opening`
-builds all this from the settings.
+reads a call's references from the store; `deletion` deletes calls when their time or their scene is over.
 """

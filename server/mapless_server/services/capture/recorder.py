@@ -5,28 +5,43 @@ is counted. `deletion` deletes them on time.
 """
 
 import logging
+import os
+import platform
+import sys
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from importlib.metadata import PackageNotFoundError, version
 
 from google.protobuf.message import Message
 
 from mapless.names import parse_scene_name
+from mapless_server import __version__
 from mapless_server.engine.query import Query, Result, Tier
 from mapless_server.errors import DataLoss, NotFound, Unavailable
+from mapless_server.observability.metrics import Metrics
+from mapless_server.observability.provenance import ROOT, commit_of, cpu_model
 from mapless_server.rpc import Call
 from mapless_server.scenes.observer import BackgroundObserver
-from mapless_server.security import key_of
+from mapless_server.security import check_tenant, key_of
+from mapless_server.settings import Settings
 from mapless_server.store import SceneAttributes, Store, time_us
 
-from .calls import BlobDeleted, CapturedCall, Request, Response, diagnostics_of
+from .calls import BlobDeleted, CapturedCall, CaptureError, Request, Response, diagnostics_of
 from .collecting import Collector, ReferencesDeleted, UsedReferences, used_references
 from .deletion import Deletion
-from .folder import CaptureFolder
+from .folder import CaptureFolder, Retention
 
 log = logging.getLogger(__name__)
+
+PACKAGES = ("numpy", "scipy", "opencv-python-headless", "poselib", "torch", "kornia")
+"""Packages whose arithmetic decides answers."""
+
+DECISIVE_SETTINGS = ("device", "coverage", "retrieval", "max_batch", "compiled_views")
+"""Settings of which another value may change an answer, beside features, backend and weights."""
 
 MAX_QUEUED = 32
 """Calls that wait for the disk."""
@@ -257,3 +272,51 @@ class Recorder:
     def _drop(self, reason: str) -> None:
         self._observer.count("capture_dropped", 1, reason)
         self._log.dropped(reason)
+
+
+def circumstances_of(settings: Settings, tiers: Sequence[Tier]) -> dict[str, str]:
+    """Collects what decides the answers of a server with these settings and tiers on this machine, by name."""
+    found = {
+        "mapless": __version__,
+        "commit": commit_of(ROOT),
+        "backend": tiers[0].backend,
+        "weights_sha256": tiers[0].weights_sha256,
+        "features": ", ".join(tier.features for tier in tiers),
+        "processor": f"{cpu_model()}, {platform.machine()}",
+        "python": platform.python_version(),
+        "blas_threads": os.environ.get("OPENBLAS_NUM_THREADS", ""),
+        **{name: str(getattr(settings, name)) for name in DECISIVE_SETTINGS},
+        **{name: _version_of(name) for name in PACKAGES},
+    }
+    return {name: value for name, value in found.items() if value}
+
+
+def _version_of(package: str) -> str:
+    if package in ("torch", "kornia") and package not in sys.modules:
+        return ""  # it may be installed, but this server does not use it
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""
+
+
+def open_recorder(settings: Settings, store: Store, metrics: Metrics) -> Recorder | None:
+    """Opens the recorder if the settings want one; logs a warning, since photographs are then stored.
+
+    CaptureError if the folder cannot be used, or capture_tenants has an invalid name.
+    """
+    if settings.capture_dir is None:
+        return None
+    try:
+        tenants = frozenset(check_tenant(it) for it in settings.capture_tenants.split(",") if it)
+    except ValueError as error:
+        raise CaptureError(f"capture_tenants: {error}") from None
+    folder = CaptureFolder(settings.capture_dir, Retention(3600 * settings.capture_hours, settings.capture_mib * 2**20))
+    log.warning(
+        "calls are captured, photographs and all: %s, for %g hours, %d MiB at most",
+        settings.capture_dir,
+        settings.capture_hours,
+        settings.capture_mib,
+    )
+    metrics.watch_captures(lambda: folder.disk_bytes)
+    return Recorder(folder, store, metrics, partial(circumstances_of, settings), tenants)
