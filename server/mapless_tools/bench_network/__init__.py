@@ -4,11 +4,9 @@ Weights are random: time does not depend on them. `python -m mapless_tools.bench
 the dependencies of the others; all parts except whole queries need only torch and NumPy.
 
     operations.py    counts operations and bytes, and predicts times from them
-    subject.py       the networks, their weights and their inputs
-    device.py        what the device reaches at most; memory
-    forward.py       the network's forward pass, step by step; other attention kernels and types
+    subject.py       the networks, their weights and their inputs, and what is counted of them
+    forward.py       the network's forward pass, step by step; attention alone; the device's limits and memory
     query.py         whole queries, on a network whose answer is replaced by the truth (planted.py)
-    host.py          what can be measured without a CUDA device
     report.py        a table for people, JSON for programs, Markdown for BENCHMARKS.md
     command.py       all of it in order; begin reading here
 """

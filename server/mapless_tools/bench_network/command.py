@@ -12,22 +12,19 @@ import torch
 from mapless_server.networks.runner import CompiledShape, NetworkRunner, RunnerOptions
 from mapless_server.observability.provenance import cpu_model
 
-from . import host
-from .device import measure_memory, measure_rates
-from .forward import measure_attention, measure_forward, measure_kernels, measure_variants, reason_of
+from .forward import measure_attention, measure_forward, measure_kernels, measure_memory, measure_rates, reason_of
 from .operations import H200, Rates
 from .report import Figure, as_json, markdown, table
-from .subject import GRID, REFERENCES, make_network
+from .subject import GRID, REFERENCES, count_all, make_network
 
 OUTPUT = Path("bench-output")
-HOST_PARTS = ("operations", "blocks", "kept", "rounding", "compilations")
+HOST_PARTS = ("operations",)
 CUDA_PARTS = (
     "attention",
     "memory-pi3",
     "forward-pi3",
     "query-pi3",
     "kernels-pi3",
-    "variants-pi3",
     "memory-mapanything",
     "forward-mapanything",
     "query-mapanything",
@@ -102,17 +99,12 @@ class _Bench:
             raise RuntimeError("there is no CUDA device")
         kind, _, name = part.partition("-")
         parts: dict[str, Callable[[], Iterator[Figure]]] = {
-            "operations": lambda: host.count_all(self.rates, self.quick),
-            "blocks": lambda: host.measure_blocks(1 if self.quick else 3),
-            "kept": host.compare_kept_tokens,
-            "rounding": host.compare_rounding,
-            "compilations": host.count_compilations,
+            "operations": lambda: count_all(self.rates, self.quick),
             "attention": lambda: measure_attention(self.rates, self.device, self._repeats),
             "memory": lambda: measure_memory(lambda: self._runner(name, "cpu"), self.device),
             "forward": lambda: measure_forward(name, self.rates, self.device, self._repeats, not self.quick),
             "query": lambda: self._query(name),
             "kernels": lambda: self._kernels(name),
-            "variants": lambda: measure_variants(name, self.device, self._repeats),
         }
         yield from parts[kind]()
 

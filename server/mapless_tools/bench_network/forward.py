@@ -1,12 +1,12 @@
-"""A network's forward pass on a CUDA device: its steps with their least and predicted times, kernels, variants."""
+"""A network's forward pass on a CUDA device: its steps with their least and predicted times, and its kernels."""
 
+import statistics
+import time
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
-from unittest.mock import patch
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -16,14 +16,12 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from mapless_server.networks.blocks import Attention
 from mapless_server.networks.network import Network, NetworkOutput
-from mapless_server.networks.pi3 import PiNetwork
+from mapless_server.networks.runner import NetworkRunner
 
-from .device import median_s
 from .operations import ATTENTION_EFFICIENCY, Rates
 from .report import Figure
-from .subject import GRID, REFERENCES, Scene, Work, make_network, operations_of
+from .subject import CACHED, GRID, REFERENCES, VIEWS, Scene, Work, make_network, operations_of
 
-VIEWS = REFERENCES + 1
 PLAIN_MS, KEPT_MS = 90.0, 60.0
 """Targets: without and with what is kept."""
 MAX_DIFFERENCE = 0.2
@@ -62,48 +60,27 @@ STEPS = (
 
 
 class Forward:
-    """A network in bfloat16 with exactly one kind of attention, and a scene."""
+    """A network in bfloat16, and a scene."""
 
-    def __init__(
-        self,
-        network: Network,
-        backend: SDPBackend = SDPBackend.FLASH_ATTENTION,
-        views: int = VIEWS,
-        grid: tuple[int, int] = GRID,
-    ) -> None:
+    @torch.no_grad()
+    def __init__(self, network: Network, views: int = VIEWS, grid: tuple[int, int] = GRID) -> None:
         network.set_compute_type(torch.bfloat16)
         self.network = network
-        self.backend = backend
         self.scene = Scene(network, views, grid)
         self._compiled = _compiled(network)
-        with self.kernels():
-            self.kept = self.scene.encode(network, slice(None)).to(torch.bfloat16)
+        self.kept = self.scene.encode(network, slice(None)).to(torch.bfloat16)
 
-    @contextmanager
-    def kernels(self) -> Iterator[None]:
-        """Enables only the wanted attention; if it cannot run, that is an error. The network itself uses flash."""
-        with torch.no_grad():
-            if self.backend is SDPBackend.FLASH_ATTENTION:
-                yield
-                return
-            with sdpa_kernel(self.backend), patch.object(Attention, "attend", staticmethod(_any_attention)):
-                yield
-
+    @torch.no_grad()
     def run(self, work: Work, compiled: bool = False) -> NetworkOutput:
         """Encodes the last views, the query last of all, uses kept tokens for the others, and reconstructs."""
         encode, reconstruct = self._compiled if compiled else (self.network.encode, self.network.reconstruct)
         scene, kept = self.scene, work.views - work.encoded
-        with self.kernels():
-            intrinsics = None if scene.intrinsics is None else scene.intrinsics[kept:]
-            encoded: Tensor = encode(scene.images[kept:], scene.layout, intrinsics)
-            # Recorded graphs write into the same memory again and again: joining copies.
-            tokens = torch.cat([self.kept[:kept], encoded.to(torch.bfloat16)])[None]
-            output: NetworkOutput = reconstruct(tokens, scene.layout, work.mapped, *scene.conditions)
-            return output
-
-
-def _any_attention(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-    return F.scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v)
+        intrinsics = None if scene.intrinsics is None else scene.intrinsics[kept:]
+        encoded: Tensor = encode(scene.images[kept:], scene.layout, intrinsics)
+        # Recorded graphs write into the same memory again and again: joining copies.
+        tokens = torch.cat([self.kept[:kept], encoded.to(torch.bfloat16)])[None]
+        output: NetworkOutput = reconstruct(tokens, scene.layout, work.mapped, *scene.conditions)
+        return output
 
 
 def _compiled(network: Network) -> tuple[Callable[..., Any], Callable[..., Any]]:
@@ -228,40 +205,82 @@ def measure_attention(rates: Rates, device: torch.device, repeats: int) -> Itera
             yield Figure(part, name, 1e3 * times[0], "ms", 1e3 * times[1], floor_ms, predicted, note=note)
 
 
-def measure_variants(name: str, device: torch.device, repeats: int) -> Iterator[Figure]:
-    """Measures eager forward passes with kept references' tokens, with one change at a time."""
-    part = f"{name} forward, eager, tokens kept, otherwise"
-    network = make_network(name, device=device)
-    for label, backend in BACKENDS.items():
-        yield _figure(part, f"{label} attention", network, backend, device, repeats)
-    if isinstance(network, PiNetwork):
-        with_low_precision_stream(network)
-        label = "main decoder's residual stream in bfloat16"
-        yield _figure(part, label, network, SDPBackend.FLASH_ATTENTION, device, repeats)
-    yield _rounding(part, make_network(name, device=device))
+PRODUCT_SIDE = 8192
+COPY_BYTES = 4 * 2**30
+"""Much larger than any cache."""
+LIMIT_GB = 8.0
 
 
-def _rounding(part: str, network: Network) -> Figure:
-    """The effect of bfloat16 at full size; casts the network to it."""
-    scene = Scene(network, VIEWS, GRID)
-    with torch.no_grad():
-        exact = scene.reconstruct(network, scene.encode(network, slice(None))[None], REFERENCES)
-    rounded = Forward(network).run(Work(1, REFERENCES))
-    note = "of the largest value, with random weights"
-    return Figure(part, "largest difference from float32", max_difference(rounded, exact), "", note=note)
+def median_s(work: Callable[[], object], device: torch.device, repeats: int, warm_up: int = 3) -> tuple[float, float]:
+    """The median time of `work`, seconds, measured twice: a difference smaller than that of the two is none."""
+    for _ in range(warm_up):
+        work()
+    first, second = (_median_s(work, device, repeats) for _ in range(2))
+    return first, second
 
 
-def _figure(part: str, label: str, network: Network, backend: SDPBackend, device: torch.device, repeats: int) -> Figure:
-    try:
-        forward = Forward(network, backend)
-        times = median_s(lambda: forward.run(Work(1, REFERENCES)), device, repeats)
-    except Exception as error:  # the others can still be measured
-        return Figure(part, label, None, "ms", note=reason_of(error))
-    return Figure(part, label, 1e3 * times[0], "ms", 1e3 * times[1])
+def _median_s(work: Callable[[], object], device: torch.device, repeats: int) -> float:
+    if device.type != "cuda":
+        times = []
+        for _ in range(repeats):
+            start_s = time.perf_counter()
+            work()
+            times.append(time.perf_counter() - start_s)
+        return statistics.median(times)
+    events = [(torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)) for _ in range(repeats)]
+    torch.cuda.synchronize(device)
+    for start, end in events:
+        start.record()
+        work()
+        end.record()
+    torch.cuda.synchronize(device)
+    return statistics.median(float(start.elapsed_time(end)) for start, end in events) / 1000
 
 
-def with_low_precision_stream(network: PiNetwork) -> None:
-    """Makes the main decoder's residual stream bfloat16, unlike the official code."""
-    network.set_compute_type(torch.bfloat16)
-    network.decoder.to(torch.bfloat16)
-    network.register_token.data = network.register_token.to(torch.bfloat16)
+def measure_rates(device: torch.device, repeats: int = 20) -> Rates:
+    """Measures the limits of a CUDA device on random numbers, since zeros are faster."""
+    a, b = (torch.randn(PRODUCT_SIDE, PRODUCT_SIDE, device=device, dtype=torch.bfloat16) for _ in range(2))
+    product_s = min(median_s(lambda: a @ b, device, repeats))
+    source = torch.randint(0, 255, (COPY_BYTES,), dtype=torch.uint8, device=device)
+    target = torch.empty_like(source)
+    copy_s = min(median_s(lambda: target.copy_(source), device, repeats))
+    name = torch.cuda.get_device_name(device)
+    return Rates(name, 2 * PRODUCT_SIDE**3 / product_s, 2 * COPY_BYTES / copy_s, _launch_s(device), measured=True)
+
+
+def _launch_s(device: torch.device, count: int = 2000) -> float:
+    """The host's time for an operation on a tiny tensor, whose kernel takes less time."""
+    x = torch.ones(1, device=device)
+    torch.cuda.synchronize(device)
+    start_s = time.perf_counter()
+    for _ in range(count):
+        x.add_(1)
+    took_s = time.perf_counter() - start_s
+    torch.cuda.synchronize(device)
+    return took_s / count
+
+
+def measure_memory(make_runner: Callable[[], NetworkRunner], device: torch.device) -> Iterator[Figure]:
+    """Peak memory while the network is loaded, warmed up and used, with a hundred references' tokens on the device.
+
+    The figures are those of the whole process, so nothing else may be on the device before.
+    """
+    torch.cuda.empty_cache()
+    torch.cuda.reset_peak_memory_stats(device)
+    runner = make_runner()
+    part = f"{runner.name} memory"
+    yield Figure(part, "weights and recorded graphs", torch.cuda.memory_allocated(device) / 1e9, "GB")
+    scene = Scene(runner.network, REFERENCES + 1, GRID)
+    intrinsics = None if scene.intrinsics is None else scene.intrinsics[:1]
+    kept = [runner.encode(scene.images[:1], intrinsics).clone() for _ in range(CACHED)]
+    for _ in range(3):
+        query = runner.encode(scene.images[:1], intrinsics)
+        runner.reconstruct(torch.cat([*kept[:REFERENCES], query])[None], GRID, REFERENCES, scene.poses, scene.posed)
+    torch.cuda.synchronize(device)
+    yield Figure(part, f"tokens of {CACHED} references", sum(it.nbytes for it in kept) / 1e9, "GB")
+    peak = torch.cuda.max_memory_allocated(device) / 1e9
+    yield Figure(part, "peak, of tensors", peak, "GB", target=LIMIT_GB)
+    free, total = torch.cuda.mem_get_info(device)
+    note = "with the driver's and the allocator's own, and other processes'"
+    yield Figure(part, "taken from the device", (total - free) / 1e9, "GB", target=LIMIT_GB, note=note)
+    runner.close()

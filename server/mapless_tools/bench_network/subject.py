@@ -1,20 +1,26 @@
 """The networks to measure: the official sizes, random weights."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from mapless_server.method.choices import NETWORKS
 from mapless_server.networks.encoder import PATCH_PX
 from mapless_server.networks.mapanything import MapAnything, MapAnythingSizes
 from mapless_server.networks.network import Network, NetworkOutput
 from mapless_server.networks.pi3 import Pi3, Pi3X, Sizes
 
-from .operations import Operations, count_operations
+from .operations import H200, Operations, Rates, count_operations
+from .report import Figure
 
 GRID = (28, 37)
 """Rows and columns of patches of 518x392 pixels, the server's size for 4:3."""
 REFERENCES = 10
+VIEWS = REFERENCES + 1
+CACHED = 100
+"""References whose tokens lie on the device."""
 QK_GAIN = 1.5
 """Selective attention, like a trained network's: with uniform attention everything averages out, rounding too."""
 
@@ -147,3 +153,68 @@ def meta_network(name: str, sizes: AnySizes | None = None, dtype: torch.dtype = 
     network = network_without_weights(name, sizes)
     network.requires_grad_(False).set_compute_type(dtype)
     return network.to("meta")
+
+
+GRIDS = {"518x392": GRID, "504x378": (27, 36), "392x294": (21, 28)}
+WORKS = {
+    "everything": Work(VIEWS, VIEWS),
+    "references mapped": Work(VIEWS, REFERENCES),
+    "references' tokens kept, references mapped": Work(1, REFERENCES),
+    "references' tokens kept, cameras only": Work(1, 0),
+    "references' tokens kept, the query's camera only": Work(1, 0, query_only=True),
+}
+
+
+def count_all(rates: Rates, quick: bool) -> Iterator[Figure]:
+    """Counts operations of forward passes and of the layers for each pixel, and bytes on the device."""
+    yield from count_forward(rates, quick)
+    yield from count_memory()
+    yield from count_pixel_heads()
+
+
+def count_forward(rates: Rates = H200, quick: bool = False) -> Iterator[Figure]:
+    """Counts operations of forward passes of the official networks; yields the least and the predicted times."""
+    for name in NETWORKS:
+        for size, grid in GRIDS.items():
+            if quick and grid is not GRID:
+                continue
+            part = f"{name}, {VIEWS} views of {size}; times are those of {rates.device}, compiled"
+            for label, work in WORKS.items():
+                if work.query_only and name != "mapanything":
+                    continue
+                operations = operations_of(name, replace(work, grid=grid))
+                yield _counted(part, label, operations, rates)
+
+
+def _counted(part: str, label: str, operations: Operations, rates: Rates) -> Figure:
+    floor_ms, predicted_ms = 1e3 * operations.floor_s(rates), 1e3 * operations.predicted_s(rates, True)
+    note = (
+        f"eager {1e3 * operations.predicted_s(rates, False):.0f} ms; "
+        f"attention {operations.attention_flop / 1e12:.2f} TFLOP, "
+        f"in float32 {(operations.tf32_flop + operations.float32_flop) / 1e12:.2f}; "
+        f"{operations.kernels} kernels, {operations.eager_bytes / 1e9:.0f} GB between products, "
+        f"{operations.fused_bytes / 1e9:.0f} GB fused"
+    )
+    return Figure(part, label, operations.flop / 1e12, "TFLOP", None, floor_ms, predicted_ms, note=note)
+
+
+def count_memory() -> Iterator[Figure]:
+    """Counts bytes that remain on the device between queries."""
+    for name in NETWORKS:
+        network = meta_network(name)
+        weights = sum(it.nbytes for it in network.parameters())
+        tokens = CACHED * network.token_count(GRID) * network.width * torch.bfloat16.itemsize
+        yield Figure(f"{name} memory", "weights, linear layers in bfloat16", weights / 1e9, "GB")
+        yield Figure(f"{name} memory", f"tokens of {CACHED} references of 518x392", tokens / 1e9, "GB")
+
+
+def count_pixel_heads() -> Iterator[Figure]:
+    """The share of the layers after the last tokens: computing points only at keypoints could save no more."""
+    for name in ("pi3", "pi3x"):
+        network = meta_network(name)
+        heads = [network.get_submodule(head) for head in ("point_head", "conf_head")]
+        tokens = torch.empty(REFERENCES, GRID[0] * GRID[1], network.width, device="meta")
+        operations = count_operations(lambda: [head(tokens, GRID) for head in heads])  # noqa: B023
+        whole = operations_of(name, Work(1, REFERENCES))
+        note = f"{operations.flop / 1e12:.3f} of {whole.flop / 1e12:.2f} TFLOP; tokens kept, {REFERENCES} mapped"
+        yield Figure(f"{name} heads", "per-pixel layers' share", 100 * operations.flop / whole.flop, "%", note=note)
