@@ -1,4 +1,4 @@
-"""Files that commands write for programs."""
+"""Files that commands write: JSON for programs, HTML reports that need nothing else and run no scripts."""
 
 import json
 import math
@@ -32,3 +32,17 @@ def whole_file(file: Path) -> Iterator[Path]:
     partial = file.with_name(file.name + ".partial")
     yield partial
     os.replace(partial, file)
+
+
+def render(template: str, **values: object) -> str:
+    """A page of `templates/`, with `values` for its names; text is escaped."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("mapless_tools"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(**values)

@@ -26,7 +26,7 @@ def chess(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def _same_code(monkeypatch: pytest.MonkeyPatch) -> None:
     """Code that is edited while its tests run would be measured anew."""
-    monkeypatch.setattr("mapless_tools.evaluate.provenance.commit_of", lambda _: "abc1234")
+    monkeypatch.setattr("mapless_tools.evaluate.suite.commit_of", lambda _: "abc1234")
 
 
 def test_a_failed_scene_stops_no_other_and_is_measured_later(chess: Path, tmp_path: Path) -> None:

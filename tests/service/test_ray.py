@@ -50,7 +50,7 @@ from mapless_server.services.handlers import SERVICE_NAMES
 from mapless_server.store import Store
 from mapless_tools.child import child_server
 from mapless_tools.demo import Photograph, Place, split_folder
-from mapless_tools.load.requests import photo_request
+from mapless_tools.load.driving import photo_request
 
 pytest.importorskip("ray.serve", reason="needs Ray Serve: the extra `ray`")
 

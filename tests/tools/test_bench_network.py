@@ -24,7 +24,7 @@ from mapless_tools.bench_network.forward import Forward, max_difference
 from mapless_tools.bench_network.operations import H200, Operations, count_operations
 from mapless_tools.bench_network.planted import UNITS_PER_METRE, PlantedReconstructor, Truth, true_points
 from mapless_tools.bench_network.report import Figure, markdown, table
-from mapless_tools.bench_network.subject import Work, make_network, operations_of
+from mapless_tools.bench_network.subject import AnySizes, Work, make_network, operations_of
 
 GRID = (3, 4)
 SIZES = PI3
@@ -96,7 +96,8 @@ def test_prediction_is_above_the_floor_and_compiling_is_faster() -> None:
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_a_random_network_is_nowhere_zero_and_finite(name: str) -> None:
-    network = make_network(name, {"pi3": PI3, "pi3x": PI3X, "mapanything": MAPANYTHING}[name], seed=3)
+    small: dict[str, AnySizes] = {"pi3": PI3, "pi3x": PI3X, "mapanything": MAPANYTHING}
+    network = make_network(name, small[name], seed=3)
     assert all(float((parameter != 0).float().mean()) > 0.99 for parameter in network.parameters())
     layout = network.layout((3, 4))
     output = network.reconstruct(network.encode(torch.rand(2, 3, 42, 56), layout)[None], layout, 2)

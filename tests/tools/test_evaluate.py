@@ -16,8 +16,7 @@ from support.images import encode, textured
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_server.images import ImageLimits
-from mapless_tools.bench.latency import Latency
-from mapless_tools.bench.report import BenchResult, BenchScene, Figures, as_json, markdown, met
+from mapless_tools.bench.report import BenchResult, BenchScene, Figures, Latency, as_json, markdown, met
 from mapless_tools.child import Memory
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.evaluate.metrics import QueryResult, pose_error, quantile, stage_share, summarize, trajectory_radius

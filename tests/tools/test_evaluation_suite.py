@@ -23,18 +23,24 @@ from mapless_server.settings import Settings
 from mapless_tools.charts import inline_svg
 from mapless_tools.dataset import Dataset, Frame, Refusal
 from mapless_tools.evaluate import suite as suite_module
-from mapless_tools.evaluate.averages import groups_of
-from mapless_tools.evaluate.benchmarks import BENCHMARKS, ScenePlace, find_scenes
+from mapless_tools.evaluate.benchmarks import BENCHMARKS, DENSE, ScenePlace, find_scenes
 from mapless_tools.evaluate.figures import write_figures
 from mapless_tools.evaluate.metrics import QueryResult
 from mapless_tools.evaluate.page import ablation, along_sequence, cumulative, page, sparsity
-from mapless_tools.evaluate.paper import DENSE
 from mapless_tools.evaluate.pictures import WorstQuery, data_uri, fit_true_poses
 from mapless_tools.evaluate.plan import EvaluationOptions, Method, SuiteOptions, split_scene
-from mapless_tools.evaluate.provenance import Provenance
 from mapless_tools.evaluate.references import Matcher, PlannedQuery, paired, pairs_file, read_pairs
-from mapless_tools.evaluate.suite import Failure, Journal, Run, RunSetup, SceneWork, Suite, measure
-from mapless_tools.evaluate.tables import FAILED, NO_FIGURE, OURS, Table, format_median, tables_of, text_lines
+from mapless_tools.evaluate.suite import Failure, Journal, Provenance, Run, RunSetup, SceneWork, Suite, measure
+from mapless_tools.evaluate.tables import (
+    FAILED,
+    NO_FIGURE,
+    OURS,
+    Table,
+    format_median,
+    groups_of,
+    tables_of,
+    text_lines,
+)
 from mapless_tools.usage import UsageError
 
 CAMERA = Camera(96, 64, 80.0, 80.0, 47.5, 31.5)

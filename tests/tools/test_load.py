@@ -41,10 +41,10 @@ from mapless_tools.load.calls import (
     regular_times,
 )
 from mapless_tools.load.charts import LATENCIES, RATES, draw_load
+from mapless_tools.load.driving import photo_request, read_answer
 from mapless_tools.load.no_op import CAMERA, padded_photo
 from mapless_tools.load.pipeline import PipelineOptions, PipelineResult, pipeline_checks, pipeline_json
 from mapless_tools.load.report import Check, check_lines, machine_lines, step_lines, update_json
-from mapless_tools.load.requests import photo_request, read_answer
 from mapless_tools.load.sender import Target, connected, send_closed_loop, send_open_loop
 from mapless_tools.load.step import Step, run_step
 from mapless_tools.load.watch import (

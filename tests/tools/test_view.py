@@ -19,8 +19,8 @@ from mapless import Datum, Quaternion, Reference, Scene
 from mapless.answers import Accuracy, Debug, Diagnostics, Hint, Hypothesis, LocalizationResult, ReferenceUse, Rejected
 from mapless.geometry import Array, Camera, RigidTransform, rotation_from_vector
 from mapless_tools.cli.app import app
-from mapless_tools.view.meshes import ellipsoid, enlargement, rays
-from mapless_tools.view.queries import Query, colours_at, read_picture
+from mapless_tools.view.drawing import ellipsoid, enlargement, rays
+from mapless_tools.view.feed import Query, colours_at, read_picture
 from mapless_tools.view.scenery import lay_out, spread_out
 
 CAMERA = Camera(1800, 1350, 1500.0, 1500.0, 899.5, 674.5)

@@ -12,8 +12,7 @@ from mapless_tools.output_files import write_json
 from mapless_tools.progress import Progress, progress_bars
 from mapless_tools.usage import UsageError, usage_errors
 
-from .latency import measure_latency
-from .report import KITCHEN, OTHER_FOLDERS, SCENES, BenchResult, as_json, markdown
+from .report import KITCHEN, OTHER_FOLDERS, SCENES, BenchResult, as_json, markdown, measure_latency
 
 OUTPUT = Path("bench-output/bench.json")
 QUICK_QUERIES = 6

@@ -14,8 +14,7 @@ from scipy.special import bdtrik
 from mapless_server import __version__
 from mapless_tools.charts import figure_of, inline_svg, new_axes, plot, use_logarithms
 from mapless_tools.dataset import Dataset
-from mapless_tools.output_files import finite
-from mapless_tools.pages import render
+from mapless_tools.output_files import finite, render
 
 from .claims import MIN_QUERIES, PRIOR_QUERIES, Claim
 from .findings import DIAGRAM, Findings, Held, RightRule, Share, reliability

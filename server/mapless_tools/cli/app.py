@@ -15,8 +15,7 @@ from mapless_tools.evaluate.cli import evaluate_command
 from mapless_tools.gateway.command import gateway_command
 from mapless_tools.ingest.command import ImportCommand, export_command, import_command
 from mapless_tools.load.command import load_app
-from mapless_tools.replay.bag_command import replay_bag_command
-from mapless_tools.replay.command import replay_command
+from mapless_tools.replay.command import replay_bag_command, replay_command
 from mapless_tools.view.command import view_command
 
 from .audit import audit_command

@@ -218,7 +218,7 @@ def to_json(examined: Examined) -> dict[str, Any]:
 
 def to_html(examined: Examined) -> str:
     """The report as one self-contained page."""
-    from mapless_tools.pages import render
+    from mapless_tools.output_files import render
 
     kinds = ["alarm" if a.verdict in ALARMS else "" if a.verdict == "CONSISTENT" else "note" for a in examined.audits]
     return render(

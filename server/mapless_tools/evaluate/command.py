@@ -16,11 +16,10 @@ from mapless_tools.usage import UsageError, usage_errors
 
 from .benchmarks import ScenePlace, find_scenes
 from .plan import EvaluationOptions, SuiteOptions, split_scene
-from .provenance import provenance_of
 from .references import Matcher, check_images, paired, pairs_file, read_pairs
 from .report import print_report, to_json
 from .run import evaluate
-from .suite import RunSetup, SceneWork, measure
+from .suite import RunSetup, SceneWork, measure, provenance_of
 
 PAGE_FILE = "report.html"
 RUNS_FOLDER = "runs"

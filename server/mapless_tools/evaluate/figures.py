@@ -8,11 +8,11 @@ from typing import Any
 
 from mapless_tools.output_files import finite, whole_file, write_json
 
-from .averages import Group, groups_of
+from .benchmarks import PaperTables
 from .metrics import RECALL_BARS, summarize
-from .paper import PaperTables
 from .plan import setting_name
 from .suite import Run, Suite
+from .tables import Group, groups_of
 
 JSON_FILE, RUNS_FILE, QUERIES_FILE = "evaluation.json", "evaluation.csv", "queries.csv"
 RULES = (

@@ -10,16 +10,15 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from mapless_tools.charts import figure_of, inline_svg, new_axes, plot, use_logarithms
-from mapless_tools.pages import render
+from mapless_tools.output_files import render
 
-from .averages import Average, Group, groups_of
+from .benchmarks import DENSE
 from .figures import RULES
 from .metrics import QueryResult
-from .paper import DENSE
 from .pictures import EPIPOLAR_PX, WorstQuery
 from .plan import Method, setting_name
 from .suite import SceneWork, Suite
-from .tables import tables_of, text_lines
+from .tables import Average, Group, groups_of, tables_of, text_lines
 
 
 def page(suite: Suite, worst: Sequence[WorstQuery]) -> str:

@@ -15,8 +15,7 @@ from mapless_server.method.options import ScaleStrategy, Variant
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.usage import UsageError
 
-from .benchmarks import LAYOUTS, ScenePlace
-from .paper import DENSE
+from .benchmarks import DENSE, LAYOUTS, ScenePlace
 
 T = TypeVar("T")
 

@@ -5,6 +5,6 @@
                   > rpc      (gRPC-Web and Connect, for browsers)
             > guard  (origins, size and number of requests)
 
-It is a client like any other: a separate process, which calls the server by gRPC and stores nothing. `failures` has the
-form of its errors, `openapi` the description of its interface. Begin with `app`.
+It is a client like any other: a separate process, which calls the server by gRPC and stores nothing. `guard` has the
+form of its errors, too, `openapi` the description of its interface. Begin with `app`.
 """

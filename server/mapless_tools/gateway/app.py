@@ -23,8 +23,7 @@ from mapless.names import parse_scene_name, scene_name
 from mapless.v1 import localization_service_pb2 as pb
 
 from . import geopose, openapi, plain
-from .failures import Failure, of_server
-from .guard import Guard, GuardOptions
+from .guard import Failure, Guard, GuardOptions, of_server
 
 LOCALIZE = "mapless.v1.LocalizationService/Localize"
 _SENT_HEADERS = (

@@ -25,8 +25,7 @@ from mapless_server.images import ImageLimits
 from mapless_server.images.decode import image_size
 from mapless_tools.ingest.formats.colmap.cameras import PARAMETERS, ColmapCamera
 
-from .failures import Failure
-from .guard import check_json
+from .guard import Failure, check_json
 from .messages import CameraParameters, CameraReading, GeolocationReading, Request, Response
 
 MEDIA_TYPE = "application/vnd.oscp+json;version=2.0"

@@ -10,8 +10,7 @@ from starlette.formparsers import MultiPartException, MultiPartParser
 from mapless.names import scene_name
 from mapless.v1 import localization_service_pb2 as pb
 
-from .failures import Failure
-from .guard import check_json
+from .guard import Failure, check_json
 
 FIELDS = ("image", "intrinsics", "scene", "request")
 _MAX_PART_BYTES = 2**20

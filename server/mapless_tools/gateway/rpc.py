@@ -26,8 +26,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from mapless.v1 import localization_service_pb2, reference_service_pb2
 
-from .failures import Failure
-from .guard import check_json
+from .guard import Failure, check_json
 
 _PASSED_METADATA = ("authorization", "x-client-id", "x-mapless-scene", "x-request-id")
 _CONTENT_TYPES = ("application/grpc-web", "application/connect+", "application/proto", "application/json")

@@ -24,7 +24,7 @@ from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless.v1 import reference_service_pb2_grpc as reference_rpcs
 from mapless_tools.demo import Photograph, Place
 
-from .requests import SCENE
+from .driving import SCENE
 from .sender import MAX_MESSAGE_BYTES
 
 ONCE = ConnectOptions(max_attempts=1, timeout_s=20.0)

@@ -16,9 +16,9 @@ from mapless_tools.demo import Photograph
 from mapless_tools.progress import Progress
 
 from . import no_op
+from .driving import METHOD, photo_request, read_answer, store_references
 from .echo import ECHO_METHOD, SHORT_METHOD
 from .report import Check
-from .requests import METHOD, photo_request, read_answer, store_references
 from .sender import connected
 from .step import Step, closed_loop_step
 from .watch import ServerUnderLoad

@@ -12,9 +12,8 @@ from mapless_tools.demo import Place
 from mapless_tools.progress import Progress
 
 from .calls import Fate, regular_times
-from .driving import LoadedServer, find_saturation, open_step, server_with_scene
+from .driving import METHOD, LoadedServer, find_saturation, open_step, read_answer, server_with_scene
 from .report import Check, loop_lag_check, trend_check
-from .requests import METHOD, read_answer
 from .sender import connected
 from .step import Step, closed_loop_step
 

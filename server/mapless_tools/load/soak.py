@@ -18,9 +18,8 @@ from mapless_tools.progress import Progress
 
 from .calls import Fate, Mix
 from .churn import WORK, Outcomes, Workers, churning
-from .driving import LoadedServer, find_saturation, open_step, server_with_scene
+from .driving import METHOD, LoadedServer, find_saturation, mixed_requests, open_step, read_answer, server_with_scene
 from .report import Check, loop_lag_check
-from .requests import METHOD, mixed_requests, read_answer
 from .sender import connected
 from .slopes import CONFIDENCE, MIN_SAMPLES, Slope, slope
 from .step import Step, closed_loop_step

@@ -7,9 +7,9 @@ from mapless import Client
 from mapless_server.settings import PREFIX
 from mapless_tools.child import child_module
 from mapless_tools.load import no_op
+from mapless_tools.load.driving import SCENE, photo_request
 from mapless_tools.load.overhead import Called, OverheadOptions, Subject, compare_by_turns
 from mapless_tools.load.report import Check
-from mapless_tools.load.requests import SCENE, photo_request
 from mapless_tools.progress import Progress
 
 from .cluster import application, running_cluster

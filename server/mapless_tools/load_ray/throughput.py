@@ -12,8 +12,8 @@ from typing import Any
 from mapless import Client
 from mapless_tools.demo import Place
 from mapless_tools.load.calls import Fate
+from mapless_tools.load.driving import METHOD, read_answer, requests_for, store_references
 from mapless_tools.load.report import Check
-from mapless_tools.load.requests import METHOD, read_answer, requests_for, store_references
 from mapless_tools.load.sender import Target, connected
 from mapless_tools.load.step import Step, closed_loop_step
 from mapless_tools.load.watch import ServerUnderLoad, read_process

@@ -16,8 +16,7 @@ from mapless_server.services.capture.recorder import circumstances_of
 from mapless_server.settings import Settings
 
 from .comparing import Change, changed, compare, outcome_of, stage_seconds
-from .recompute import recompute, response_of
-from .recorded import Blobs
+from .recompute import Blobs, recompute, response_of
 
 IDENTICAL, CHANGED, NOT_COMPUTED = "identical", "changed", "not computed"
 """Verdicts on a call; the last: a part of the capture is damaged, or unknown to this version."""

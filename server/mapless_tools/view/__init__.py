@@ -1,7 +1,7 @@
 """A scene in the browser: its references, the points that were matched, and queries as they are answered.
 
-    command > viewer > scenery (the references' layout)          > stage (the page) > drawing, meshes
-                     > feed (WatchQueries) > queries  -----------^
+    command > viewer > scenery (the references' layout)          > stage (the page) > drawing
+                     > feed (WatchQueries) ----------------------^
 
 It is a client like any other: all that it shows comes from calls to a server. Only `stage`, `drawing` and `guarded`
 import viser. Begin reading with `viewer`.

@@ -17,8 +17,8 @@ from mapless.geometry import Array
 from mapless.report import report_html
 
 from .drawing import DOUBT, OTHER, QUERY, REFERENCE, SELECTED, Drawing
+from .feed import THUMBNAIL_PX, Picture, Query, read_picture
 from .guarded import GuardedViser
-from .queries import THUMBNAIL_PX, Picture, Query, read_picture
 from .scenery import Scenery
 
 MAX_QUERIES = 12

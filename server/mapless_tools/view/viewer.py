@@ -14,9 +14,8 @@ from mapless import Client, ConnectOptions, MaplessError, Reference, ResourceExh
 from mapless_server.errors import InvalidArgument
 from mapless_server.method.options import check_bounds
 
-from .feed import Feed
+from .feed import THUMBNAIL_PX, Feed, Picture, Query, colours_at, read_picture
 from .guarded import GuardedViser
-from .queries import THUMBNAIL_PX, Picture, Query, colours_at, read_picture
 from .scenery import Scenery, lay_out
 from .stage import Stage
 

@@ -13,7 +13,7 @@ from mapless_tools.bags import SUFFIXES, is_recording
 from mapless_tools.dataset import Dataset, printable
 
 from .. import FORMATS
-from .options import Intrinsics, KeyframeOptions, ReadOptions
+from .collecting import Intrinsics, KeyframeOptions, ReadOptions
 
 __all__ = ["Intrinsics", "KeyframeOptions", "ReadOptions", "fits", "read_dataset", "recognize"]
 

@@ -20,8 +20,7 @@ from typing import Any
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless_tools.dataset import Dataset, finite_numbers, read_json
 
-from .collecting import Collector, from_corner, from_opengl, natural_order, size_of
-from .options import ReadOptions
+from .collecting import Collector, ReadOptions, from_corner, from_opengl, natural_order, size_of
 
 _POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 _IMAGE_ENDS = (".jpg", ".jpeg", ".png")

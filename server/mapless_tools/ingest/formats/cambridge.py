@@ -13,8 +13,7 @@ from pathlib import Path, PurePosixPath
 from mapless.geometry import Camera, RadialTangential, RigidTransform
 from mapless_tools.dataset import Dataset, finite_numbers
 
-from .collecting import Collector, from_corner, natural_order, read_text, rotation_of, size_of
-from .options import ReadOptions
+from .collecting import Collector, ReadOptions, from_corner, natural_order, read_text, rotation_of, size_of
 
 SPLIT_FILES = {"train": "dataset_train.txt", "test": "dataset_test.txt"}
 RECONSTRUCTION = "reconstruction.nvm"

@@ -16,8 +16,7 @@ from mapless.cameras import FOLDER_FILE, camera_of_frame
 from mapless.geometry import RigidTransform
 from mapless_tools.dataset import Dataset, finite_numbers, printable, read_json, read_place
 
-from .collecting import Collector
-from .options import ReadOptions
+from .collecting import Collector, ReadOptions
 
 
 def fits(path: Path) -> bool:

@@ -21,9 +21,8 @@ from typing import Any
 from mapless.geometry import RigidTransform
 from mapless_tools.dataset import Dataset, finite_numbers, read_place
 
-from .collecting import Collector, read_text, rotation_of
+from .collecting import Collector, ReadOptions, read_text, rotation_of
 from .colmap.cameras import PARAMETERS, ColmapCamera
-from .options import ReadOptions
 
 PROPERTIES = "# mapless: "
 """Begins a comment of our own exports in sensors.txt: what kapture has no field for, as JSON."""

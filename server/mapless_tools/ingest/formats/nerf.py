@@ -17,8 +17,7 @@ from typing import Any
 from mapless.geometry import Camera, Distortion, Fisheye, RadialTangential, RigidTransform, nearest_rotation
 from mapless_tools.dataset import Dataset, finite_numbers, read_json
 
-from .collecting import Collector, from_corner, from_opengl, natural_order, size_of
-from .options import ReadOptions
+from .collecting import Collector, ReadOptions, from_corner, from_opengl, natural_order, size_of
 
 FILE_NAME = "transforms.json"
 SPLIT_FILES = {"transforms_train.json": "train", "transforms_val.json": "test", "transforms_test.json": "test"}

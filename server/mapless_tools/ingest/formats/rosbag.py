@@ -21,8 +21,7 @@ from mapless.ros import RosCamera, pixels_from_image
 from mapless_tools.bags import is_recording
 from mapless_tools.dataset import Dataset
 
-from .collecting import Collector
-from .options import Intrinsics, KeyframeOptions, ReadOptions
+from .collecting import Collector, Intrinsics, KeyframeOptions, ReadOptions
 from .writing import image_name
 
 CANDIDATES = 5

@@ -16,8 +16,7 @@ from mapless.geometry import Array, Camera, RadialTangential
 from mapless_tools.bags.trajectory import Trajectory
 from mapless_tools.dataset import Dataset, finite_numbers
 
-from .collecting import Collector, read_text, size_of
-from .options import ReadOptions
+from .collecting import Collector, ReadOptions, read_text, size_of
 
 MAX_GAP_S = 0.02
 """A frame without a pose this near, before and after, is refused: a hand-held camera moves centimetres in that time."""

@@ -10,10 +10,8 @@ from pathlib import Path
 
 from mapless_tools.dataset import Dataset, finite_numbers
 
-from .collecting import Collector, check_camera, read_text, size_of
-from .options import Intrinsics, ReadOptions
-from .pseudo_ground_truth import GROUND_TRUTH, find_ground_truth
-from .seven_scenes import read_pose
+from .collecting import Collector, Intrinsics, ReadOptions, check_camera, read_text, size_of
+from .seven_scenes import GROUND_TRUTH, find_ground_truth, read_pose
 
 _LINE = re.compile(r"sequence\d+\s+\[frames=\d+\]\s+\[start=(\d+)\s*;\s*end=(\d+)\]")
 _IMAGE_END = ".color.jpg"
