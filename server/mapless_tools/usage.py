@@ -26,17 +26,25 @@ def usage_errors() -> Iterator[None]:
 
 
 @contextmanager
-def failures_end_command(usage: type[ValueError] = UsageError, interrupted: str = "interrupted") -> Iterator[None]:
-    """Ends the command after a failure: exit code 2 for wrong usage, 1 for a server or a file, 130 after Ctrl-C."""
+def failures_end_command(
+    usage: type[ValueError] = UsageError, interrupted: str = "interrupted", failure: type[Exception] = OSError
+) -> Iterator[None]:
+    """Ends the command after a failure: exit code 2 for wrong usage or a missing package, 130 after Ctrl-C.
+
+    1 for a server, a file, or another `failure`.
+    """
     from mapless import MaplessError
+    from mapless_server.extras import install_hint
     from mapless_server.settings import ConfigError
     from mapless_tools.child import ServerFailed
 
     try:
         yield
+    except ImportError as error:
+        fail(install_hint(error))
     except (usage, ConfigError) as error:
         fail(str(error))
-    except (ServerFailed, MaplessError, OSError) as error:
+    except (ServerFailed, MaplessError, OSError, failure) as error:
         fail(str(error), code=1)
     except KeyboardInterrupt:
         fail(interrupted, code=128 + signal.SIGINT)

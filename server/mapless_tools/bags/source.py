@@ -213,12 +213,10 @@ class _Rows:
     previous_ns: int | None = None
 
     def add(self, time_s: float, pose: RigidTransform) -> None:
-        """Adds a pose."""
         q = pose.quaternion()
         self.table.extend([time_s, *pose.translation.tolist(), q.x, q.y, q.z, q.w])
 
     def trajectory(self, max_gap_s: float) -> Trajectory:
-        """Makes the trajectory of all poses; ValueError for fewer than two."""
         return Trajectory(np.frombuffer(self.table).reshape(-1, 8), max_gap_s)
 
 
@@ -258,7 +256,6 @@ def _pose_of(rows: _Rows, index: int) -> RigidTransform:
 
 
 def _poses(images: Images, topic: str, options: BagOptions) -> tuple[str, str, Trajectory]:
-    """World frame, body frame (empty if the messages do not name it) and poses of a topic."""
     recording = images.recording
     rows: _Rows | None = None
     body = ""

@@ -55,5 +55,4 @@ def bench(data: Path, quick: bool) -> None:
 
 
 def _labelled(progress: Progress, label: str) -> Progress:
-    """Returns a progress whose steps have this label."""
     return lambda step, done, total: progress(f"{label}: {step}", done, total)

@@ -122,7 +122,6 @@ def _prior_of(frame: Frame, random: np.random.Generator) -> PosePrior:
 def _call(
     client: Client, server: ChildServer, frame: Frame, priors: Priors | None
 ) -> tuple[float, float, Array | None]:
-    """Processor time of the server, time of the call, and the position found."""
     image = frame.image_path.read_bytes()
     begin_cpu_s, begin_s = _processor_s(server.process_id), time.perf_counter()
     answer = client.localize(image, frame.camera, SCENE, priors=priors)

@@ -81,7 +81,6 @@ class _Bench:
         return rates
 
     def run(self, part: str) -> None:
-        """Runs a part and adds its figures."""
         start_s = time.perf_counter()
         print(f"{part}: ", end="", flush=True)
         figures = [*self._tried(self._part(part), part)]
@@ -127,7 +126,6 @@ class _Bench:
         runner.close()
 
     def _tried(self, figures: Iterator[Figure], part: str) -> Iterator[Figure]:
-        """Yields the figures until one fails."""
         try:
             yield from figures
         except Exception as error:  # what comes after can still be measured
@@ -142,7 +140,6 @@ class _Bench:
         return None if self.quick else "inductor"
 
     def write(self, output: Path) -> None:
-        """Writes the figures so far."""
         content = as_json(self.title, self.figures, self._details)
         (output / "network.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
         (output / "network.md").write_text("\n".join(markdown(self.title, self.figures)) + "\n", encoding="utf-8")

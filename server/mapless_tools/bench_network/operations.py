@@ -135,7 +135,6 @@ def _counted(func: Any, inputs: Sequence[Tensor], made: Sequence[Tensor]) -> Ope
 
 
 def _is_new(tensor: Tensor, inputs: Sequence[Tensor]) -> bool:
-    """Whether a tensor has memory of its own."""
     return not tensor._is_view() and all(tensor is not it for it in inputs)
 
 

@@ -147,7 +147,6 @@ Runs = Sequence[tuple[Answer, dict[str, float]]]
 
 
 def _runs(bench: Bench, pipeline: Pipeline, rounds: int) -> Runs:
-    """Localizes every query `rounds` times, one after the other."""
     return [bench.localize(key, pipeline) for _ in range(rounds) for key in bench.room.queries]
 
 

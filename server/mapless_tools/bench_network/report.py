@@ -74,7 +74,6 @@ def as_json(title: str, figures: Sequence[Figure], details: dict[str, Any]) -> d
 
 
 def _cells(figure: Figure) -> tuple[str, ...]:
-    """The cells below `HEADINGS`."""
     ratio = figure.value / figure.floor_ms if figure.value and figure.floor_ms and figure.unit == "ms" else None
     met = {True: "yes", False: "no", None: ""}[figure.is_met]
     measured = "not measured" if figure.value is None else f"{_short(figure.value)} {figure.unit}".rstrip()

@@ -127,7 +127,6 @@ def timeout_s(page_size: int) -> float:
 
 
 def _report(examined: Examined, everything: bool, report: Path | None, html: Path | None, as_json: bool | None) -> None:
-    """Prints and writes the findings."""
     from rich.console import Console
 
     from mapless_tools.output_files import write_json

@@ -17,16 +17,11 @@ def demo_command(
     output: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("demo-output"),
 ) -> None:
     """Localize photographs end to end, judge every answer and draw it; exit code 1 if it did not go well."""
-    from mapless import MaplessError
-    from mapless_tools.child import ServerFailed
     from mapless_tools.demo.run import run_demo
+    from mapless_tools.usage import failures_end_command
 
-    try:
+    with failures_end_command(ValueError):
         went_well = run_demo(data, output)
-    except (ValueError, OSError) as error:
-        fail(str(error))
-    except (ServerFailed, MaplessError) as error:
-        fail(str(error), code=1)
     raise typer.Exit(0 if went_well else 1)
 
 

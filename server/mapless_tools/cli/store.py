@@ -50,7 +50,7 @@ def verify_command(
     with (
         _store_errors(),
         progress_bars() as on_progress,
-        closing(SqliteDatabase.open_as_is(file) if file else _look(config, data_dir)) as database,
+        closing(SqliteDatabase.open_as_is(file) if file else _open(config, data_dir, as_is=True)) as database,
         database.read() as connection,
     ):
         database.lift_limits(connection)
@@ -69,7 +69,7 @@ def backup_command(
     """Copy the store to one file, whether it is served or not; exit code 1 if something in the store is damaged."""
     from mapless_server.store.backup import back_up
 
-    with _store_errors(), progress_bars() as on_progress, closing(_look(config, data_dir)) as database:
+    with _store_errors(), progress_bars() as on_progress, closing(_open(config, data_dir, as_is=True)) as database:
         found = back_up(database, file, on_progress)
     _report(found, f"written to {file}, read again and found whole")
 
@@ -91,36 +91,22 @@ def restore_command(
     _report(found, "restored, read again and found whole")
 
 
-def _open(config: Path | None, data_dir: Path | None) -> Database:
-    """Opens the settings' store, migrated to this program's schema; created if missing."""
-    from mapless_server.store.postgresql import PostgresqlDatabase
-    from mapless_server.store.sqlite import SqliteDatabase
-
-    url, folder = _settings(config, data_dir)
-    return PostgresqlDatabase.open(url) if url else SqliteDatabase.open(folder)
-
-
-def _look(config: Path | None, data_dir: Path | None) -> Database:
-    """Opens the settings' store read-only, while others may use it."""
+def _open(config: Path | None, data_dir: Path | None, as_is: bool = False) -> Database:
+    """The settings' store: migrated to this program's schema, and created if missing; or read while others use it."""
+    from mapless_server.settings import load_settings
     from mapless_server.store.postgresql import PostgresqlDatabase
     from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
 
-    url, folder = _settings(config, data_dir)
-    return PostgresqlDatabase.open_as_is(url) if url else SqliteDatabase.open_as_is(folder / DATABASE_FILE)
-
-
-def _settings(config: Path | None, data_dir: Path | None) -> tuple[str | None, Path]:
-    """URL of the shared database, if there is one, and the data folder."""
-    from mapless_server.settings import load_settings
-
     settings = load_settings({"data_dir": data_dir}, config).settings
-    url = settings.database_url
-    return url.get_secret_value() if url else None, settings.data_dir
+    if settings.database_url:
+        url = settings.database_url.get_secret_value()
+        return PostgresqlDatabase.open_as_is(url) if as_is else PostgresqlDatabase.open(url)
+    folder = settings.data_dir
+    return SqliteDatabase.open_as_is(folder / DATABASE_FILE) if as_is else SqliteDatabase.open(folder)
 
 
 @contextmanager
 def _store_errors() -> Iterator[None]:
-    """Ends the command with one line for an error of the store or the settings."""
     from mapless_server.errors import RequestError
     from mapless_server.settings import ConfigError
     from mapless_server.store import StoreError

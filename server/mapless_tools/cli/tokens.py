@@ -68,7 +68,6 @@ def revoke_command(
 
 @contextmanager
 def _tokens_file(given: Path | None) -> Iterator[Path]:
-    """The file of tokens; an error ends the command with one line."""
     from mapless_server.security import SecurityError
     from mapless_server.settings import ConfigError, load_settings
 
@@ -84,7 +83,6 @@ def _tokens_file(given: Path | None) -> Iterator[Path]:
 
 
 def _read_time(text: str) -> datetime:
-    """Reads a time in the future; ends the command if the text is not one."""
     from pydantic import AwareDatetime, TypeAdapter, ValidationError
 
     try:

@@ -120,7 +120,6 @@ def check_command(name: Name, weights_dir: WeightsDir = None) -> None:
 
 @contextmanager
 def _weights_folder(weights_dir: Path | None) -> Iterator[Path]:
-    """The weights folder; an error of weights or settings ends the command with one line."""
     try:
         yield load_settings({"weights_dir": weights_dir}).settings.weights_dir
     except (ConfigError, UnknownWeights) as error:

@@ -215,7 +215,6 @@ def _search(folder: Path, wanted: tuple[str, ...], depth: int) -> tuple[list[tup
 
 
 def _layout(folder: Path, wanted: tuple[str, ...]) -> str:
-    """The layout of a folder; of several, one of the wanted ones; empty if it has none."""
     found = [layout for layout in _MARKS if fits(folder, layout)]
     return next((layout for layout in found if layout in wanted), next(iter(found), ""))
 

@@ -125,7 +125,6 @@ def _is_own_folder(folder: Path, layout: str) -> bool:
 
 
 def _refuse(only: str, **flags: object) -> None:
-    """Raises UsageError if a flag is given that has no effect with this report."""
     from mapless_tools.usage import UsageError
 
     given = [f"--{name.replace('_', '-')}" for name, value in flags.items() if value not in (None, False)]

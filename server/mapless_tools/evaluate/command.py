@@ -97,7 +97,6 @@ def evaluate_benchmarks(
 
 
 def _journal_folder(output: Path) -> Path:
-    """The folder of journals in the output; raises UsageError if it cannot be written."""
     journals = output / RUNS_FOLDER
     try:
         journals.mkdir(parents=True, exist_ok=True)

@@ -154,7 +154,6 @@ def _side_by_side(query: _Shown, reference: _Shown, matches: NDArray[np.int32], 
 
 
 def _some(count: int) -> Sequence[int]:
-    """Evenly spread indices."""
     return [int(i) for i in np.unique(np.linspace(0, count - 1, min(count, MAX_DRAWN)).round())] if count else []
 
 

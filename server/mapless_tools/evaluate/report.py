@@ -117,7 +117,6 @@ def format_stages(shares: Mapping[str, float]) -> str:
 
 
 def _format_features(counts: Mapping[str, int]) -> str:
-    """The features; with the number of their answers if there are several."""
     if len(counts) == 1:
         return next(iter(counts))
     return ", ".join(f"{name} {count}" for name, count in counts.items())

@@ -306,7 +306,6 @@ def _measure_setting(client: Client, split: SceneSplit, runs: Sequence[Run], set
 def _with_references(
     scene: SceneWork, split: SceneSplit, setup: RunSetup, progress: Progress
 ) -> tuple[PlannedQuery, ...]:
-    """The queries with their references; empty if the server chooses."""
     options = setup.options
     if scene.pairs is not None:
         known = {frame.name for frame in split.references}

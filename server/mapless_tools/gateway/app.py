@@ -104,14 +104,11 @@ def _handler(handle: "Callable[[_Handlers, Request], Awaitable[Response]]") -> "
 
 @dataclass
 class _Handlers:
-    """Answers requests by calls of a client."""
-
     connect: Callable[[], Client]
     options: GatewayOptions
     _client: Client | None = None
 
     def _client_for(self, request: Request) -> Client:
-        """A client with the caller's token, if the request has one."""
         if self._client is None:
             self._client = self.connect()
         given, identity = request.headers.get("authorization"), request.headers.get("x-client-id", "")
@@ -141,14 +138,12 @@ class _Handlers:
 
     @_handler
     async def status(self, request: Request) -> Response:
-        """Answers whether the server behind the gateway serves, for clients of the protocol."""
         if not await self._client_for(request).is_serving():
             raise of_server(Unavailable("UNAVAILABLE", "the server does not serve", retry_after_s=1.0))
         return JSONResponse({"status": "running"})
 
     @_handler
     async def geopose(self, request: Request) -> Response:
-        """Answers a request of the GeoPose Protocol."""
         geopose.check_version(request.headers.get("accept", ""))
         client, scene = self._client_for(request), self._scene_of(request)
         body = b"".join([part async for part in request.stream()])  # `request.body()` would keep it
@@ -181,18 +176,15 @@ class _Handlers:
 
     @_handler
     async def localize(self, request: Request) -> Response:
-        """Answers a photograph that is sent as a form."""
         client = self._client_for(request)
         asked = await plain.read_form(request.headers, request.stream(), self.options.scene)
         response = await _while_connected(request, client.run(_localized(asked)))
         return JSONResponse(await asyncio.to_thread(plain.to_json, response))
 
     async def description(self, request: Request) -> Response:
-        """Answers with the description of the interface, for programs."""
         return JSONResponse(openapi.description())
 
     async def page(self, request: Request) -> Response:
-        """Answers with the description of the interface, for people."""
         return HTMLResponse(openapi.page())
 
 
@@ -218,7 +210,6 @@ async def _while_connected(request: Request, work: Coroutine[Any, Any, T]) -> T:
 
 
 def _localized(request: pb.LocalizeRequest) -> Exchange[pb.LocalizeResponse]:
-    """Makes the call, and returns the server's message unchanged."""
     response: pb.LocalizeResponse = yield Call(LOCALIZE, request, pb.LocalizeResponse)
     return response
 

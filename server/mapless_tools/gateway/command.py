@@ -6,7 +6,6 @@ from typing import Annotated
 
 import typer
 
-from mapless_server.serve.command import fail
 from mapless_tools.connection import Connection, with_flags
 
 
@@ -35,15 +34,13 @@ def gateway_command(
     A token given here is used for requests of the GeoPose Protocol and of the form that have none of their own, never
     for the calls of browsers.
     """
-    from mapless import MaplessError
-    from mapless_server.extras import install_hint
     from mapless_server.serve.libraries import configure_libraries
     from mapless_server.serve.signals import terminable
-    from mapless_server.settings import ConfigError, load_settings
-    from mapless_tools.child import ServerFailed
+    from mapless_server.settings import load_settings
     from mapless_tools.connection import reachable
+    from mapless_tools.usage import failures_end_command
 
-    try:
+    with failures_end_command(ValueError):
         settings = load_settings({}).settings
         configure_libraries(settings)
         from .app import GatewayOptions
@@ -61,11 +58,3 @@ def gateway_command(
             if not connection.address:
                 print(f"a server was started at {server}", file=sys.stderr)
             run(server, connect, options, binding)
-    except ImportError as error:
-        fail(install_hint(error))
-    except (ValueError, ConfigError) as error:
-        fail(str(error))
-    except (MaplessError, ServerFailed, OSError) as error:
-        fail(str(error), code=1)
-    except KeyboardInterrupt:
-        raise typer.Exit(130) from None

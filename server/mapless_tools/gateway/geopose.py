@@ -148,7 +148,6 @@ def response_to(photograph: Photograph, answer: LocalizationResult) -> dict[str,
 
 
 def _image_of(reading: CameraReading, where: str) -> tuple[bytes, tuple[int, int]]:
-    """The file's bytes, and its width and height."""
     text = reading.imageBytes
     if text.startswith("data:"):
         text = text.partition(",")[2]

@@ -58,7 +58,6 @@ def page() -> str:
 
 
 def _add_message(message: Any, schemas: dict[str, Any]) -> None:
-    """Adds the JSON schema of a message and of those in it."""
     if message.full_name in schemas:
         return
     properties: dict[str, Any] = {}

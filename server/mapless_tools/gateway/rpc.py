@@ -40,8 +40,6 @@ Connect = Callable[[], grpc.aio.Channel]
 
 
 class _Application(ConnectASGIApplication[None]):
-    """All methods of a server's interface."""
-
     path = "/"
 
 
@@ -53,7 +51,6 @@ class _JsonCodec:
         self.name, self.encode, self._decode = codec.name, codec.encode, codec.decode
 
     def decode(self, data: bytes | bytearray, message_class: type[Any]) -> Any:
-        """Implements Codec."""
         check_json(data)
         return self._decode(data, message_class)
 
@@ -104,7 +101,6 @@ def rpc_application(connect: Connect, max_message_bytes: int) -> ASGIApp:
 
 
 def _is_printable(text: bytes) -> bool:
-    """Whether a text can be metadata of gRPC."""
     return text.isascii() and text.decode("ascii").isprintable()
 
 

@@ -131,7 +131,6 @@ def open_scene(client: Client, scene: str, dataset: Dataset, chosen: Sequence[Fr
 
 
 def _share_positions(existing: Sequence[Reference], chosen: Sequence[Frame]) -> bool:
-    """Whether both have two distant references with the same ids and positions, so that the unit is the same."""
     there = {reference.reference_id: reference.world_from_camera.translation for reference in existing}
     shared = [
         frame.world_from_camera.translation

@@ -77,7 +77,6 @@ def fetch_all(
 
 
 def _reference_ids(client: Client, scene: str) -> list[str]:
-    """Ids of all references, including damaged ones."""
     with suppress(DataLoss):
         return [reference.reference_id for reference in client.list_references(scene, page_size=1000)]
     # A list ends at a reference whose pose is damaged; an audit names it and continues, but examines each reference.

@@ -177,7 +177,6 @@ class _File:
         self._in_world.append(self._node(node))
 
     def add_points(self, points: Array, colours: NDArray[np.uint8]) -> None:
-        """Adds one node with all points."""
         positions = self._array((points - self._scenery.origin).astype(np.float32), FLOAT, "VEC3")
         linear = np.rint(255 * (colours / 255) ** _GAMMA).astype(np.uint8)
         rgba = np.concatenate([linear, np.full((len(colours), 1), 255, np.uint8)], axis=1)  # four bytes: aligned
@@ -186,7 +185,6 @@ class _File:
         self._in_world.append(self._node(Node(name="points", mesh=mesh)))
 
     def content(self) -> bytes:
-        """Returns the complete file."""
         self._gltf.buffers = [Buffer(byteLength=len(self._blob))]
         self._gltf.set_binary_blob(bytes(self._blob))
         return b"".join(self._gltf.save_to_bytes())
@@ -217,7 +215,6 @@ class _File:
         return rays / rays[:, 2:] * self._scenery.size_m @ OPENCV_FROM_OPENGL
 
     def _picture(self, reference: Reference, thumbnail: bytes) -> int:
-        """Adds a mesh of two triangles with the photograph."""
         gltf = self._gltf
         gltf.images.append(EmbeddedImage(bufferView=self._view(thumbnail), mimeType="image/jpeg"))
         gltf.textures.append(Texture(source=len(gltf.images) - 1))

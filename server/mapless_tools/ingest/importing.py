@@ -156,7 +156,6 @@ def _store(report: ImportReport, options: UploadOptions, settings: Settings, con
 
 
 def _attributes(dataset: Dataset) -> SceneAttributes:
-    """Attributes of the scene that the dataset makes; ValueError if they contradict each other."""
     try:
         return SceneAttributes(dataset.datum, dataset.down_in_world, arbitrary_unit=not dataset.metric)
     except DatumWithoutMetres:

@@ -143,7 +143,6 @@ class Uploader:
         return None
 
     def _send(self, items: Sequence[Item]) -> None:
-        """Stores items, in one message if the server accepts it."""
         waiting = Waiting(self._options, self._stop)
         left = list(items)
         while left:

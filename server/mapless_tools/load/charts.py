@@ -101,7 +101,6 @@ def _values(curves: Mapping[str, tuple[str, Value]], steps: Sequence[Step]) -> l
 
 
 def _curves(axes: Axes, curves: Mapping[str, tuple[str, Value]], steps: Sequence[Step], last: str) -> None:
-    """A curve for each figure, with its last value in the legend."""
     for name, (colour, of) in curves.items():
         known = [(step.account.offered_per_s, y) for step in steps if (y := of(step)) is not None]
         if known:

@@ -154,7 +154,6 @@ def _new_log(output: Path, part: str) -> Path:
 def _report(
     output: Path, part: str, lines: list[str], checks: list[Check], figures: dict[str, Any], *files: Path
 ) -> None:
-    """Prints a part, adds it to the JSON file, and names this and its other files."""
     from .report import check_lines, machine, update_json
 
     print("\n".join([f"## {part}", "", machine(), "", *lines, *check_lines(checks)]), flush=True)
@@ -175,5 +174,4 @@ def _measuring() -> Iterator[Progress]:
 
 
 def _finish(checks: list[Check]) -> None:
-    """Ends with exit code 1 if a bar was missed."""
     raise typer.Exit(1 if any(check.met is False for check in checks) else 0)

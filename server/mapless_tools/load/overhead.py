@@ -163,7 +163,6 @@ def overhead_json(subjects: Sequence[Subject], options: OverheadOptions) -> dict
 
 
 def _prepared(server: ChildServer, options: OverheadOptions) -> bytes:
-    """Creates a scene; returns a request to it."""
     photo = no_op.padded_photo(options.message_bytes)
     references = [Photograph(f"r{i}", photo, no_op.CAMERA, RigidTransform.identity()) for i in range(2)]
     with Client(server.address) as client:

@@ -209,7 +209,6 @@ def _own_places(folder: Path, ports: list[int]) -> dict[str, str]:
 
 
 def _free_ports(count: int) -> list[int]:
-    """Ports of loopback that are free now."""
     with _bound([0] * count) as sockets:
         return [it.getsockname()[1] for it in sockets]
 

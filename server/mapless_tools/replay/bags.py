@@ -145,7 +145,6 @@ def _with_frames(options: LocalizerOptions, images: Images, poses: Poses | None)
 
 
 def _framed(message: Any, frame: str) -> Any:
-    """The image with a name for its camera's frame, as tf needs one."""
     message.header.frame_id = frame
     return message
 
@@ -173,8 +172,6 @@ def _compare(
 
 
 class _Output:
-    """The recording that is written."""
-
     def __init__(self, out: Path, recording: Recording, options: LocalizerOptions) -> None:
         self._recording = recording
         self._options = options
@@ -200,7 +197,6 @@ class _Output:
             self._put(topic, images.begin_ns, message)
 
     def write(self, time_ns: int, outcome: Outcome, tree: FrameTree, images: Images) -> None:
-        """Writes what is published for an image."""
         self._put(DIAGNOSTICS_TOPIC, time_ns, self._messages.diagnostics(outcome, self._options.scene))
         if outcome.map_from_body is None:
             return

@@ -208,8 +208,6 @@ def recompute(call: CapturedCall, blobs: Blobs, tiers: Sequence[Tier], options: 
 
 
 class _Attributes:
-    """The part of the store that services call."""
-
     def __init__(self, call: CapturedCall) -> None:
         self._attributes = call.attributes
 
@@ -281,7 +279,6 @@ class _Recomputing:
 
 
 def _compute(stages: QueryStages, job: Job) -> Result:
-    """Runs a job through the stages, without a queue."""
     of_name = {PREPARE: stages.prepare, COARSE: stages.coarse, REFINE: stages.refine}
     while True:
         (result,) = of_name[job.step.stage]([job])

@@ -29,24 +29,20 @@ def view_command(
 
     Live queries take a server with the setting allow_watching, and a token of the role write.
     """
-    from mapless import MaplessError
-    from mapless_server.extras import install_hint
     from mapless_server.security import is_loopback
     from mapless_server.serve.signals import terminable
-    from mapless_server.settings import ConfigError, load_settings
-    from mapless_tools.child import ServerFailed
+    from mapless_server.settings import load_settings
     from mapless_tools.connection import reachable
+    from mapless_tools.usage import failures_end_command
 
     if not is_loopback(host):
         fail(
             f"--host {host} is not a loopback address: the page has no authentication, and shows the scene's "
             f"photographs; from another machine, use a tunnel: ssh -L {port}:127.0.0.1:{port} THIS-MACHINE"
         )
-    try:
+    with failures_end_command(ValueError, failure=RuntimeError):
         from .viewer import ViewOptions, viewer
-    except ImportError as error:
-        fail(install_hint(error))
-    try:
+
         options = ViewOptions(host, port, max_pictured, seeds)
         settings = load_settings({}).settings
         with (
@@ -56,12 +52,6 @@ def view_command(
         ):
             _announce(page, "" if connection.address else server, no_open)
             threading.Event().wait()
-    except (ValueError, ConfigError) as error:
-        fail(str(error))
-    except (MaplessError, ServerFailed, RuntimeError) as error:
-        fail(str(error), code=1)
-    except KeyboardInterrupt:
-        raise typer.Exit(130) from None
 
 
 def _announce(page: str, own_server: str, no_open: bool) -> None:

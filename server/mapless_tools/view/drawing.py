@@ -163,7 +163,6 @@ class Drawing:
         return drawn
 
     def _set_the_view(self, server: GuardedViser) -> None:
-        """Sets the view: from behind and above the references, in their direction."""
         scenery = self._scenery
         up = -scenery.down
         server.scene.set_up_direction(tuple(up.tolist()))

@@ -83,7 +83,6 @@ def _down(scene: Scene, references: Sequence[Reference]) -> Array:
 
 
 def _size_m(centres: Array) -> float:
-    """A third of the usual distance of neighbours."""
     if len(centres) < 2:
         return 0.3
     some = centres[:200]

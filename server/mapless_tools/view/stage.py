@@ -109,7 +109,6 @@ class Stage:
         self._select(shown)
 
     def _select(self, shown: _Shown) -> None:
-        """Selects a query, and draws only its support."""
         with self._lock:
             self._selected = shown
             for it in self._shown:
@@ -154,7 +153,6 @@ class Stage:
         return handle
 
     def _draw_others(self) -> list[Any]:
-        """Draws references that have no frustum."""
         scenery = self._scenery
         others = np.setdiff1d(np.arange(len(scenery.references)), scenery.pictured)
         if not len(others):

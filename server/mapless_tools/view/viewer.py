@@ -90,12 +90,10 @@ class _Background:
             self._pool.submit(self._do, work)
 
     def close(self) -> None:
-        """Ends after the current call."""
         self._closing.set()
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def show_query(self, query: Query) -> None:
-        """Shows an answered query."""
         try:
             self._stage.show_query(query)
             self._show_points(query)

@@ -75,7 +75,6 @@ class _Comparison:
         self.matched += [item for item in found if item is not None and len(item.matches)]
 
     def verdict(self) -> Verdict:
-        """The verdict on all pairs so far."""
         views = {i: view for i, view in self.views.items() if view is not None}
         readable = sum(views.keys() >= set(pair) for pair in self.pairs)
         return judge(views, self.matched, readable - len(self.matched))

@@ -66,8 +66,6 @@ def pairs_by_order(frame_count: int, count: int = PAIR_COUNT) -> list[Pair]:
 
 
 class _Neighbours:
-    """Defines which photographs are near each other and look the same way."""
-
     def __init__(self, poses: Sequence[RigidTransform]) -> None:
         self._centre: Array = np.array([pose.translation for pose in poses])
         self._ahead: Array = np.array([pose.rotation[:, 2] for pose in poses])
@@ -84,7 +82,6 @@ class _Neighbours:
         return [int(i) for i in others[np.argsort(np.abs(np.log(distances / self._baseline)), kind="stable")]]
 
     def _distances(self, reference: int) -> tuple[NDArray[np.intp], Array]:
-        """Photographs at other places, and their distances."""
         distances = np.linalg.norm(self._centre - self._centre[reference], axis=1)
         elsewhere = np.flatnonzero(distances > 1e-6)
         return elsewhere, distances[elsewhere]

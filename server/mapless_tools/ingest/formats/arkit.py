@@ -72,7 +72,6 @@ def _frame(file: Path, size: tuple[int, int], parse: Parse) -> tuple[Camera, Rig
 
 
 def _polycam(path: Path) -> tuple[str, str] | None:
-    """Names of the folders of images and cameras."""
     keyframes = path / "keyframes"
     return next((pair for pair in _POLYCAM if all((keyframes / name).is_dir() for name in pair)), None)
 

@@ -87,7 +87,6 @@ def _world_from_camera(words: list[str]) -> RigidTransform:
 
 
 def _lenses(file: Path) -> Mapping[str, Lens]:
-    """Lenses by image path without ending."""
     lines = enumerate(read_text(file).splitlines(), 1)
     _, first = next(lines, (0, ""))
     if not first.startswith("NVM_V3"):

@@ -107,7 +107,6 @@ class _Row:
     is_inverse: bool
 
     def pose(self) -> RigidTransform:
-        """Pose of the device in the world, or of the sensor in the rig."""
         if "" in self.words:
             raise ValueError(f"{self.place}: the pose is not complete")
         numbers = finite_numbers(self.words, f"{self.place}: the pose", (7,))

@@ -66,7 +66,6 @@ def _read_file(file: Path, split: str, collector: Collector) -> None:
 
 
 def _image(collector: Collector, frame: Mapping[str, Any]) -> str:
-    """Path of the image, with its ending."""
     path = frame.get("file_path")
     if not isinstance(path, str) or not path:
         raise ValueError("file_path must be a path")

@@ -104,7 +104,6 @@ class _Unposed:
         self.last, self.end_s = number, time_s
 
     def end(self) -> None:
-        """Refuses the images that were added."""
         if self.first:
             which = f"images {self.first} to {self.last}, {self.begin_s:.3f} to {self.end_s:.3f} s after the first"
             with self.collector.attempt(which):

@@ -152,7 +152,6 @@ def read_pose(file: Path) -> RigidTransform:
 
 
 def _splits(path: Path) -> dict[str, str]:
-    """Split by sequence folder; empty if there are no split files."""
     splits: dict[str, str] = {}
     for split, file_name in SPLIT_FILES.items():
         file = path / file_name

@@ -51,7 +51,6 @@ def read(path: Path, options: ReadOptions) -> Dataset:
 
 
 def _intrinsics(file: Path) -> tuple[tuple[int, int], Intrinsics]:
-    """Size and intrinsics of the colour camera."""
     lines = (line.partition("=") for line in read_text(file).splitlines())
     values = {key.strip(): value for key, _, value in lines}
     fields = ("m_colorWidth", "m_colorHeight", "m_calibrationColorIntrinsic")

@@ -43,7 +43,6 @@ class Layout:
 
 
 def _properties(scene: Scene | None) -> dict[str, Any]:
-    """Known properties of a scene: unit, datum, direction of gravity."""
     content: dict[str, Any] = {"metric": scene is None or not scene.arbitrary_unit}
     if scene is not None and scene.datum is not None:
         content["datum"] = scene.datum.to_json()

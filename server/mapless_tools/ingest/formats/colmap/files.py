@@ -76,7 +76,6 @@ class _Cursor:
             raise ValueError(f"{file} cannot be read: {error.strerror}") from error
 
     def take(self, layout: str) -> tuple[int | float, ...]:
-        """Reads the next values."""
         size = struct.calcsize("<" + layout)
         if self.position + size > len(self._data):
             raise self.fault(f"the file ends after {len(self._data)} bytes")
@@ -93,7 +92,6 @@ class _Cursor:
         return number
 
     def text(self) -> str:
-        """Reads the next text, which ends with a zero byte."""
         end = self._data.find(b"\0", self.position, self.position + _MAX_NAME_BYTES)
         if end < 0:
             raise self.fault("the name does not end")
@@ -105,13 +103,11 @@ class _Cursor:
         return name
 
     def end(self) -> None:
-        """Raises ValueError unless the file ends here."""
         if self.position != len(self._data):
             self.record = "end"
             raise self.fault(f"{len(self._data) - self.position} bytes are left over")
 
     def fault(self, what: str) -> ValueError:
-        """The error that says what is wrong, and where."""
         return ValueError(f"{self.file}: {self.record}, byte {self.position}: {what}; the file is cut off or damaged")
 
 
