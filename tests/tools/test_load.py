@@ -44,7 +44,7 @@ from mapless_tools.load.charts import LATENCIES, RATES, draw_load
 from mapless_tools.load.driving import photo_request, read_answer
 from mapless_tools.load.no_op import CAMERA, padded_photo
 from mapless_tools.load.pipeline import PipelineOptions, PipelineResult, pipeline_checks, pipeline_json
-from mapless_tools.load.report import Check, check_lines, machine_lines, step_lines, update_json
+from mapless_tools.load.report import Check, check_lines, machine_lines, report_part, step_lines
 from mapless_tools.load.sender import Target, connected, send_closed_loop, send_open_loop
 from mapless_tools.load.step import Step, run_step
 from mapless_tools.load.watch import (
@@ -506,8 +506,8 @@ def test_a_step_without_any_answer_can_be_reported() -> None:
 def test_the_file_of_figures_keeps_earlier_parts(tmp_path: Path) -> None:
     result = planted_result()
     file = tmp_path / "load.json"
-    update_json(file, "pipeline", pipeline_json(result), pipeline_checks(result))
-    update_json(file, "soak", {"figure": 1}, [])
+    report_part(file, "pipeline", [], pipeline_checks(result), pipeline_json(result))
+    report_part(file, "soak", [], [], {"figure": 1})
     content = json.loads(file.read_text())
     assert sorted(content) == ["pipeline", "soak"]
     assert content["pipeline"]["steps"][2]["share_of_saturation"] == 3.0

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from mapless_tools.progress import Progress
 
     from .report import Check
@@ -30,7 +32,7 @@ Clients = Annotated[int, typer.Option(help="Clients that call independently of o
 Seed = Annotated[int, typer.Option(help="Of the arrivals.")]
 Minutes = Annotated[float, typer.Option(help="How long the soak takes.")]
 
-OUTPUT = Path("load-output")
+OUTPUT, OUTPUT_FILE = Path("load-output"), "load.json"
 
 
 @load_app.command("overhead")
@@ -80,25 +82,24 @@ def all_command(data: Data = None, minutes: Minutes = 10.0, quick: Quick = False
 
 
 def _overhead(quick: bool, output: Path) -> list[Check]:
-    from .overhead import OverheadOptions, measure_overhead, overhead_checks, overhead_json, overhead_lines
+    from .overhead import OverheadOptions, measure_overhead, overhead_checks, overhead_figures, overhead_lines
+    from .report import report_part
 
     options = OverheadOptions(rounds=2, unloaded_s=0.3, saturated_s=0.5) if quick else OverheadOptions()
     with _measuring() as progress:
         subjects = measure_overhead(options, progress)
-    checks = overhead_checks(subjects)
-    _report(output, "overhead", overhead_lines(subjects, options), checks, overhead_json(subjects, options))
+    checks, lines = overhead_checks(subjects), overhead_lines(subjects, options)
+    report_part(output / OUTPUT_FILE, "overhead", lines, checks, overhead_figures(subjects, options))
     return checks
 
 
 def _pipeline(data: Path | None, quick: bool, output: Path, **given: Any) -> list[Check]:
-    from mapless_server.settings import available_cores
-    from mapless_tools.charts import write_figure
     from mapless_tools.demo import place_of
     from mapless_tools.usage import usage_errors
 
     from .charts import draw_load
     from .pipeline import PipelineOptions, measure_pipeline, pipeline_checks, pipeline_json
-    from .report import machine_lines, step_lines
+    from .report import step_lines
 
     brief = {"unloaded_s": 4.0, "ramp_s": 4.0, "step_s": 6.0, "settle_s": 1.0} if quick else {}
     with _measuring() as progress:
@@ -106,22 +107,17 @@ def _pipeline(data: Path | None, quick: bool, output: Path, **given: Any) -> lis
             options, place = PipelineOptions(**(given | brief)), place_of(data)
         log = _new_log(output, "pipeline")
         result = measure_pipeline(place, options, progress, log)
-        load = os.getloadavg()[0]
-    checks = pipeline_checks(result)
-    write_figure(draw_load(result), output / "load.png")
-    lines = [f"{result.scene}:", "", *step_lines(result.all_steps), *machine_lines(checks, load, available_cores())]
-    _report(output, "pipeline", lines, checks, pipeline_json(result), output / "load.png", log)
+    lines, checks = step_lines(result.all_steps), pipeline_checks(result)
+    _report_drawn(result.scene, lines, checks, pipeline_json(result), draw_load(result), output / "load.png", log)
     return checks
 
 
 def _soak(data: Path | None, quick: bool, output: Path, **given: Any) -> list[Check]:
-    from mapless_server.settings import available_cores
-    from mapless_tools.charts import write_figure
     from mapless_tools.demo import place_of
     from mapless_tools.usage import usage_errors
 
     from .charts import draw_soak
-    from .report import machine_lines, step_lines
+    from .report import step_lines
     from .soak import SoakOptions, least_minutes, measure_soak, soak_checks, soak_json, soak_lines
 
     brief = {"minutes": 0.25, "ramp_s": 4.0, "sample_every_s": 0.5, "churn": 4.0} if quick else {}
@@ -134,12 +130,9 @@ def _soak(data: Path | None, quick: bool, output: Path, **given: Any) -> list[Ch
             print(note, file=sys.stderr, flush=True)
         log = _new_log(output, "soak")
         result = measure_soak(place, options, progress, log)
-        load = os.getloadavg()[0]
-    checks = soak_checks(result)
-    steps = step_lines([*result.before, result.soak])
-    lines = [f"{result.scene}:", "", *steps, *soak_lines(result), *machine_lines(checks, load, available_cores())]
-    write_figure(draw_soak(result.states, result.slopes), output / "soak.svg")
-    _report(output, "soak", lines, checks, soak_json(result), output / "soak.svg", log)
+    lines, checks = [*step_lines([*result.before, result.soak]), *soak_lines(result)], soak_checks(result)
+    figure = draw_soak(result.states, result.slopes)
+    _report_drawn(result.scene, lines, checks, soak_json(result), figure, output / "soak.svg", log)
     return checks
 
 
@@ -151,15 +144,19 @@ def _new_log(output: Path, part: str) -> Path:
     return log
 
 
-def _report(
-    output: Path, part: str, lines: list[str], checks: list[Check], figures: dict[str, Any], *files: Path
+def _report_drawn(
+    scene: str, lines: list[str], checks: list[Check], figures: Any, figure: Figure, picture: Path, log: Path
 ) -> None:
-    from .report import check_lines, machine, update_json
+    from mapless_server.settings import available_cores
+    from mapless_tools.charts import write_figure
 
-    print("\n".join([f"## {part}", "", machine(), "", *lines, *check_lines(checks)]), flush=True)
-    output.mkdir(parents=True, exist_ok=True)
-    update_json(output / "load.json", part, figures, checks)
-    print(f"Written: {', '.join(map(str, [output / 'load.json', *files]))}\n", flush=True)
+    from .report import machine_lines, report_part
+
+    write_figure(figure, picture)
+    lines = [f"{scene}:", "", *lines, *machine_lines(checks, os.getloadavg()[0], available_cores())]
+    report_part(
+        picture.with_name(OUTPUT_FILE), log.name.removesuffix("-server.log"), lines, checks, figures, picture, log
+    )
 
 
 @contextmanager

@@ -145,21 +145,10 @@ def overhead_lines(subjects: Sequence[Subject], options: OverheadOptions) -> lis
     return [*lines, ""]
 
 
-def overhead_json(subjects: Sequence[Subject], options: OverheadOptions) -> dict[str, Any]:
-    """The figures as JSON values."""
-    return {
-        "options": vars(options),
-        "servers": [
-            {
-                "name": subject.name,
-                "p50_ms": subject.p50_ms,
-                "calls_per_s": subject.calls_per_s,
-                "unloaded": [step.as_json() for step in subject.unloaded],
-                "saturated": [step.as_json() for step in subject.saturated],
-            }
-            for subject in subjects
-        ],
-    }
+def overhead_figures(subjects: Sequence[Subject], options: OverheadOptions) -> dict[str, Any]:
+    """The figures for programs."""
+    servers = [{"p50_ms": it.p50_ms, "calls_per_s": it.calls_per_s, **vars(it)} for it in subjects]
+    return {"options": options, "servers": servers}
 
 
 def _prepared(server: ChildServer, options: OverheadOptions) -> bytes:

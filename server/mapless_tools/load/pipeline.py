@@ -122,20 +122,9 @@ def pipeline_checks(result: PipelineResult) -> list[Check]:
 
 
 def pipeline_json(result: PipelineResult) -> dict[str, Any]:
-    """The figures as JSON values."""
-    return {
-        "scene": result.scene,
-        "options": vars(result.options),
-        "saturation_per_s": result.saturation_per_s,
-        "unloaded": result.unloaded.as_json(),
-        "ramp": [step.as_json() for step in result.ramp],
-        "steps": [
-            {"share_of_saturation": share, **step.as_json()}
-            for share, step in zip(result.options.shares, result.steps, strict=True)
-        ],
-        "regular": result.regular.as_json(),
-        "hammered": result.hammered.as_json(),
-    }
+    """The figures for programs."""
+    steps = zip(result.options.shares, result.steps, strict=True)
+    return vars(result) | {"steps": [{"share_of_saturation": share, **it.as_json()} for share, it in steps]}
 
 
 async def _measure(place: Place, server: LoadedServer, options: PipelineOptions, progress: Progress) -> PipelineResult:

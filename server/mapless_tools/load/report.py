@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -110,11 +110,27 @@ def trend_check(figure: str, found: Slope | None, unit: str) -> Check:
     return Check(figure, value, f"no growth ({100 * TREND_CONFIDENCE:.0f} %)", not found.grows)
 
 
-def update_json(file: Path, part: str, figures: Mapping[str, Any], checks: Sequence[Check]) -> None:
-    """Writes a part's figures and verdicts into a file that may hold other parts."""
+def report_part(
+    file: Path, part: str, lines: Sequence[str], checks: Sequence[Check], figures: Any, *others: Path
+) -> None:
+    """Prints a measurement, adds it to a JSON file that may hold other parts, and names this and its other files."""
+    print("\n".join([f"## {part}", "", machine(), "", *lines, *check_lines(checks)]), flush=True)
+    file.parent.mkdir(parents=True, exist_ok=True)
     content = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-    measured = {"machine": machine(), "checks": [vars(check) for check in checks], **figures}
+    measured = {"machine": machine(), "checks": [vars(check) for check in checks], **figures_of(figures)}
     write_json(file, content | {part: measured})
+    print(f"Written: {', '.join(map(str, [file, *others]))}\n", flush=True)
+
+
+def figures_of(value: Any) -> Any:
+    """JSON values of a result: of steps their figures, of other dataclasses all fields."""
+    if isinstance(value, Step):
+        return value.as_json()
+    if is_dataclass(value):
+        value = vars(value)
+    if isinstance(value, Mapping):
+        return {name: figures_of(it) for name, it in value.items()}
+    return [figures_of(it) for it in value] if isinstance(value, list | tuple) else value
 
 
 def _ms(value: float | None) -> str:

@@ -3,34 +3,21 @@
 import argparse
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from mapless_server.serve.signals import terminable
 from mapless_tools.demo import place_of
-from mapless_tools.load.overhead import overhead_json, overhead_lines
-from mapless_tools.load.report import Check, check_lines, machine, update_json
+from mapless_tools.load.overhead import overhead_figures, overhead_lines
+from mapless_tools.load.report import Check, report_part
 from mapless_tools.progress import Progress, progress_bars
 
 from .cluster import ClusterFailed
 from .database import NoDatabase
 from .overhead import OPTIONS, measure_overhead, overhead_checks
-from .replacing import (
-    failover_checks,
-    kill_one,
-    measure_replacements,
-    redeploy,
-    redeploys_checks,
-    replacement_lines,
-)
-from .throughput import (
-    ThroughputOptions,
-    measure_throughput,
-    throughput_checks,
-    throughput_json,
-    throughput_lines,
-)
+from .replacing import failover_checks, kill_one, measure_replacements, redeploy, redeploys_checks, replacement_lines
+from .throughput import ThroughputOptions, measure_throughput, throughput_checks, throughput_lines
 
 KILLS, REDEPLOYS = 10, 20
 Part = tuple[list[str], list[Check], dict[str, Any]]
@@ -41,7 +28,7 @@ def overhead(given: argparse.Namespace, progress: Progress) -> Part:
     """Measures the cost of the ingress."""
     options = replace(OPTIONS, rounds=2, unloaded_s=0.5, saturated_s=0.5) if given.quick else OPTIONS
     ways = measure_overhead(options, progress)
-    return overhead_lines(ways, options), overhead_checks(ways), overhead_json(ways, options)
+    return overhead_lines(ways, options), overhead_checks(ways), overhead_figures(ways, options)
 
 
 def throughput(given: argparse.Namespace, progress: Progress) -> Part:
@@ -49,19 +36,19 @@ def throughput(given: argparse.Namespace, progress: Progress) -> Part:
     options = ThroughputOptions(rounds=1, step_s=5.0) if given.quick else ThroughputOptions()
     place = place_of(given.data)
     rounds = measure_throughput(place, options, progress)
-    return throughput_lines(rounds, place, options), throughput_checks(rounds), throughput_json(rounds, options)
+    return throughput_lines(rounds, place, options), throughput_checks(rounds), {"options": options, "rounds": rounds}
 
 
 def failover(given: argparse.Namespace, progress: Progress) -> Part:
     """Measures kills of one replica."""
     result = measure_replacements(kill_one, given.count or (2 if given.quick else KILLS), "failover", progress)
-    return replacement_lines(result, "of which one is killed"), failover_checks(result), asdict(result)
+    return replacement_lines(result, "of which one is killed"), failover_checks(result), vars(result)
 
 
 def redeploys(given: argparse.Namespace, progress: Progress) -> Part:
     """Measures replacements of all replicas."""
     result = measure_replacements(redeploy, given.count or (1 if given.quick else REDEPLOYS), "redeploys", progress)
-    return replacement_lines(result, "replaced one after the other"), redeploys_checks(result), asdict(result)
+    return replacement_lines(result, "replaced one after the other"), redeploys_checks(result), vars(result)
 
 
 PARTS: dict[str, Callable[[argparse.Namespace, Progress], Part]] = {
@@ -86,9 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with terminable(), progress_bars() as progress:
             for name in PARTS if given.part == "all" else (given.part,):
                 lines, checks, figures = PARTS[name](given, progress)
-                print("\n".join([f"## {name}", "", machine(), "", *lines, *check_lines(checks)]), flush=True)
-                given.output.mkdir(parents=True, exist_ok=True)
-                update_json(given.output / "load-ray.json", name, figures, checks)
+                report_part(given.output / "load-ray.json", name, lines, checks, figures)
                 is_met &= all(check.met for check in checks)
     except (ClusterFailed, NoDatabase, ValueError) as error:
         print(f"mapless_tools.load_ray: {error}", file=sys.stderr)

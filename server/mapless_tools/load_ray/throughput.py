@@ -7,7 +7,6 @@ from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 from mapless import Client
 from mapless_tools.demo import Place
@@ -106,12 +105,6 @@ def throughput_lines(rounds: list[Round], place: Place, options: ThroughputOptio
             f"| {100 * it.balancer_share:.1f} % |"
         )
     return [*lines, ""]
-
-
-def throughput_json(rounds: list[Round], options: ThroughputOptions) -> dict[str, Any]:
-    """The figures for programs."""
-    steps = [{"one": it.one.as_json(), "two": it.two.as_json(), "haproxy_share": it.balancer_share} for it in rounds]
-    return {"options": vars(options), "rounds": steps}
 
 
 async def _compare(
