@@ -1,87 +1,15 @@
-"""An export: fetches references concurrently, writes their images unchanged, then the file that describes them.
+"""An export: fetches references, writes their images unchanged, then the file that describes them.
 
 It can also rescue a damaged store: undamaged references are written.
 """
 
-import hashlib
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
-from mapless import Client, DataLoss, Reference
+from mapless import Client, Reference
 from mapless_tools.progress import Progress
 
+from .fetching import Export, fetch_all
 from .formats.writing import LAYOUTS, PosedImage, image_name, write_file
-
-PARALLEL = 4
-
-T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Export:
-    """The number of written references, and the server's messages about damaged ones by their ids, in their order."""
-
-    written: int
-    damaged: Mapping[str, str]
-
-    @property
-    def total(self) -> int:
-        """Number of references of the scene."""
-        return self.written + len(self.damaged)
-
-
-def fetch_all(
-    client: Client,
-    scene: str,
-    take: Callable[[Reference], T],
-    progress: Progress,
-    pictures: int | None = None,
-) -> tuple[list[T], dict[str, str]]:
-    """Calls `take`, in threads, for each reference; returns its results in order, and messages about damaged ones.
-
-    So many `pictures`, evenly spread, have their photographs; None for all. ValueError if the scene has no references.
-    """
-    references = _reference_ids(client, scene)
-    if not references:
-        raise ValueError(f"scene {scene} has no references")
-    step = 1 if pictures is None else -(-len(references) // pictures)
-
-    def fetch(position: int) -> tuple[T | None, str]:
-        try:
-            with_image = position % step == 0
-            reference = client.get_reference(scene, references[position], include_image=with_image)
-        except DataLoss as error:
-            return None, error.message
-        if with_image and hashlib.sha256(reference.image or b"").hexdigest() != reference.image_sha256:
-            return None, f"reference {reference.reference_id!r}: the image received is not the one that was stored"
-        return take(reference), ""
-
-    progress("references", 0, len(references))
-    taken: list[T] = []
-    damaged: dict[str, str] = {}
-    threads = ThreadPoolExecutor(PARALLEL, "export")
-    try:
-        for reference_id, (found, message) in zip(references, threads.map(fetch, range(len(references))), strict=True):
-            if found is None:
-                damaged[reference_id] = message
-            else:
-                taken.append(found)
-            progress("references", len(taken) + len(damaged), len(references))
-    finally:
-        threads.shutdown(wait=True, cancel_futures=True)
-    return taken, damaged
-
-
-def _reference_ids(client: Client, scene: str) -> list[str]:
-    with suppress(DataLoss):
-        return [reference.reference_id for reference in client.list_references(scene, page_size=1000)]
-    # A list ends at a reference whose pose is damaged; an audit names it and continues, but examines each reference.
-    return [audit.name.rpartition("/")[2] for audit in client.audit_scene(scene)]
-
 
 FORMATS = (*LAYOUTS, "gltf")
 

@@ -45,7 +45,7 @@ from mapless.geometry import Array, Quaternion, RigidTransform
 from mapless_tools.progress import Progress
 from mapless_tools.view.scenery import Scenery, lay_out
 
-from .exporting import Export, fetch_all
+from .fetching import Export, fetch_all
 from .formats.collecting import OPENCV_FROM_OPENGL
 from .formats.writing import write_file
 
