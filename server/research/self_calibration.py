@@ -25,7 +25,7 @@ from mapless_server.method.uncertainty import radii as uncertainty
 from mapless_server.method.uncertainty.radii import Accuracy
 from mapless_server.scenes.calibration.calibrator import left_out
 from mapless_server.scenes.calibration.fit import FitOptions, LeftOut, fit
-from mapless_server.services.messages.radii import Factors, scaled_accuracy
+from mapless_server.services.messages.answers import Factors, scaled_accuracy
 from mapless_server.store import SelfCalibration
 
 from .places import KITCHEN, QUERIES, Measured, Pair, Place, answered, read_places, samples_of_command, spread

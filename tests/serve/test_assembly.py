@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from support.programs import printed
 
+from mapless_server.method.correspond import make_matcher
 from mapless_server.method.features import make_extractor
 from mapless_server.networks.weights import WeightsMissing
 from mapless_server.observability.metrics import Metrics
@@ -151,12 +152,12 @@ def test_a_stronger_tier_rematches_by_light_glue(tmp_path: Path) -> None:
     from mapless_server.networks.lightglue import LightGlue
 
     missing: dict[str, ImportError | WeightsMissing] = {}
-    without = assembly._make_strong_matcher("aliked", settings(tmp_path), missing)
+    without = make_matcher("aliked", 1, assembly._find_light_glue("aliked", settings(tmp_path), missing))
     assert without.pair_matching is None
     assert list(missing) == ["aliked-lightglue"]
     (tmp_path / "weights").mkdir()
     save_file(LightGlue(128).state_dict(), tmp_path / "weights" / "aliked-lightglue.safetensors")
-    matcher = assembly._make_strong_matcher("aliked", settings(tmp_path), missing := {})
+    matcher = make_matcher("aliked", 1, assembly._find_light_glue("aliked", settings(tmp_path), missing := {}))
     assert not missing
     assert matcher.pair_matching is not None
     assert matcher.matching(strong=True) not in {matcher.matching(), without.matching()}

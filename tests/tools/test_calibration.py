@@ -20,7 +20,7 @@ from mapless_server.method.uncertainty.radii import (
     Accuracy,
     accuracy_from_covariance,
 )
-from mapless_server.services.messages.radii import (
+from mapless_server.services.messages.answers import (
     Conditions,
     Factors,
     reported_radii,

@@ -74,7 +74,12 @@ class Engine(Protocol):
         ...
 
     def query_job(self, query: Query, caller: Caller, *, on_coarse: Callable[[Result], None] | None = None) -> Job:
-        """Makes the job of localizing a photograph; its `records` list the stages that it has been through."""
+        """Makes the job of localizing a photograph, for `run`; its `records` list the stages that it has been through.
+
+        `on_coarse` is called on the event loop, before the answer, with the first tier's localization before its
+        refinement, if there is one; nothing has checked it. It is called again if references are deleted while they are
+        used. The answer does not depend on it.
+        """
         ...
 
     async def run(self, job: Job) -> Result:
@@ -103,11 +108,11 @@ class Engine(Protocol):
         ...
 
     def hold(self, queries: Sequence[Query], caller: Caller) -> AbstractContextManager[None]:
-        """Reserves the memory of a group's photographs for the duration of its call."""
+        """Reserves the memory of a group's photographs for its whole call, however many of them are queued."""
         ...
 
     def check_room(self, flow: Flow, is_query: bool = True) -> None:
-        """Raises RequestError if no query of a caller would be admitted now, or no upload of references."""
+        """Raises RequestError if no query of a caller would be admitted now, or no upload; its message is not read."""
         ...
 
     async def describe(self, photos: Sequence[Photo], caller: Caller) -> list[Description]:
@@ -123,7 +128,10 @@ class Engine(Protocol):
     async def audit(
         self, scene_key: SceneKey, reference_ids: Sequence[str], caller: Caller, are_listed: bool = False
     ) -> tuple[int, list[ReferenceAudit]]:
-        """Audits references of a scene by their neighbours; returns the scene's generation and the audits, in order."""
+        """Audits references of a scene by their neighbours; returns the scene's generation and the audits, in order.
+
+        References that do not exist any more are left out if `are_listed`, that is, if the caller did not name them.
+        """
         ...
 
     async def check_coverage(self, scene_key: SceneKey, view: Viewpoint, caller: Caller) -> tuple[int, Coverage]:

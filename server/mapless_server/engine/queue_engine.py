@@ -114,12 +114,7 @@ class QueueEngine:
         *,
         on_coarse: Callable[[Result], None] | None = None,
     ) -> Job:
-        """Makes the job of localizing a photograph, for `run`; its `records` list the stages that it has been through.
-
-        The references are those of the scene, unless another source is given. `on_coarse` is called on the event loop,
-        before the answer, with the first tier's localization before its refinement, if there is one; nothing has
-        checked it. It is called again if references are deleted while they are used. The answer does not depend on it.
-        """
+        """Implements Engine, with another source of references for the warm-up."""
         views = QueryViews(query.photo, self.options.image_limits)
         run = QueryRun(query, source or self.references, views, caller.deadline_s)
         if on_coarse is not None:
@@ -129,19 +124,13 @@ class QueueEngine:
         return Job(caller.flow, run.first_step, caller.deadline_s, size_bytes)
 
     async def run(self, job: Job) -> Result:
-        """Computes a query's job and returns its result.
-
-        RequestError for a bad image, unknown scene or reference, a full queue, a passed deadline.
-        """
+        """Implements Engine."""
         with _as_request_errors():
             return cast(Result, await self.queue.run(job))
 
     @contextmanager
     def hold(self, queries: Sequence[Query], caller: Caller) -> Iterator[None]:
-        """Reserves the memory of a group's photographs for the duration of its call, however many of them are queued.
-
-        RequestError if the queue has no room for them.
-        """
+        """Implements Engine."""
         with ExitStack() as stack:
             with _as_request_errors():
                 size_bytes = sum(len(query.photo.image) for query in queries)
@@ -149,30 +138,21 @@ class QueueEngine:
             yield
 
     def check_room(self, flow: Flow, is_query: bool = True) -> None:
-        """Raises RequestError if no query of a caller would be admitted now, or no upload of references.
-
-        Of what is refused here the message need not be read.
-        """
+        """Implements Engine."""
         try:
             self.queue.check_room(flow, _QUERY if is_query else _UPLOAD)
         except Refused as refused:
             raise _refusal(refused) from None
 
     async def describe(self, photos: Sequence[Photo], caller: Caller) -> list[Description]:
-        """Computes features and descriptors of photographs, in order.
-
-        RequestError for a bad image, a full queue, a passed deadline.
-        """
+        """Implements Engine."""
         size_bytes = sum(len(photo.image) for photo in photos)
         return await self._each(DESCRIBE, photos, self.references.describe, caller, size_bytes)
 
     async def retrieve(
         self, scene_key: SceneKey, photo: Photo, count: int, narrowing: Narrowing, caller: Caller
     ) -> Choice:
-        """Chooses the references of a scene that resemble a photograph most.
-
-        RequestError for a bad image, an unknown scene, a full queue, a passed deadline.
-        """
+        """Implements Engine."""
 
         def choose(photo: Photo, check: Callable[[], None]) -> Choice:
             views = QueryViews(photo, self.options.image_limits)
@@ -184,20 +164,13 @@ class QueueEngine:
     async def audit(
         self, scene_key: SceneKey, reference_ids: Sequence[str], caller: Caller, are_listed: bool = False
     ) -> tuple[int, list[ReferenceAudit]]:
-        """Audits references of a scene by their neighbours; returns the scene's generation and the audits, in order.
-
-        References that do not exist any more are left out if `are_listed`, that is, if the caller did not name them.
-        RequestError for an unknown scene or named reference, a full queue, a passed deadline.
-        """
+        """Implements Engine."""
         auditor = self.references.auditor(scene_key, () if are_listed else reference_ids)
         audits = await self._each(AUDIT, reference_ids, auditor.audit, caller, 0, jobs=1)
         return auditor.generation, [audit for audit in audits if audit is not None]
 
     async def check_coverage(self, scene_key: SceneKey, view: Viewpoint, caller: Caller) -> tuple[int, Coverage]:
-        """Predicts whether a photograph would be localized at a viewpoint; also returns the scene's generation.
-
-        RequestError for an unknown scene, a full queue, a passed deadline.
-        """
+        """Implements Engine."""
         auditor = self.references.auditor(scene_key)
         (coverage,) = await self._each(COVERAGE, [view], auditor.check_coverage, caller, 0)
         return auditor.generation, coverage

@@ -83,18 +83,8 @@ RADIUS_BUCKETS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5)
 """Metres; 0.2: above, a pose is doubtful."""
 
 _CODES = (
-    "OK",
-    "CANCELLED",
-    "INVALID_ARGUMENT",
-    "DEADLINE_EXCEEDED",
-    "NOT_FOUND",
-    "ALREADY_EXISTS",
-    "PERMISSION_DENIED",
-    "RESOURCE_EXHAUSTED",
-    "INTERNAL",
-    "UNAVAILABLE",
-    "DATA_LOSS",
-    "UNAUTHENTICATED",
+    *("OK", "CANCELLED", "INVALID_ARGUMENT", "DEADLINE_EXCEEDED", "NOT_FOUND", "ALREADY_EXISTS", "PERMISSION_DENIED"),
+    *("RESOURCE_EXHAUSTED", "INTERNAL", "UNAVAILABLE", "DATA_LOSS", "UNAUTHENTICATED"),
 )
 _OTHER = "other"
 _MAX_CHILDREN = 64
@@ -405,6 +395,5 @@ class Metrics(Observer, BackgroundObserver):
 
 
 def _observe(histogram: Histogram, value: float | None) -> None:
-    # One NaN would make the histogram's sum NaN for good.
-    if value is not None and math.isfinite(value):
+    if value is not None and math.isfinite(value):  # one NaN would make the histogram's sum NaN for good
         histogram.observe(value)

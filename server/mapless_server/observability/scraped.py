@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -40,13 +41,8 @@ class Scraped(Collector):
 
     def collect(self) -> Iterable[Metric]:
         """Implements Collector."""
-        for add_to in (
-            self._reference_cache,
-            self._retrieval_index,
-            self._token_cache,
-            self._gpu_memory,
-            self._certificate,
-        ):
+        parts = self._reference_cache, self._retrieval_index, self._token_cache, self._gpu_memory, self._certificate
+        for add_to in parts:
             metrics: dict[str, Metric] = {}
             try:
                 add_to(metrics)
@@ -105,3 +101,16 @@ def _counter(metrics: dict[str, Metric], name: str, text: str, labels: Iterable[
 def _gauge(metrics: dict[str, Metric], name: str, text: str, labels: Iterable[str] = ()) -> GaugeMetricFamily:
     family = metrics[name] = GaugeMetricFamily(name, text, labels=list(labels))
     return family
+
+
+def gpu_memory() -> dict[str, float]:
+    """Memory of the CUDA device in use, bytes by kind; empty without one. Does not import torch."""
+    torch = sys.modules.get("torch")
+    if torch is None or not torch.cuda.is_initialized():
+        return {}
+    cuda = torch.cuda
+    return {
+        "allocated": cuda.memory_allocated(),
+        "reserved": cuda.memory_reserved(),
+        "peak": cuda.max_memory_allocated(),
+    }

@@ -4,7 +4,6 @@ Nothing here imports torch unless the settings name a network.
 """
 
 import logging
-import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -219,7 +218,8 @@ def make_tiers(settings: Settings) -> tuple[Tier, ...]:
     extractors = _make_extractors(settings, device, missing)
     first = next(iter(extractors))
     matchers = {
-        name: _make_strong_matcher(name, settings, missing)
+        # A stronger tier on a CPU has LightGlue, half a second per pair.
+        name: make_matcher(name, available_cores(), _find_light_glue(name, settings, missing))
         if device == "cpu" and name != first
         else _make_matcher(name, settings, device)
         for name in extractors
@@ -285,16 +285,12 @@ def device_for(settings: Settings) -> str:
     Without networks it is the CPU: searching for others would import torch, a third of the server's memory.
     """
     needs_none = settings.backend == "geometric" and settings.reference_depth in (OFF, STORED)
-    if settings.device == "auto" and needs_none and not _wants_networks(settings):
+    features: Iterable[str] = [settings.features]
+    if settings.features == AUTO:
+        features = _present([*CPU_TIERS, *GPU_TIERS], settings)
+    if settings.device == "auto" and needs_none and all(name == WITHOUT_WEIGHTS for name in features):
         return "cpu"
     return choose_device(settings.device)
-
-
-def _wants_networks(settings: Settings) -> bool:
-    """Whether the features are a network's; with `auto`, whether weights of a network are present."""
-    if settings.features != AUTO:
-        return settings.features != WITHOUT_WEIGHTS
-    return any(name != WITHOUT_WEIGHTS for tiers in (CPU_TIERS, GPU_TIERS) for name in _present(tiers, settings))
 
 
 def _present(tiers: Iterable[Sequence[str]], settings: Settings) -> Iterator[str]:
@@ -319,18 +315,6 @@ def choose_device(device: str) -> str:
         # LightGlue. To be set before there are threads.
         torch.backends.cuda.enable_cudnn_sdp(False)
     return chosen
-
-
-def gpu_memory() -> dict[str, float]:
-    """Memory of the CUDA device in use, bytes by kind; empty without one. Does not import torch."""
-    torch = sys.modules.get("torch")
-    if torch is None or not torch.cuda.is_initialized():
-        return {}
-    return {
-        "allocated": torch.cuda.memory_allocated(),
-        "reserved": torch.cuda.memory_reserved(),
-        "peak": torch.cuda.max_memory_allocated(),
-    }
 
 
 def _find_device(device: str) -> str:
@@ -367,20 +351,13 @@ def _make_extractors(settings: Settings, device: str, missing: _Missing) -> dict
 
 def _log_missing(present: Iterable[str], missing: _Missing) -> None:
     if missing:
+        package = next((install_hint(it) for it in missing.values() if isinstance(it, ImportError)), "")
         log.info(
             "features auto: %s; with %s more photographs are localized where references are few or far apart: %s",
             " and ".join(present),
             " and ".join(missing),
-            _remedy(missing),
+            package or f"run `mapless-server weights fetch {' '.join(missing)}`",
         )
-
-
-def _remedy(missing: _Missing) -> str:
-    """Says how to get the missing features: a package first, then all weights at once."""
-    for error in missing.values():
-        if isinstance(error, ImportError):
-            return install_hint(error)
-    return f"run `mapless-server weights fetch {' '.join(missing)}`"
 
 
 def _make_extractor(name: str, settings: Settings, device: str) -> FeatureExtractor:
@@ -398,14 +375,6 @@ def _make_matcher(name: str, settings: Settings, device: str) -> Matcher:
         except WeightsMissing as error:
             log.warning("features %s: matched by nearest neighbours: %s", name, error)
     return make_matcher(name, available_cores())
-
-
-def _make_strong_matcher(name: str, settings: Settings, missing: _Missing) -> Matcher:
-    """Makes the matcher of a stronger tier, on a CPU: with LightGlue, half a second per pair.
-
-    Adds its weights to `missing` if they are missing.
-    """
-    return make_matcher(name, available_cores(), _find_light_glue(name, settings, missing))
 
 
 def _find_light_glue(features: str, settings: Settings, missing: _Missing) -> Path | None:

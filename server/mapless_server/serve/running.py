@@ -15,6 +15,7 @@ from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.observability.event_loop import watch_event_loop
 from mapless_server.observability.exporter import MetricsServer
 from mapless_server.observability.metrics import Metrics
+from mapless_server.observability.scraped import gpu_memory
 from mapless_server.observability.tracing import Tracer
 from mapless_server.scheduling import Fatal
 from mapless_server.security import SecurityError
@@ -26,7 +27,7 @@ from mapless_server.services.handlers import Services
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 
-from .assembly import MakeEngine, StartupError, gpu_memory, make_engine, open_store, what_is_missing
+from .assembly import MakeEngine, StartupError, make_engine, open_store, what_is_missing
 from .listening import AddressTaken, GrpcServer
 from .store_health import watch_store
 from .warm_up import warm_up

@@ -23,6 +23,7 @@ from mapless_server.store import SceneAttributes
 
 from .answers import (
     MAX_SESSION_COORDINATE_M,
+    ReportedRadii,
     accuracy_to_message,
     axes_from_message,
     check_to_message,
@@ -41,7 +42,6 @@ from .queries import (
     reference_count_from_message,
     reference_ids_from_names,
 )
-from .radii import ReportedRadii
 
 if TYPE_CHECKING:
     from mapless_server.engine.groups import GroupResult

@@ -3,7 +3,7 @@
 import base64
 import binascii
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from mapless import names, wire
 from mapless.scenes import (
@@ -29,18 +29,6 @@ MAX_PAGE_SIZE = 1000
 Record = TypeVar("Record")
 
 
-class PageRequest(Protocol):
-    """A request for one page of a list."""
-
-    @property
-    def page_size(self) -> int:
-        """The number of items wanted; 0 for the default."""
-
-    @property
-    def page_token(self) -> str:
-        """The token that the previous page returned; empty for the first page."""
-
-
 class Page:
     """One page of a list: number of items to read, where to begin, and the token of the next page.
 
@@ -53,7 +41,7 @@ class Page:
 
     def __init__(
         self,
-        request: PageRequest,
+        request: Any,
         tenant: str,
         collection: str,
         default_size: int = DEFAULT_PAGE_SIZE,
