@@ -341,7 +341,7 @@ class Camera:
 
     def pinhole(self) -> Camera:
         """The ideal camera with the same K and size."""
-        return replace(self, distortion=None)
+        return self if self.distortion is None else replace(self, distortion=None)
 
     def resized(self, width_px: int, height_px: int) -> Camera:
         """The camera of the same photograph resampled to another size.

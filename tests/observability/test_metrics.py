@@ -24,7 +24,7 @@ from mapless_server.observability import exporter
 from mapless_server.observability.event_loop import watch_event_loop
 from mapless_server.observability.exporter import MAX_CONNECTIONS, MetricsServer
 from mapless_server.observability.metrics import COUNTED, LOCALIZED, STAGES, Metrics
-from mapless_server.scheduling import Ending, Refusal
+from mapless_server.scheduling import Ending, Refusal, StageLoad
 
 LOCALIZE = "/mapless.v1.LocalizationService/Localize"
 
@@ -118,8 +118,7 @@ def count_everything(metrics: Metrics) -> None:
     metrics.call_handled(LOCALIZE, "OK", 0.2)
     metrics.admitted(0.5)
     metrics.refused(Refusal.QUEUE_FULL)
-    metrics.queued("coarse", 3, 1.5)
-    metrics.running("coarse", 2)
+    metrics.watch_queue(lambda stage: StageLoad(3, 1.5, 2) if stage == "coarse" else StageLoad(0, 0.0, 0))
     metrics.waited("coarse", 0.1)
     metrics.computed("coarse", "392x518x10", 2, 0.3)
     metrics.ended("refine", Ending.OK)

@@ -19,7 +19,8 @@ from support.programs import printed
 
 from mapless_server.extras import install_hint
 from mapless_server.observability.otlp import OtlpTracer, make_otlp_tracer
-from mapless_server.observability.tracing import TracedStep
+from mapless_server.observability.tracing import MAX_STAGES
+from mapless_server.scheduling import StageRecord
 from mapless_server.serve import running
 from mapless_server.serve.assembly import StartupError
 from mapless_server.settings import Settings
@@ -31,11 +32,11 @@ TRACEPARENT = ("traceparent", f"00-{TRACE_ID}-{PARENT_ID}-01")
 
 
 def spans_of(*calls: tuple[Any, ...]) -> dict[str, ReadableSpan]:
-    """What is exported of calls (metadata, code, steps, attributes), by name."""
+    """What is exported of calls (metadata, code, stages, attributes), by name."""
     exporter = InMemorySpanExporter()
     tracer = OtlpTracer(exporter)
-    for metadata, code, steps, attributes in calls:
-        tracer.begin(METHOD, metadata, time.monotonic()).end(code, steps, attributes)
+    for metadata, code, stages, attributes in calls:
+        tracer.begin(METHOD, metadata, time.monotonic()).end(code, stages, attributes)
     tracer.close(10)
     return {span.name: span for span in exporter.get_finished_spans()}
 
@@ -85,7 +86,7 @@ def test_what_the_caller_does_not_sample_is_not_recorded() -> None:
     tracer = OtlpTracer(exporter := InMemorySpanExporter())
     span = tracer.begin(METHOD, [("traceparent", f"00-{TRACE_ID}-{PARENT_ID}-00")], 0.0)
     assert span.trace_id == ""
-    span.end("OK", [TracedStep("coarse", 0.0, 1.0)], {})
+    span.end("OK", [StageRecord("coarse", 0.0, 0.0, 1.0, 1, 1)], {})
     tracer.close(10)
     assert exporter.get_finished_spans() == ()
 
@@ -101,18 +102,13 @@ def test_only_faults_of_the_server_are_errors(code: str) -> None:
     assert (span.attributes or {}).get("error.type") == (code if is_fault else None)
 
 
-def test_steps_are_children_and_parts_follow_each_other() -> None:
+def test_waits_and_computations_are_children() -> None:
     start_s = time.monotonic() - 100
-    steps = [
-        TracedStep("queue prepare", start_s, start_s + 1),
-        TracedStep("prepare", start_s + 1, start_s + 4, {"batch_id": "b-7"}, {"decode": 1.0, "features": 2.0}),
-    ]
     before_ns = time.time_ns()
-    spans = spans_of(([], "OK", steps, {}))
+    spans = spans_of(([], "OK", [StageRecord("prepare", start_s, start_s + 1, start_s + 4, batch=7, jobs=2)], {}))
     root = spans["mapless.v1.LocalizationService/Localize"]
     parents = {name: span.parent.span_id if span.parent else None for name, span in spans.items()}
     assert parents["queue prepare"] == parents["prepare"] == id_of(root)
-    assert parents["decode"] == parents["features"] == id_of(spans["prepare"])
     assert len({span.context.trace_id for span in spans.values() if span.context}) == 1
     seconds = {
         name: ((span.start_time or 0) / 1e9 - before_ns / 1e9, (span.end_time or 0) / 1e9 - before_ns / 1e9)
@@ -120,10 +116,12 @@ def test_steps_are_children_and_parts_follow_each_other() -> None:
     }
     assert seconds["queue prepare"] == pytest.approx((-100, -99), abs=1)
     assert seconds["prepare"] == pytest.approx((-99, -96), abs=1)
-    offset = seconds["prepare"][0]
-    assert seconds["decode"] == pytest.approx((offset, offset + 1), abs=1e-3)
-    assert seconds["features"] == pytest.approx((offset + 1, offset + 3), abs=1e-3)
-    assert (spans["prepare"].attributes or {})["mapless.batch_id"] == "b-7"
+    assert dict(spans["prepare"].attributes or {}) == {"mapless.batch": 7, "mapless.batch_size": 2}
+
+
+def test_a_trace_has_a_bounded_number_of_stages() -> None:
+    spans = spans_of(([], "OK", [StageRecord(f"{i}", 0.0, 1.0, 2.0, i, 1) for i in range(1000)], {}))
+    assert len(spans) == 1 + 2 * MAX_STAGES
 
 
 def test_every_value_has_a_form_as_an_attribute() -> None:
@@ -192,12 +190,12 @@ def test_a_real_collector_gets_the_call_when_the_server_ends(collector: tuple[Co
     tracer = make_otlp_tracer(endpoint)
     now_s = time.monotonic()
     span = tracer.begin(METHOD, [TRACEPARENT], now_s)
-    span.end("OK", [TracedStep("coarse", now_s, now_s + 0.1, {"batch_id": "b-7"})], {"scene": "hall"})
+    span.end("OK", [StageRecord("coarse", now_s, now_s, now_s + 0.1, 7, 1)], {"scene": "hall"})
     tracer.close(20)
     (request,) = receiver.received
     (resource_spans,) = request.resource_spans
     assert {a.key: a.value.string_value for a in resource_spans.resource.attributes}["service.name"] == "mapless"
-    child, root = sorted(resource_spans.scope_spans[0].spans, key=lambda span: str(span.name))
+    child, root, _ = sorted(resource_spans.scope_spans[0].spans, key=lambda span: str(span.name))
     assert (child.name, root.name) == ("coarse", "mapless.v1.LocalizationService/Localize")
     assert child.parent_span_id == root.span_id
     assert root.parent_span_id.hex() == PARENT_ID

@@ -21,11 +21,11 @@ from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server.errors import NotFound, Overloaded, PermissionDenied, RequestError, Unauthenticated, Unavailable
-from mapless_server.observability.tracing import MAX_STEPS, CallSpan, TracedStep, Tracer
+from mapless_server.observability.tracing import CallSpan, Tracer
 from mapless_server.rpc import CallGuard, pace, receiving
 from mapless_server.rpc.call import ANSWER_MARGIN_SHARE, Call
 from mapless_server.rpc.receiving import OpenMethods, Receiver
-from mapless_server.scheduling import Flow
+from mapless_server.scheduling import Flow, StageRecord
 from mapless_server.security import Principal, Role
 
 CHECK, WATCH = "/grpc.health.v1.Health/Check", "/grpc.health.v1.Health/Watch"
@@ -44,7 +44,7 @@ class Counted(Tracer, CallSpan):
     trace_id: str = ""
     started: list[str] = field(default_factory=list)
     handled: list[tuple[str, str, float, str]] = field(default_factory=list)
-    ended: list[tuple[str, Sequence[TracedStep], Mapping[str, object]]] = field(default_factory=list)
+    ended: list[tuple[str, Sequence[StageRecord], Mapping[str, object]]] = field(default_factory=list)
 
     def call_started(self, method: str) -> None:
         self.started.append(method)
@@ -55,8 +55,8 @@ class Counted(Tracer, CallSpan):
     def begin(self, method: str, metadata: Any, start_s: float) -> Counted:
         return self
 
-    def end(self, code: str, steps: Sequence[TracedStep], attributes: Mapping[str, object]) -> None:
-        self.ended.append((code, steps, attributes))
+    def end(self, code: str, stages: Sequence[StageRecord], attributes: Mapping[str, object]) -> None:
+        self.ended.append((code, stages, attributes))
 
     def close(self, limit_s: float) -> None:
         pass
@@ -479,10 +479,8 @@ async def test_a_servicers_notes_are_in_the_log_and_in_the_trace(
     async def answer(request: Any, call: Call) -> Any:
         start_s = call.arrived_s
         call.note(scene="hall", reference_count=10, code="forged", msg="not the record's")
-        call.waited("prepare", start_s, start_s + 0.010)
-        call.computed("prepare", start_s + 0.010, start_s + 0.040, {"decode": 0.010, "features": 0.020})
-        call.waited("coarse", start_s + 0.040, start_s + 0.045)
-        call.computed("coarse", start_s + 0.045, start_s + 0.145, batch_id="b-1", batch_size=3)
+        prepared = StageRecord("prepare", start_s, start_s + 0.010, start_s + 0.040, batch=1, jobs=1)
+        call.record([prepared, StageRecord("coarse", start_s + 0.040, start_s + 0.045, start_s + 0.145, 2, jobs=3)])
         return pb.LocalizeResponse()
 
     counted.trace_id = "0af7651916cd43dd8448eb211c80319c"
@@ -490,23 +488,14 @@ async def test_a_servicers_notes_are_in_the_log_and_in_the_trace(
         await ask(channel, b"\x0a\x01s", x_request_id="logged")
     (line,) = lines_of(caplog)
     assert line["queue_ms"] == pytest.approx(15)
-    assert line["stages_ms"] == {"decode": 10.0, "features": 20.0, "coarse": 100.0}
+    assert line["stages_ms"] == {"prepare": 30.0, "coarse": 100.0}
     assert (line["request_id"], line["scene"], line["reference_count"]) == ("logged", "hall", 10)
     assert (line["code"], line["msg_"]) == ("OK", "not the record's")
     assert (line["bytes_in"], line["bytes_out"], line["deadline_ms"]) == (3, 0, pytest.approx(30_000, abs=2000))
     assert line["trace_id"] == counted.trace_id == counted.handled[0][3]
-    _, steps, attributes = counted.ended[0]
-    assert [step.name for step in steps] == ["queue prepare", "prepare", "queue coarse", "coarse"]
-    assert steps[3].attributes == {"batch_id": "b-1", "batch_size": 3}
+    _, stages, attributes = counted.ended[0]
+    assert [it.stage for it in stages] == ["prepare", "coarse"]
     assert (attributes["scene"], attributes["request_id"]) == ("hall", "logged")
-
-
-def test_a_call_of_many_steps_adds_them_up_and_keeps_the_first() -> None:
-    call = Call("id", 0.0, 10.0)
-    for i in range(1000):
-        call.computed("describe", i, i + 0.5)
-    assert call.history.stage_seconds == {"describe": 500.0}
-    assert len(call.history.steps) == MAX_STEPS
 
 
 async def test_cancellation_inside_a_servicer_is_no_cancelled_call(counted: Counted) -> None:

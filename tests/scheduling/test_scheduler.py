@@ -293,7 +293,7 @@ class TestOrder:
             sizes.append(len(batch.jobs))
             toy.finish(batch, *(Done(None) for _ in batch.jobs))
         assert sizes == [3, 3, 1, 1]
-        assert toy.observer.inflight["coarse"] == toy.observer.waiting["coarse"] == 0
+        assert toy.scheduler.load("coarse") == (0, 0.0, 0)
 
     def test_a_larger_batch_is_tried_again_ever_more_rarely(self) -> None:
         toy = Toy(WorkQueueOptions(max_queued_s=1e9))
@@ -578,8 +578,8 @@ class Events(RuleBasedStateMachine):
         )
         running = Counter(job_stage for it in self.batches for job_stage in [it.stage.name] * len(it.jobs))
         for stage in COST_S:
-            assert self.toy.observer.waiting.get(stage, 0) == waiting[stage]
-            assert self.toy.observer.inflight.get(stage, 0) == running[stage]
+            load = self.toy.scheduler.load(stage)
+            assert (load.waiting, load.running) == (waiting[stage], running[stage])
 
     def teardown(self) -> None:
         """Nothing starves: let alone, everything comes to its end."""

@@ -199,7 +199,7 @@ class TestResults:
             before_s = time.monotonic()
             job = Job(Flow("t", "c"), Step("first", "toy", "b", "z"), before_s + FAR_S, 1)
             running = asyncio.ensure_future(toy.queue.run(job))
-            await until(lambda: toy.observer.waiting["then"] == 3)
+            await until(lambda: toy.queue.load("then").waiting == 3)
             toy.gate.set()
             value = await running
             await outcomes(others)
@@ -396,7 +396,7 @@ class TestEndOfAll:
         async with Toy(compute) as toy:
             await self._ends(toy, [toy.submit(i, "first") for i in range(2)])
 
-    @pytest.mark.parametrize("event", ["queued", "running", "waited", "computed", "ended"])
+    @pytest.mark.parametrize("event", ["waited", "computed", "ended"])
     async def test_a_bug_in_the_loop_itself_ends_the_queue(self, event: str) -> None:
         """Such as an observer that raises, which it must not."""
         broken = threading.Event()
@@ -548,8 +548,8 @@ class TestCallersWhoLeave:
         async with Toy(compute) as toy:
             found = await outcomes([asyncio.ensure_future(caller(i)) for i in range(400)])
             assert toy.queue.job_count == 0
-            await until(lambda: not any(toy.observer.inflight.values()))
-            assert not any(toy.observer.waiting.values())
+            await until(lambda: not any(toy.queue.load(stage).running for stage in ("first", "then")))
+            assert not any(toy.queue.load(stage).waiting for stage in ("first", "then"))
         observer, kinds = toy.observer, Counter(map(type, found))
         assert observer.admissions + observer.refusals.total() == len(found)
         assert observer.endings.total() == observer.admissions

@@ -6,15 +6,13 @@ from mapless_server.scheduling import Ending, Observer, Refusal
 
 
 class CountingObserver(Observer):
-    """Counts events, and keeps the latest loads of stages."""
+    """Counts events."""
 
     def __init__(self) -> None:
         self.admissions = 0
         self.out_of_memory = 0
         self.refusals: Counter[Refusal] = Counter()
         self.endings: Counter[Ending] = Counter()
-        self.waiting: Counter[str] = Counter()
-        self.inflight: Counter[str] = Counter()
         self.batches: list[tuple[str, int]] = []
 
     def admitted(self, cost_s: float) -> None:
@@ -22,12 +20,6 @@ class CountingObserver(Observer):
 
     def refused(self, reason: Refusal) -> None:
         self.refusals[reason] += 1
-
-    def queued(self, stage: str, jobs: int, cost_s: float) -> None:
-        self.waiting[stage] = jobs
-
-    def running(self, stage: str, jobs: int) -> None:
-        self.inflight[stage] = jobs
 
     def computed(self, stage: str, bucket: str, jobs: int, seconds: float) -> None:
         self.batches.append((stage, jobs))

@@ -90,7 +90,7 @@ class QueryStages:
             # A reference deleted since the scene was listed was not the caller's choice: the next list is without it.
             is_outdated = isinstance(error, NotFound) and error.field != "scene" and not run.query.reference_ids
             if is_outdated and run.listings < MAX_LISTINGS:
-                return self._next(run, replace(run, listings=run.listings + 1, view=None).first_step)
+                return self._next(run, run.but(listings=run.listings + 1, view=None).first_step)
             if run.earlier is None:
                 if not is_outdated:
                     return error
@@ -107,12 +107,12 @@ class QueryStages:
         tier, query = self._tiers[run.tier], run.query
         if run.view is not None:  # its first step is done
             return self._matched_further(self._rematched(run) if self._has_time_to_rematch(run, tier) else run)
-        run = replace(run, context=StageContext(job.check))
+        run = run.but(context=StageContext(job.check))
         try:
             attributes = run.source.attributes(query.scene_key)
             if query.is_generic:
                 attributes = replace(attributes, calibration=None, self_calibrations=())
-            run = replace(run, attributes=attributes)
+            run = run.but(attributes=attributes)
             tracked = self._tracked(run, tier) if run.tracks else None
             if tracked is not None:
                 return tracked
@@ -131,9 +131,9 @@ class QueryStages:
             if run.query_matches is None:
                 with run.context.stage("correspond"):
                     matches = matcher.match_quickly(run.view, run.references, run.context.check)
-                run = replace(run, query_matches=tuple(matches))
+                run = run.but(query_matches=tuple(matches))
             assert run.query_matches is not None
-            run = replace(run, unmatched=tuple(matcher.to_rematch(run.query_matches)))
+            run = run.but(unmatched=tuple(matcher.to_rematch(run.query_matches)))
         return self._matched_further(run)
 
     def _rematched(self, run: QueryRun) -> QueryRun:
@@ -144,7 +144,7 @@ class QueryStages:
         matches = list(run.query_matches)
         with run.context.stage("rematch"):
             matches[index] = self._tiers[run.tier].pipeline.matcher.rematch(run.view, run.references[index])
-        return replace(run, query_matches=tuple(matches), unmatched=tuple(others))
+        return run.but(query_matches=tuple(matches), unmatched=tuple(others))
 
     def _matched_further(self, run: QueryRun) -> StageResult:
         """Matches the next reference, or goes on with the query if all are matched or no time is left for more."""
@@ -153,15 +153,15 @@ class QueryStages:
         if self._has_time_to_rematch(run, tier):
             # If the queue finds no time for that, the pose is computed from the matches there are.
             again = Step(PREPARE, f"{run.kind}, rematch", f"{run.kind}, rematch", run, run.kind)
-            pose = Step(PREPARE, f"{run.kind}, matched", f"{run.kind}, matched", replace(run, unmatched=()), run.kind)
+            pose = Step(PREPARE, f"{run.kind}, matched", f"{run.kind}, matched", run.but(unmatched=()), run.kind)
             return self._next(run, again, pose)
-        run = replace(run, unmatched=())
+        run = run.but(unmatched=())
         pipeline = _pipeline_in(run, tier)
         given = run.view, run.references, pipeline, query.options, run.context, run.query_matches, query.priors
         part = self._method.prepare(*given, not run.attributes.arbitrary_unit)
         if isinstance(part, Answer):
             return self._conclude(run, part)
-        return self._next(run, Step(COARSE, run.kind, str(part.bucket), replace(run, part=part)))
+        return self._next(run, Step(COARSE, run.kind, str(part.bucket), run.but(part=part)))
 
     def _has_time_to_rematch(self, run: QueryRun, tier: Tier) -> bool:
         """Whether another reference is left to be matched, and time for it before the tier must compute the pose."""
@@ -204,7 +204,7 @@ class QueryStages:
             rivals = run.load_chosen(others, tier)[1] if others else ()
             if tracking.is_contradicted(answer, view, rivals, pipeline.matcher):
                 return None
-        tracked = replace(run, generation=generation, references=references, view=view, choice=near)
+        tracked = run.but(generation=generation, references=references, view=view, choice=near)
         result = replace(self._result(tracked, answer), tier=tier)
         return result if isinstance(result.answer.outcome, Localization) else None
 
@@ -213,7 +213,7 @@ class QueryStages:
         # References come first: a wrong name is found before the photograph is described.
         generation, references = run.load(run.query.reference_ids, tier)
         view = run.views.view(tier.extractor, run.context)
-        return replace(run, generation=generation, references=references, view=view)
+        return run.but(generation=generation, references=references, view=view)
 
     def _with_chosen(self, run: QueryRun, tier: Tier) -> QueryRun:
         """Chooses, among the references that resemble the photograph most, those with the most matches."""
@@ -230,15 +230,15 @@ class QueryStages:
             matcher = tier.pipeline.matcher
             matches = matcher.match_best(view, shortlist, query.reference_count, choose, context.check)
         chosen, query_matches = tuple(shortlist[i] for i in matches), tuple(matches.values())
-        found = replace(run, generation=generation, references=chosen, view=view, choice=choice)
-        return replace(found, query_matches=query_matches)
+        found = run.but(generation=generation, references=chosen, view=view, choice=choice)
+        return found.but(query_matches=query_matches)
 
     def _after_coarse(self, run: QueryRun, part: Coarse | Answer | Exception) -> StageResult:
         if isinstance(part, Exception):
             raise part
         if isinstance(part, Answer):
             return self._conclude(run, part)
-        step = Step(REFINE, run.kind, run.kind, replace(run, part=part))
+        step = Step(REFINE, run.kind, run.kind, run.but(part=part))
         if run.earlier is not None or not (run.query.allow_coarse or run.on_coarse is not None):
             return self._next(run, step)
         answer = self._method.coarse_answer(part)
@@ -287,7 +287,7 @@ class QueryStages:
         matches = None if run.query_matches is None else tuple(run.query_matches[i] for i in kept)
         references, give_up_s = tuple(run.references[i] for i in kept), min(run.give_up_s, self._give_up_s(run))
         return self._matched_further(
-            replace(run, references=references, query_matches=matches, ambiguous=ambiguous, give_up_s=give_up_s)
+            run.but(references=references, query_matches=matches, ambiguous=ambiguous, give_up_s=give_up_s)
         )
 
     def _give_up_s(self, run: QueryRun) -> float:

@@ -201,10 +201,9 @@ def _read_jpeg_header(data: bytes) -> tuple[int, int]:
     """Reads the segments up to the frame header, which precedes the first scan."""
     position = 2
     for _ in range(_MAX_JPEG_SEGMENTS):
-        marker = _big_endian(data, position, 2)
-        if marker >> 8 != 0xFF:
+        first, marker = data[position], data[position + 1]
+        if first != 0xFF:
             raise _Malformed("the JPEG is damaged: no marker where one must stand", "IMAGE_UNDECODABLE")
-        marker &= 0xFF
         if marker == 0xFF:  # padding
             position += 1
         elif marker in _JPEG_WITHOUT_LENGTH:
@@ -214,7 +213,7 @@ def _read_jpeg_header(data: bytes) -> tuple[int, int]:
         elif marker in (0xDA, 0xD9):
             raise _Malformed("the JPEG has no frame header", "IMAGE_UNDECODABLE")
         else:
-            position += 2 + _big_endian(data, position + 2, 2)
+            position += 2 + (data[position + 2] << 8 | data[position + 3])
     raise _Malformed("the JPEG has too many segments before its frame header", "IMAGE_TOO_COMPLEX")
 
 

@@ -146,7 +146,8 @@ def plain(value: object) -> object:
 
 
 def _plain(value: object, depth: int) -> object:
-    if type(value) is float and math.isfinite(value):  # the usual case first
+    kind = type(value)  # the usual cases first
+    if (kind is float and math.isfinite(value)) or (kind is int and abs(value) < _MAX_INTEGER):  # type: ignore[arg-type]
         return value
     if isinstance(value, Enum):
         return _plain(value.value, depth)

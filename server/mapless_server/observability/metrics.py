@@ -19,7 +19,7 @@ from prometheus_client.metrics_core import Metric
 from mapless.v1 import localization_service_pb2, reference_service_pb2
 from mapless_server.method.rejection import RejectionReason
 from mapless_server.scenes.observer import BackgroundObserver
-from mapless_server.scheduling import Ending, Observer, Refusal
+from mapless_server.scheduling import Ending, Observer, Refusal, StageLoad
 from mapless_server.security import ENDLESS_METHODS
 
 from .scraped import Scraped
@@ -171,14 +171,15 @@ class Metrics(Observer, BackgroundObserver):
         """Implements Observer."""
         self._refused(reason.value).inc()
 
-    def queued(self, stage: str, jobs: int, cost_s: float) -> None:
-        """Implements Observer."""
-        self._depth(stage).set(jobs)
-        self._cost(stage).set(cost_s)
+    def watch_queue(self, load: Callable[[str], StageLoad]) -> None:
+        """Registers a function that returns the load of a stage of the queue, called at every scrape."""
 
-    def running(self, stage: str, jobs: int) -> None:
-        """Implements Observer."""
-        self._inflight(stage).set(jobs)
+        def read(stage: str, part: int) -> Callable[[], float]:
+            return lambda: load(stage)[part]
+
+        for stage in STAGES:
+            for part, gauge in enumerate((self._depth, self._cost, self._inflight)):  # as in `StageLoad`
+                gauge.labels(stage).set_function(read(stage, part))
 
     def waited(self, stage: str, seconds: float) -> None:
         """Implements Observer."""
@@ -321,10 +322,10 @@ class Metrics(Observer, BackgroundObserver):
         self._refused = _Children(refused, [(reason.value,) for reason in Refusal])
         waited = histogram("mapless_queue_wait_seconds", "Time that jobs waited for a stage.", WAIT_BUCKETS, stage)
         self._waited = _Children(waited, stages)
-        self._depth = _Children(gauge("mapless_queue_depth", "Jobs that wait.", stage), stages)
-        cost = gauge("mapless_queue_cost_seconds", "Computing time predicted for jobs that wait.", stage)
-        self._cost = _Children(cost, stages)
-        self._inflight = _Children(gauge("mapless_inflight", "Jobs that are computed.", stage), stages)
+        self._depth = gauge("mapless_queue_depth", "Jobs that wait.", stage)
+        self._cost = gauge("mapless_queue_cost_seconds", "Computing time predicted for jobs that wait.", stage)
+        self._inflight = gauge("mapless_inflight", "Jobs that are computed.", stage)
+        self.watch_queue(lambda _: StageLoad(0, 0.0, 0))
         ended = counter("mapless_jobs_terminated", "Admitted jobs that ended.", ["stage", "outcome"])
         self._ended = _Children(ended, [(name, ending.value) for name in STAGES for ending in Ending])
         self._batch_size = _Children(histogram("mapless_batch_size", "Jobs in a batch.", BATCH_BUCKETS, stage), stages)

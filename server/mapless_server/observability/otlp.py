@@ -15,9 +15,10 @@ from opentelemetry.trace import Span, SpanKind, Status, StatusCode, set_span_in_
 from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
 from mapless_server import __version__
+from mapless_server.scheduling import StageRecord
 
 from .logs import plain
-from .tracing import CallSpan, Metadata, TracedStep, Tracer
+from .tracing import MAX_STAGES, CallSpan, Metadata, Tracer
 
 EXPORT_LIMIT_S = 5.0
 """Time that a collector may take for a batch, retries included."""
@@ -76,24 +77,17 @@ class OtlpTracer(Tracer):
             self._exporter.shutdown()
             flushing.join(_CANCEL_LIMIT_S)
 
-    def record(self, parent: Span, steps: Sequence[TracedStep]) -> None:
-        """Adds a child span for each step, and below it one for each of the step's parts."""
-        for step in steps:
-            span = self._child(parent, step.name, step.start_s, step.attributes)
-            part_start_s = step.start_s
-            for name, seconds in step.part_seconds.items():
-                part = self._child(span, name, part_start_s, {})
-                part_start_s += seconds
-                part.end(_epoch_ns(part_start_s))
-            span.end(_epoch_ns(step.end_s))
+    def record(self, parent: Span, stages: Sequence[StageRecord]) -> None:
+        """Adds two child spans for each stage: the wait for it, and its computation."""
+        for it in stages[:MAX_STAGES]:
+            self._add(parent, f"queue {it.stage}", it.queued_s, it.start_s, {})
+            if it.jobs:
+                self._add(parent, it.stage, it.start_s, it.end_s, {"batch": it.batch, "batch_size": it.jobs})
 
-    def _child(self, parent: Span, name: str, start_s: float, attributes: Mapping[str, object]) -> Span:
-        return self._tracer.start_span(
-            name,
-            set_span_in_context(parent, Context()),
-            attributes=_attributes(attributes),
-            start_time=_epoch_ns(start_s),
-        )
+    def _add(self, parent: Span, name: str, start_s: float, end_s: float, about: Mapping[str, object]) -> None:
+        context = set_span_in_context(parent, Context())
+        span = self._tracer.start_span(name, context, attributes=_attributes(about), start_time=_epoch_ns(start_s))
+        span.end(_epoch_ns(end_s))
 
 
 class _OtlpSpan(CallSpan):
@@ -103,7 +97,7 @@ class _OtlpSpan(CallSpan):
         context = span.get_span_context()
         self.trace_id = f"{context.trace_id:032x}" if context.trace_flags.sampled else ""
 
-    def end(self, code: str, steps: Sequence[TracedStep], attributes: Mapping[str, object]) -> None:
+    def end(self, code: str, stages: Sequence[StageRecord], attributes: Mapping[str, object]) -> None:
         """Implements CallSpan."""
         if not self._span.is_recording():
             return
@@ -111,7 +105,7 @@ class _OtlpSpan(CallSpan):
         if code in _SERVER_FAULTS:
             self._span.set_attribute("error.type", code)
             self._span.set_status(Status(StatusCode.ERROR))
-        self._tracer.record(self._span, steps)
+        self._tracer.record(self._span, stages)
         self._span.end()
 
 

@@ -4,7 +4,7 @@ import math
 import random
 import re
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from urllib.parse import unquote
 
@@ -58,22 +58,9 @@ class Call:
         """Adds fields to the call's line in the log and to its trace; they cannot replace the standard fields."""
         self.history.notes.update(fields)
 
-    def record(self, records: Iterable[StageRecord]) -> None:
+    def record(self, stages: Iterable[StageRecord]) -> None:
         """Records the queue's stages that a job of the call has passed."""
-        for it in records:
-            self.waited(it.stage, it.queued_s, it.start_s)
-            if it.jobs:
-                self.computed(it.stage, it.start_s, it.end_s, batch=it.batch, batch_size=it.jobs)
-
-    def waited(self, stage: str, start_s: float, end_s: float) -> None:
-        """Records a wait for a stage of the queue; times by `time.monotonic`."""
-        self.history.waited(stage, start_s, end_s)
-
-    def computed(
-        self, stage: str, start_s: float, end_s: float, part_seconds: Mapping[str, float] | None = None, **about: object
-    ) -> None:
-        """Records the computation of a stage, and of its parts in sequence; times by `time.monotonic`."""
-        self.history.computed(stage, start_s, end_s, part_seconds or {}, **about)
+        self.history.stages += stages
 
 
 @dataclass(frozen=True)

@@ -302,12 +302,11 @@ class CallGuard:
     def _log_end(self, method: str, call: Call, result: _Result, seconds: float) -> None:
         span, record = result.span, call.history
         fields: dict[str, object] = {**record.notes, "request_id": call.request_id, "client": call.client}
-        span.end(result.code, record.steps, fields)
+        span.end(result.code, record.stages, fields)
         if span.trace_id:
             fields["trace_id"] = span.trace_id
-        if record.queue_s is not None:
+        if record.stages:
             fields["queue_ms"] = _ms(record.queue_s)
-        if record.stage_seconds:
             fields["stages_ms"] = {name: _ms(spent_s) for name, spent_s in record.stage_seconds.items()}
         fields |= {"method": method, "code": result.code, "duration_ms": _ms(seconds)}
         log.info("%s %s", method.rpartition("/")[2], result.code, extra=as_extra(fields))

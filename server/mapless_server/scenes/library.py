@@ -9,7 +9,6 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -20,7 +19,7 @@ from mapless_server.errors import AlreadyExists, DataLoss, InvalidArgument, Requ
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import StageContext
-from mapless_server.method.views import Photograph, PosedView
+from mapless_server.method.views import Photograph, PosedView, View
 from mapless_server.security import SceneKey
 from mapless_server.store import DescribedReference, ReferenceRecord, SceneAttributes, Store
 
@@ -169,12 +168,12 @@ class ReferenceLibrary:
                 self._store.add_features(record.key, extractor.name, view)
 
     def _posed_view(self, reference: DescribedReference) -> PosedView:
-        record = reference.record
+        record, view = reference.record, reference.view
         photograph = Photograph(lambda: record.image_sha256, record.camera, partial(self._pixels, record))
         return PosedView(
             record.key,
             reference_name(record.scene_id, record.reference_id),
-            replace(reference.view, photograph=photograph),
+            View(view.camera, view.features, photograph),
             record.world_from_camera,
         )
 

@@ -87,8 +87,10 @@ class Ledger:
     def rebook(self, job: Job, cost_s: Counter[str]) -> None:
         """Replaces the computing time predicted for a job, by lane."""
         for holdings in (self._flows[job.flow], self._all):
-            holdings.booked_s.subtract(job.booked_s)
-            holdings.booked_s.update(cost_s)
+            for lane, seconds in job.booked_s.items():  # Counter's methods take ten times as long
+                holdings.booked_s[lane] -= seconds
+            for lane, seconds in cost_s.items():
+                holdings.booked_s[lane] += seconds
         job.booked_s = cost_s
 
     def close(self, job: Job) -> None:

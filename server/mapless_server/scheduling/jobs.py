@@ -3,7 +3,7 @@
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, NamedTuple
@@ -78,6 +78,14 @@ class Stage:
     lane: str
     then: str | None = None
     max_batch: int = 1
+
+
+class StageLoad(NamedTuple):
+    """The jobs that wait for a stage, their predicted computing time from there on, and the jobs that it computes."""
+
+    waiting: int
+    cost_s: float
+    running: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,6 +271,7 @@ class Lane:
     Attributes:
         threads: number of threads.
         stages: the stages that they compute, in the order in which jobs go through them.
+        queues: the jobs that wait for each of them.
         free: number of idle threads.
         passed_over: batches since the first stage that has waiting jobs was served.
         busy_s: sum of the threads' computing times so far.
@@ -271,7 +280,8 @@ class Lane:
     """
 
     threads: int
-    stages: list[Stage]
+    stages: Sequence[Stage]
+    queues: Sequence[Collection[Job]]
     free: int
     passed_over: int = 0
     busy_s: float = 0.0

@@ -15,12 +15,6 @@ class Observer:
     def refused(self, reason: Refusal) -> None:
         """A job was refused."""
 
-    def queued(self, stage: str, jobs: int, cost_s: float) -> None:
-        """Reports the number of jobs that wait for a stage, and their predicted computing time from there on."""
-
-    def running(self, stage: str, jobs: int) -> None:
-        """Reports the number of jobs that are being computed in a stage."""
-
     def waited(self, stage: str, seconds: float) -> None:
         """A job was taken from a stage's waiting jobs after this time."""
 

@@ -29,6 +29,7 @@ from .jobs import (
     Refusal,
     Refused,
     Stage,
+    StageLoad,
     StageRecord,
     StageResult,
     Step,
@@ -84,9 +85,10 @@ class Scheduler:
         self._stages = {stage.name: stage for stage in stages}
         self._queues: dict[str, FairQueue[Job]] = {stage.name: FairQueue(options.quantum_s) for stage in stages}
         self._running: Counter[str] = Counter()
-        self._lanes = {
-            name: Lane(count, [stage for stage in stages if stage.lane == name], count) for name, count in lanes.items()
-        }
+        self._lanes = {}
+        for name, count in lanes.items():
+            own = [stage for stage in stages if stage.lane == name]
+            self._lanes[name] = Lane(count, own, [self._queues[stage.name] for stage in own], count)
         self._limits: dict[tuple[str, str], BatchLimit] = {}
         self._declined: Counter[tuple[str, str]] = Counter()
         self._first_steps: OrderedDict[tuple[Flow, str], Step] = OrderedDict()
@@ -123,6 +125,11 @@ class Scheduler:
             heapq.heappop(self._due)  # the job has ended or is now due at another time
         return None
 
+    def load(self, stage: str) -> StageLoad:
+        """The jobs of a stage."""
+        queue = self._queues[stage]
+        return StageLoad(len(queue), queue.cost_s, self._running[stage])
+
     def admit(self, job: Job, now_s: float) -> None:
         """Admits a job, which then ends exactly once; raises Refused without any change."""
         cost_s = self._predict(job.step, job.flow, now_s)
@@ -138,7 +145,7 @@ class Scheduler:
                     raise Refused(Refusal.TENANT_QUOTA, "the tenant's computing time is used up", wait_s)
         self._observer.admitted(cost_s.total())
         self._ledger.open(job, self._admission.bookable(cost_s))
-        self._enqueue(job, now_s)
+        self._enqueue(job, cost_s.total(), now_s)
 
     def hold(self, flow: Flow, size_bytes: int) -> None:
         """Books memory that a call needs besides its jobs, until `release`; raises Refused if there is no room."""
@@ -165,7 +172,7 @@ class Scheduler:
     def has_work(self, lane_name: str) -> bool:
         """Whether a job waits for an idle thread of a lane."""
         lane = self._lanes[lane_name]
-        return lane.free > 0 and any(self._queues[stage.name] for stage in lane.stages)
+        return lane.free > 0 and any(lane.queues)
 
     def take(self, lane_name: str, now_s: float) -> Batch | None:
         """Selects what a thread of a lane computes now; None if all threads are busy or no job waits."""
@@ -180,7 +187,7 @@ class Scheduler:
             step_s = self._step_s(job, now_s)
             return step_s <= self._options.quantum_s or not lane.expects_shorter(job.flow, step_s, now_s)
 
-        waiting = [stage for stage in lane.stages if any(map(is_allowed, self._queues[stage.name]))]
+        waiting = [it for it, queue in zip(lane.stages, lane.queues, strict=True) if any(map(is_allowed, queue))]
         if not waiting:
             return None
         # Late stages first: jobs that have begun hold memory, and time has been spent on them.
@@ -193,7 +200,6 @@ class Scheduler:
             job.is_computed = True
             self._observer.waited(stage.name, now_s - job.waits_since_s)
         self._running[stage.name] += len(jobs)
-        self._report_load(stage)
         batch = Batch(stage, jobs, now_s, next(self._batch_number))
         if self._step_s(jobs[0], now_s) > self._options.quantum_s:
             lane.long.add(batch.number)
@@ -232,7 +238,6 @@ class Scheduler:
                 self._end(job, result.ending, result.value, now_s)
             else:
                 self._end(job, self._ending_of(result), result, now_s)
-        self._report_load(stage)
 
     def cancel(self, job: Job, now_s: float) -> None:
         """Ends a job whose caller does not wait for it any more."""
@@ -318,6 +323,7 @@ class Scheduler:
         """
         job.step, job.fallback = result.step, result.fallback
         cost_s = self._predict(job.step, job.flow, now_s)
+        in_order_s = cost_s.total()
         if job.fallback is None:
             cost_s &= job.booked_s  # it was admitted for no more
         elif not self._is_worthwhile(job, cost_s, now_s):
@@ -328,7 +334,7 @@ class Scheduler:
                 self._give_fallback(job, job.fallback, now_s)
                 return
         self._ledger.rebook(job, self._admission.bookable(cost_s))
-        self._enqueue(job, now_s)
+        self._enqueue(job, in_order_s, now_s)
 
     def _is_worthwhile(self, job: Job, cost_s: Counter[str], now_s: float) -> bool:
         """Whether a job's next step fits within the bounds and ends before the job is due."""
@@ -342,18 +348,16 @@ class Scheduler:
         self._declined[step.stage, step.kind] += 1
         return self._declined[step.stage, step.kind] % _TRY_ONE_IN == 0
 
-    def _enqueue(self, job: Job, now_s: float) -> None:
+    def _enqueue(self, job: Job, cost_s: float, now_s: float) -> None:
+        """Lets a job wait for its step; the cost includes later stages, else a cheap first stage would be unordered."""
         stage = self._stages[job.step.stage]
         job.waits_since_s = now_s
-        # The cost includes later stages: with a cheap first stage the order would otherwise be first in, first out.
-        cost_s = self._predict(job.step, job.flow, now_s).total()
         self._queues[stage.name].push(job, job.flow, cost_s)
         self._lanes[stage.lane].arrivals.append((job.flow, cost_s, now_s))
         if job.timer_s != job.due_s:
             job.timer_s = job.due_s
             heapq.heappush(self._due, (job.due_s, next(self._tick), weakref.ref(job)))
             self._sweep_timers()
-        self._report_load(stage)
 
     def _sweep_timers(self) -> None:
         """Removes outdated timers, so that their number stays close to that of the jobs."""
@@ -378,8 +382,6 @@ class Scheduler:
             job.records.append(StageRecord(stage.name, job.waits_since_s, now_s, now_s, batch=0, jobs=0))
         self._ledger.close(job)
         job.end(ending, value)  # before the observer and the quota, which may raise
-        if waits:
-            self._report_load(stage)
         if self._quota is not None and job.flow.tenant:
             # The batch that it is in has not been added to `used_s` yet.
             used_s = max(job.used_s, job.charged_s) if job.is_computed else job.used_s
@@ -389,8 +391,3 @@ class Scheduler:
     def _give_fallback(self, job: Job, fallback: Fallback, now_s: float) -> None:
         done = fallback.make()
         self._end(job, done.ending, done.value, now_s)
-
-    def _report_load(self, stage: Stage) -> None:
-        queue = self._queues[stage.name]
-        self._observer.queued(stage.name, len(queue), queue.cost_s)
-        self._observer.running(stage.name, self._running[stage.name])

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from enum import Enum
 from typing import Any, Generic, TypeVar
 
-from .jobs import Batch, Done, Ending, Flow, Job, Next, Stage, StageResult, Step
+from .jobs import Batch, Done, Ending, Flow, Job, Next, Stage, StageLoad, StageResult, Step
 from .observer import Observer
 from .options import WorkQueueOptions
 from .scheduler import Quota, Scheduler
@@ -115,6 +115,11 @@ class WorkQueue:
         """Computing time so far, per thread, of the lane with the most of it."""
         with self._lock:
             return self._scheduler.busy_s
+
+    def load(self, stage: str) -> StageLoad:
+        """The jobs of a stage."""
+        with self._lock:
+            return self._scheduler.load(stage)
 
     def is_alive_within(self, limit_s: float) -> bool:
         """Whether the queue runs and has checked itself within the last `limit_s` seconds."""
