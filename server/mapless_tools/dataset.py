@@ -2,7 +2,8 @@
 
 import json
 import re
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
@@ -96,10 +97,8 @@ def read_json(file: Path) -> Any:
 def _parsed(file: Path, content: Mapping[str, Any], field: str, read: Callable[[object], Parsed]) -> Parsed | None:
     if content.get(field) is None:
         return None
-    try:
+    with named(f"{file}: {field}"):
         return read(content[field])
-    except ValueError as error:
-        raise ValueError(f"{file}: {field}: {error}") from error
 
 
 def _direction(content: object) -> Vector:
@@ -129,6 +128,15 @@ def image_file(folder: Path, image: str) -> Path:
     if not found:
         raise ValueError(f"image: there is no file {file}")
     return file
+
+
+@contextmanager
+def named(what: str) -> Iterator[None]:
+    """Puts what is wrong, a file or a field, before the message of a ValueError of the block."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{what}: {error}") from error
 
 
 def finite_numbers(value: object, what: str, shape: tuple[int, ...] | None = None) -> Array:

@@ -10,6 +10,7 @@ import numpy as np
 from mapless.geometry import Quaternion, RigidTransform
 from mapless.ros import RosCamera, camera_from_info, transform_from_message, transform_from_pose
 from mapless.ros.images import ENCODINGS
+from mapless_tools.dataset import named
 
 from .options import BagOptions
 from .recording import Recording, seconds, stamp_of
@@ -179,10 +180,8 @@ def _camera(recording: Recording, topic: str, image_topic: str) -> RosCamera:
         matrices = (it.tobytes() for it in (message.k, message.d, message.p))
         state = (message.width, message.height, message.distortion_model, *matrices)
         if known is None:
-            try:
+            with named(f"{recording.path}: {topic}"):
                 known, camera = state, camera_from_info(message, is_rectified)
-            except ValueError as error:
-                raise ValueError(f"{recording.path}: {topic}: {error}") from error
         if state != known:
             raise ValueError(f"{recording.path}: {topic} changes at {seconds(time_ns)}: a camera must stay as it is")
     assert camera is not None  # topics without messages are left out
@@ -233,10 +232,8 @@ def _transforms(images: Images, topics: list[str], options: BagOptions) -> dict[
                 raise ValueError(f"{what}: was {found.parent} > {child} before: a frame has one parent")
             stamp_ns = time_ns if is_static else stamp_of(transform, found.previous_ns, what)
             found.previous_ns = max(stamp_ns, found.previous_ns or 0)
-            try:
+            with named(what):
                 found.add(images.time_s(stamp_ns), transform_from_message(transform.transform))
-            except ValueError as error:
-                raise ValueError(f"{what}: {error}") from error
     return {child: Edge(it.parent, _static(it) if is_static else _moving(it, options)) for child, it in rows.items()}
 
 
@@ -268,10 +265,8 @@ def _poses(images: Images, topic: str, options: BagOptions) -> tuple[str, str, T
             raise ValueError(f"{what}: is of {frame} > {child}, those before of {rows.parent} > {body}")
         stamp_ns = stamp_of(message, rows.previous_ns, what)
         rows.previous_ns = max(stamp_ns, rows.previous_ns or 0)
-        try:
+        with named(what):
             rows.add(images.time_s(stamp_ns), _pose(message))
-        except ValueError as error:
-            raise ValueError(f"{what}: {error}") from error
     assert rows is not None  # topics without messages are left out
     try:
         return rows.parent or "world", body, rows.trajectory(options.max_pose_gap_s)

@@ -170,13 +170,13 @@ def _settings(data_dir: Path | None, connection: Connection) -> Settings:
 
 
 def _known_distance(text: str) -> KnownDistance:
+    from mapless_tools.dataset import named
+
     from .metres import KnownDistance
 
     first, second, metres = text.split(DISTANCE_SEPARATOR)
-    try:
+    with named(f"--distance {first} {second} {metres}"):
         return KnownDistance(first, second, float(metres))
-    except ValueError as error:
-        raise ValueError(f"--distance {first} {second} {metres}: {error}") from None
 
 
 def _intrinsics(text: str) -> Intrinsics | None:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from mapless.geometry import Array, Camera, RigidTransform
-from mapless_tools.dataset import Dataset, finite_numbers, read_json
+from mapless_tools.dataset import Dataset, finite_numbers, named, read_json
 
 from .collecting import Collector, ReadOptions, from_corner, from_opengl, natural_order, size_of
 
@@ -64,10 +64,8 @@ def _frame(file: Path, size: tuple[int, int], parse: Parse) -> tuple[Camera, Rig
     content = read_json(file)
     if not isinstance(content, dict):
         raise ValueError(f"{file} must hold an object")
-    try:
+    with named(f"{file.name}"):
         camera, pose = parse(content, size)
-    except ValueError as error:
-        raise ValueError(f"{file.name}: {error}") from error
     return from_corner(camera), pose
 
 
@@ -91,10 +89,8 @@ def _scanner_images(path: Path) -> Any:
 
 def _scanner_frame(content: Mapping[str, Any], size: tuple[int, int]) -> tuple[Camera, RigidTransform]:
     k = _numbers(content, "intrinsics", 9).reshape(3, 3)
-    try:
+    with named("cameraPoseARFrame"):
         pose = RigidTransform.from_matrix(_numbers(content, "cameraPoseARFrame", 16).reshape(4, 4))
-    except ValueError as error:
-        raise ValueError(f"cameraPoseARFrame: {error}") from error
     return Camera(*size, *k[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()), pose
 
 
@@ -108,10 +104,8 @@ def _polycam_frame(content: Mapping[str, Any], size: tuple[int, int]) -> tuple[C
     if (width, height) != size:
         raise ValueError(f"width and height are {width:g}x{height:g}, the image is {size[0]}x{size[1]}")
     matrix = finite_numbers([content[name] for name in names], "pose", (12,)).reshape(3, 4)
-    try:
+    with named("t_00 to t_23"):
         return Camera(*size, *k), RigidTransform.from_matrix(matrix)
-    except ValueError as error:
-        raise ValueError(f"t_00 to t_23: {error}") from error
 
 
 def _numbers(content: Mapping[str, Any], field: str, count: int) -> Array:

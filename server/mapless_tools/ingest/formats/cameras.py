@@ -14,7 +14,7 @@ from typing import Any
 
 from mapless.cameras import FOLDER_FILE, camera_of_frame
 from mapless.geometry import RigidTransform
-from mapless_tools.dataset import Dataset, finite_numbers, printable, read_json, read_place
+from mapless_tools.dataset import Dataset, finite_numbers, named, printable, read_json, read_place
 
 from .collecting import Collector, ReadOptions
 
@@ -61,10 +61,8 @@ def add_frame(collector: Collector, entry: Any) -> None:
         raise ValueError("image must be a path")
     if "world_from_camera" not in entry:
         raise ValueError("world_from_camera is missing")
-    try:
+    with named("world_from_camera"):
         pose = RigidTransform.from_matrix(finite_numbers(entry["world_from_camera"], "it", (4, 4)))
-    except ValueError as error:
-        raise ValueError(f"world_from_camera: {error}") from error
     camera = camera_of_frame(entry)
     if not (camera.focal_x_px > 0 and camera.focal_y_px > 0):
         raise ValueError(f"K: focal lengths must be above 0, are {camera.focal_x_px:g} and {camera.focal_y_px:g}")

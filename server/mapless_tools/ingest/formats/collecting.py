@@ -17,7 +17,7 @@ from mapless.geometry import MAX_COORDINATE_M, Array, Camera, Quaternion, RigidT
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, image_size
 from mapless_tools.bags.options import BagOptions
-from mapless_tools.dataset import Dataset, Frame, Refusal, image_file, legal_id
+from mapless_tools.dataset import Dataset, Frame, Refusal, image_file, legal_id, named
 
 
 @dataclass(frozen=True)
@@ -202,10 +202,8 @@ def read_text(file: Path) -> str:
 def rotation_of(quaternion: Array, what: str) -> Array:
     """The rotation of a unit quaternion (w, x, y, z); ValueError, naming `what` it belongs to, if it is not one."""
     w, x, y, z = quaternion.tolist()
-    try:
+    with named(what):
         return Quaternion(x, y, z, w).matrix()
-    except ValueError as error:
-        raise ValueError(f"{what}: {error}") from error
 
 
 def natural_order(name: str) -> list[tuple[int, int, str]]:

@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from mapless.geometry import Camera, Distortion, Fisheye, RadialTangential, RigidTransform, nearest_rotation
-from mapless_tools.dataset import Dataset, finite_numbers, read_json
+from mapless_tools.dataset import Dataset, finite_numbers, named, read_json
 
 from .collecting import Collector, ReadOptions, from_corner, from_opengl, natural_order, size_of
 
@@ -46,11 +46,9 @@ def _read_file(file: Path, split: str, collector: Collector) -> None:
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list) or not content["frames"]:
         raise ValueError(f"{file}: frames must be a list with at least one frame")
     frames = content["frames"]
-    try:
+    with named(str(file)):
         scale, transform = _applied(content)
         splits = _splits(content)
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from error
     if scale != 1:
         collector.notes.append(f"{file.name}: applied_scale {scale:g} is undone")
     labels = [str(frame.get("file_path", "?")) if isinstance(frame, dict) else "?" for frame in frames]
@@ -79,10 +77,8 @@ def _image(collector: Collector, frame: Mapping[str, Any]) -> str:
 
 def _world_from_camera(frame: Mapping[str, Any], scale: float, world_from_original: RigidTransform) -> RigidTransform:
     matrix = finite_numbers(frame.get("transform_matrix"), "transform_matrix")
-    try:
+    with named("transform_matrix"):
         pose = RigidTransform.from_matrix(matrix)
-    except ValueError as error:
-        raise ValueError(f"transform_matrix: {error}") from error
     unscaled = RigidTransform(pose.rotation, pose.translation / scale)
     return from_opengl(world_from_original.inverse().compose(unscaled))
 
@@ -137,10 +133,8 @@ def _applied(content: Mapping[str, Any]) -> tuple[float, RigidTransform]:
     matrix = finite_numbers(content["applied_transform"], "applied_transform")
     if matrix.shape not in ((3, 4), (4, 4)):
         raise ValueError(f"applied_transform must be 3x4, is {'x'.join(map(str, matrix.shape))}")
-    try:
+    with named("applied_transform"):
         return scale, RigidTransform(nearest_rotation(matrix[:3, :3]), matrix[:3, 3])
-    except ValueError as error:
-        raise ValueError(f"applied_transform: {error}") from error
 
 
 def _splits(content: Mapping[str, Any]) -> dict[str, str]:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mapless.geometry import Camera, RigidTransform
-from mapless_tools.dataset import Dataset, finite_numbers
+from mapless_tools.dataset import Dataset, finite_numbers, named
 
 from .collecting import Collector, Intrinsics, ReadOptions, check_camera, from_corner, read_text, rotation_of, size_of
 from .colmap import Model, find_model, read_model
@@ -145,10 +145,8 @@ def read_pose(file: Path) -> RigidTransform:
     """Reads the pose in a text file of 4x4 numbers; ValueError if there is none, as where tracking was lost."""
     if not file.is_file():
         raise ValueError(f"pose: there is no file {file}")
-    try:
+    with named(f"pose: {file.name}"):
         return RigidTransform.from_matrix(finite_numbers(read_text(file).split(), "pose", (16,)).reshape(4, 4))
-    except ValueError as error:
-        raise ValueError(f"pose: {file.name}: {error}") from error
 
 
 def _splits(path: Path) -> dict[str, str]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from mapless.geometry import Array, Camera, RadialTangential
 from mapless_tools.bags.trajectory import Trajectory
-from mapless_tools.dataset import Dataset, finite_numbers
+from mapless_tools.dataset import Dataset, finite_numbers, named
 
 from .collecting import Collector, ReadOptions, read_text, size_of
 
@@ -77,10 +77,8 @@ def _lines(file: Path) -> list[tuple[int, list[str]]]:
 
 
 def _row(file: Path, number: int, words: list[str]) -> Array:
-    try:
+    with named(f"{file}:{number}"):
         row = finite_numbers(words, "time, position and quaternion", (8,))
         if not abs(np.linalg.norm(row[4:]) - 1) < 1e-2:
             raise ValueError("the quaternion must have norm 1")
-    except ValueError as error:
-        raise ValueError(f"{file}:{number}: {error}") from error
     return row

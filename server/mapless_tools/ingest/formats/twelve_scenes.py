@@ -8,7 +8,7 @@ m_calibrationColorIntrinsic (4x4, row by row). The pose is a 4x4 world_from_came
 import re
 from pathlib import Path
 
-from mapless_tools.dataset import Dataset, finite_numbers
+from mapless_tools.dataset import Dataset, finite_numbers, named
 
 from .collecting import Collector, Intrinsics, ReadOptions, check_camera, read_text, size_of
 from .seven_scenes import GROUND_TRUTH, find_ground_truth, read_pose
@@ -58,12 +58,10 @@ def _intrinsics(file: Path) -> tuple[tuple[int, int], Intrinsics]:
         if field not in values:
             raise ValueError(f"{file}: {field} is missing")
     width, height, matrix = (values[field].split() for field in fields)
-    try:
+    with named(str(file)):
         k = finite_numbers(matrix, fields[2], (16,))
         size = (int(finite_numbers(width, fields[0], (1,))[0]), int(finite_numbers(height, fields[1], (1,))[0]))
         return size, Intrinsics(*k[[0, 5, 2, 6]].tolist())
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from error
 
 
 def _queries(file: Path) -> range:

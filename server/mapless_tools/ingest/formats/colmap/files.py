@@ -11,6 +11,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from mapless_tools.dataset import named
+
 from .cameras import MODEL_NAMES, PARAMETERS, ColmapCamera
 
 _POINT_BYTES = 24  # x, y, point3D_id of an observation
@@ -119,11 +121,9 @@ def _cameras_txt(file: Path) -> Iterator[ColmapCamera]:
         wanted = PARAMETERS[words[1]]
         if len(words) != 4 + len(wanted):
             raise ValueError(f"{place}: {words[1]} has parameters {' '.join(wanted)}, found {len(words) - 4} numbers")
-        try:
+        with named(place):
             camera_id, width_px, height_px = int(words[0]), int(words[2]), int(words[3])
             yield ColmapCamera(camera_id, words[1], width_px, height_px, [float(word) for word in words[4:]])
-        except ValueError as error:
-            raise ValueError(f"{place}: {error}") from error
 
 
 def _images_txt(file: Path) -> Iterator[ImageRecord]:
@@ -134,10 +134,8 @@ def _images_txt(file: Path) -> Iterator[ImageRecord]:
             raise ValueError(
                 f"{place}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, found {line.strip()[:80]!r}"
             )
-        try:
+        with named(place):
             yield ImageRecord(int(words[0]), [float(w) for w in words[1:8]], int(words[8]), words[9].rstrip())
-        except ValueError as error:
-            raise ValueError(f"{place}: {error}") from error
 
 
 def _lines(file: Path, skipped_after: int = 0) -> Iterator[tuple[str, str]]:
