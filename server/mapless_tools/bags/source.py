@@ -139,9 +139,7 @@ def _check_chain(tree: FrameTree, images: Images, topic: str, world: str, body: 
 def _image_topic(recording: Recording, given: str) -> str:
     known = recording.topics(*IMAGES)
     if given:
-        if given not in known:
-            raise ValueError(f"{recording.path} has no images on {given!r}, but on {_listed(known)}")
-        return given
+        return _known(recording, given, known, "images")
     if len(known) > 1:
         shown = [it for it in known if not (it.endswith("/compressed") and it.removesuffix("/compressed") in known)]
         known = [it for it in shown if _shows_photographs(recording, it)] or shown
@@ -149,6 +147,12 @@ def _image_topic(recording: Recording, given: str) -> str:
         what = f"images on {_listed(known)}: choose with --image-topic" if known else "no topic of images"
         raise ValueError(f"{recording.path} has {what}")
     return known[0]
+
+
+def _known(recording: Recording, given: str, known: list[str], what: str) -> str:
+    if given not in known:
+        raise ValueError(f"{recording.path} has no {what} on {given!r}, but on {_listed(known)}")
+    return given
 
 
 def _shows_photographs(recording: Recording, topic: str) -> bool:
@@ -160,9 +164,7 @@ def _shows_photographs(recording: Recording, topic: str) -> bool:
 def _camera_topic(recording: Recording, image_topic: str, given: str) -> str:
     known = recording.topics(CAMERA_INFO)
     if given:
-        if given not in known:
-            raise ValueError(f"{recording.path} has no CameraInfo on {given!r}, but on {_listed(known)}")
-        return given
+        return _known(recording, given, known, "CameraInfo")
     namespace = image_topic.removesuffix("/compressed").rpartition("/")[0]
     beside = f"{namespace}/camera_info"
     if beside in known or len(known) < 2:
@@ -192,9 +194,7 @@ def _pose_topic(recording: Recording, options: BagOptions) -> str:
     known = recording.topics(*POSES)
     has_tf = recording.types.get(TF_TOPIC) == TF
     if options.pose_topic:
-        if options.pose_topic not in (*known, *([TF_TOPIC] if has_tf else [])):
-            raise ValueError(f"{recording.path} has no poses on {options.pose_topic!r}, but on {_listed(known)}")
-        return options.pose_topic
+        return _known(recording, options.pose_topic, [*known, *([TF_TOPIC] if has_tf else [])], "poses")
     if has_tf and (options.world_frame or not known):
         return TF_TOPIC
     if len(known) != 1:
@@ -220,7 +220,7 @@ class _Rows:
 
 
 def _transforms(images: Images, topics: list[str], options: BagOptions) -> dict[str, Edge]:
-    """Edges of all TFMessages by child frame; a frame that is known at one time only is static."""
+    """Edges of all TFMessages by child frame; known at one time only it is static. Of static poses the last counts."""
     rows: dict[str, _Rows] = {}
     is_static = topics == [STATIC_TF_TOPIC]
     for topic, time_ns, message in images.recording.messages([it for it in topics if it in images.recording.types]):
@@ -234,12 +234,9 @@ def _transforms(images: Images, topics: list[str], options: BagOptions) -> dict[
             found.previous_ns = max(stamp_ns, found.previous_ns or 0)
             with named(what):
                 found.add(images.time_s(stamp_ns), transform_from_message(transform.transform))
-    return {child: Edge(it.parent, _static(it) if is_static else _moving(it, options)) for child, it in rows.items()}
-
-
-def _static(rows: _Rows) -> RigidTransform:
-    """The static pose: the last one counts, as in ROS."""
-    return _pose_of(rows, -1)
+    return {
+        child: Edge(it.parent, _pose_of(it, -1) if is_static else _moving(it, options)) for child, it in rows.items()
+    }
 
 
 def _moving(rows: _Rows, options: BagOptions) -> RigidTransform | Trajectory:

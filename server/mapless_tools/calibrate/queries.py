@@ -53,18 +53,18 @@ class Outcome:
     """
 
     name: str
-    error_m: float
-    error_deg: float
-    position: Claim | None
-    rotation: Claim | None
-    trust: float | None
-    inlier_count: int
-    match_count: int
-    rejection: str
-    message: str
-    conditions: Conditions | None
     true_pose: RigidTransform
-    pose: RigidTransform | None
+    pose: RigidTransform | None = None
+    error_m: float = math.inf
+    error_deg: float = math.inf
+    position: Claim | None = None
+    rotation: Claim | None = None
+    trust: float | None = None
+    inlier_count: int = 0
+    match_count: int = 0
+    rejection: str = ""
+    message: str = ""
+    conditions: Conditions | None = None
 
 
 def planned_queries(queries: Sequence[PlannedQuery]) -> list[Query]:
@@ -110,12 +110,13 @@ def localize(client: Client, scene: str, query: Query, *, count: int, variant: s
             timeout_s=CONNECT.timeout_s,
         )
     except InvalidArgument as error:
-        return _nothing(frame, "REFUSED", error.message)
+        return Outcome(frame.name, frame.world_from_camera, rejection="REFUSED", message=error.message)
     used = answer.diagnostics
     conditions = Conditions(used.features, used.backend, used.variant, used.server_version)
+    outcome = Outcome(frame.name, frame.world_from_camera, conditions=conditions)
     if isinstance(answer, Rejected):
-        return replace(_nothing(frame, answer.reason, answer.message), conditions=conditions)
-    return _outcome(frame, answer, conditions)
+        return replace(outcome, rejection=answer.reason, message=answer.message)
+    return _judged(outcome, answer)
 
 
 @dataclass(frozen=True)
@@ -154,8 +155,8 @@ def other_world(outcomes: Sequence[Outcome]) -> OtherWorld | None:
     return OtherWorld(moved_m, turned_deg, left[best])
 
 
-def _outcome(frame: Frame, answer: LocalizationResult, conditions: Conditions) -> Outcome:
-    error_m, error_deg = pose_error(frame.world_from_camera, answer.world_from_camera)
+def _judged(outcome: Outcome, answer: LocalizationResult) -> Outcome:
+    error_m, error_deg = pose_error(outcome.true_pose, answer.world_from_camera)
     position = rotation = None
     if answer.accuracy is not None and answer.covariance is not None:
         claimed, covariance = answer.accuracy, answer.covariance
@@ -164,8 +165,9 @@ def _outcome(frame: Frame, answer: LocalizationResult, conditions: Conditions) -
         position = Claim.of(error_m, claimed.position_68_m, claimed.position_95_m, covariance[:3, :3])
         in_degrees = np.degrees(np.degrees(covariance[3:, 3:]))
         rotation = Claim.of(error_deg, claimed.rotation_68_deg, claimed.rotation_95_deg, in_degrees)
-    return Outcome(
-        name=frame.name,
+    return replace(
+        outcome,
+        pose=answer.world_from_camera,
         error_m=error_m,
         error_deg=error_deg,
         position=position,
@@ -173,17 +175,7 @@ def _outcome(frame: Frame, answer: LocalizationResult, conditions: Conditions) -
         trust=answer.trust,
         inlier_count=answer.inlier_count,
         match_count=answer.match_count,
-        rejection="",
-        message="",
-        conditions=conditions,
-        true_pose=frame.world_from_camera,
-        pose=answer.world_from_camera,
     )
-
-
-def _nothing(frame: Frame, reason: str, message: str) -> Outcome:
-    pose = frame.world_from_camera
-    return Outcome(frame.name, math.inf, math.inf, None, None, None, 0, 0, reason, message, None, pose, None)
 
 
 def _refuse_another_pose(frame: Frame, own: Sequence[Reference], scene: str) -> None:

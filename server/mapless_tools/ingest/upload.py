@@ -1,8 +1,8 @@
 """Stores references through a server: several concurrent messages, each stored completely or not at all.
 
-At most as many messages as threads are read ahead. A reference that the server rejects is removed from its message, and
-the rest is sent again; if the server is busy or unreachable, the import waits. A message whose answer was lost may have
-been stored, so an existing reference is compared before it is reported as a duplicate.
+At most as many messages as threads are read ahead. The references of a rejected message are sent one by one; if the
+server is busy or unreachable, the import waits. A message whose answer was lost may have been stored, so an existing
+reference is compared before it is reported as a duplicate.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ BATCH_BYTES = 6 * 2**20
 """Of images a message; large ones take the server long to receive, which its other callers feel."""
 
 STORE_FULL = "STORE_FULL"
-_REQUEST = re.compile(r"requests\[(\d+)\]")
+_REQUEST = re.compile(r"requests\[\d+\]")
 
 
 @dataclass(frozen=True)
@@ -152,21 +152,21 @@ class Uploader:
                 stored = self._client.add_references(self._report.scene, [item.reference() for item in left])
             except AlreadyExists as error:
                 left = self._reconcile(left, waiting, error)
-            except InvalidArgument as error:
-                left = self._without_guilty(left, error)
             except ResourceExhausted as error:
                 if error.reason == STORE_FULL:
                     self._end(f"{error.message}: free space, then import again")
                 if error.retry_after_s is None:
-                    left = self._halves(left, error)
-                elif not waiting.for_busy(error.retry_after_s):
+                    self._one_by_one(left, error)
+                    return
+                if not waiting.for_busy(error.retry_after_s):
                     self._end(f"the server stays too busy: {error.message}")
             except (Unavailable, DeadlineExceeded) as error:
                 waiting.lost_an_answer = True
                 if not waiting.for_return():
                     self._end(f"the server cannot be reached: {error.message}")
-            except Internal as error:
-                left = self._halves(left, error)
+            except (InvalidArgument, Internal) as error:
+                self._one_by_one(left, error)
+                return
             except MaplessError as error:
                 self._end(str(error))
             else:
@@ -196,28 +196,16 @@ class Uploader:
             self._end(str(error))
         return left
 
-    def _without_guilty(self, items: Sequence[Item], error: InvalidArgument) -> list[Item]:
-        """The items without the one that the server names; if it names none, they are sent one by one."""
-        named = _REQUEST.match(error.field or "")
-        if named and int(named[1]) < len(items):
-            return self._without(items, int(named[1]), error)
-        return self._halves(items, error)
-
-    def _halves(self, items: Sequence[Item], error: MaplessError) -> list[Item]:
-        """Sends a rejected message in parts, and reports a rejected single item; returns no items."""
-        if len(items) == 1:
-            return self._without(items, 0, error)
-        middle = len(items) // 2
-        self._send(items[:middle])
-        self._send(items[middle:])
-        return []
-
-    def _without(self, items: Sequence[Item], index: int, error: MaplessError) -> list[Item]:
+    def _one_by_one(self, items: Sequence[Item], error: MaplessError) -> None:
+        """Sends the references of a rejected message one by one, and refuses one that is rejected alone."""
+        if len(items) > 1:
+            for item in items:
+                self._send([item])
+            return
         field = _REQUEST.sub("", error.field or "").lstrip(".")
         request = f" (request {error.request_id})" if isinstance(error, Internal) else ""
-        self._refuse(items[index].frame, f"{f'{field}: ' if field else ''}{error.message}{request}")
-        self._known.forget(items[index].stored)
-        return [*items[:index], *items[index + 1 :]]
+        self._refuse(items[0].frame, f"{f'{field}: ' if field else ''}{error.message}{request}")
+        self._known.forget(items[0].stored)
 
     def _duplicate(self, frame: Frame, there: Stored, new: Stored) -> None:
         what = difference(there, new)

@@ -57,17 +57,13 @@ def replay_command(
     except CaptureError as error:
         fail(str(error))
     if json_output:
-        _print_json(report)
+        import json
+        from dataclasses import asdict
+
+        print(json.dumps(asdict(report) | {"is_identical": report.is_identical}, indent=2))
     else:
         _print(report)
     raise typer.Exit(0 if report.is_identical else 1)
-
-
-def _print_json(report: Report) -> None:
-    import json
-    from dataclasses import asdict
-
-    print(json.dumps(asdict(report) | {"is_identical": report.is_identical}, indent=2))
 
 
 def _print(report: Report) -> None:
