@@ -26,10 +26,7 @@ _HINTS = (
 
 
 class Recording:
-    """A recording, open until the end of its block.
-
-    `types` and `counts` are the type and number of each topic's messages.
-    """
+    """A recording, open until its block ends; `types` and `counts` are each topic's type and number of messages."""
 
     def __init__(self, path: Path) -> None:
         """Opens a recording; raises ValueError, with the file's name, if it cannot be opened."""
@@ -56,10 +53,7 @@ class Recording:
         return sorted(name for name, kind in self.types.items() if kind in types)
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
-        """Yields topic, time of recording (nanoseconds) and message of these topics, in the order of recording.
-
-        ValueError if the recording is damaged: names the topic, the message and the time.
-        """
+        """Yields topic, time of recording (ns) and message in that order; ValueError names what is damaged."""
         connections = [it for it in self._connections if it.topic in topics]
         if not connections:
             return
@@ -97,10 +91,7 @@ class Recording:
 
 
 def stamp_of(message: Any, previous_ns: int | None, what: str) -> int:
-    """Stamp of a message's header, nanoseconds.
-
-    ValueError, naming `what` it is, without a stamp, or if time jumps back.
-    """
+    """Stamp of a message's header, nanoseconds; ValueError, naming `what` it is, without one or if time jumps back."""
     stamp_ns = int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)
     if not stamp_ns:
         raise ValueError(f"{what} has no time: header.stamp is 0")

@@ -27,10 +27,7 @@ RECTIFIED = "image_rect"
 
 @dataclass(frozen=True, eq=False)
 class Images:
-    """The images of one camera of a recording, with its frame and, if the recording has them, its intrinsics.
-
-    Times in seconds count from `begin_ns`.
-    """
+    """The images of one camera, with its frame and perhaps its intrinsics; times in seconds count from `begin_ns`."""
 
     recording: Recording
     topic: str

@@ -20,10 +20,7 @@ COLD_STARTS = 5
 
 
 def bench(data: Path, quick: bool) -> None:
-    """Measures all scenes in a folder, prints Markdown and writes `OUTPUT`; absent scenes are named and skipped.
-
-    UsageError if no scene is present, one is damaged, or a setting is wrong.
-    """
+    """Measures a folder of scenes, prints Markdown and writes `OUTPUT`; UsageError for a wrong folder or setting."""
     folders = [*dict.fromkeys(scene.folder for scene in SCENES), *OTHER_FOLDERS]
     absent = [folder for folder in folders if not (data / folder / "cameras.json").is_file()]
     if len(absent) == len(folders):

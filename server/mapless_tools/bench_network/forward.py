@@ -114,10 +114,7 @@ def measure_forward(name: str, rates: Rates, device: torch.device, repeats: int,
 
 
 def _check(forward: Forward, step: Step) -> float:
-    """Runs a step; returns its largest difference from the eager pass.
-
-    ArithmeticError if the output is not finite, or differs too much.
-    """
+    """Runs a step; its largest difference from the eager pass. ArithmeticError if that is not finite, or too large."""
     output = forward.run(step.work, step.compiled)
     if not all(bool(tensor.isfinite().all()) for tensor in vars(output).values()):
         raise ArithmeticError("the output is not finite")

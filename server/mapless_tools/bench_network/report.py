@@ -8,10 +8,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Figure:
-    """One measured or counted number; less is better unless `target_is_least`.
-
-    `again` is the same measured a second time. Without a value, `note` is the reason.
-    """
+    """One number, `again` the same measured a second time; less is better unless `target_is_least`."""
 
     part: str
     name: str

@@ -45,10 +45,7 @@ def network_without_weights(name: str, sizes: AnySizes | None = None) -> Network
 def make_network(
     name: str, sizes: AnySizes | None = None, device: torch.device | str = "cpu", seed: int = 0
 ) -> Network:
-    """A float32 network with seeded random weights, whose activations are finite and of a trained network's order.
-
-    Zeros would be faster to compute, and would hide errors.
-    """
+    """A float32 network with seeded random weights and finite activations; zeros would be faster and hide errors."""
     network = network_without_weights(name, sizes)
     random = torch.Generator(device).manual_seed(seed)
     parameters = dict(network.named_parameters())

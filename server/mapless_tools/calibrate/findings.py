@@ -60,10 +60,7 @@ class Share:
 
 @dataclass(frozen=True)
 class Held:
-    """How often the truth is within a claimed radius, without a factor and with the factor from all other answers.
-
-    There is no factor if there are too few answers.
-    """
+    """How often the truth is within a claimed radius, without a factor and with that of all others, if there is one."""
 
     claim: str
     probability: float
@@ -74,10 +71,7 @@ class Held:
 
 @dataclass(frozen=True)
 class Operating:
-    """The result of accepting every answer with at least a given score.
-
-    The coverage is the share of the right answers that are accepted, the risk that of wrong ones among the accepted.
-    """
+    """Accepting every answer with this score: share of right answers accepted, and of wrong ones among the accepted."""
 
     score: float
     coverage: float
@@ -150,10 +144,7 @@ def reliability(claims: Sequence[Claim]) -> list[tuple[float, float]]:
 
 
 def auroc(scores: Sequence[float], right: Sequence[bool]) -> float:
-    """Probability that a right answer has a higher score than a wrong one; equal scores count half.
-
-    This is the area under the ROC curve, computed as the Mann-Whitney statistic. NaN if all are right or none is.
-    """
+    """Probability that a right answer scores higher than a wrong one (Mann-Whitney); NaN if there is none of either."""
     is_right = np.asarray(right, bool)
     rights, wrongs = int(is_right.sum()), int((~is_right).sum())
     if not rights or not wrongs:

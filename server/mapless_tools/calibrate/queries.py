@@ -35,10 +35,7 @@ EXPLAINED = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """A photograph, and the references that it is compared with; without any, the server chooses among all.
-
-    If `reranked`, the server chooses among them.
-    """
+    """A photograph, and the references it is compared with or (`reranked`) chosen from; none for all."""
 
     frame: Frame
     references: tuple[str, ...] = ()
@@ -73,10 +70,7 @@ def planned_queries(queries: Sequence[PlannedQuery]) -> list[Query]:
 
 
 def scene_queries(client: Client, scene: str, frames: Sequence[Frame], progress: Progress) -> list[Query]:
-    """Makes queries for a stored scene: no photograph is compared with itself or a copy of itself.
-
-    UsageError if the scene has too few references, or a photograph's poses in the folder and in the scene differ.
-    """
+    """Queries for a stored scene, none compared with a copy of itself; UsageError for few references or other poses."""
     known = list(client.list_references(scene, page_size=1000))
     if len(known) < 2:
         raise UsageError(

@@ -39,10 +39,7 @@ RULES = (
 
 @dataclass(frozen=True, eq=False)
 class CalibrationReport:
-    """The figures of a calibration, what they were measured on, and a sentence on what was done with the factors.
-
-    The scene is empty if the folder alone was measured. `count` is the number of references of a query.
-    """
+    """The figures of a calibration, and what they were measured on; the scene is empty if the folder alone was."""
 
     dataset: Dataset
     scene: str

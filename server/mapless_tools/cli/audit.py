@@ -95,10 +95,7 @@ def audit_command(
 
 @dataclass
 class Examined:
-    """The findings of an audit.
-
-    `stopped` says why it ended early, `warnings` what contradicts the references' poses.
-    """
+    """The findings of an audit, why it ended early, and warnings of what contradicts the references' poses."""
 
     scene: str
     audits: list[ReferenceAudit] = field(default_factory=list)

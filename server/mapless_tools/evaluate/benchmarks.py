@@ -180,10 +180,7 @@ class ScenePlace:
 
 
 def find_scenes(folder: Path, layout: str = "auto") -> tuple[ScenePlace, ...]:
-    """Finds the scene that a folder is, or those in it, in the paper's order, others after them by name.
-
-    UsageError if there is no such folder, or no scene of this layout in it.
-    """
+    """The scene that a folder is, or those in it, in the paper's order, others after; UsageError if there is none."""
     if layout not in LAYOUTS:
         raise UsageError(f"layout must be one of {', '.join(LAYOUTS)}, not {layout!r}")
     if not folder.is_dir():

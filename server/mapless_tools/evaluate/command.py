@@ -55,18 +55,11 @@ def evaluate_benchmarks(
     worst: int = 4,
     **options: Any,
 ) -> bool:
-    """Measures the server on a scene, or on all scenes of a folder, and writes the report.
+    """Measures a scene, or all scenes of a folder, and writes the report; returns whether it is complete.
 
-    Returns whether it is complete.
-
-    Args:
-        folder: a scene, or a folder of scenes.
-        output: folder of the report. Its results of the same evaluation are not measured again.
-        pairs: references of each query, a file or a folder with one for each scene; None: see the options' `choice`.
-        ground_truth: poses instead of the layout's own, see `ReadOptions`.
-        partial: whether images that are missing or damaged may be left out; the report names them.
-        worst: how many queries of each scene are shown as pictures.
-        options: fields of SuiteOptions.
+    What the folder `output` holds of the same evaluation is not measured again. `pairs` are references of each query, a
+    file or a folder with one for each scene; `partial` leaves out images that are missing or damaged; so many `worst`
+    queries of each scene are shown as pictures. `options` are fields of SuiteOptions.
     """
     from .figures import write_figures
     from .page import page, print_suite

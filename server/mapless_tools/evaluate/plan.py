@@ -105,10 +105,7 @@ class SuiteOptions:
         return (*(Method(v, first) for v in self.variants), *(Method(self.ablated, scale) for scale in others))
 
     def settings(self, place: ScenePlace) -> tuple[int, ...]:
-        """Numbers of references of a scene: DENSE first, then in decreasing order.
-
-        UsageError if a sparse setting is requested, without numbers, for a scene of no benchmark.
-        """
+        """Numbers of references of a scene: DENSE, then in decreasing order; UsageError if sparse ones are unknown."""
         sparse: tuple[int, ...] = ()
         if "sparse" in self.protocols:
             if not self.sparse and place.benchmark is None:

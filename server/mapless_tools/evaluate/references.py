@@ -43,10 +43,7 @@ class Matcher:
 
     @classmethod
     def of(cls, settings: Settings) -> "Matcher":
-        """Makes the matcher with the first features that a server with these settings has.
-
-        UsageError if it has none.
-        """
+        """Of the first features that a server with these settings has; UsageError if it has none."""
         try:
             features, extractor = make_first_features(settings)
         except (ValueError, ImportError, WeightsError) as error:
@@ -55,10 +52,7 @@ class Matcher:
 
 
 def check_images(frames: Iterable[Frame], limits: ImageLimits) -> None:
-    """Reads the images' headers.
-
-    UsageError if one is missing, too large, no JPEG, PNG or WebP, or of another size than its camera.
-    """
+    """Reads the images' headers; UsageError if one is missing, too large, no photograph, or unlike its camera."""
     for frame in frames:
         try:
             size = image_size(frame.image_path.read_bytes(), limits)
@@ -111,10 +105,7 @@ def rank_by_matches(
 
 
 def pairs_file(path: Path, scene: str, scene_count: int) -> Path:
-    """The file of a scene's pairs: the given file, or the one of the scene's name in the given folder.
-
-    UsageError if there is no such file, or one file is given for several scenes.
-    """
+    """The file of a scene's pairs, or that of its name in a folder; UsageError without one, or for several scenes."""
     if path.is_dir():
         path = path / f"{scene.replace('/', '_')}.txt"
     elif scene_count > 1:

@@ -56,10 +56,7 @@ class _JsonCodec:
 
 
 def rpc_application(connect: Connect, max_message_bytes: int) -> ASGIApp:
-    """Makes the application that serves the interface's methods at gRPC's paths.
-
-    `connect` makes the channel to the server, and is called when the event loop runs.
-    """
+    """Serves the interface's methods at gRPC's paths; `connect` makes the channel, once the event loop runs."""
     channel: list[grpc.aio.Channel] = []
 
     def connected() -> grpc.aio.Channel:

@@ -100,10 +100,7 @@ def _thumbnail(image: NDArray[np.uint8]) -> bytes:
 def _points(
     client: Client, scene: str, reference: Reference, image: NDArray[np.uint8]
 ) -> tuple[Array, NDArray[np.uint8]] | tuple[None, None]:
-    """Points in the world that a reference's photograph shares with others, and their colours; None without any.
-
-    No failure here ends the export, since points are optional.
-    """
+    """Points in the world that a photograph shares with others, with colours; None without any, or after a failure."""
     try:
         answer = client.localize(reference.image or b"", reference.camera, scene, include_debug=True)
     except MaplessError:

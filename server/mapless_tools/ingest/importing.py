@@ -105,10 +105,7 @@ def run_import(
 
 
 def read_frames(folder: Path, options: ImportOptions) -> tuple[Dataset, tuple[Frame, ...]]:
-    """Reads the dataset, and selects the frames to import.
-
-    ValueError if it cannot be read, its metres or its datum contradict it, or nothing is left to import.
-    """
+    """Reads the dataset and selects the frames to import; ValueError if it contradicts itself, or none is left."""
     dataset = in_metres(read_dataset(folder, options.format, options.read), options.metres, options.id_prefix)
     _attributes(dataset)
     frames = [frame for frame in dataset.frames if not options.split or frame.split == options.split]

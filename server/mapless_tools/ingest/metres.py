@@ -106,10 +106,7 @@ def in_metres(dataset: Dataset, options: MetreOptions, id_prefix: str = "") -> D
 
 
 def scale_of_distances(distances: Sequence[KnownDistance], find: "Finder") -> tuple[float, list[str]]:
-    """Metres per unit, with a line of text for each distance; ValueError if they contradict each other.
-
-    The scale minimizes the squared differences, each in units of its bound.
-    """
+    """Metres per unit, by least squares in units of bounds, and a line for each; ValueError if they contradict."""
     units = np.array([_length_in_units(it, find) for it in distances])
     metres = np.array([it.metres for it in distances])
     bounds = np.maximum(DISTANCE_SHARE * metres, DISTANCE_M)
@@ -138,10 +135,7 @@ def scale_of_distances(distances: Sequence[KnownDistance], find: "Finder") -> tu
 
 
 def umeyama(source: Array, target: Array) -> Similarity:
-    """The similarity ``target_from_source`` with the least squared distances between points (N, 3) and points (N, 3).
-
-    Collinear points do not determine the rotation about their line; points at one place do not determine the scale.
-    """
+    """The similarity ``target_from_source`` with the least squared distances between two sets of points (N, 3)."""
     centre, target_centre = source.mean(axis=0), target.mean(axis=0)
     here, there = source - centre, target - target_centre
     rotation = Rotation.align_vectors(there, here)[0].as_matrix()

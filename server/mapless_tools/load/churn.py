@@ -43,10 +43,7 @@ UNCERTAIN = ("ALREADY_EXISTS", "NOT_FOUND")
 
 @dataclass
 class Outcomes:
-    """Counts how calls ended, by worker and status; of each kind of unexpected end, the first is kept in full.
-
-    The statuses of the calls of Localize are kept for comparing with the server's account.
-    """
+    """Counts how calls ended, by worker and status; the first failure of each kind; statuses of calls of Localize."""
 
     counts: Counter[tuple[str, str]] = field(default_factory=Counter)
     failures: dict[str, str] = field(default_factory=dict)
@@ -80,11 +77,7 @@ WORK: Mapping[str, str] = {
 
 @dataclass(frozen=True)
 class Workers:
-    """The data that the workers share.
-
-    Times between a worker's calls are divided by `pace`. `stopping` is set when workers are to end, each after its
-    current calls.
-    """
+    """What the workers share: times between calls are divided by `pace`; they end once `stopping` is set."""
 
     address: str
     place: Place

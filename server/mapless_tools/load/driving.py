@@ -35,10 +35,7 @@ def store_references(client: Client, references: Sequence[Photograph]) -> None:
 
 
 def requests_for(client: Client, queries: Sequence[Photograph]) -> Requests:
-    """Makes requests that name the references which the server would choose, and bad ones.
-
-    A robot that localizes once a second knows its neighbourhood; searching a whole scene would be a different load.
-    """
+    """Requests that name the references which the server would choose, as robots know them, and bad ones."""
     good = []
     for query in queries:
         uses = client.localize(query.data, query.camera, SCENE).diagnostics.references

@@ -162,10 +162,7 @@ def _prepared(server: ChildServer, options: OverheadOptions) -> bytes:
 async def compare_by_turns(
     places: Mapping[str, Called], request: bytes, options: OverheadOptions, progress: Progress
 ) -> list[Subject]:
-    """Calls servers with the same request, sequentially and concurrently, in rounds.
-
-    RuntimeError if a call did not end as expected, or was too late.
-    """
+    """Calls servers in rounds, one call at a time and many; RuntimeError if a call ends otherwise than expected."""
     subjects = {name: Subject(name, [], []) for name in places}
     async with AsyncExitStack() as stack:
         targets = {

@@ -91,10 +91,7 @@ class PipelineResult:
 def measure_pipeline(
     place: Place, options: PipelineOptions, progress: Progress, log: Path | None = None
 ) -> PipelineResult:
-    """Starts a server, finds its largest rate of answers, and offers shares of it.
-
-    RuntimeError if the server answered no call.
-    """
+    """Starts a server and offers shares of its largest rate of answers; RuntimeError if it answers no call."""
     with server_with_scene(place, progress, log=log) as server:
         return asyncio.run(_measure(place, server, options, progress))
 

@@ -87,10 +87,7 @@ def loop_lag_check(steps: Sequence[Step], bar_s: float = 0.02) -> Check:
 
 
 def machine_lines(checks: Sequence[Check], load: float, cores: int) -> list[str]:
-    """A hint for missed bars if more threads were ready to run than there are cores.
-
-    `load` is the system's load average.
-    """
+    """A hint for missed bars if more threads were ready (`load`, the load average) than there are cores."""
     if load <= cores or all(check.met is not False for check in checks):
         return []
     return [

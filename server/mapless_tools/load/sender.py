@@ -26,10 +26,7 @@ ReadAnswer = Callable[[bytes], str]
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """The method that is called, of each client on its own connection; `deadline_s` is that of calls without their own.
-
-    `read_answer` returns the outcome of an answer.
-    """
+    """The called method, of each client on its own connection; the default deadline; and how an answer is read."""
 
     methods: Sequence[Any]
     deadline_s: float

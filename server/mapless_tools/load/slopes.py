@@ -26,10 +26,7 @@ _UNCORRELATED = 0.05
 
 @dataclass(frozen=True)
 class Slope:
-    """The trend of a figure: its slope, with the confidence interval, and the median of the samples.
-
-    The samples span so many hours, in blocks of so many.
-    """
+    """The trend of a figure: its slope with the confidence interval, and the samples' median, hours and block size."""
 
     level: float
     per_hour: float
@@ -55,10 +52,7 @@ class Slope:
 
 
 def slope(times_s: Sequence[float], values: Sequence[float], confidence: float = CONFIDENCE) -> Slope:
-    """The slope of samples in the order of time, with its interval.
-
-    ValueError for fewer than `MIN_SAMPLES`, or times that do not ascend.
-    """
+    """The slope of samples in the order of time; ValueError for fewer than `MIN_SAMPLES`, or other times."""
     hours, y = np.asarray(times_s, float) / 3600, np.asarray(values, float)
     if len(hours) != len(y) or len(y) < MIN_SAMPLES or not (np.diff(hours) > 0).all():
         raise ValueError(f"a slope needs {MIN_SAMPLES} samples in the order of time")

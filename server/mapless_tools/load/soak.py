@@ -102,10 +102,7 @@ class SoakResult:
 
 
 def measure_soak(place: Place, options: SoakOptions, progress: Progress, log: Path | None = None) -> SoakResult:
-    """Starts a server, measures its saturation unless a rate is given, and keeps it busy; appends its log to `log`.
-
-    RuntimeError if the server answered no call, or ended.
-    """
+    """Starts a server, measures its saturation unless a rate is given, and keeps it busy; RuntimeError if it ends."""
     with server_with_scene(place, progress, {"MAPLESS_ALLOW_WATCHING": "true"}, log) as server:
         return asyncio.run(_measure(place, server, options, progress))
 

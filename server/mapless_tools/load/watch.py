@@ -213,10 +213,7 @@ def read_process(process_id: int, at_s: float) -> ProcessSample:
 
 
 def read_state(server: ServerUnderLoad, at_s: float, before: Scrape | None) -> tuple[ServerState, Scrape]:
-    """Reads the present state, and the metrics for the next call.
-
-    OSError if the process has ended or does not answer.
-    """
+    """The present state, and the metrics for the next call; OSError if the process has ended or does not answer."""
     process, folder = read_process(server.process_id, at_s), Path(f"/proc/{server.process_id}")
     scrape = server.scrape()
     if scrape is None:

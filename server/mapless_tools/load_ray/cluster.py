@@ -57,10 +57,7 @@ class Replica:
 
 @dataclass
 class Cluster:
-    """A running cluster: the "host:port" of its ingress, and the folder of logs and configurations.
-
-    `application` is the last deployed one, as in a Serve config.
-    """
+    """A running cluster: its ingress's "host:port", the folder of logs and configurations, the last application."""
 
     address: str
     folder: Path
@@ -69,10 +66,7 @@ class Cluster:
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def deploy(self, application: Mapping[str, Any], limit_s: float = START_LIMIT_S) -> None:
-        """Deploys one of the `applications` of a Serve config, "mapless"; returns when exactly its replicas run.
-
-        ClusterFailed if they did not within the limit.
-        """
+        """Deploys an application of a Serve config until exactly its replicas run; ClusterFailed beyond the limit."""
         self.application = dict(application)
         self._ask({"deploy": self.application, "limit_s": limit_s})
         give_up_s = time.monotonic() + limit_s
@@ -147,10 +141,7 @@ def application(
 
 @contextmanager
 def running_cluster(environment: Mapping[str, str] | None = None) -> Iterator[Cluster]:
-    """A cluster without an application, until the block is left; ClusterFailed if it did not start.
-
-    `environment` has variables of all its processes, such as settings that are not in the application's arguments.
-    """
+    """A cluster without an application, with variables for all its processes; ClusterFailed if it did not start."""
     # It holds sockets, whose paths are limited to 107 bytes.
     folder = Path(tempfile.mkdtemp(prefix="mr-", dir="/tmp"))
     ports = _free_ports(8)

@@ -22,10 +22,7 @@ END_LIMIT_S = 60.0
 
 @dataclass(frozen=True)
 class Call:
-    """A call that has ended; times of `time.monotonic`, before its first attempt and after its last.
-
-    `error` is the final one, empty if it was answered.
-    """
+    """A call that has ended, by `time.monotonic`, with all its attempts; `error` is the final one, if any."""
 
     caller: int
     begin_s: float
@@ -35,10 +32,7 @@ class Call:
 
 @dataclass
 class Calls:
-    """All calls that were made, in the order of their ends.
-
-    Acknowledged are (scene, reference) of all that the server reported as stored.
-    """
+    """All calls in the order of their ends, and (scene, reference) of all that was reported as stored."""
 
     ended: list[Call] = field(default_factory=list)
     acknowledged: list[tuple[str, str]] = field(default_factory=list)
@@ -77,10 +71,7 @@ Kind = Callable[[Client, int, Calls], None]
 def calling(
     address: str, kinds: Sequence[Kind], pause_s: float = 0.0, options: ConnectOptions | None = None
 ) -> Iterator[Calls]:
-    """A caller for each kind of call, each with a connection of its own, until the block is left.
-
-    They pause between their calls; without options, connections have the client's defaults, with retries.
-    """
+    """A caller for each kind of call, on a connection of its own with the client's retries, pausing between calls."""
     calls, done, lock = Calls(), threading.Event(), threading.Lock()
 
     def call_on(caller: int, kind: Kind) -> None:
@@ -111,10 +102,7 @@ def calling(
 
 @dataclass(frozen=True)
 class Scenes:
-    """Scenes whose calls cost no computing, and the kinds of calls on them.
-
-    Calls of different scenes go to different replicas. All references and queries have the same photograph.
-    """
+    """Scenes whose calls cost no computing, with one photograph for all; calls of each go to other replicas."""
 
     count: int = 16
     photo: bytes = padded_photo(300_000)

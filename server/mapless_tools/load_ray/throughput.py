@@ -56,10 +56,7 @@ class Round:
 
 
 def measure_throughput(place: Place, options: ThroughputOptions, progress: Progress) -> list[Round]:
-    """Starts two replicas, each with one computing thread on its own core.
-
-    RuntimeError if a call did not end with an answer, or there are fewer than two cores.
-    """
+    """Starts two replicas, each with one thread on its own core; RuntimeError without two cores, or for a lost call."""
     cores = sorted(os.sched_getaffinity(0))[:2]
     if len(cores) < 2:
         raise RuntimeError("two replicas on two cores need two cores")

@@ -39,10 +39,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Comparison:
-    """An answer beside the same one computed again: whether they are equal to the last bit, and the first differences.
-
-    Distance and angle of the poses are None unless both have one.
-    """
+    """Whether an answer is the same to the last bit, the first differences, and how far two poses are apart."""
 
     is_identical: bool
     changes: tuple[Change, ...] = ()

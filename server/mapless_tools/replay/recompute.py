@@ -65,10 +65,7 @@ _CACHE_BYTES = 512 * 2**20
 
 
 class Blobs:
-    """Photographs and features of references in a capture folder, cached for the next call.
-
-    `found_anew` are the keys of references whose captured features this program cannot read.
-    """
+    """Photographs and features in a capture folder, cached; `found_anew` are keys whose features cannot be read."""
 
     def __init__(self, folder: Path) -> None:
         self.found_anew: set[str] = set()
@@ -152,10 +149,7 @@ class RecordedSource:
         selection: Selection,
         context: StageContext,
     ) -> Choice:
-        """Implements ReferenceSource with the captured choice; DamagedCapture if there is none.
-
-        For any arguments, but that references near a prior are none unless the captured ones were chosen so.
-        """
+        """The captured choice; of references near a prior only if it was so chosen. DamagedCapture if there is none."""
         if selection.near is not None and (self.part.choice is None or self.part.choice.descriptor != POSE_PRIOR):
             return Choice((), POSE_PRIOR, self.part.generation)
         if self.part.choice is None:

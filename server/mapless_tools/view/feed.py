@@ -96,10 +96,7 @@ class Feed:
         show: Callable[[Query], None],
         report: Callable[[str, bool], None],
     ) -> None:
-        """Begins to watch a scene at once; `show` is called with each query, in the feed's thread.
-
-        `report` is called with the state of the watching, in a few words, and whether there will be queries.
-        """
+        """Watches a scene: `show` is called with queries, `report` with the state and whether queries will come."""
         self._channel = options.channel(address)
         self._metadata = options.metadata()
         self._timeout_s = options.timeout_s

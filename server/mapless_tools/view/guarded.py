@@ -23,10 +23,7 @@ class GuardedViser(viser.ViserServer):
     """A viser server that serves its own pages only."""
 
     def __init__(self, host: str, port: int, label: str) -> None:
-        """Listens on a loopback address; port 0 takes any free one.
-
-        RuntimeError if the port is taken; or viser does not serve as it used to, so that it could not be guarded.
-        """
+        """Listens on a loopback address, port 0 for any; RuntimeError if it is taken, or viser cannot be guarded."""
         # It prints its address, which the command prints, too.
         with _guarded_connections() as guarded, redirect_stdout(io.StringIO()):
             super().__init__(host=host, port=port, label=label, verbose=False)

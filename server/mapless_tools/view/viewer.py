@@ -51,10 +51,7 @@ class ViewOptions:
 
 @contextmanager
 def viewer(address: str, connect: ConnectOptions, scene: str, options: ViewOptions) -> Iterator[str]:
-    """Shows a scene of a server until the end of the block; yields the page's address.
-
-    ValueError if the scene has no references, RuntimeError if viser cannot be guarded.
-    """
+    """Shows a scene until the block ends; yields the page's address. Errors as in `lay_out` and `GuardedViser`."""
     with ExitStack() as stack:
         client = stack.enter_context(Client(address, connect))
         scenery = lay_out(client.get_scene(scene), list(client.list_references(scene)), options.max_pictured)

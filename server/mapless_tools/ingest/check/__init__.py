@@ -32,10 +32,7 @@ LIMITS = ImageLimits(max_bytes=2**28, max_pixels=200_000_000)
 
 
 def check_frames(frames: Sequence[Frame], progress: Progress, extractor: FeatureExtractor | None = None) -> Verdict:
-    """Judges frames by SIFT or other features; pairs and suspects are indices of frames.
-
-    Photographs that cannot be read are left out: the upload reports them.
-    """
+    """Judges frames, by their indices, by SIFT or other features; those that cannot be read are left out."""
     poses = [frame.world_from_camera for frame in frames]
     if len(frames) < 2:
         return judge({}, [])

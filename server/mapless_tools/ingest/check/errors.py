@@ -37,10 +37,7 @@ Pair = tuple[int, int]
 
 
 def pairs_by_pose(poses: Sequence[RigidTransform], count: int = PAIR_COUNT) -> list[Pair]:
-    """Pairs of neighbours that look the same way, with a good baseline; fewer if there are not enough.
-
-    With few photographs each of them is in several pairs.
-    """
+    """Pairs of neighbours that look the same way, with a good baseline; of few photographs each is in several."""
     near = _Neighbours(poses)
     rounds = (_partner_of_each(near, len(poses), count, rank) for rank in range(3))
     return _distinct(chain.from_iterable(rounds), count)

@@ -93,10 +93,7 @@ class Explanation:
 
 
 def explain(views: Views, matched: Sequence[MatchedPair], given_px: float) -> Explanation:
-    """Finds the mistake whose correction makes the poses fit best.
-
-    `given_px` is the median error without correction.
-    """
+    """Finds the mistake whose correction makes the poses fit best; `given_px` is the median error without it."""
     matched = [MatchedPair(item.pair, item.matches[:: 1 + len(item.matches) // _ENOUGH_MATCHES]) for item in matched]
     candidates = []
     for text, correction in CONVENTIONS.items():

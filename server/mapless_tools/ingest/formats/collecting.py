@@ -160,10 +160,7 @@ def check_camera(camera: Camera) -> None:
 
 
 def from_corner(camera: Camera) -> Camera:
-    """Converts a camera whose principal point is counted from the corner of the top-left pixel instead of its centre.
-
-    COLMAP, layouts that are made from its models, nerfstudio and ARKit count so.
-    """
+    """Converts a camera whose principal point counts from the top-left pixel's corner, as COLMAP's and ARKit's."""
     return replace(camera, principal_x_px=camera.principal_x_px - 0.5, principal_y_px=camera.principal_y_px - 0.5)
 
 

@@ -114,10 +114,7 @@ class _Unposed:
 def keyframes(
     images: Iterator[tuple[int, Any, RigidTransform]], options: KeyframeOptions
 ) -> Iterator[tuple[int, Any, RigidTransform]]:
-    """Yields the images, with time and pose, that are far enough from the previous keyframe and the sharpest nearby.
-
-    An image that cannot be decoded is used only if there is no other.
-    """
+    """Yields the images, with time and pose, that are far enough from the last keyframe and the sharpest nearby."""
     if options.takes_all:
         yield from images
         return
