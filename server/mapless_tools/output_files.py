@@ -1,9 +1,9 @@
-"""Files that commands write: JSON for programs, HTML reports that need nothing else and run no scripts."""
+"""What commands write: JSON for programs, tables, and HTML reports that need nothing else and run no scripts."""
 
 import json
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,12 @@ def finite(value: float) -> float | None:
 def write_json(file: Path, content: Any) -> None:
     """Writes strict JSON; it has no infinities."""
     file.write_text(json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def markdown_table(head: str, rows: Iterable[Iterable[object]]) -> list[str]:
+    """Lines of a table in Markdown; `head` has its headings, "scene | median"."""
+    lines = (f"| {' | '.join(map(str, row))} |" for row in rows)
+    return [f"| {head} |", "|---" * (head.count("|") + 1) + "|", *lines]
 
 
 @contextmanager

@@ -1,8 +1,9 @@
 """The progress of a command, on standard error: a bar on a terminal, lines in a log."""
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from typing import TypeVar
 
 from rich.console import Console
 from rich.progress import (
@@ -14,6 +15,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.progress import Progress as Bars
+
+T = TypeVar("T")
 
 LINES = 10
 """Lines of a step in a log, after that of its beginning."""
@@ -45,6 +48,19 @@ def progress_bars() -> Iterator[Progress]:
             bars.update(tasks[step], completed=done, total=total)
 
         yield progress
+
+
+def tracked(step: str, items: Iterable[T], total: int, progress: Progress) -> Iterator[T]:
+    """Yields the items, and reports each as done when the next is asked for."""
+    progress(step, 0, total)
+    for done, item in enumerate(items, 1):
+        yield item
+        progress(step, done, total)
+
+
+def labelled(progress: Progress, label: str) -> Progress:
+    """A progress whose steps begin with this label."""
+    return lambda step, done, total: progress(f"{label}: {step}", done, total)
 
 
 def _lines() -> Progress:

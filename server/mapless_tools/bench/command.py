@@ -9,7 +9,7 @@ from mapless_tools.evaluate.plan import EvaluationOptions
 from mapless_tools.evaluate.run import Evaluation, evaluate
 from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.output_files import write_json
-from mapless_tools.progress import Progress, progress_bars
+from mapless_tools.progress import labelled, progress_bars
 from mapless_tools.usage import UsageError, usage_errors
 
 from .report import KITCHEN, OTHER_FOLDERS, SCENES, BenchResult, as_json, markdown, measure_latency
@@ -36,20 +36,16 @@ def bench(data: Path, quick: bool) -> None:
         def measure(folder: str, references: int | None) -> Evaluation:
             options = EvaluationOptions(reference_count=references, query_count=query_count)
             label = folder if references is None else f"{folder}, {references} references"
-            return evaluate(datasets[folder], options, settings, _labelled(progress, label))
+            return evaluate(datasets[folder], options, settings, labelled(progress, label))
 
         scenes = [(scene, measure(scene.folder, scene.references)) for scene in SCENES if scene.folder in datasets]
         others = [measure(folder, None) for folder in OTHER_FOLDERS if folder in datasets]
         latency = None
         if KITCHEN in datasets:
             cold_count = 2 if quick else COLD_STARTS
-            labelled = _labelled(progress, "latency")
-            latency = measure_latency(datasets[KITCHEN], settings, query_count, cold_count, labelled)
+            own = labelled(progress, "latency")
+            latency = measure_latency(datasets[KITCHEN], settings, query_count, cold_count, own)
     machine = f"{cpu_model()}, {available_cores()} cores"
     result = BenchResult(machine, scenes, others, latency, absent, quick)
     print("\n".join(markdown(result)))
     write_json(OUTPUT, as_json(result))
-
-
-def _labelled(progress: Progress, label: str) -> Progress:
-    return lambda step, done, total: progress(f"{label}: {step}", done, total)

@@ -26,6 +26,7 @@ from mapless_tools.evaluate.report import (
     to_json,
 )
 from mapless_tools.evaluate.run import SCENE, Evaluation, Plan, localize_queries, plan_for, store_references
+from mapless_tools.output_files import markdown_table
 from mapless_tools.progress import Progress
 
 REFERENCE_COUNT = 30
@@ -142,18 +143,12 @@ def markdown(result: BenchResult) -> list[str]:
         lines += ["**Quick run, few queries a scene: not comparable with the targets.**", ""]
     if result.absent:
         lines += [f"Not measured, their folders are absent: {', '.join(result.absent)}.", ""]
-    lines += [
-        "| scene | references | localized | median | target | met | COLMAP 4.2, prebuilt map | p50 ms |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    lines += [*(_row(scene, summarize(evaluation.results), result.quick) for scene, evaluation in result.scenes), ""]
+    head = "scene | references | localized | median | target | met | COLMAP 4.2, prebuilt map | p50 ms"
+    rows = (_row(scene, summarize(evaluation.results), result.quick) for scene, evaluation in result.scenes)
+    lines += [*markdown_table(head, rows), ""]
     if result.others:
-        lines += [
-            "| scene | localized | median | of the references' radius | of the distance to the references |",
-            "|---|---|---|---|---|",
-            *map(_other_row, result.others),
-            "",
-        ]
+        head = "scene | localized | median | of the references' radius | of the distance to the references"
+        lines += [*markdown_table(head, map(_other_row, result.others)), ""]
     for evaluation in [*(e for _, e in result.scenes), *result.others]:
         rejections = summarize(evaluation.results).rejections
         if rejections:
@@ -185,9 +180,9 @@ def as_json(result: BenchResult) -> dict[str, Any]:
     }
 
 
-def _row(scene: BenchScene, summary: Summary, quick: bool) -> str:
+def _row(scene: BenchScene, summary: Summary, quick: bool) -> list[str]:
     reached = "yes" if met(scene.target, summary) else "no"
-    cells = [
+    return [
         scene.folder,
         "leave one out" if scene.references is None else str(scene.references),
         f"{summary.localized_count} of {summary.query_count}",
@@ -197,12 +192,11 @@ def _row(scene: BenchScene, summary: Summary, quick: bool) -> str:
         _figures(scene.with_map),
         f"{summary.latency_p50_ms:.0f}",
     ]
-    return f"| {' | '.join(cells)} |"
 
 
-def _other_row(evaluation: Evaluation) -> str:
+def _other_row(evaluation: Evaluation) -> list[str]:
     summary = summarize(evaluation.results)
-    cells = [
+    return [
         evaluation.dataset.name,
         f"{summary.localized_count} of {summary.query_count}",
         f"{format_length(summary.median_translation, evaluation.dataset.metric)} / "
@@ -210,7 +204,6 @@ def _other_row(evaluation: Evaluation) -> str:
         format_share(summary.median_translation / evaluation.trajectory_radius),
         format_share(summary.median_relative),
     ]
-    return f"| {' | '.join(cells)} |"
 
 
 def _split(evaluation: Evaluation) -> str:
@@ -229,14 +222,15 @@ def _figures(figures: Figures) -> str:
 
 def _latency_lines(latency: Latency) -> list[str]:
     first, warm, cold = _milliseconds(latency.first_pass), _milliseconds(latency.warm), latency.cold_ms
+    rows = [
+        ("every photograph for the first time", f"{quantile(first, 0.5):.0f}", f"{quantile(first, 0.95):.0f}"),
+        ("the same again (warm)", f"{quantile(warm, 0.5):.0f}", f"{quantile(warm, 0.95):.0f}"),
+        (f"first call of a fresh server (cold), median of {len(cold)}", f"{quantile(cold, 0.5):.0f}", ""),
+    ]
     lines = [
         f"Localize on {KITCHEN}, {REFERENCE_COUNT} stored references, K = 10, one call at a time:",
         "",
-        "| | p50 ms | p95 ms |",
-        "|---|---|---|",
-        f"| every photograph for the first time | {quantile(first, 0.5):.0f} | {quantile(first, 0.95):.0f} |",
-        f"| the same again (warm) | {quantile(warm, 0.5):.0f} | {quantile(warm, 0.95):.0f} |",
-        f"| first call of a fresh server (cold), median of {len(cold)} | {quantile(cold, 0.5):.0f} | |",
+        *markdown_table(" | p50 ms | p95 ms", rows),
         "",
         f"Time by stage, warm: {format_stages(stage_share(latency.warm))}.",
     ]

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from mapless_tools.output_files import markdown_table
+
 
 @dataclass(frozen=True)
 class Figure:
@@ -36,14 +38,8 @@ COLUMNS = 120
 
 def markdown(title: str, figures: Sequence[Figure]) -> list[str]:
     """The lines of a section."""
-    headings = ("part", *HEADINGS, "note")
-    return [
-        title,
-        "",
-        f"| {' | '.join(headings)} |",
-        "|" + "---|" * len(headings),
-        *(f"| {' | '.join((figure.part, *_cells(figure), figure.note))} |" for figure in figures),
-    ]
+    rows = ((figure.part, *_cells(figure), figure.note) for figure in figures)
+    return [title, "", *markdown_table(" | ".join(("part", *HEADINGS, "note")), rows)]
 
 
 def table(figures: Sequence[Figure]) -> list[str]:

@@ -16,7 +16,7 @@ from mapless_tools.child import CONNECT
 from mapless_tools.dataset import Frame
 from mapless_tools.evaluate.metrics import pose_error
 from mapless_tools.evaluate.references import PlannedQuery
-from mapless_tools.progress import Progress
+from mapless_tools.progress import Progress, tracked
 from mapless_tools.usage import UsageError
 
 from .claims import Claim
@@ -80,11 +80,10 @@ def scene_queries(client: Client, scene: str, frames: Sequence[Frame], progress:
     for reference in known:
         by_digest.setdefault(reference.image_sha256, []).append(reference)
     queries = []
-    for frame in frames:
+    for frame in tracked("choosing references", frames, len(frames), progress):
         own = by_digest.get(hashlib.sha256(frame.image_path.read_bytes()).hexdigest(), [])
         _refuse_another_pose(frame, own, scene)
         queries.append(_without(client, scene, frame, known, own))
-        progress("choosing references", len(queries), len(frames))
     return queries
 
 

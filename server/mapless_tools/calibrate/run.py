@@ -21,7 +21,7 @@ from mapless_tools.evaluate.references import check_images
 from mapless_tools.evaluate.run import plan_for, store_references
 from mapless_tools.ingest.formats import read_dataset
 from mapless_tools.output_files import write_json
-from mapless_tools.progress import Progress, progress_bars
+from mapless_tools.progress import Progress, progress_bars, tracked
 from mapless_tools.usage import UsageError, usage_errors
 
 from .findings import Findings, RightRule, find
@@ -144,18 +144,10 @@ def calibration_of(found: Findings) -> Calibration:
 
 
 def _localize_all(
-    client: Client,
-    scene: str,
-    queries: Sequence[Query],
-    options: EvaluationOptions,
-    progress: Progress,
+    client: Client, scene: str, queries: Sequence[Query], options: EvaluationOptions, progress: Progress
 ) -> list[Outcome]:
-    outcomes: list[Outcome] = []
-    progress("localizing", 0, len(queries))
-    for query in queries:
-        outcomes.append(localize(client, scene, query, count=options.k, variant=options.variant))
-        progress("localizing", len(outcomes), len(queries))
-    return outcomes
+    localizing = tracked("localizing", queries, len(queries), progress)
+    return [localize(client, scene, query, count=options.k, variant=options.variant) for query in localizing]
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from mapless_server.scenes.retrieval.ranking import spread_choice
 from mapless_server.serve.assembly import image_limits, make_first_features
 from mapless_server.settings import Settings, available_cores
 from mapless_tools.dataset import Dataset, Frame
-from mapless_tools.progress import Progress
+from mapless_tools.progress import Progress, tracked
 from mapless_tools.usage import UsageError
 
 T = TypeVar("T")
@@ -166,14 +166,9 @@ def _by_name(dataset: Dataset, folder: Path) -> dict[str, Frame]:
 
 
 def _map(function: Callable[[Frame], T], items: Sequence[Frame], step: str, progress: Progress) -> list[T]:
-    results: list[T] = []
     with ThreadPoolExecutor(available_cores()) as pool:
-        progress(step, 0, len(items))
         try:
-            for result in pool.map(function, items):
-                results.append(result)
-                progress(step, len(results), len(items))
+            return list(tracked(step, pool.map(function, items), len(items), progress))
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
             raise
-    return results

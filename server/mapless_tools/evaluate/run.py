@@ -12,7 +12,7 @@ from mapless.names import parse_reference_name
 from mapless_server.settings import Settings
 from mapless_tools.child import temporary_server
 from mapless_tools.dataset import Dataset, Frame
-from mapless_tools.progress import Progress
+from mapless_tools.progress import Progress, tracked
 
 from .metrics import QueryResult, pose_error, trajectory_radius
 from .plan import EvaluationOptions, split_frames
@@ -80,13 +80,9 @@ def localize_queries(
     client: Client, plan: Plan, options: EvaluationOptions, progress: Progress
 ) -> tuple[QueryResult, ...]:
     """Localizes the plan's queries, one after the other."""
-    results: list[QueryResult] = []
     references = {frame.name: frame for frame in plan.references}
-    progress("localizing", 0, len(plan.queries))
-    for query in plan.queries:
-        results.append(localize_query(client, SCENE, query, options, references))
-        progress("localizing", len(results), len(plan.queries))
-    return tuple(results)
+    queries = tracked("localizing", plan.queries, len(plan.queries), progress)
+    return tuple(localize_query(client, SCENE, query, options, references) for query in queries)
 
 
 def localize_query(

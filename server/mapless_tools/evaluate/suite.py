@@ -23,7 +23,7 @@ from mapless_server.serve.assembly import device_for, feature_names
 from mapless_server.settings import Settings, available_cores
 from mapless_tools.child import ServerFailed, temporary_server
 from mapless_tools.dataset import Dataset, Frame
-from mapless_tools.progress import Progress
+from mapless_tools.progress import Progress, labelled
 from mapless_tools.usage import UsageError
 
 from .benchmarks import ScenePlace
@@ -286,16 +286,13 @@ def _measure_scene(scene: SceneWork, runs: Sequence[Run], setup: RunSetup) -> No
 
 def _measure_setting(client: Client, split: SceneSplit, runs: Sequence[Run], setup: RunSetup) -> None:
     scene, scene_id = runs[0].scene, setting_name(split.setting).replace("=", "-")
-
-    def labelled(label: str) -> Progress:
-        return lambda step, done, total: setup.progress(f"{scene.place.name}, {label}: {step}", done, total)
-
-    planned = _with_references(scene, split, setup, labelled(setting_name(split.setting)))
-    store_references(client, scene_id, split.references, labelled(setting_name(split.setting)))
+    progress = labelled(setup.progress, f"{scene.place.name}, {setting_name(split.setting)}")
+    planned = _with_references(scene, split, setup, progress)
+    store_references(client, scene_id, split.references, progress)
     references = {frame.name: frame for frame in split.references}
     for run in runs:
         options = EvaluationOptions(k=setup.options.k, variant=run.method.variant, scale_strategy=run.method.scale)
-        progress = labelled(run.label)
+        progress = labelled(setup.progress, f"{scene.place.name}, {run.label}")
         progress("localizing", len(run.journal.results), len(planned))
         for done, query in enumerate(planned, start=1):
             if query.frame.name not in run.journal.results:

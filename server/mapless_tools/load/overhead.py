@@ -13,7 +13,8 @@ from mapless import Client, RigidTransform
 from mapless_server.method.options import check_bounds
 from mapless_tools.child import ChildServer, child_module
 from mapless_tools.demo import Photograph
-from mapless_tools.progress import Progress
+from mapless_tools.output_files import markdown_table
+from mapless_tools.progress import Progress, tracked
 
 from . import no_op
 from .driving import METHOD, photo_request, read_answer, store_references
@@ -135,14 +136,14 @@ def overhead_lines(subjects: Sequence[Subject], options: OverheadOptions) -> lis
         f"{options.concurrency} calls side by side from {options.clients} connections; "
         f"load average {os.getloadavg()[0]:.1f}:",
         "",
-        "| server | p50 unloaded, ms | p99 unloaded, ms | calls/s | server CPU ms/call | generator's core |",
-        "|---|---|---|---|---|---|",
     ]
-    for subject in subjects:
-        cpu_ms = median(1000 * step.cpu_s_per_answer for step in subject.saturated)
-        cells = (f"{subject.p50_ms:.2f}", f"{subject.p99_ms:.2f}", f"{subject.calls_per_s:.0f}", f"{cpu_ms:.2f}")
-        lines.append(f"| {subject.name} | {' | '.join(cells)} | {100 * subject.own_share:.0f} % |")
-    return [*lines, ""]
+    rows = []
+    for it in subjects:
+        cpu_ms = median(1000 * step.cpu_s_per_answer for step in it.saturated)
+        times = (f"{it.p50_ms:.2f}", f"{it.p99_ms:.2f}", f"{it.calls_per_s:.0f}", f"{cpu_ms:.2f}")
+        rows.append((it.name, *times, f"{100 * it.own_share:.0f} %"))
+    head = "server | p50 unloaded, ms | p99 unloaded, ms | calls/s | server CPU ms/call | generator's core"
+    return [*lines, *markdown_table(head, rows), ""]
 
 
 def overhead_figures(subjects: Sequence[Subject], options: OverheadOptions) -> dict[str, Any]:
@@ -183,11 +184,9 @@ async def compare_by_turns(
 
         for name in places:
             await step(name, 4, 0.5)  # so that no round pays for the start
-        for done in range(options.rounds):
-            progress("overhead, rounds", done, options.rounds)
+        for _ in tracked("overhead, rounds", range(options.rounds), options.rounds, progress):
             for name, subject in subjects.items():
                 subject.unloaded.append(await step(name, 1, options.unloaded_s))
             for name, subject in subjects.items():
                 subject.saturated.append(await step(name, options.concurrency, options.saturated_s))
-        progress("overhead, rounds", options.rounds, options.rounds)
     return list(subjects.values())

@@ -9,7 +9,7 @@ from typing import Any
 from mapless_server import __version__
 from mapless_server.observability.provenance import cpu_model
 from mapless_server.settings import available_cores
-from mapless_tools.output_files import write_json
+from mapless_tools.output_files import markdown_table, write_json
 
 from .calls import Fate
 from .slopes import Slope
@@ -34,21 +34,21 @@ def machine() -> str:
 def check_lines(checks: Sequence[Check]) -> list[str]:
     """A table of figure, value, bar and verdict."""
     verdict = {True: "yes", False: "**no**", None: "not measured"}
-    rows = [f"| {check.figure} | {check.value} | {check.bar} | {verdict[check.met]} |" for check in checks]
-    return ["| figure | measured | bar | met |", "|---|---|---|---|", *rows, ""]
+    rows = [(check.figure, check.value, check.bar, verdict[check.met]) for check in checks]
+    return [*markdown_table("figure | measured | bar | met", rows), ""]
 
 
 def step_lines(steps: Sequence[Step]) -> list[str]:
     """A table with a row for each step, and below it how every call ended."""
-    lines = [
-        "| step | offered/s | sent | goodput/s | refused/s | answers p50 / p95 / p99 ms | refusals p50 / p99 / max ms "
-        "| overdue | server CPU s/answer | RSS MiB, before > after | threads | fds | generator's core |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    head = (
+        "step | offered/s | sent | goodput/s | refused/s | answers p50 / p95 / p99 ms | refusals p50 / p99 / max ms | "
+        "overdue | server CPU s/answer | RSS MiB, before > after | threads | fds | generator's core"
+    )
+    rows = []
     for step in steps:
         account, first, last = step.account, step.samples[0], step.samples[-1]
         answers, refusals = account.answers, account.refusals
-        cells = [
+        cells = (
             step.name,
             f"{account.offered_per_s:.2f}",
             str(account.sent),
@@ -62,9 +62,9 @@ def step_lines(steps: Sequence[Step]) -> list[str]:
             f"{first.threads} > {last.threads}",
             f"{first.descriptors} > {last.descriptors}",
             f"{100 * step.own_share:.0f} %",
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    lines.append("")
+        )
+        rows.append(cells)
+    lines = [*markdown_table(head, rows), ""]
     for step in steps:
         outcomes = ", ".join(f"{count} {outcome}" for outcome, count in step.account.outcomes.items())
         lag = step.account.send_lag

@@ -12,6 +12,7 @@ from mapless import Client, ConnectOptions, MaplessError, NewReference, RigidTra
 from mapless.geometry import Camera
 from mapless_tools.load.no_op import CAMERA, padded_photo
 from mapless_tools.load.report import Check
+from mapless_tools.output_files import markdown_table
 from mapless_tools.progress import Progress
 
 from .cluster import Cluster, application, running_cluster
@@ -247,15 +248,19 @@ def replacement_lines(result: Replacements, what: str) -> list[str]:
         f"Two replicas that compute nothing, {what}; 4 callers (two of Localize with 0.3 MB, one of a stored "
         "photograph, one that adds references), each on a connection of its own with the client's usual retries:",
         "",
-        "| number | took, s | calls | failed | slowest before, s | slowest call, s | longest gap of a caller, s |",
-        "|---|---|---|---|---|---|---|",
     ]
-    for number, it in enumerate(result.events, 1):
-        lines.append(
-            f"| {number} | {it.duration_s:.1f} | {it.calls} | {len(it.errors)} | {it.usual_s:.2f} | {it.slowest_s:.2f} "
-            f"| {it.gap_s:.2f} |"
+    rows = (
+        (
+            number,
+            f"{it.duration_s:.1f}",
+            it.calls,
+            len(it.errors),
+            *(f"{s:.2f}" for s in (it.usual_s, it.slowest_s, it.gap_s)),
         )
-    return [*lines, "", *(f"- {error}" for it in result.events for error in it.errors[:3])]
+        for number, it in enumerate(result.events, 1)
+    )
+    head = "number | took, s | calls | failed | slowest before, s | slowest call, s | longest gap of a caller, s"
+    return [*lines, *markdown_table(head, rows), "", *(f"- {error}" for it in result.events for error in it.errors[:3])]
 
 
 def failover_checks(result: Replacements) -> list[Check]:

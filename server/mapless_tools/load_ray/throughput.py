@@ -16,7 +16,8 @@ from mapless_tools.load.report import Check
 from mapless_tools.load.sender import Target, connected
 from mapless_tools.load.step import Step, closed_loop_step
 from mapless_tools.load.watch import ServerUnderLoad, read_process
-from mapless_tools.progress import Progress
+from mapless_tools.output_files import markdown_table
+from mapless_tools.progress import Progress, tracked
 
 from .cluster import Cluster, application, running_cluster
 from .database import VARIABLE, database_url
@@ -91,17 +92,14 @@ def throughput_lines(rounds: list[Round], place: Place, options: ThroughputOptio
     lines = [
         f"{place.title}; {options.concurrency} parallel calls a replica; load average {os.getloadavg()[0]:.1f}:",
         "",
-        "| round | one replica, answers/s | its CPU, s/answer | two replicas, answers/s | gain | generator's core "
-        "| HAProxy's core |",
-        "|---|---|---|---|---|---|---|",
     ]
+    rows = []
     for number, it in enumerate(rounds, 1):
-        lines.append(
-            f"| {number} | {it.one.account.completed_per_s:.2f} | {it.one.cpu_s_per_answer:.3f} "
-            f"| {it.two.account.completed_per_s:.2f} | {it.gain:.2f} | {100 * it.two.own_share:.1f} % "
-            f"| {100 * it.balancer_share:.1f} % |"
-        )
-    return [*lines, ""]
+        one, two = it.one.account.completed_per_s, it.two.account.completed_per_s
+        times = (f"{one:.2f}", f"{it.one.cpu_s_per_answer:.3f}", f"{two:.2f}", f"{it.gain:.2f}")
+        rows.append((number, *times, f"{100 * it.two.own_share:.1f} %", f"{100 * it.balancer_share:.1f} %"))
+    replicas = "one replica, answers/s | its CPU, s/answer | two replicas, answers/s | gain"
+    return [*lines, *markdown_table(f"round | {replicas} | generator's core | HAProxy's core", rows), ""]
 
 
 async def _compare(
@@ -122,8 +120,7 @@ async def _compare(
         enter = stack.enter_async_context
         direct = await enter(connected(first.address, METHOD, 4, 30.0, read_answer))
         through = await enter(connected(cluster.address, METHOD, 4, 30.0, read_answer))
-        for done in range(options.rounds):
-            progress("throughput, rounds", done, options.rounds)
+        for _ in tracked("throughput, rounds", range(options.rounds), options.rounds, progress):
             one = await step("one", direct, options.concurrency)
             balancer = cluster.balancer_processes()
             before_s = _cpu_s(balancer)
