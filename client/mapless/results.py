@@ -21,7 +21,8 @@ class Scene:
         down_in_world: unit vector of gravity; None if unknown or given by the datum alone.
         calibration: measured factors of radii; None if never measured.
         arbitrary_unit: whether lengths are in an arbitrary unit, as of a COLMAP model, instead of metres.
-        warnings: contradictions of these properties and the references' poses, which `update_scene` found; else empty.
+        warnings: contradictions of these properties and the references' poses, which `update_scene` found, or of the
+            references' intrinsics, of which `get_scene` knows; else empty.
     """
 
     scene_id: str

@@ -9,20 +9,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.special import ndtri
-from support.scenes import CAMERA, SceneOptions, make_scene, random_for
+from support.scenes import SceneOptions, make_scene, random_for
 from support.servers import StandInDescriptor, StandInExtractor
 from support.stores import Folder, Place
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.errors import Unavailable
-from mapless_server.method.intrinsics import IntrinsicsEvidence
+from mapless_server.method.intrinsics import corrected_view
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.trust.judge import LEVELS, trust_in_scene
 from mapless_server.method.uncertainty.radii import USUAL_GAP, Accuracy, growth
 from mapless_server.method.views import PosedView
 from mapless_server.scenes.calibration.calibrations import SceneCalibrations
 from mapless_server.scenes.calibration.calibrator import Calibrator, CalibratorOptions
-from mapless_server.scenes.calibration.fit import FitOptions, LeftOut, fit, lens_contradictions
+from mapless_server.scenes.calibration.fit import FitOptions, LeftOut, fit
+from mapless_server.scenes.calibration.lens import SharedErrors, lens_contradiction, without_errors
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import Closed, ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
@@ -94,23 +95,6 @@ class TestFit:
         ours, theirs = fit(results, KIND, 1), fit([in_millimetres(it) for it in results], KIND, 1)
         assert theirs.position_factor == pytest.approx(ours.position_factor)
         assert theirs.reference_noise_m == pytest.approx(1e3 * ours.reference_noise_m)
-
-    def test_a_wrong_lens_of_all_is_named(self) -> None:
-        random, prior = random_for("lens"), np.array([0.003, 3.0, 3.0, 0.01])
-
-        def with_lens(it: LeftOut, error: float) -> LeftOut:
-            value = np.array([error, 0.5, 0.0, 0.001]) + 0.3 * prior * random.normal(size=4)
-            zeros = np.zeros((6, 4))
-            lens = IntrinsicsEvidence(CAMERA, CAMERA, value, 0.3 * prior, prior, np.eye(4), zeros, np.zeros(4))
-            return replace(it, lens=lens)
-
-        right, wrong = ([with_lens(it, error) for it in spread(20, 1.0)] for error in (0.0, 0.03))
-        assert lens_contradictions(right) == []
-        certain = [replace(it, lens=replace(it.lens, sigma=0.01 * prior)) for it in right if it.lens]
-        assert lens_contradictions(certain) == []  # half a pixel is usual, however certain
-        assert [it.partition(" off")[0] for it in lens_contradictions(wrong)] == ["focal length"]
-        assert "off by 3" in lens_contradictions(wrong)[0]
-        assert lens_contradictions(spread(20, 1.0)) == []
 
     def test_two_answers_say_nothing(self) -> None:
         assert fit(spread(2, 9.0), KIND, 3) == SelfCalibration(KIND, 3, 0)
@@ -196,6 +180,12 @@ def mirrored(it: RigidTransform) -> RigidTransform:
     return RigidTransform(mirror @ it.rotation @ mirror, mirror @ it.translation)
 
 
+def with_errors(references: Sequence[PosedView], errors: Sequence[float]) -> list[PosedView]:
+    """The same photographs with intrinsics that are off by these errors of `method.intrinsics`, stored as pinholes."""
+    wrong = [corrected_view(it.view, np.array(errors)) for it in references]
+    return [replace(it, view=replace(view, distortion=None)) for it, view in zip(references, wrong, strict=True)]
+
+
 def found_in(store: Store, references: Sequence[PosedView], change: Change = lambda it: it) -> SelfCalibration:
     add(store, references, change)
     found = Server(store).run()
@@ -203,12 +193,40 @@ def found_in(store: Store, references: Sequence[PosedView], change: Change = lam
     return found
 
 
+class TestLens:
+    def test_without_errors_keypoints_are_the_planted_ones(self) -> None:
+        wrong = with_errors(REFERENCES[:1], [0.0, 0.0, 0.0, 0.01])[0]
+        right = without_errors(wrong, SharedErrors(np.array([0.0, -0.01]), np.zeros(2)))
+        planted = REFERENCES[0].view.features.keypoints
+        assert np.abs(wrong.view.features.keypoints - planted).max() > 1
+        assert np.abs(right.view.features.keypoints - planted).max() < 0.1
+
+    def test_errors_that_disagree_are_not_certain(self) -> None:
+        own = [SharedErrors(np.array([0.0, it]), np.full(2, 0.001)) for it in (-0.2, 0.0, 0.1, 0.3)]
+        assert lens_contradiction(own) is None
+        alike = [SharedErrors(np.array([0.0, it]), np.full(2, 0.001)) for it in (0.09, 0.1, 0.1, 0.11)]
+        found = lens_contradiction(alike)
+        assert found is not None
+        assert found.value.tolist() == [0.0, pytest.approx(0.1)]
+        assert lens_contradiction(alike[:3]) is None
+
+
 class TestScenes:
     def test_references_are_localized_against_the_others(self, store: Store) -> None:
         found = found_in(store, REFERENCES)
-        assert found.answer_count == len(REFERENCES)
+        assert (found.answer_count, found.lens) == (len(REFERENCES), "")
         assert 0.3 < found.position_factor < 3
         assert 0.3 < found.rotation_factor < 3
+
+    def test_a_lens_left_out_is_named(self, store: Store) -> None:
+        found = found_in(store, with_errors(REFERENCES, [0.0, 0.0, 0.0, 0.3]))
+        assert found.lens.startswith("matches between the references show another lens distortion (k1 -0.2")
+        assert found.answer_count == len(REFERENCES)
+
+    def test_a_wrong_focal_length_of_all_is_named(self, store: Store) -> None:
+        found = found_in(store, with_errors(REFERENCES, [0.1, 0.0, 0.0, 0.0]))
+        assert "another focal length (-" in found.lens
+        assert "distortion" not in found.lens
 
     def test_all_wrong_by_a_similarity_say_the_same(self, store: Store, tmp_path: Path) -> None:
         ours = found_in(store, REFERENCES)

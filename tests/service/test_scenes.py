@@ -29,7 +29,7 @@ from mapless.v1 import reference_service_pb2 as pb
 from mapless.v1.geometry_pb2 import Vector3
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.security import key_of
-from mapless_server.store import Store
+from mapless_server.store import SceneAttributes, SelfCalibration, Store
 
 DATUM = Datum(47.5, 8.25, 400.0, enu_from_y_up(0))
 CALIBRATION = Calibration(1.5, 1.25, 2.0, 1.75, 40, "sift-2048", "geometric", "BEST", "0.1.0")
@@ -205,6 +205,12 @@ def test_added_references_that_contradict_their_scene_are_said(client: Client, s
     client.update_scene("added", down_in_world=None)
     assert client.add_reference("added", NewReference("d", PHOTO, CAMERA, pose(4.0))).warnings == ()
     client.delete_scene("added")
+
+
+def test_a_lens_that_references_contradict_is_said(client: Client, scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    known = SceneAttributes(self_calibrations=tuple(SelfCalibration(kind, 1, 3, lens="a lens") for kind in "ab"))
+    monkeypatch.setattr(Store, "get_attributes", lambda *_: known)
+    assert client.get_scene(scene).warnings == ("a lens",)
 
 
 def test_coverage_has_the_mark_of_an_arbitrary_unit(client: Client, scene: str) -> None:

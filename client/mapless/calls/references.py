@@ -67,7 +67,7 @@ def get_scene(scene: str, *, timeout_s: float | None = None) -> Exchange[Scene]:
     """Gets a scene."""
     request = pb.GetSceneRequest(name=scene_name(scene))
     response = yield Call(f"{SERVICE}/GetScene", request, pb.GetSceneResponse, timeout_s)
-    return scene_from_message(response.scene)
+    return scene_from_message(response.scene, response.warnings)
 
 
 def update_scene(

@@ -79,6 +79,7 @@ def _datum(arguments: argparse.Namespace) -> Datum | None:
 def get_scene(client: Client, arguments: argparse.Namespace) -> int:
     """Prints a scene with its datum and calibration."""
     scene = client.get_scene(arguments.scene)
+    _warn(scene.warnings)
     return show(arguments, scene, _scene_card(scene))
 
 

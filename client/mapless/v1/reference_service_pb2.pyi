@@ -141,10 +141,12 @@ class GetSceneRequest(_message.Message):
     def __init__(self, name: _Optional[str] = ...) -> None: ...
 
 class GetSceneResponse(_message.Message):
-    __slots__ = ("scene",)
+    __slots__ = ("scene", "warnings")
     SCENE_FIELD_NUMBER: _ClassVar[int]
+    WARNINGS_FIELD_NUMBER: _ClassVar[int]
     scene: Scene
-    def __init__(self, scene: _Optional[_Union[Scene, _Mapping]] = ...) -> None: ...
+    warnings: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, scene: _Optional[_Union[Scene, _Mapping]] = ..., warnings: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class UpdateSceneRequest(_message.Message):
     __slots__ = ("scene", "update_mask")

@@ -27,7 +27,6 @@ from mapless.geometry import Array, Camera, Distortion, RadialTangential
 from .options import IntrinsicsSigma, check_bounds
 from .views import View, undistort_pixels
 
-NAMES = ("focal length", "principal point x", "principal point y", "k1")
 PRINCIPAL = (1, 2)
 """Which of the four errors are those of the principal point."""
 

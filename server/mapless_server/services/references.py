@@ -83,10 +83,11 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
 
     async def GetScene(self, request: pb.GetSceneRequest, call: Call) -> pb.GetSceneResponse:
         """Implements ReferenceService.GetScene."""
-        scene = await self._stored(
-            self._store.get_scene, scene_key_from_name(request.name, "name", call.principal.tenant)
-        )
-        return pb.GetSceneResponse(scene=scene_to_message(scene))
+        key = scene_key_from_name(request.name, "name", call.principal.tenant)
+        scene = await self._stored(self._store.get_scene, key)
+        known = await self._stored(self._store.get_attributes, key)
+        warnings = dict.fromkeys(it.lens for it in known.self_calibrations if it.lens)
+        return pb.GetSceneResponse(scene=scene_to_message(scene), warnings=warnings)
 
     async def UpdateScene(self, request: pb.UpdateSceneRequest, call: Call) -> pb.UpdateSceneResponse:
         """Implements ReferenceService.UpdateScene."""

@@ -43,6 +43,7 @@ class SelfCalibration:
             which every answer contains.
         trust_quantiles: quantiles of the generic trust of right answers, at the levels of `method.trust.judge`; empty
             if unknown.
+        lens: sentence about an error of the intrinsics that the references share; empty if they show none.
     """
 
     kind: str
@@ -53,6 +54,7 @@ class SelfCalibration:
     reference_noise_m: float = 0.0
     reference_noise_deg: float = 0.0
     trust_quantiles: tuple[float, ...] = ()
+    lens: str = ""
 
     def __post_init__(self) -> None:
         for name in ("position_factor", "rotation_factor"):

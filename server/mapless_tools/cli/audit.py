@@ -69,7 +69,7 @@ def audit_command(
         with terminable(), connected(connection, settings) as client, progress_bars() as progress:
             known = client.get_scene(scene)
             examined.total = known.reference_count
-            examined.warnings = warnings_of(client, known)
+            examined.warnings = [*warnings_of(client, known), *known.warnings]
             progress("audit", 0, examined.total)
             for found in client.audit_scene(scene, page_size=page_size, timeout_s=timeout_s(page_size)):
                 examined.audits.append(found)

@@ -88,10 +88,15 @@ class TwoViewMatches:
 
     def sampson_px(self, world_from_query: RigidTransform) -> Array:
         """Sampson distances (T,) of the matches, pixels; NaN without a baseline."""
+        return np.asarray(np.abs(self.signed_sampson_px(world_from_query)[0]))
+
+    def signed_sampson_px(self, world_from_query: RigidTransform) -> tuple[Array, Array]:
+        """The distances (T,) with their signs, and their derivatives (T, 4) by the pixels of query and reference."""
         rotation, centre = world_from_query.rotation, world_from_query.translation
         error, gradient = self._constraint(rotation, self.ray @ rotation.T, self.reference_centre - centre)
+        length = np.linalg.norm(gradient, axis=1)
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.asarray(np.abs(error) / np.linalg.norm(gradient, axis=1))
+            return np.asarray(error / length), np.asarray(gradient / length[:, None])
 
     def sampson_along_px(self, rotation: Array, centre: Array, direction: Array, distance: Array) -> Array:
         """Sampson distances (S, T) of queries at centre + distance * direction, for S distances."""

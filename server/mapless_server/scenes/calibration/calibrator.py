@@ -3,7 +3,7 @@
 import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, zip_longest
 
@@ -25,7 +25,8 @@ from ..indexes import SceneIndexes
 from ..library import ReferenceLibrary
 from ..retrieval.index import Entries
 from ..retrieval.ranking import rank_beside, spread_choice
-from .fit import LeftOut, fit, lens_contradictions
+from .fit import LeftOut, fit
+from .lens import LENS_REFERENCES, SharedErrors, lens_contradiction, shared_errors, without_errors
 
 log = logging.getLogger(__name__)
 
@@ -79,21 +80,42 @@ class Calibrator:
         `newest` are ids of its latest references, the latest first; `pause` is called between the stages of each, and
         may raise, which ends it. NotFound if there is no such scene (field "scene").
         """
-        begin_s = time.thread_time()
         context = StageContext(pause)
         entries = self._indexes.entries(scene_key, context)
-        results: list[LeftOut] = []
+        sample = self._sample(entries, newest)
+        shared: list[SharedErrors] = []
+        results = self._localize(scene_key, entries, library, sample, context, shared)
+        found, lens = fit(results, self.kind, entries.generation), lens_contradiction(shared)
+        if lens is None:
+            return found
+        log.warning("scene %s: %s", scene_key, lens)
+        # With the same wrong lens references agree with one another. Photographs with the right one are off by more, or
+        # rejected, so that nothing is known of them.
+        results = self._localize(scene_key, entries, library, sample, context, lens=lens)
+        right = fit(results, self.kind, entries.generation)
+        return replace(right if right.answer_count else found, lens=str(lens))
+
+    def _localize(
+        self,
+        scene_key: SceneKey,
+        entries: Entries,
+        library: ReferenceLibrary,
+        sample: Sequence[str],
+        context: StageContext,
+        shared: list[SharedErrors] | None = None,
+        lens: SharedErrors | None = None,
+    ) -> list[LeftOut]:
+        """Localizes each of a sample against the others, without errors `lens`; appends what it shows to `shared`."""
+        begin_s, results = time.thread_time(), []
         most_s = self.options.max_cpu_s * max(1, -(-len(entries) // 1000))
-        for reference_id in self._sample(entries, newest):
+        for reference_id in sample:
             if time.thread_time() - begin_s > most_s:
                 break
-            result = self._leave_out(scene_key, entries, library, reference_id, context)
+            result = self._leave_out(scene_key, entries, library, reference_id, context, shared, lens)
             if result is not None:
                 results.append(result)
             context.check()
-        for phrase in lens_contradictions(results):
-            log.warning("scene %s: its references together contradict their intrinsics: %s", scene_key, phrase)
-        return fit(results, self.kind, entries.generation)
+        return results
 
     def _sample(self, entries: Entries, newest: Sequence[str]) -> list[str]:
         """Ids of references to leave out: the newest and the worst covered by turns."""
@@ -113,6 +135,8 @@ class Calibrator:
         library: ReferenceLibrary,
         reference_id: str,
         context: StageContext,
+        shared: list[SharedErrors] | None,
+        lens: SharedErrors | None,
     ) -> LeftOut | None:
         """Localizes one reference; None if it has too few others, or is deleted or damaged."""
         load = partial(self._indexes.load_existing, library, scene_key, extractor=self._extractor, context=context)
@@ -120,6 +144,8 @@ class Calibrator:
         if not loaded:
             return None
         (subject,), count = loaded, self.options.reference_count
+        if lens is not None:
+            subject = without_errors(subject, lens)
         wanted = [it.reference_id for it in rank_beside(entries, reference_id, self.options.shortlist * count)]
         others = [it for it in load(reference_ids=wanted) if not _is_copy(it, subject)]
         if len(others) < 2:
@@ -129,6 +155,9 @@ class Calibrator:
         centres = [it.world_from_camera.translation for it in others]
         chosen = spread_choice([len(it) for it in matches], centres, count)
         references, chosen_matches = [others[i] for i in chosen], [matches[i] for i in chosen]
+        if shared is not None and len(shared) < LENS_REFERENCES:
+            found = shared_errors(subject, references, chosen_matches)
+            shared.extend([found] if found else [])
         options = LocalizeOptions(coverage=1.0)
         prepared = prepare(subject.view, references, self._pipeline, options, context, chosen_matches)
         if isinstance(prepared, Answer):
@@ -151,7 +180,6 @@ def left_out(subject: PosedView, answer: Answer) -> LeftOut | None:
         accuracy_from_covariance(outcome.covariance),
         outcome.trust or 0.0,
         *viewpoint_gap(support),
-        support.estimate.intrinsics if support.estimate else None,
     )
 
 

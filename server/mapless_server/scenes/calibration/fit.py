@@ -25,7 +25,6 @@ from dataclasses import astuple, dataclass
 import numpy as np
 
 from mapless.geometry import Array
-from mapless_server.method.intrinsics import NAMES, IntrinsicsEvidence
 from mapless_server.method.options import check_bounds
 from mapless_server.method.trust.judge import LEVELS
 from mapless_server.method.uncertainty.radii import Accuracy, growth
@@ -37,9 +36,6 @@ RIGHT_SHARE, RIGHT_DEG = 0.05, 5.0
 _FACTORS = np.exp(np.linspace(np.log(0.15), np.log(6.0), 57))
 _NOISES = np.array([0.0, 0.1, 0.2, 0.3, 0.45, 0.6, 0.8, 1.0, 1.3, 1.7, 2.2])
 """Values of f, and of s by the median radius, that are tried."""
-
-_UNITS = ((100.0, " %"), (1.0, " px"), (1.0, " px"), (1.0, ""))
-"""Of `NAMES` in messages, with the factor to each."""
 
 _FARTHEST_LOG = 3.0
 """Standard deviations beyond which an error counts no more."""
@@ -80,7 +76,6 @@ class LeftOut:
         trust: generic trust of the answer.
         gap: distance of the answer to its nearest reference, as a share of the depth that it sees.
         depth_m: that depth.
-        lens: evidence of errors of the intrinsics; None if there is none.
     """
 
     error_m: float
@@ -89,7 +84,6 @@ class LeftOut:
     trust: float
     gap: float
     depth_m: float
-    lens: IntrinsicsEvidence | None = None
 
     @property
     def is_right(self) -> bool:
@@ -148,39 +142,3 @@ def _trust_quantiles(right: Array, highest_wrong: float, options: FitOptions) ->
     quantiles = trust[np.searchsorted(share, np.array(LEVELS) - 1e-12)]
     levels = np.array(LEVELS)
     return np.clip(quantiles, np.minimum(levels, highest_wrong), levels)
-
-
-def lens_contradictions(results: Sequence[LeftOut]) -> list[str]:
-    """Finds contradictions of the references' intrinsics by all of them together, a phrase for each parameter.
-
-    A parameter is named if its error exceeds three standard deviations, both of the estimate and of calibrated lenses.
-    Pixels are those of the reduced image.
-    """
-    evidence = [it.lens for it in results if it.is_right and it.lens is not None]
-    if not evidence:
-        return []
-    values, sigmas = _lens(evidence)
-    usual = np.median([it.prior_sigma for it in evidence], axis=0).tolist()
-    found = []
-    for name, (factor, unit), *numbers in zip(NAMES, _UNITS, values, sigmas, usual, strict=True):
-        value, sigma, usual_sigma = (factor * it for it in numbers)
-        if abs(value) > 3 * max(sigma, usual_sigma):
-            found.append(
-                f"{name} off by {value:.3g}{unit} (standard deviation {sigma:.2g}{unit}; of calibrated lenses "
-                f"{usual_sigma:.2g}{unit})"
-            )
-    return found
-
-
-def _lens(evidence: Sequence[IntrinsicsEvidence]) -> tuple[list[float], list[float]]:
-    """Errors of the intrinsics by all references together, and their standard deviations; both (4,).
-
-    The error is the median over the references, so that a single wrong pose does not matter; the standard deviation
-    follows from their spread, so that references that disagree do not become certain by their number alone.
-    """
-    values = np.array([it.value for it in evidence])
-    middle = np.median(values, axis=0)
-    spread = 1.4826 * np.median(np.abs(values - middle), axis=0)
-    claimed = np.median([it.sigma for it in evidence], axis=0)
-    sigma = 1.2533 * np.maximum(spread, claimed) / np.sqrt(len(values))
-    return middle.tolist(), sigma.tolist()
