@@ -106,7 +106,7 @@ def test_replaced_problems_share_sorted_observations_and_cost_the_same() -> None
 
 def residuals(problem: BundleProblem, state: Bundle) -> Array:
     """(O, 2)."""
-    return problem.by_view.residuals(problem.by_view.in_camera(state.poses, state.points.T), state.intrinsics).T
+    return problem.by_view.linearized(state)[0].T
 
 
 def dense_system(problem: BundleProblem, state: Bundle) -> tuple[Array, Array]:

@@ -10,6 +10,7 @@ from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 from mapless.geometry import RigidTransform
 from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.results import PoseEstimate, Support
+from mapless_server.method.trust import evidence
 from mapless_server.method.trust.evidence import (
     NO_AGREEMENT,
     AgreementOptions,
@@ -46,6 +47,16 @@ def test_halves_of_a_right_pose_agree(outlier_share: float) -> None:
     for case in range(5):
         scene = planted(case, outlier_share=outlier_share)
         assert max(both(scene, solved(scene))) < 0.01
+
+
+def test_small_motions_of_halves_are_those_of_ransac(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenes = [planted(case, outlier_share=0.3, noise_px=1.0) for case in range(5)]
+    supports = [solved(scene) for scene in scenes]
+    moved = [both(*it) for it in zip(scenes, supports, strict=True)]
+    monkeypatch.setattr(evidence, "MAJORITY", 1.0)
+    found = [both(*it) for it in zip(scenes, supports, strict=True)]
+    assert moved != found
+    np.testing.assert_allclose(moved, found, rtol=0.1, atol=2e-4)  # a thousandth counts as nothing
 
 
 def test_halves_of_random_matches_disagree() -> None:

@@ -39,6 +39,10 @@ references' points too, and moves the pose but little: focus and stabilization r
 errors exceeds all others in scenes of one camera, where radii hold too often."""
 
 
+Optimum = tuple[Structure, PointMatches, Solved]
+"""All points of an adjustment, the query's matches with them, and what was solved."""
+
+
 def adjust_pose(
     query: View,
     references: Sequence[PosedView],
@@ -68,19 +72,45 @@ def adjust_pose(
         The estimate with a refined pose and its covariance; unchanged if the adjustment fails.
     """
 
-    def adjusted(start: PoseEstimate, active: Priors) -> PoseEstimate | None:
+    def adjusted(start: PoseEstimate, active: Priors) -> tuple[PoseEstimate, Optimum | None] | None:
         given = query, references, structure, matches, start, options, active, intrinsics
         return _adjusted(*given, query_matches)
 
     # If no prior is used, the answer is bit-identical to the one without priors.
     without_priors = estimate.without_priors or estimate
-    alone = adjusted(without_priors, NO_PRIORS)
+    alone, where = adjusted(without_priors, NO_PRIORS) or (None, None)
     if not priors:
         return alone or without_priors
     checks = priors.check(alone.world_from_camera, alone.covariance) if alone else estimate.prior_checks
     used = priors.consistent(checks)
-    answer = (adjusted(estimate, used) or estimate) if used else (alone or without_priors)
+    answer = alone or without_priors
+    if used:
+        informed = _with_priors(query, alone, where, used, options) if alone and where else None
+        answer = informed or (adjusted(estimate, used) or (estimate, None))[0]
     return replace(answer, prior_checks=checks)
+
+
+def _with_priors(
+    query: View, alone: PoseEstimate, where: Optimum, priors: Priors, options: AdjustOptions
+) -> PoseEstimate | None:
+    """The estimate with priors that are consistent with the one without, from whose optimum it starts.
+
+    What the photograph says of the pose's errors is computed there.
+    """
+    structure, matches, (problem, start, used) = where
+    bundle = optimum(problem.replaced(priors=priors, prior_weight=options.error_inflation**2), start, options)
+    errors = alone.covariance, alone.intrinsics
+    found = adjusted_estimate(query, structure, matches, used, alone, bundle, options, errors)
+    return found and _sharpened(_of_matches(found, len(alone.inliers)), priors)
+
+
+def _sharpened(found: PoseEstimate, priors: Priors) -> PoseEstimate:
+    return replace(found, covariance=priors.sharpened(found.covariance, found.world_from_camera))
+
+
+def _of_matches(found: PoseEstimate, count: int) -> PoseEstimate:
+    """The estimate without the matches that were added to the first ones."""
+    return replace(found, inliers=found.inliers[:count], errors_px=found.errors_px[:count])
 
 
 def _adjusted(
@@ -93,33 +123,30 @@ def _adjusted(
     priors: Priors,
     intrinsics: IntrinsicsSigma | None,
     query_matches: Sequence[Matches],
-) -> PoseEstimate | None:
-    """Returns the estimate at the optimum with priors; None if it diverges or has too few matches.
+) -> tuple[PoseEstimate, Optimum | None] | None:
+    """Returns the estimate at the optimum with priors, and where that is; None if it diverges or has too few matches.
 
     Points of the query's own are chosen at its pose, with whatever error the intrinsics give it, so they hide a part
     of this error: intrinsics that seem wrong with them are judged, and estimated, without them.
     """
     terms = intrinsics_terms(query, references, intrinsics)
 
-    def solved(start: PoseEstimate, tracks: Tracks | None = None) -> tuple[PoseEstimate, Solved] | None:
+    def solved(start: PoseEstimate, tracks: Tracks | None = None) -> tuple[PoseEstimate, Optimum] | None:
         return _at_optimum(query, references, structure, matches, start, options, priors, terms, tracks)
-
-    def sharpened(found: PoseEstimate) -> PoseEstimate:
-        return replace(found, covariance=priors.sharpened(found.covariance, found.world_from_camera))
 
     own = _own_tracks(query, references, structure, matches, estimate, options, query_matches)
     first = solved(estimate, own) if own and estimate.inliers.mean() >= options.agreeing_share else None
     if first and not is_suspicious(first[0], options):
-        return sharpened(first[0])
+        return _sharpened(first[0], priors), first[1]
     plain = solved(estimate)
     if plain is None:
         return None
     found, where = plain
-    better = recalibrated(query, references, structure, matches, found, options, priors, terms[2], where)
+    better = recalibrated(query, references, structure, matches, found, options, priors, terms[2], where[2])
     if better is found and own:
-        more, _ = first or solved(found, own) or plain
+        more, where = first or solved(found, own) or plain
         better = replace(more, intrinsics=found.intrinsics)
-    return sharpened(better)
+    return _sharpened(better, priors), where if better.view is None else None
 
 
 def _own_tracks(
@@ -149,7 +176,7 @@ def _at_optimum(
     priors: Priors,
     terms: tuple[View, Array, Array, Array],
     own: Tracks | None,
-) -> tuple[PoseEstimate, Solved] | None:
+) -> tuple[PoseEstimate, Optimum] | None:
     """The estimate at the optimum, with points of the query's own tracks, and where it was found."""
     given, pose = len(matches), estimate.world_from_camera
     if own:
@@ -166,11 +193,11 @@ def _at_optimum(
     with_priors = problem.replaced(priors=priors, prior_weight=options.error_inflation**2)
     bundle = optimum(with_priors, start, options)
     before = replace(estimate, inliers=start_inliers, errors_px=errors_px)
-    found = adjusted_estimate(query, structure, matches, used, before, problem, bundle, options, terms)
+    errors = errors_of_pose(query, problem, bundle, options, terms)
+    found = adjusted_estimate(query, structure, matches, used, before, bundle, options, errors)
     if found is None:
         return None
-    found = replace(found, inliers=found.inliers[:given], errors_px=found.errors_px[:given])
-    return found, (problem, bundle, used)
+    return _of_matches(found, given), (structure, matches, (problem, bundle, used))
 
 
 def intrinsics_terms(

@@ -19,17 +19,18 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csc_array
 
 from mapless.geometry import Array, RigidTransform
 
 from .arrays import apply_columns, columns, symmetric_products, take
 from .observations import Observations
 from .optimize import cauchy_cost, cauchy_weight, solve_step
+from .perturbation import pose_columns
 from .priors.known import NO_PRIORS, Priors
 from .results import DepthPlanes, Structure
 from .structure import observe
-from .tracks import Tracks
+from .tracks import Tracks, summed
 from .views import PosedView
 
 
@@ -139,8 +140,10 @@ class BundleProblem:
 
     def replaced(self, **changes: Any) -> BundleProblem:
         """Returns the problem with other priors or `keypoint_motion`; the same observations are not sorted again."""
-        other = replace(self, **changes)
-        vars(other)["by_view"] = replace(self.by_view, by_intrinsics=_by_intrinsics(other.keypoint_motion))
+        other, by_view = replace(self, **changes), self.by_view
+        if "keypoint_motion" in changes:
+            by_view = replace(by_view, by_intrinsics=_by_intrinsics(other.keypoint_motion))
+        vars(other)["by_view"] = by_view
         return other
 
     @property
@@ -155,8 +158,7 @@ class BundleProblem:
 
     def cost(self, bundle: Bundle) -> float:
         """Cost of the values; NaN if a point is behind a camera."""
-        x_in_camera = self.by_view.in_camera(bundle.poses, np.ascontiguousarray(bundle.points.T))
-        squared = (self.by_view.residuals(x_in_camera, bundle.intrinsics) ** 2).sum(axis=0)
+        squared = (self.by_view.linearized(bundle)[0] ** 2).sum(axis=0)
         motion = self.reference_motion(bundle).ravel()
         prior = float(motion @ self.information @ motion)
         if bundle.intrinsics.size:
@@ -269,53 +271,42 @@ class ViewColumns:
         """Makes the columns from arrays that are sorted by view."""
         parts = itertools.pairwise(np.searchsorted(view, np.arange(view_count + 1)).tolist())
         count = len(point)
-        sums = csr_array((np.ones(count), (point, np.arange(count))), shape=(int(point.max(initial=-1)) + 1, count))
+        sums = csc_array((np.ones(count), point, np.arange(count + 1)), shape=(int(point.max(initial=-1)) + 1, count))
         slices = tuple(slice(*part) for part in parts)
         return ViewColumns(point, view, slices, focal, offset, sums, by_intrinsics, planes)
 
     def of_points(self, chosen: NDArray[np.bool_]) -> ViewColumns:
         """Returns the observations of some of the points (P,), with the points numbered anew."""
-        kept = chosen[self.point]
+        kept = np.flatnonzero(chosen[self.point])
         point, view = (np.cumsum(chosen) - 1)[self.point[kept]], self.view[kept]
-        by_intrinsics = (
-            self.by_intrinsics[:, :, kept[self.parts[-1]]] if self.by_intrinsics.size else self.by_intrinsics
-        )
-        columns = self.focal[:, kept], self.offset[:, kept], by_intrinsics
+        by_intrinsics = self.by_intrinsics
+        if by_intrinsics.size:
+            begin = self.parts[-1].start
+            by_intrinsics = take(by_intrinsics, kept[np.searchsorted(kept, begin) :] - begin)
+        columns = take(self.focal, kept), take(self.offset, kept), by_intrinsics
         return ViewColumns._sorted(point, view, *columns, len(self.parts), self.planes and self.planes[chosen])
 
-    def in_camera(self, poses: Poses, x_in_world: Array) -> Array:
-        """Coordinates (3, O) of the observed points in the cameras' frames, from points (3, P)."""
-        rotation = take(columns(poses.rotation), self.view)
-        return np.asarray(apply_columns(rotation, take(x_in_world, self.point)) + take(poses.translation.T, self.view))
-
-    def residuals(self, x_in_camera: Array, intrinsics: Array) -> Array:
-        """Residuals (2, O) in standard deviations; NaN for points behind the camera."""
-        depth = np.where(x_in_camera[2] > 0, x_in_camera[2], np.nan)
-        return self._with_intrinsics(np.asarray(x_in_camera[:2] / depth * self.focal + self.offset), intrinsics)
-
-    def _with_intrinsics(self, residual: Array, intrinsics: Array) -> Array:
-        """Changes residuals (2, O) in place to those at errors (I,) of the query's intrinsics, and returns them."""
-        if intrinsics.size:
-            residual[:, self.parts[-1]] += np.einsum("aio,i->ao", self.by_intrinsics, intrinsics)
-        return residual
-
     def linearized(self, bundle: Bundle) -> tuple[Array, Array, Array]:
-        """Residuals (2, O) and their derivatives by the point (2, 3, O) and the pose (2, 6, O)."""
+        """Residuals (2, O), NaN behind the camera, and derivatives by the point (2, 3, O) and the pose (2, 6, O).
+
+        They are kept with the bundle: its cost needs the residuals, and few bundles are not linearized too.
+        """
+        known: tuple[ViewColumns, tuple[Array, Array, Array]] | None = vars(bundle).get("_linearized")
+        if known is None or known[0] is not self:
+            vars(bundle)["_linearized"] = known = self, self._linearized(bundle)
+        return known[1]
+
+    def _linearized(self, bundle: Bundle) -> tuple[Array, Array, Array]:
         rotation = take(columns(bundle.poses.rotation), self.view)
         x_in_world = take(np.ascontiguousarray(bundle.points.T), self.point)
         x, y, z = apply_columns(rotation, x_in_world) + take(bundle.poses.translation.T, self.view)
         inverse_depth = 1 / np.where(z > 0, z, np.nan)
         ideal, slope = np.stack([x, y]) * inverse_depth, self.focal * inverse_depth
         by_point = slope[:, None] * (rotation[:2] - ideal[:, None] * rotation[2])
-        # The derivative by the camera's point, times [I | -[x]x] (see `perturbation.motion_jacobian`).
-        (u, v), (fx, fy), zero = ideal, self.focal, np.zeros_like(z)
-        by_pose = np.stack(
-            [
-                np.stack([slope[0], zero, -slope[0] * u, -fx * u * v, fx * (1 + u * u), -fx * v]),
-                np.stack([zero, slope[1], -slope[1] * v, -fy * (1 + v * v), fy * u * v, fy * u]),
-            ]
-        )
-        residual = self._with_intrinsics(ideal * self.focal + self.offset, bundle.intrinsics)
+        by_pose = pose_columns(ideal, self.focal, inverse_depth)
+        residual = ideal * self.focal + self.offset
+        if bundle.intrinsics.size:
+            residual[:, self.parts[-1]] += np.einsum("aio,i->ao", self.by_intrinsics, bundle.intrinsics)
         return residual, by_point, by_pose
 
     def equations(
@@ -356,8 +347,8 @@ class ViewColumns:
                 weighted_x, weighted_y = np.concatenate([weighted_pose[:, :, part], weighted_intrinsics], axis=1)
             blocks.append(weighted_x @ x.T + weighted_y @ y.T)
             gradients.append(weighted_x @ residual[0, part] + weighted_y @ residual[1, part])
-        point_block = np.stack([self.sums @ row for row in symmetric_products(weighted_point, by_point)])
-        point_gradient = np.stack([self.sums @ row for row in (weighted_point * residual[:, None]).sum(axis=0)])
+        terms = symmetric_products(weighted_point, by_point), (weighted_point * residual[:, None]).sum(axis=0)
+        point_block, point_gradient = np.split(summed(self.sums, np.concatenate(terms)), [6])
         if self.planes is not None:
             normal = self.planes.normal.T
             weighted = normal * self.planes.information

@@ -78,28 +78,31 @@ class IntrinsicsEquations:
     def estimate(
         self, removed: Array, information: Array, inflation: float, region_factor: float
     ) -> tuple[Array, Array]:
-        """The errors (4,), and their covariance (4, 4), which contains what matches share.
+        """The errors (..., 4), and their covariance (..., 4, 4), which contains what matches share.
 
         As that of a pose, it is the sum of the jackknife over references and over regions, these at the errors that are
         found; to which come what the prior leaves and what the residuals say, for few references may agree by chance.
 
         Args:
             removed: (4,) errors that are removed from the intrinsics at which the equations are linearized.
-            information: (4,) inverse variances of the errors without the photograph.
+            information: (..., 4) inverse variances of the errors without the photograph.
             inflation: of standard deviations that follow from residuals; weighs the data against the prior.
             region_factor: see `UncertaintyOptions`.
 
         Raises:
             np.linalg.LinAlgError: the data do not determine an error without a prior.
         """
-        matrices, prior = self.matrices / inflation**2, np.diag(information)
-        inverse = np.linalg.inv(matrices + prior)
-        change, *without = -(inverse @ (self.gradients / inflation**2 + information * removed)[:, :, None])[:, :, 0]
-        parts = (self.region_gradients + self.region_matrices @ change) @ inverse[0] / inflation**2
-        references = np.array(without) - np.mean(without, axis=0) if without else np.zeros((1, len(removed)))
-        regions = region_factor * (parts - parts.mean(axis=0))
-        count, chance = len(references), inverse[0] @ (prior + matrices[0] / inflation**2) @ inverse[0]
-        return removed + change, (count - 1) / count * references.T @ references + regions.T @ regions + chance
+        matrices, prior = self.matrices / inflation**2, information[..., None] * np.eye(len(removed))
+        inverses = np.linalg.inv(matrices + prior[..., None, :, :])
+        gradients = self.gradients / inflation**2 + (information * removed)[..., None, :]
+        changes = -(inverses @ gradients[..., None])[..., 0]
+        change, inverse = changes[..., :1, :], inverses[..., 0, :, :]
+        parts = self.region_gradients + (self.region_matrices @ change[..., None])[..., 0]
+        regions = parts @ inverse / inflation**2
+        both = (it - it.mean(axis=-2, keepdims=True) for it in (changes[..., 1:, :], region_factor * regions))
+        references, regions = (np.swapaxes(it, -1, -2) @ it for it in both)
+        count, chance = changes.shape[-2] - 1, inverse @ (prior + matrices[0] / inflation**2) @ inverse
+        return removed + change[..., 0, :], (count - 1) / count * references + regions + chance
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,13 +174,10 @@ def intrinsics_evidence(
             off, and the latter more often than a normal distribution says.
         to_world: (6, 6) derivative of the world error by the pose's unknowns.
     """
-    value, sigma = np.zeros(4), np.zeros(4)
     try:
-        for i in range(4):
-            others = prior_sigma**-2.0
-            others[i] = 0.0
-            found, covariance = equations.estimate(removed, others, inflation, region_factor)
-            value[i], sigma[i] = found[i], np.sqrt(covariance[i, i])
+        others = np.where(np.eye(4, dtype=bool), 0.0, prior_sigma**-2.0)
+        found, covariance = equations.estimate(removed, others, inflation, region_factor)
+        value, sigma = np.diag(found), np.sqrt(np.einsum("iii->i", covariance))
         doubtful = suspicion.contradicted(value, sigma, prior_sigma, given.camera.width_px)
         doubtful &= (held_sigma >= prior_sigma) | np.array(
             [False, False, False, True]

@@ -90,8 +90,8 @@ def vote(structure: Structure, keypoint_counts: Sequence[int], correspondences: 
     keypoint = np.concatenate([m[:, 0] for m in matches]).astype(np.intp)
     point = np.concatenate([point_of[offsets[view] + m[:, 1]] for view, m in enumerate(matches)])
     keypoint, point = keypoint[point >= 0], point[point >= 0]
-    pairs, votes = np.unique(np.stack([keypoint, point], axis=1), axis=0, return_counts=True)
-    keypoint, point = one_to_one(pairs[:, 0], pairs[:, 1], votes.astype(float))
+    pairs, votes = np.unique(keypoint * (tracks.point_count + 1) + point, return_counts=True)
+    keypoint, point = one_to_one(*np.divmod(pairs, tracks.point_count + 1), votes.astype(float))
     return PointMatches(point, keypoint, np.zeros(len(point), bool), 0.0)
 
 

@@ -19,7 +19,7 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian, rotation_from_vector
+from mapless.geometry import Array, Camera, RigidTransform, rotation_from_vector
 
 
 def perturbed(target_from_source: RigidTransform, step: Array) -> RigidTransform:
@@ -82,9 +82,27 @@ def reprojection_errors_px(
     return np.asarray(np.linalg.norm(projected - pixels, axis=1))
 
 
+def pose_columns(ideal: Array, focal: Array, inverse_depth: Array) -> Array:
+    """Derivative (2, 6, M) of projections by a left perturbation of camera_from_world, in the unit of focal lengths.
+
+    Of points that are seen at x / z, y / z (2, M), of inverse depths (M,); `focal` is (2, M) or (2, 1).
+    """
+    (u, v), (fx, fy) = ideal, focal
+    jacobian = np.empty((2, 6, len(u)))
+    jacobian[0, 0], jacobian[0, 1], jacobian[0, 3], jacobian[0, 5] = fx * inverse_depth, 0, -fx * u * v, -fx * v
+    jacobian[1, 0], jacobian[1, 1], jacobian[1, 4], jacobian[1, 5] = 0, fy * inverse_depth, fy * u * v, fy * u
+    jacobian[0, 2], jacobian[0, 4] = -jacobian[0, 0] * u, fx * (1 + u * u)
+    jacobian[1, 2], jacobian[1, 3] = -jacobian[1, 1] * v, -fy * (1 + v * v)
+    return jacobian
+
+
+def pose_jacobian(camera: Camera, x_in_camera: Array) -> Array:
+    """Derivative (2, 6, M) of the projections of points (M, 3), in pixels; NaN behind the camera."""
+    x, y, z = np.where(x_in_camera[:, 2] > 0, x_in_camera.T, np.nan)
+    return pose_columns(np.stack([x / z, y / z]), np.array([[camera.focal_x_px], [camera.focal_y_px]]), 1 / z)
+
+
 def pose_hessian(camera: Camera, world_from_camera: RigidTransform, x_in_world: Array) -> Array:
     """J^T J (6, 6) of the projections in pixels by a left perturbation (v, w) of camera_from_world."""
-    x_in_camera = world_from_camera.inverse().apply(x_in_world)
-    focal = np.array([camera.focal_x_px, camera.focal_y_px])
-    jacobian = (normalize_jacobian(x_in_camera) * focal[:, None]) @ motion_jacobian(x_in_camera)
-    return np.asarray(np.einsum("mia,mib->ab", jacobian, jacobian))
+    x, y = pose_jacobian(camera, world_from_camera.inverse().apply(x_in_world))
+    return np.asarray(x @ x.T + y @ y.T)

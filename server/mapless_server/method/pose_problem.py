@@ -156,26 +156,18 @@ def adjusted_estimate(
     matches: PointMatches,
     used: NDArray[np.intp],
     estimate: PoseEstimate,
-    problem: BundleProblem,
     bundle: Bundle,
     options: AdjustOptions,
-    intrinsics: tuple[View, Array, Array, Array],
+    errors: tuple[Array, IntrinsicsEvidence | None] | None,
 ) -> PoseEstimate | None:
-    """Returns the estimate at the optimum, with its covariance without priors; None if it has diverged.
-
-    `intrinsics`: the query with its intrinsics as given, the errors that are removed from them, and the standard
-    deviations `prior_sigma` and `held_sigma` of `intrinsics_evidence`.
-    """
+    """Returns the estimate at the optimum; None if it has diverged. `errors` are what `errors_of_pose` returns."""
     pose = bundle.world_from_query
     pixels = query.features.keypoints[matches.keypoint].astype(np.float64)
     points = structure.x_in_world.copy()
     points[np.unique(matches.point[used])] = bundle.points
     errors_px = reprojection_errors_px(query.camera, pose, points[matches.point], pixels)
     inliers = errors_px < options.inlier_px
-    if inliers.sum() < max(1, options.min_kept_share * estimate.inliers.sum()):
-        return None
-    errors = errors_of_pose(query, problem, bundle, options, intrinsics)
-    if errors is None:
+    if errors is None or inliers.sum() < max(1, options.min_kept_share * estimate.inliers.sum()):
         return None
     return PoseEstimate(pose, PoseStage.REFINED, inliers, errors_px, errors[0], is_adjusted=True, intrinsics=errors[1])
 
@@ -190,7 +182,8 @@ def errors_of_pose(
 ) -> tuple[Array, IntrinsicsEvidence | None] | None:
     """A pose's covariance without scale and priors, and the evidence of errors of its intrinsics; None for neither.
 
-    `intrinsics` as for `adjusted_estimate`, `is_offset` as for `dispersed_covariance`.
+    `intrinsics`: the query with its intrinsics as given, the errors that are removed from them, and the standard
+    deviations `prior_sigma` and `held_sigma` of `intrinsics_evidence`. `is_offset` as for `dispersed_covariance`.
     """
     pose = bundle.world_from_query
     dispersion = disperse(*with_intrinsics(problem, bundle, query), options.uncertainty.max_matches)

@@ -15,7 +15,15 @@ from mapless.geometry import Array
 from .bundle import Bundle, BundleProblem
 from .intrinsics import PRINCIPAL, ContradictionOptions, IntrinsicsEvidence, corrected_view
 from .perturbation import reprojection_errors_px
-from .pose_problem import AdjustOptions, adjusted_estimate, optimum, pose_problem, shares_camera, with_intrinsics
+from .pose_problem import (
+    AdjustOptions,
+    adjusted_estimate,
+    errors_of_pose,
+    optimum,
+    pose_problem,
+    shares_camera,
+    with_intrinsics,
+)
 from .priors.known import Priors
 from .results import PointMatches, PoseEstimate, Structure
 from .views import PosedView, View
@@ -157,5 +165,6 @@ def _with_errors(
     terms = (query, errors, usual, held)
     before = replace(found, inliers=errors_px < options.inlier_px)
     bundle = optimum(problem, start, options)
-    better = adjusted_estimate(view, structure, matches, used, before, problem, bundle, options, terms)
+    its_errors = errors_of_pose(view, problem, bundle, options, terms)
+    better = adjusted_estimate(view, structure, matches, used, before, bundle, options, its_errors)
     return better and replace(better, view=view)

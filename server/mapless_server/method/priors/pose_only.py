@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian
+from mapless.geometry import Array, Camera, RigidTransform
 
 from ..optimize import MinimizeOptions, cauchy_cost, cauchy_weight, damped_step, minimize
 from ..options import check_bounds
-from ..perturbation import moved
+from ..perturbation import moved, pose_jacobian, world_jacobian
 from .known import NO_PRIORS, Priors
 
 
@@ -74,7 +74,6 @@ class _Problem:
     ) -> None:
         self.camera, self.x_in_world, self.pixels = camera, x_in_world, pixels
         self.priors, self.options = priors, options
-        self.focal = np.array([camera.focal_x_px, camera.focal_y_px])
 
     def residuals(self, pose: RigidTransform) -> tuple[Array, Array]:
         """Points in the camera frame (N, 3), and reprojection errors (N, 2) in standard deviations."""
@@ -90,15 +89,13 @@ class _Problem:
     def linearize(self, pose: RigidTransform) -> tuple[Array, Array]:
         x_in_camera, residual = self.residuals(pose)
         weight = cauchy_weight((residual**2).sum(axis=1), self.options.loss_scale_sigma)
-        # x_in_camera = R^T (X - t): a shift of the camera moves it by -R^T, a turn w by R^T [X - t]x w.
-        by_camera_point = normalize_jacobian(x_in_camera) * (self.focal / self.options.sigma_px)[:, None]
-        by_point = by_camera_point @ pose.rotation.T  # (N, 2, 3)
-        lever = (self.x_in_world - pose.translation)[:, None, :]
-        jacobian = np.concatenate([-by_point, np.cross(by_point, lever)], axis=2).reshape(-1, 6)
-        weighted = jacobian * np.repeat(weight, 2)[:, None]
+        jacobian = pose_jacobian(self.camera, x_in_camera) / self.options.sigma_px
+        weighted, to_camera = weight * jacobian, np.linalg.inv(world_jacobian(pose))
+        by_pose = weighted[0] @ residual[:, 0] + weighted[1] @ residual[:, 1]
+        hessian = weighted[0] @ jacobian[0].T + weighted[1] @ jacobian[1].T
         gradient, information = self.priors.gradient_and_information(pose)
         w = self.options.prior_weight
-        return weighted.T @ residual.ravel() + w * gradient, weighted.T @ jacobian + w * information
+        return to_camera.T @ by_pose + w * gradient, to_camera.T @ hessian @ to_camera + w * information
 
     def step(self, pose: RigidTransform, equations: tuple[Array, Array], damping: float) -> RigidTransform | None:
         gradient, hessian = equations

@@ -5,9 +5,13 @@ found again from half of the matches, and from the matches with half of the refe
 repeated structure put the halves at different places, wrong reference poses put the halves of the references there, and
 a pose that few matches or a flat scene determine badly moves by as much as its own error. Matches from a guided search
 agree with the pose around which they were searched, so they take no part unless there are no others.
+
+RANSAC finds the pose of a half, which knows nothing of the pose in question. But where most of a half agree with this,
+RANSAC could not find another one that more of them agree with, only the same a little moved, so that is computed.
 """
 
 import math
+import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -17,8 +21,9 @@ from scipy.spatial import ConvexHull
 
 from mapless.geometry import Array, Camera, RigidTransform
 
+from ..optimize import cauchy_weight
 from ..options import check_bounds
-from ..perturbation import reprojection_errors_px
+from ..perturbation import pose_jacobian, reprojection_errors_px
 from ..pnp import PnpOptions, ransac
 from ..results import PointMatches, Structure, Support
 from ..two_view.matches import TwoViewMatches
@@ -30,11 +35,17 @@ MOST_POINTS = 2000
 LEAST_SHARE, LEAST_HULL_SHARE, LEAST_EPIPOLAR_SHARE, LEAST_DISAGREEMENT = 0.01, 0.002, 0.0004, 0.001
 """Below these evidence is not better or worse. A right pose's halves are apart by a thousandth of the distance."""
 
-AGREED = LEAST_DISAGREEMENT / math.sqrt(2)
-"""Halves of matches and of references that are apart by less are together not better evidence than any nearer ones."""
-
 EPIPOLAR_PX = 2.0
 """Largest Sampson distance of a match that agrees with a pose; keypoints are accurate to about a pixel."""
+
+MAJORITY, LEAST_AGREEING = 0.5, 8
+"""Where a larger share of a half's matches agree with the pose, and so many, the half's own pose is near it."""
+
+LINEAR_SHARE, LINEAR_STEPS = 0.02, 5
+"""Largest motion (of the distance, and radians) in which residuals are linear, and steps of least squares."""
+
+LEAST_DAMPING = 1e-9
+"""Relative: matches that do not determine a pose move it far."""
 
 NO_AGREEMENT = 1.0
 """The disagreement of halves that give no pose: as far apart as what they see is away."""
@@ -124,7 +135,8 @@ def disagreement_of_matches(support: Support, distance_m: float, options: Agreem
     def random_half(random: np.random.Generator) -> NDArray[np.bool_]:
         return np.asarray(random.permutation(len(rows)) % 2 == 0)
 
-    return _median_disagreement(support.query.camera, x_in_world, pixels, random_half, distance_m, options)
+    camera, pose = support.query.camera, _pose(support)
+    return _median_disagreement(camera, x_in_world, pixels, random_half, distance_m, options, pose)
 
 
 def disagreement_of_references(support: Support, votes: Votes, distance_m: float, options: AgreementOptions) -> float:
@@ -144,8 +156,13 @@ def disagreement_of_references(support: Support, votes: Votes, distance_m: float
 
     camera, key = support.query.camera, votes.keypoint
     return _median_disagreement(
-        camera, votes.x_in_world, votes.pixels, half_of_the_references, distance_m, options, key
+        camera, votes.x_in_world, votes.pixels, half_of_the_references, distance_m, options, _pose(support), key
     )
+
+
+def _pose(support: Support) -> RigidTransform:
+    assert support.estimate is not None
+    return support.estimate.world_from_camera
 
 
 def _median_disagreement(
@@ -155,29 +172,77 @@ def _median_disagreement(
     draw_half: Callable[[np.random.Generator], NDArray[np.bool_]],
     distance_m: float,
     options: AgreementOptions,
+    pose: RigidTransform,
     keypoint: NDArray[np.intp] | None = None,
 ) -> float:
     """Median over the splits of the distance of the two halves' cameras, as a share of `distance_m`; at most 1."""
-    random, apart = np.random.default_rng(0), []
-    order = slice(None) if keypoint is None else np.argsort(keypoint, kind="stable")
-    x_in_world, pixels = x_in_world[order], pixels[order]
-    keypoint = None if keypoint is None else keypoint[order]
-    for _ in range(options.splits):
-        in_first = draw_half(random)[order]
-        centres = []
-        for half in (in_first, ~in_first):
-            rows = np.flatnonzero(half)
-            if keypoint is not None:
-                is_first, its = np.ones(len(rows), bool), keypoint[rows]
-                is_first[1:] = its[1:] != its[:-1]
-                rows = rows[is_first]
-            pose = ransac(camera, x_in_world[rows], pixels[rows], None, options.pnp) if len(rows) >= 4 else None
-            centres.append(None if pose is None else pose.translation)
-        first, second = centres
-        apart.append(NO_AGREEMENT if first is None or second is None else math.dist(first, second) / distance_m)
-        if 2 * len(apart) > options.splits and max(apart) < AGREED:
-            break  # so is the median of all
-    return min(NO_AGREEMENT, float(np.median(apart)))
+    random = np.random.default_rng(0)
+    firsts = np.array([draw_half(random) for _ in range(options.splits)])
+    halves = np.stack([firsts, ~firsts], axis=1).reshape(2 * options.splits, -1)
+    if keypoint is not None:
+        rows, halves = _first_of_each(keypoint, x_in_world, halves)
+        x_in_world, pixels = x_in_world[rows], pixels[rows]
+    shifts = _shifts_nearby(camera, x_in_world, pixels, halves, pose, distance_m, options.pnp)
+    for half, shift in zip(halves, shifts, strict=True):
+        if np.isnan(shift[0]) and half.sum() >= 4:
+            found = ransac(camera, x_in_world[half], pixels[half], None, options.pnp)
+            shift[:] = np.nan if found is None else found.translation - pose.translation
+    apart = np.linalg.norm(shifts[::2] - shifts[1::2], axis=1) / distance_m
+    return float(min(NO_AGREEMENT, statistics.median(np.nan_to_num(apart, nan=NO_AGREEMENT).tolist())))
+
+
+def _first_of_each(
+    keypoint: NDArray[np.intp], x_in_world: Array, halves: NDArray[np.bool_]
+) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Indices (R,) of different matches, and which of these are the first of their keypoint in each half (H, R)."""
+    order = np.argsort(keypoint, kind="stable")
+    keypoint, x = keypoint[order], x_in_world[order, 0]
+    is_new = np.diff(keypoint, prepend=-1) > 0
+    starts = np.flatnonzero(is_new | (np.diff(x, prepend=np.nan) != 0))
+    if not len(starts):
+        return order, halves
+    halves = np.logical_or.reduceat(halves[:, order], starts, axis=1)
+    count = np.cumsum(halves, axis=1)
+    of_keypoint = np.flatnonzero(is_new[starts])[np.cumsum(is_new[starts]) - 1]
+    return order[starts], halves & (count - (count - halves)[:, of_keypoint] == 1)
+
+
+def _shifts_nearby(
+    camera: Camera,
+    x_in_world: Array,
+    pixels: Array,
+    halves: NDArray[np.bool_],
+    pose: RigidTransform,
+    distance_m: float,
+    options: PnpOptions,
+) -> Array:
+    """Shifts (H, 3) from a pose's centre to those of halves (H, M) of the matches; NaN where the pose is not theirs.
+
+    By least squares with the weights of Cauchy's loss, as in `ransac`; residuals are linear in motions so small.
+    """
+    shifts = np.full((len(halves), 3), np.nan)
+    x_in_camera = pose.inverse().apply(x_in_world)
+    residual = camera.project(x_in_camera) - pixels
+    agrees: NDArray[np.bool_] = np.linalg.norm(residual, axis=1) < options.inlier_px
+    in_half = halves[:, agrees]
+    agreeing = in_half.sum(axis=1)
+    chosen: NDArray[np.bool_] = (agreeing >= LEAST_AGREEING) & (agreeing > MAJORITY * halves.sum(axis=1))
+    if not chosen.any():
+        return shifts
+    by_pose = pose_jacobian(camera, x_in_camera[agrees])
+    products = (by_pose[:, :, None] * by_pose[:, None]).sum(axis=0).reshape(36, -1)
+    residual, motion = residual[agrees].T[:, None], np.zeros((int(chosen.sum()), 6))
+    largest = LINEAR_SHARE * np.repeat([distance_m, 1.0], 3)
+    for _ in range(LINEAR_STEPS):
+        moved = residual + motion @ by_pose
+        weight = in_half[chosen] * cauchy_weight(moved[0] ** 2 + moved[1] ** 2, options.loss_scale_px)
+        gradient = (weight * moved[0]) @ by_pose[0].T + (weight * moved[1]) @ by_pose[1].T
+        hessian = (weight @ products.T).reshape(-1, 6, 6) * (1 + LEAST_DAMPING * np.eye(6))
+        step = np.linalg.solve(hessian, gradient[:, :, None])[:, :, 0]
+        motion = np.clip(motion - step, -largest, largest)
+    is_small = np.asarray((np.abs(motion) < largest).all(axis=1))
+    shifts[chosen] = np.where(is_small[:, None], -motion[:, :3] @ pose.rotation.T, np.nan)
+    return shifts
 
 
 @dataclass(frozen=True)

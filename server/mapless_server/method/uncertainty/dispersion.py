@@ -47,6 +47,7 @@ from ..arrays import take
 from ..bundle import Bundle, BundleProblem, EliminatedPoints, ViewColumns
 from ..intrinsics import IntrinsicsEquations
 from ..optimize import cauchy_weight
+from ..tracks import summed
 from .radii import SUPPORTING_SHARE
 
 DAMPING = 1e-9
@@ -144,7 +145,7 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
     to_rest = np.hstack([-solved[0, :, :-1].T, np.eye(len(data) - posed.stop)])
     regions = _regions(seen)
     to_both = np.vstack([np.hstack([-to_pose, np.zeros((6, len(to_rest)))]), to_rest])
-    influences = _influences(seen, regions, to_both, residual, by_pose, weight, points)
+    influences, known = _by_region(seen, regions, to_both, residual, by_pose, weight, points)
     if not (np.isfinite(poses).all() and np.isfinite(influences).all()):
         return None
     found = Dispersion(
@@ -156,7 +157,7 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
     intrinsics = IntrinsicsEquations(
         thinning * rest[observing, :, :-1],
         thinning * rest[observing, :, -1],
-        thinning * _information(seen, regions, to_rest, by_pose, weight, points),
+        thinning * known,
         thinning * influences[:, 6:],
         -solved[0, query, :-1],
     )
@@ -231,7 +232,7 @@ def _by_camera(seen: ViewColumns, by_pose: Array) -> Iterator[tuple[slice, slice
     yield query, slice(6 * len(references), None), slopes
 
 
-def _influences(
+def _by_region(
     seen: ViewColumns,
     regions: Sequence[NDArray[np.intp]],
     rows: Array,
@@ -239,42 +240,27 @@ def _influences(
     by_pose: Array,
     weight: Array,
     points: EliminatedPoints,
-) -> Array:
-    """(G, R): each region's part of the gradient, points eliminated, in combinations (R, U) of the unknowns."""
-    weighted = weight * residual
-    of_observation = np.concatenate(
-        [
-            rows[:, unknowns] @ (slopes * weighted[:, None, part]).sum(axis=0)
-            for part, unknowns, slopes in _by_camera(seen, by_pose)
-        ],
-        axis=1,
-    )
-    of_match = np.stack([seen.sums @ row for row in of_observation])
-    of_match -= ((rows @ points.cross).reshape(len(rows), *points.gradient.shape) * points.gradient).sum(axis=1)
-    return np.stack([of_match[:, it].sum(axis=1) for it in regions])
+) -> tuple[Array, Array]:
+    """Each region's part of the gradient (G, R) in combinations (R, U) of the unknowns, and of the matrix (G, I, I).
 
-
-def _information(
-    seen: ViewColumns,
-    regions: Sequence[NDArray[np.intp]],
-    rows: Array,
-    by_pose: Array,
-    weight: Array,
-    points: EliminatedPoints,
-) -> Array:
-    """(G, R, R): each region's part of the matrix, as for `_influences`."""
+    The points are eliminated; the matrix is in the last I combinations, of the intrinsics.
+    """
     slopes = [rows[:, unknowns] @ by_camera for _, unknowns, by_camera in _by_camera(seen, by_pose)]
-    of_observation = np.swapaxes(np.concatenate(slopes, axis=2) * np.sqrt(weight), 0, 1)
+    of_observation = np.concatenate(slopes, axis=2)  # (2, R, O)
     lost = (rows @ points.cross).reshape(len(rows), *points.gradient.shape)
+    of_match = summed(seen.sums, (of_observation * (weight * residual)[:, None]).sum(axis=0))
+    of_match -= (lost * points.gradient).sum(axis=1)
     region = np.empty(lost.shape[2], np.intp)
     for i, it in enumerate(regions):
         region[it] = i
+    of_observation, lost = np.swapaxes(of_observation[:, 6:] * np.sqrt(weight), 0, 1), lost[6:]
     of_view = region[seen.point]
     parts = [
-        (of_observation[:, :, of_view == i].reshape(len(rows), -1), lost[:, :, it].reshape(len(rows), -1))
+        (of_observation[:, :, of_view == i].reshape(len(lost), -1), lost[:, :, it].reshape(len(lost), -1))
         for i, it in enumerate(regions)
     ]
-    return np.stack([kept @ kept.T - gone @ gone.T for kept, gone in parts])
+    influences = np.stack([of_match[:, it].sum(axis=1) for it in regions])
+    return influences, np.stack([kept @ kept.T - gone @ gone.T for kept, gone in parts])
 
 
 def _whitened(seen: ViewColumns, residual: Array, weight: Array, points: EliminatedPoints) -> tuple[Array, Array]:
