@@ -255,12 +255,10 @@ def _by_region(
         region[it] = i
     of_observation, lost = np.swapaxes(of_observation[:, 6:] * np.sqrt(weight), 0, 1), lost[6:]
     of_view = region[seen.point]
-    parts = [
-        (of_observation[:, :, of_view == i].reshape(len(lost), -1), lost[:, :, it].reshape(len(lost), -1))
-        for i, it in enumerate(regions)
-    ]
+    parts = [(of_observation[:, :, of_view == i], lost[:, :, it]) for i, it in enumerate(regions)]
+    squares = [[np.tensordot(it, it, ((1, 2), (1, 2))) for it in part] for part in parts]
     influences = np.stack([of_match[:, it].sum(axis=1) for it in regions])
-    return influences, np.stack([kept @ kept.T - gone @ gone.T for kept, gone in parts])
+    return influences, np.stack([kept - gone for kept, gone in squares])
 
 
 def _whitened(seen: ViewColumns, residual: Array, weight: Array, points: EliminatedPoints) -> tuple[Array, Array]:
