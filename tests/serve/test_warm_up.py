@@ -43,7 +43,7 @@ from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling import CostModel, Flow, Job
 from mapless_server.security import RateLimiter
 from mapless_server.serve.assembly import MakeEngine, StartupError, engine_options, engine_over, make_tiers
-from mapless_server.serve.warm_up import ROUNDS, warm_up
+from mapless_server.serve.warm_up import ROUNDS, warm_up, warm_up_stronger
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 from mapless_tools.load.driving import free_port
@@ -61,6 +61,7 @@ async def warm(folder: Path, tiers: Sequence[Tier], method: Method | None = None
         try:
             yield engine
             await warm_up(engine)
+            await warm_up_stronger(engine)
         finally:
             await engine.close()
 
@@ -85,7 +86,7 @@ async def test_the_real_method_localizes_the_rendered_scene(tmp_path: Path) -> N
 
 
 async def test_every_tier_describes_the_references(tmp_path: Path) -> None:
-    """So that its network is loaded before the first call; the second one a pair, the first one also the query."""
+    """So that its network is loaded; the second one a pair, the first one also the query."""
     extractors = [StandInExtractor(f"stand-in {i}") for i in range(2)]
     tiers = [Tier(it, Pipeline(cast(Any, StandInReconstructor()))) for it in extractors]
     async with warm(tmp_path, tiers, whole(lambda *_: answer_at(TRUTH))):
@@ -97,10 +98,15 @@ def answer_at(centre: NDArray[np.float64]) -> Answer:
     return Answer(Localization(RigidTransform(np.eye(3), centre), COVARIANCE, PoseStage.REFINED, 90, 120, 0.7))
 
 
-def engine_of(localize: Callable[..., Answer], begin: Callable[[], object] = lambda: None) -> MakeEngine:
+def engine_of(
+    localize: Callable[..., Answer],
+    begin: Callable[[], object] = lambda: None,
+    stronger: StandInExtractor | None = None,
+) -> MakeEngine:
     def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
         begin()
-        tiers = [Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))]
+        extractors = [StandInExtractor(), *([] if stronger is None else [stronger])]
+        tiers = [Tier(it, Pipeline(cast(Any, StandInReconstructor()))) for it in extractors]
         return engine_over(store, tiers, engine_options(settings), metrics, quota, whole(localize))
 
     return make
@@ -180,6 +186,18 @@ def test_a_broken_method_ends_the_start(tmp_path: Path, way: str) -> None:
         raise AssertionError("it began to serve")
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_stronger_features_that_fail_are_logged_while_serving(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stronger = StandInExtractor("stronger")
+    monkeypatch.setattr(stronger, "extract", raising(RuntimeError("no kernel image")))
+    settings = Settings(host="127.0.0.1", port=0, data_dir=tmp_path, metrics=False)
+    make = engine_of(lambda *_: answer_at(TRUTH), stronger=stronger)
+    with listening(settings, Store.open(tmp_path), make) as (running, _):
+        wait_until(lambda: "no kernel image" in caplog.text)
+        assert not running.failed.done()
 
 
 @contextmanager

@@ -63,12 +63,10 @@ def serve_command(config: Config = None, **flags: Any) -> None:
     logging.getLogger(__name__).info("mapless-server %s\n%s", __version__, loaded)
     configure_libraries(loaded.settings)
 
-    gc.disable()  # a fifth of the time of the imports
+    gc.disable()  # a fifth of the time of the imports, also of torch's; `serve` enables it when it is ready
     from .assembly import StartupError
     from .run import serve
 
-    gc.freeze()
-    gc.enable()
     try:
         asyncio.run(serve(loaded.settings))
     except StartupError as error:

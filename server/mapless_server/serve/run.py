@@ -59,6 +59,7 @@ async def serve(settings: Settings, make: MakeEngine = make_engine) -> None:
         # Present objects stay; scanning them again would only block the event loop.
         gc.collect()
         gc.freeze()
+        gc.enable()
         # Parsed by programs that start a server on port 0: keep its form.
         print(f"mapless-server listening on {running.address}", flush=True)
         ended: set[asyncio.Future[Any]] = {stopped, running.failed}

@@ -30,7 +30,7 @@ from mapless_server.store import Store
 from .assembly import MakeEngine, StartupError, make_engine, open_store, what_is_missing
 from .listening import AddressTaken, GrpcServer
 from .store_health import watch_store
-from .warm_up import warm_up
+from .warm_up import warm_up, warm_up_stronger
 
 log = logging.getLogger(__name__)
 
@@ -130,6 +130,8 @@ async def _start(
     _run_task(stack, _stop_serving(services, failed))
     await _warm_up(settings, engine, metrics)
     await services.open(engine)
+    if settings.warm_up:
+        _run_task(stack, warm_up_stronger(engine))
     if engine.background is not None:
         engine.background.start(settings.background_matching)
         stack.push_async_callback(asyncio.to_thread, engine.background.close)

@@ -10,17 +10,16 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Camera, RigidTransform
-from mapless_server.engine.query import Caller, Photo, Query
+from mapless_server.engine.query import Caller, Photo, Query, Tier
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.method.answer import Localization
-from mapless_server.method.correspond import Matcher
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import LocalizeOptions, StageContext
 from mapless_server.method.views import Photograph, PosedView
@@ -42,8 +41,6 @@ _CAMERA = Camera(640, 480, 520.0, 520.0, 319.5, 239.5)
 _REFERENCE_CAMERA = _CAMERA.resized(400, 300)
 """Describing these costs half, and their keypoints still are as many as a query's."""
 _CENTRES_X_M = (-0.6, 0.0, 0.6)
-_FARTHEST = (0, 2)
-"""Numbers of the two centres that are farthest apart."""
 _QUERY_X_M = 0.25
 _WALLS = ((4.0, 4.0), (2.5, 0.8))
 """Distance and half the side of each, metres, the furthest first."""
@@ -57,7 +54,8 @@ class WarmUpFailed(Exception):
 async def warm_up(engine: QueueEngine) -> None:
     """Localizes until the queue can predict the time of a query; raises WarmUpFailed if the answer is wrong."""
     # Outside the queue, because describing references is no part of a usual query.
-    references = await asyncio.to_thread(_RenderedReferences, [tier.extractor for tier in engine.tiers])
+    first = engine.tiers[0]
+    references = await asyncio.to_thread(_RenderedReferences, first.extractor)
     query_pose = _pose(_QUERY_X_M)
     image = await asyncio.to_thread(_photograph, query_pose)
     query = Query(
@@ -80,14 +78,28 @@ async def warm_up(engine: QueueEngine) -> None:
             raise WarmUpFailed(f"an easy photograph was placed {error_m:.2f} m off")
         if number == 0:
             engine.queue.forget_costs()
-    for tier in engine.tiers:
-        if tier.pipeline.matcher.pair_matching is not None:
-            await asyncio.to_thread(_time_pair, tier.pipeline.matcher, *references.pair(tier.extractor))
+    if first.pipeline.matcher.pair_matching is not None:
+        await asyncio.to_thread(_time_pair, first)
 
 
-def _time_pair(matcher: Matcher, first: PosedView, second: PosedView) -> None:
-    """Measures the time of one pair, by which queries compute how many they have time for."""
-    for _ in range(ROUNDS):
+async def warm_up_stronger(engine: QueueEngine) -> None:
+    """Uses the features of the later tiers once; raises whatever makes them fail.
+
+    They answer only where the first tier is in doubt, and with LightGlue this takes as long as all before it, so that
+    the server is ready before. A query that is in doubt meanwhile finds them slower, and its deadline bounds that.
+    """
+    for tier in engine.tiers[1:]:
+        await asyncio.to_thread(_time_pair, tier)
+
+
+def _time_pair(tier: Tier) -> None:
+    """Describes two references and measures the time of a pair, by which queries compute how many they have time for.
+
+    The two are the farthest apart.
+    """
+    first, second = (_reference(tier.extractor, number) for number in (0, len(_CENTRES_X_M) - 1))
+    matcher = tier.pipeline.matcher
+    for _ in range(ROUNDS if matcher.pair_matching is not None else 0):
         matcher.pair_s = None
         matcher.rematch(first.view, second)
 
@@ -95,13 +107,10 @@ def _time_pair(matcher: Matcher, first: PosedView, second: PosedView) -> None:
 class _RenderedReferences:
     """Rendered references in place of the store's."""
 
-    def __init__(self, extractors: Sequence[FeatureExtractor]) -> None:
+    def __init__(self, extractor: FeatureExtractor) -> None:
         self._views: dict[tuple[str, int], PosedView] = {}
-        first, *others = extractors
-        views = [(first, i) for i in range(len(_CENTRES_X_M))]
-        views += [(it, i) for it in others for i in _FARTHEST]  # the others answer only where the first cannot
         with ThreadPoolExecutor(2) as pool:
-            list(pool.map(self._view, *zip(*views, strict=True)))
+            list(pool.map(partial(self._view, extractor), range(len(_CENTRES_X_M))))
 
     def load(
         self,
@@ -119,11 +128,6 @@ class _RenderedReferences:
         if key not in self._views:
             self._views[key] = _reference(extractor, number)
         return self._views[key]
-
-    def pair(self, extractor: FeatureExtractor) -> tuple[PosedView, PosedView]:
-        """The two references that are farthest apart."""
-        first, last = _FARTHEST
-        return self._view(extractor, first), self._view(extractor, last)
 
     def attributes(self, scene_key: SceneKey) -> SceneAttributes:
         """See ReferenceSource."""

@@ -28,6 +28,7 @@ from mapless_server.observability.logs import configure_logging
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security import RateLimiter
 from mapless_server.serve.assembly import engine_options, engine_over
+from mapless_server.serve.libraries import configure_libraries
 from mapless_server.serve.run import serve
 from mapless_server.settings import Settings, load_settings
 from mapless_server.store import Store
@@ -85,6 +86,7 @@ def make_no_op_engine(settings: Settings, store: Store, metrics: Metrics, quota:
 def main(data_dir: Path | None) -> None:
     """Serves until SIGTERM with a store in the folder, or the environment's; logs as much as a server by default."""
     settings = load_settings({"port": 0, "metrics_port": 0, "warm_up": False, "data_dir": data_dir}).settings
+    configure_libraries(settings)
     with open(os.devnull if data_dir is None else data_dir / "log", "w", encoding="utf-8") as stream:
         configure_logging(settings, stream)
         asyncio.run(serve(settings, make_no_op_engine))
