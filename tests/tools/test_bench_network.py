@@ -196,9 +196,9 @@ def test_a_part_that_fails_is_reported_and_the_rest_runs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(command, "count_all", lambda *_: iter([Figure("operations", "of pi3", 26.3, "TFLOP")]))
-    figures = bench_network(quick=True, only=["attention", "memory-pi3", "operations"], output=tmp_path)
+    figures = bench_network(quick=True, only=["forward-pi3", "memory-pi3", "operations"], output=tmp_path)
     assert [(it.part, it.note) for it in figures[:2]] == [
-        (part, "RuntimeError: there is no CUDA device") for part in ("attention", "memory-pi3")
+        (part, "RuntimeError: there is no CUDA device") for part in ("forward-pi3", "memory-pi3")
     ]
     assert figures[2:] == [Figure("operations", "of pi3", 26.3, "TFLOP")]
     written = json.loads((tmp_path / "network.json").read_text())
@@ -206,5 +206,5 @@ def test_a_part_that_fails_is_reported_and_the_rest_runs(
     assert (tmp_path / "network.md").read_text().count("not measured") == 2
     printed = capsys.readouterr().out
     assert "There is no CUDA device" in printed
-    assert "attention: 0 figures, 1 not measured, " in printed
+    assert "forward-pi3: 0 figures, 1 not measured, " in printed
     assert printed.count("operations: 1 figures") == 1

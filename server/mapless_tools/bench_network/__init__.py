@@ -5,7 +5,7 @@ the dependencies of the others; all parts except whole queries need only torch a
 
     operations.py    counts operations and bytes, and predicts times from them
     subject.py       the networks, their weights and their inputs, and what is counted of them
-    forward.py       the network's forward pass, step by step; attention alone; the device's limits and memory
+    forward.py       the network's forward pass, step by step; the device's limits and memory
     query.py         whole queries, on a network whose answer is replaced by the truth (planted.py)
     report.py        a table for people, JSON for programs, Markdown for BENCHMARKS.md
     command.py       all of it in order; begin reading here

@@ -5,14 +5,13 @@ import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 
 from mapless_server.networks.runner import CompiledShape, NetworkRunner, RunnerOptions
 from mapless_server.observability.provenance import cpu_model
 
-from .forward import measure_attention, measure_forward, measure_kernels, measure_memory, measure_rates, reason_of
+from .forward import measure_forward, measure_memory, measure_rates, reason_of
 from .operations import H200, Rates
 from .report import Figure, as_json, markdown, table
 from .subject import GRID, REFERENCES, count_all, make_network
@@ -20,18 +19,9 @@ from .subject import GRID, REFERENCES, count_all, make_network
 OUTPUT = Path("bench-output")
 HOST_PARTS = ("operations",)
 CUDA_PARTS = (
-    "attention",
-    "memory-pi3",
-    "forward-pi3",
-    "query-pi3",
-    "kernels-pi3",
-    "memory-mapanything",
-    "forward-mapanything",
-    "query-mapanything",
-    "kernels-mapanything",
-    "forward-pi3x",
-    "query-pi3x",
-    "memory-pi3x",
+    *(f"{kind}-pi3" for kind in ("memory", "forward", "query")),
+    *(f"{kind}-mapanything" for kind in ("memory", "forward", "query")),
+    *(f"{kind}-pi3x" for kind in ("forward", "query", "memory")),
 )
 PARTS = (*HOST_PARTS, *CUDA_PARTS)
 REPEATS, QUICK_REPEATS = 20, 3
@@ -64,7 +54,6 @@ class _Bench:
         self.quick = quick
         self.figures: list[Figure] = []
         self._repeats = QUICK_REPEATS if quick else REPEATS
-        self._details: dict[str, Any] = {}
         cuda = device.type == "cuda"
         name = torch.cuda.get_device_name(device) if cuda else f"{cpu_model()}, one thread"
         quickly = ", quick run: not comparable" if quick else ""
@@ -98,12 +87,10 @@ class _Bench:
             raise RuntimeError("there is no CUDA device")
         kind, _, name = part.partition("-")
         parts: dict[str, Callable[[], Iterator[Figure]]] = {
-            "operations": lambda: count_all(self.rates, self.quick),
-            "attention": lambda: measure_attention(self.rates, self.device, self._repeats),
+            "operations": lambda: count_all(self.rates),
             "memory": lambda: measure_memory(lambda: self._runner(name, "cpu"), self.device),
             "forward": lambda: measure_forward(name, self.rates, self.device, self._repeats, not self.quick),
             "query": lambda: self._query(name),
-            "kernels": lambda: self._kernels(name),
         }
         yield from parts[kind]()
 
@@ -131,15 +118,11 @@ class _Bench:
         except Exception as error:  # what comes after can still be measured
             yield Figure(part, "failed", None, "", note=reason_of(error))
 
-    def _kernels(self, name: str) -> Iterator[Figure]:
-        figures, self._details["kernels"] = measure_kernels(name, self.device)
-        yield from figures
-
     @property
     def _backend(self) -> str | None:
         return None if self.quick else "inductor"
 
     def write(self, output: Path) -> None:
-        content = as_json(self.title, self.figures, self._details)
+        content = as_json(self.title, self.figures)
         (output / "network.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
         (output / "network.md").write_text("\n".join(markdown(self.title, self.figures)) + "\n", encoding="utf-8")

@@ -1,24 +1,19 @@
-"""A network's forward pass on a CUDA device: its steps with their least and predicted times, and its kernels."""
+"""A network's forward pass on a CUDA device: its steps with their least and predicted times; limits and memory."""
 
 import statistics
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import torch
-import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
-from torch._C._autograd import DeviceType
-from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from mapless_server.networks.blocks import Attention
 from mapless_server.networks.network import Network, NetworkOutput
 from mapless_server.networks.runner import NetworkRunner
 
-from .operations import ATTENTION_EFFICIENCY, Rates
+from .operations import Rates
 from .report import Figure
 from .subject import CACHED, GRID, REFERENCES, VIEWS, Scene, Work, make_network, operations_of
 
@@ -27,14 +22,6 @@ PLAIN_MS, KEPT_MS = 90.0, 60.0
 MAX_DIFFERENCE = 0.2
 """Between two ways to compute the same in bfloat16, largest of all pixels, as a share of the largest value: rounding in
 sixty blocks makes some hundredths of it, a wrong block about 1."""
-
-
-BACKENDS = {
-    "flash": SDPBackend.FLASH_ATTENTION,
-    "cuDNN": SDPBackend.CUDNN_ATTENTION,
-    "memory efficient": SDPBackend.EFFICIENT_ATTENTION,
-}
-HEADS, HEAD_WIDTH = 16, 64
 
 
 @dataclass(frozen=True)
@@ -134,72 +121,6 @@ def max_difference(output: NetworkOutput, reference: NetworkOutput) -> float:
 def reason_of(error: Exception) -> str:
     """What failed, in one line for the table."""
     return f"{type(error).__name__}: {error}".splitlines()[0][:160].replace("|", "/")
-
-
-def measure_kernels(name: str, device: torch.device) -> tuple[list[Figure], dict[str, Any]]:
-    """Which kernels an eager forward pass launches, how often flash attention, and how often the host waits."""
-    forward = Forward(make_network(name, device=device))
-    work = Work(1, REFERENCES)
-    forward.run(work)
-    activities = [torch.profiler.ProfilerActivity.CUDA, torch.profiler.ProfilerActivity.CPU]
-    with torch.profiler.profile(activities=activities) as profile:
-        forward.run(work)
-        torch.cuda.synchronize(device)
-    kernels = [event for event in profile.key_averages() if event.device_type == DeviceType.CUDA]
-    milliseconds: dict[str, float] = {"attention": 0.0, "matrix products": 0.0, "between": 0.0}
-    flash_count = 0
-    for event in kernels:
-        milliseconds[_kind(event.key)] += event.self_device_time_total / 1000
-        flash_count += event.count if "flash" in event.key else 0
-    blocks = sum(isinstance(module, Attention) for module in forward.network.modules())
-    part = f"{name} kernels, eager, tokens kept"
-    figures = [Figure(part, kind, value, "ms") for kind, value in milliseconds.items()]
-    note = f"{blocks} blocks; and all else that attends"
-    figures += [Figure(part, "flash attention", flash_count, "calls", target=blocks, target_is_least=True, note=note)]
-    figures += [Figure(part, "the host waits", _waits(forward, work), "times", target=0)]
-    longest = sorted(kernels, key=lambda event: -event.self_device_time_total)[:25]
-    return figures, {"kernels": [[it.key, it.count, it.self_device_time_total / 1000] for it in longest]}
-
-
-def _waits(forward: Forward, work: Work) -> int:
-    """How often the host waits for the device, as far as torch detects it."""
-    torch.cuda.set_sync_debug_mode("warn")
-    try:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            forward.run(work)
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-    return sum("synchroniz" in str(warning.message) for warning in caught)
-
-
-def _kind(kernel: str) -> str:
-    name = kernel.lower()
-    if any(word in name for word in ("flash", "fmha", "attention")):
-        return "attention"
-    if any(word in name for word in ("gemm", "cutlass", "nvjet", "xmma", "cublas", "conv", "wgrad", "dgrad")):
-        return "matrix products"
-    return "between"
-
-
-def measure_attention(rates: Rates, device: torch.device, repeats: int) -> Iterator[Figure]:
-    """Measures attention alone, over the scene and within its views, with each kernel."""
-    tokens = 5 + GRID[0] * GRID[1]
-    for batch, count in ((1, VIEWS * tokens), (VIEWS, tokens)):
-        q, k, v = torch.randn(3, batch, HEADS, count, HEAD_WIDTH, device=device, dtype=torch.bfloat16)
-        flop = 4 * batch * HEADS * count**2 * HEAD_WIDTH
-        floor_ms = 1e3 * flop / rates.matrix_flops
-        part = f"attention alone, {batch} x {count} tokens, 16 heads of 64"
-        for name, backend in BACKENDS.items():
-            predicted = floor_ms / ATTENTION_EFFICIENCY if name == "flash" else None
-            try:
-                with torch.no_grad(), sdpa_kernel(backend):
-                    times = median_s(lambda: F.scaled_dot_product_attention(q, k, v), device, repeats)  # noqa: B023
-            except Exception as error:  # a kernel that this device lacks
-                yield Figure(part, name, None, "ms", None, floor_ms, predicted, note=reason_of(error))
-                continue
-            note = f"{flop / times[0] / 1e12:.0f} TFLOP/s"
-            yield Figure(part, name, 1e3 * times[0], "ms", 1e3 * times[1], floor_ms, predicted, note=note)
 
 
 PRODUCT_SIDE = 8192

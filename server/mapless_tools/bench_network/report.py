@@ -61,9 +61,9 @@ def table(figures: Sequence[Figure]) -> list[str]:
     return result
 
 
-def as_json(title: str, figures: Sequence[Figure], details: dict[str, Any]) -> dict[str, Any]:
+def as_json(title: str, figures: Sequence[Figure]) -> dict[str, Any]:
     """The same for programs."""
-    return {"title": title, "figures": [{**asdict(it), "met": it.is_met} for it in figures], **details}
+    return {"title": title, "figures": [{**asdict(it), "met": it.is_met} for it in figures]}
 
 
 def _cells(figure: Figure) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """The networks to measure: the official sizes, random weights."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from mapless_server.networks.mapanything import MapAnything, MapAnythingSizes
 from mapless_server.networks.network import Network, NetworkOutput
 from mapless_server.networks.pi3 import Pi3, Pi3X, Sizes
 
-from .operations import H200, Operations, Rates, count_operations
+from .operations import Operations, Rates, count_operations
 from .report import Figure
 
 GRID = (28, 37)
@@ -152,7 +152,6 @@ def meta_network(name: str, sizes: AnySizes | None = None, dtype: torch.dtype = 
     return network.to("meta")
 
 
-GRIDS = {"518x392": GRID, "504x378": (27, 36), "392x294": (21, 28)}
 WORKS = {
     "everything": Work(VIEWS, VIEWS),
     "references mapped": Work(VIEWS, REFERENCES),
@@ -162,25 +161,19 @@ WORKS = {
 }
 
 
-def count_all(rates: Rates, quick: bool) -> Iterator[Figure]:
-    """Counts operations of forward passes and of the layers for each pixel, and bytes on the device."""
-    yield from count_forward(rates, quick)
+def count_all(rates: Rates) -> Iterator[Figure]:
+    """Counts operations of forward passes, and bytes on the device."""
+    yield from count_forward(rates)
     yield from count_memory()
-    yield from count_pixel_heads()
 
 
-def count_forward(rates: Rates = H200, quick: bool = False) -> Iterator[Figure]:
+def count_forward(rates: Rates) -> Iterator[Figure]:
     """Counts operations of forward passes of the official networks; yields the least and the predicted times."""
     for name in NETWORKS:
-        for size, grid in GRIDS.items():
-            if quick and grid is not GRID:
-                continue
-            part = f"{name}, {VIEWS} views of {size}; times are those of {rates.device}, compiled"
-            for label, work in WORKS.items():
-                if work.query_only and name != "mapanything":
-                    continue
-                operations = operations_of(name, replace(work, grid=grid))
-                yield _counted(part, label, operations, rates)
+        part = f"{name}, {VIEWS} views of 518x392; times are those of {rates.device}, compiled"
+        for label, work in WORKS.items():
+            if name == "mapanything" or not work.query_only:
+                yield _counted(part, label, operations_of(name, work), rates)
 
 
 def _counted(part: str, label: str, operations: Operations, rates: Rates) -> Figure:
@@ -203,15 +196,3 @@ def count_memory() -> Iterator[Figure]:
         tokens = CACHED * network.token_count(GRID) * network.width * torch.bfloat16.itemsize
         yield Figure(f"{name} memory", "weights, linear layers in bfloat16", weights / 1e9, "GB")
         yield Figure(f"{name} memory", f"tokens of {CACHED} references of 518x392", tokens / 1e9, "GB")
-
-
-def count_pixel_heads() -> Iterator[Figure]:
-    """The share of the layers after the last tokens: computing points only at keypoints could save no more."""
-    for name in ("pi3", "pi3x"):
-        network = meta_network(name)
-        heads = [network.get_submodule(head) for head in ("point_head", "conf_head")]
-        tokens = torch.empty(REFERENCES, GRID[0] * GRID[1], network.width, device="meta")
-        operations = count_operations(lambda: [head(tokens, GRID) for head in heads])  # noqa: B023
-        whole = operations_of(name, Work(1, REFERENCES))
-        note = f"{operations.flop / 1e12:.3f} of {whole.flop / 1e12:.2f} TFLOP; tokens kept, {REFERENCES} mapped"
-        yield Figure(f"{name} heads", "per-pixel layers' share", 100 * operations.flop / whole.flop, "%", note=note)
