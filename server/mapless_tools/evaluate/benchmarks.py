@@ -3,7 +3,7 @@
 Yu Zhang et al., "L3: Scene-agnostic Visual Localization in the Wild". Its ground truth indoors is SfM pseudo ground
 truth (Brachmann et al., ICCV 2021), outdoors the benchmark's own; figures against another are not comparable.
 
-`paper.json` has the lines of its tables as texts: the method; its group; the dense median error of each scene,
+`paper.json` has them; the lines of its tables are texts: the method; its group; the dense median error of each scene,
 cm/degrees; its mean over all scenes with all references, then with ever fewer ("-": it failed in at least one scene);
 the share of queries within an error.
 """
@@ -48,9 +48,18 @@ class PaperMethod:
 
 
 @dataclass(frozen=True)
-class PaperTables:
-    """The paper's tables of a benchmark: their titles, and the methods in the paper's order."""
+class Benchmark:
+    """A benchmark of the paper, the layout of its scenes on the disk, and the paper's tables of it.
 
+    `scenes` are names in the tables by name of the folder, in the paper's order; `sparse` numbers of references that
+    the paper keeps, the densest first; `ground_truth` that of its figures. Methods are in the paper's order.
+    """
+
+    layout: str
+    title: str
+    scenes: dict[str, str]
+    sparse: tuple[int, ...]
+    ground_truth: str
     dense_table: str
     sparse_table: str
     methods: tuple[PaperMethod, ...]
@@ -76,80 +85,16 @@ def _median(text: str) -> Median | None:
     return float(translation_cm), float(rotation_deg)
 
 
-def _tables(content: dict[str, Any]) -> PaperTables:
-    methods = tuple(_method(line, content["scenes"], content["counts"]) for line in content["methods"])
-    return PaperTables(content["dense_table"], content["sparse_table"], methods)
+def _benchmark(layout: str, content: dict[str, Any]) -> Benchmark:
+    methods = tuple(_method(line, list(content["scenes"]), content["sparse"]) for line in content["methods"])
+    return Benchmark(layout, **content | {"methods": methods, "sparse": tuple(content["sparse"])})
 
 
 _FILE = Path(__file__).with_name("paper.json")
-PAPER: Mapping[str, PaperTables] = {name: _tables(it) for name, it in json.loads(_FILE.read_text()).items()}
-"""The tables of each benchmark, by its layout."""
-
-
+BENCHMARKS = {layout: _benchmark(layout, it) for layout, it in json.loads(_FILE.read_text(encoding="utf-8")).items()}
+"""By the layout."""
 MAX_DEPTH = 2
 """12-Scenes keeps its rooms in folders of buildings."""
-
-
-@dataclass(frozen=True)
-class Benchmark:
-    """A benchmark of the paper, and the layout of its scenes on the disk.
-
-    `scenes` are names in the paper's tables by name of the folder, in the paper's order; `sparse` numbers of references
-    that the paper keeps, the densest first; `ground_truth` that of the paper's figures.
-    """
-
-    layout: str
-    title: str
-    scenes: dict[str, str]
-    sparse: tuple[int, ...]
-    ground_truth: str
-    paper: PaperTables
-
-
-_ROOMS = {
-    "apt1": ("kitchen", "living"),
-    "apt2": ("bed", "kitchen", "living", "luke"),
-    "office1": ("gates362", "gates381", "lounge", "manolis"),
-    "office2": ("5a", "5b"),
-}
-
-BENCHMARKS = {
-    benchmark.layout: benchmark
-    for benchmark in (
-        Benchmark(
-            "7scenes",
-            "7Scenes",
-            {
-                name: name.capitalize()
-                for name in ("chess", "fire", "heads", "office", "pumpkin", "redkitchen", "stairs")
-            },
-            (30, 20, 10, 5),
-            "SfM pseudo ground truth (Brachmann et al., ICCV 2021)",
-            PAPER["7scenes"],
-        ),
-        Benchmark(
-            "12scenes",
-            "12Scenes",
-            {f"{house}/{room}": f"{house.capitalize()}_{room}" for house, rooms in _ROOMS.items() for room in rooms},
-            (30, 20, 10, 5),
-            "SfM pseudo ground truth (Brachmann et al., ICCV 2021)",
-            PAPER["12scenes"],
-        ),
-        Benchmark(
-            "cambridge",
-            "Cambridge Landmarks",
-            {
-                "KingsCollege": "Kings",
-                "OldHospital": "Hospital",
-                "ShopFacade": "Shop",
-                "StMarysChurch": "Church",
-            },
-            (60, 50, 40, 30),
-            "the benchmark's own SfM poses",
-            PAPER["cambridge"],
-        ),
-    )
-}
 
 _MARKS = {
     "7scenes": "seq-01 and so on with TrainSplit.txt and TestSplit.txt",

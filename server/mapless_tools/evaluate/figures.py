@@ -8,7 +8,7 @@ from typing import Any
 
 from mapless_tools.output_files import finite, whole_file, write_json
 
-from .benchmarks import PaperTables
+from .benchmarks import Benchmark
 from .metrics import RECALL_BARS, summarize
 from .plan import setting_name
 from .suite import Run, Suite
@@ -54,7 +54,7 @@ def as_json(suite: Suite, groups: Sequence[Group]) -> dict[str, Any]:
             for run in suite.runs
         ],
         "averages": [average for group in groups for average in _averages(group)],
-        "paper": {group.layout: _paper(group.benchmark.paper) for group in groups if group.benchmark},
+        "paper": {group.layout: _paper(group.benchmark) for group in groups if group.benchmark},
         "failures": [asdict(failure) for failure in suite.failures],
         "rules": list(RULES),
     }
@@ -106,7 +106,7 @@ def _averages(group: Group) -> Iterable[dict[str, Any]]:
                 }
 
 
-def _paper(tables: PaperTables) -> dict[str, Any]:
+def _paper(tables: Benchmark) -> dict[str, Any]:
     return {
         "tables": [tables.dense_table, tables.sparse_table],
         "unit": "cm, degrees",

@@ -181,7 +181,7 @@ def sparsity(group: Group) -> list[Figure]:
     figures = []
     for measure in MEASURES:
         axes = _against_settings(group, measure, f"Sparsity: mean of the scenes' median {measure.name}", methods)
-        for paper in group.benchmark.paper.methods if group.benchmark else ():
+        for paper in group.benchmark.methods if group.benchmark else ():
             known = {i: paper.average[s] for i, s in enumerate(group.settings) if s in paper.average}
             if paper.name in RIVALS and known:
                 medians = [math.inf if it is None else it[measure.paper_index] for it in known.values()]

@@ -181,7 +181,7 @@ def _dense(group: Group) -> Table:
         medians = (_papers(method.scenes.get(scene)) for scene in scenes)
         rows.append(_paper_row(method, *medians, _papers(method.average.get(DENSE))))
     head = ("method", *(names.get(scene, scene) for scene in scenes), "average")
-    notes = [f'Of the paper: its table "{group.benchmark.paper.dense_table}".'] if group.benchmark else []
+    notes = [f'Of the paper: its table "{group.benchmark.dense_table}".'] if group.benchmark else []
     return Table("Dense: median error, cm/°", head, tuple(rows), (*notes, *_average_notes(group)))
 
 
@@ -194,7 +194,7 @@ def _by_setting(group: Group) -> Table:
     title = "By number of references: mean over scenes of the median error, cm/°"
     notes: list[str] = []
     if group.benchmark:
-        notes = [f'Of the paper: its table "{group.benchmark.paper.sparse_table}"; failed: in at least one scene.']
+        notes = [f'Of the paper: its table "{group.benchmark.sparse_table}"; failed: in at least one scene.']
     head = ("method", *map(setting_name, group.settings))
     return Table(title, head, tuple(rows), (*notes, *_average_notes(group)))
 
@@ -283,7 +283,7 @@ def _average_row(group: Group, name: str, method: Method) -> Row:
 
 def _paper_methods(group: Group) -> Sequence[PaperMethod]:
     """The paper's own methods first, then the others, the best first."""
-    return group.benchmark.paper.methods[::-1] if group.benchmark else ()
+    return group.benchmark.methods[::-1] if group.benchmark else ()
 
 
 def _paper_row(method: PaperMethod, *cells: str, setting: str = "") -> Row:
