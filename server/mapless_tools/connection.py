@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
+from mapless_server.serve.command import fail
 from mapless_server.settings import CLIENT_TOKEN_VARIABLE, Settings
 
 if TYPE_CHECKING:
@@ -71,8 +72,11 @@ def with_flags(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def grouped(**arguments: Any) -> None:
-        for name, group in groups.items():
-            arguments[name] = group(**{it.name: arguments.pop(it.name) for it in fields(group)})
+        try:
+            for name, group in groups.items():
+                arguments[name] = group(**{it.name: arguments.pop(it.name) for it in fields(group)})
+        except ValueError as error:
+            fail(str(error))
         command(**arguments)
 
     rest = [it for it in own.values() if it.name not in groups]

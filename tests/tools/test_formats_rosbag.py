@@ -1,5 +1,6 @@
 """Recordings of robots: planted poses come back, and what is damaged, missing or ambiguous is named."""
 
+import json
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -115,7 +116,7 @@ def test_poses_that_do_not_name_their_body(tmp_path: Path, known: str) -> None:
         check(read(bag))
     else:
         assert "do not name the frame" in refusal(bag)
-        check(read(bag, body_from_camera=BASE_FROM_CAMERA))
+        check(read(bag, body_from_camera=json.dumps(BASE_FROM_CAMERA.matrix().tolist())))
 
 
 def test_keyframes_are_the_sharpest_after_each_step(tmp_path: Path) -> None:
@@ -250,7 +251,7 @@ def test_frames_that_lead_nowhere_are_named(tmp_path: Path) -> None:
     messages = without("/tf_static", recorded())
     bag = write_bag(tmp_path / "bag", messages)
     assert "no transform leads from the camera's frame 'camera' to 'base_link', whose poses /odom has" in refusal(bag)
-    check(read(bag, body_from_camera=BASE_FROM_CAMERA))
+    check(read(bag, body_from_camera=json.dumps(BASE_FROM_CAMERA.matrix().tolist())))
     two = [("/tf_static", at(0), transforms(at(0), (it, "camera", BASE_FROM_CAMERA))) for it in ("base_link", "arm")]
     assert "a frame has one parent" in refusal(write_bag(tmp_path / "two", messages + two))
     joints = [("/tf", at(0.1), transforms(at(0.1), (it, "wheel", BASE_FROM_CAMERA))) for it in ("left", "right")]

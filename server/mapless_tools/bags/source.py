@@ -100,7 +100,7 @@ def static_tree(images: Images, options: BagOptions) -> FrameTree:
 
 def _unnamed_body(images: Images, topic: str, static: dict[str, Edge], options: BagOptions) -> str:
     """The frame of poses that do not name it: the body that carries the camera."""
-    if options.body_from_camera is not None:
+    if options.body_from_camera:
         return "(body)"
     if images.frame in static:
         return FrameTree(static).lineage(images.frame)[-1]
@@ -111,11 +111,12 @@ def _unnamed_body(images: Images, topic: str, static: dict[str, Edge], options: 
 
 
 def _with_extrinsics(edges: dict[str, Edge], images: Images, body: str, options: BagOptions) -> dict[str, Edge]:
-    if options.body_from_camera is None:
+    body_from_camera = options.extrinsics()
+    if body_from_camera is None:
         return edges
     if not body:
         raise ValueError("--body-from-camera takes --body-frame, too, where no topic of poses names the body")
-    return edges | {images.frame: Edge(body, options.body_from_camera)}
+    return edges | {images.frame: Edge(body, body_from_camera)}
 
 
 def _check_chain(tree: FrameTree, images: Images, topic: str, world: str, body: str) -> None:

@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperCommand
 
 from mapless_server.serve.command import fail
-from mapless_tools.bags.flags import BagFlags
+from mapless_tools.bags.options import BagOptions
 from mapless_tools.connection import Connection, Scene, with_flags
 
 from . import FORMATS
@@ -87,7 +87,7 @@ def import_command(
     report: Annotated[Path | None, typer.Option(help="JSON file for the whole report.")] = None,
     data_dir: DataDir = None,
     *,
-    bag: BagFlags,
+    bag: BagOptions,
     connection: Connection,
 ) -> None:
     """Store the posed photographs of a folder, or keyframes of a recording, as references of a scene.
@@ -106,7 +106,7 @@ def import_command(
             images=images,
             ground_truth=ground_truth,
             intrinsics=_intrinsics(intrinsics),
-            bag=bag.options(),
+            bag=bag,
             keyframes=KeyframeOptions(keyframe_distance, keyframe_angle),
         )
         options = ImportOptions(

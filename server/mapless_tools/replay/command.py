@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapless_server.serve.command import fail
-from mapless_tools.bags.flags import BagFlags
+from mapless_tools.bags.options import BagOptions
 from mapless_tools.connection import Connection, with_flags
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def replay_bag_command(
         Path | None, typer.Option(help="Folder of the store, where no --address is given; default: the settings'.")
     ] = None,
     *,
-    bag: BagFlags,
+    bag: BagOptions,
     connection: Connection,
 ) -> None:
     """Localize the images of a robot's recording, and write poses, map > odom and diagnostics as a recording.
@@ -151,8 +151,7 @@ def replay_bag_command(
         )
         settings = load_settings({"data_dir": data_dir}).settings
         given = read_camera(camera) if camera else None
-        found = bag.options()
         with terminable(), connected(connection, settings) as client, progress_bars() as progress:
-            report = replay_bag(recording, out, client, found, options, given, progress, sequence_length)
+            report = replay_bag(recording, out, client, bag, options, given, progress, sequence_length)
     print(*report.lines(), f"written to {out}", sep="\n")
     raise typer.Exit(1 if report.stopped else 0)
