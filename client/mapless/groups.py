@@ -22,6 +22,7 @@ from .answers import (
     rejection_fields,
     rejection_text,
 )
+from .axes import Axes, pose_to
 from .geodesy import GeoPose
 from .geometry import Array, Camera, RigidTransform, Similarity
 from .priors import Priors
@@ -179,14 +180,16 @@ class SequenceLocalization:
     trust: float | None = None
 
     def __str__(self) -> str:
-        last = pose_lines(self.world_from_camera[-1], self.accuracy, self.arbitrary_unit)
+        axes = Axes.__members__.get(self.axes, Axes.OPENCV)
+        frame = "" if axes is Axes.OPENCV else f"   in {self.axes} axes"
+        last = pose_lines(pose_to(axes, self.world_from_camera[-1]), self.accuracy, self.arbitrary_unit)
         unit = "units" if self.arbitrary_unit else "m"
         jumps = [
             f"  jump      between photographs {it.before} and {it.after}: {it.shift_m:.3g} {unit}, "
             f"{it.rotation_deg:.3g} deg"
             for it in self.jumps
         ]
-        return "\n".join([f"sequence {_support(self)}", *last, *jumps])
+        return "\n".join([f"sequence {_support(self)}{frame}", *last, *jumps])
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from support.planted_answers import diagnostics, localized, rejected, truth
 
 from mapless import wire
 from mapless.answers import IntrinsicsCheck, LocalizationResult, PriorCheck, Rejected
-from mapless.axes import Axes
+from mapless.axes import Axes, pose_to
 from mapless.cameras import read_camera
 from mapless.cli.arguments import make_parser
 from mapless.cli.folder import Tally
@@ -127,6 +127,11 @@ def test_text_of_a_group_is_its_pose_or_its_reason() -> None:
     assert str(moved).splitlines()[1:] == [
         *lines(answer)[1:3],
         "  jump      between photographs 3 and 4: 0.25 m, 2 deg",
+    ]
+    turned = replace(answer, world_from_camera=pose_to(Axes.ROS, truth()), in_axes=None)
+    assert str(replace(moved, axes="ROS", jumps=())).splitlines() == [
+        "sequence localized: 180 of 200 matches, 0 photographs   in ROS axes",
+        *lines(turned)[1:3],
     ]
     assert str(GroupRejected("GATE", "No.", (), rejected().hint)).splitlines() == lines(
         replace(rejected(), reason="GATE", message="No.")

@@ -220,6 +220,8 @@ class TestAdmission:
         job = toy.admit(client="tracked")
         assert job.booked_s["host"] == pytest.approx(COST_S["prepare"], rel=0.1)
         assert job.booked_s["device"] == pytest.approx(0.0, abs=0.02)
+        certain = toy.admit(stage="refine", client="tracked")
+        assert certain.booked_s["host"] == pytest.approx(COST_S["refine"], rel=0.1)
 
     def test_no_job_is_admitted_while_draining(self) -> None:
         toy = Toy()

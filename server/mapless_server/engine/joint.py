@@ -36,11 +36,12 @@ def pose_sequence(
 ) -> SequenceEstimate | Rejection:
     """Estimates the poses of a sequence's frames, in order, in OpenCV's axes."""
     options = SequenceOptions(coverage=queries[0].options.coverage)
+    unit = "units" if any(it.attributes.arbitrary_unit for it in results) else "m"
     found = solve_sequence(_images(queries, results), session_from_camera, estimate_scale, options)
     if not isinstance(found, Rejection):
-        found = check_tracking(found, session_from_camera)
+        found = check_tracking(found, session_from_camera, unit)
     if not isinstance(found, Rejection) and not estimate_scale:
-        found = check_unit(found, session_from_camera)
+        found = check_unit(found, session_from_camera, unit)
     if isinstance(found, Rejection):
         return _hinted(found, results)
     since = max((jump.after for jump in found.jumps), default=0)

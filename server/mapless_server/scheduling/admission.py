@@ -13,10 +13,12 @@ from .options import WorkQueueOptions
 
 FIRST_GUESS_S = 0.25
 """Predicted before anything is observed."""
+_EXPECTED = ", if reached"
+"""Of a stage's name, where jobs that did not reach it count."""
 MEMORY = 10
 """About so many of the last jobs of a kind count."""
 MAX_OF_CALLERS = 4000
-"""Predictions for single callers that are kept, about four of each."""
+"""Predictions for single callers that are kept, about six of each."""
 FORGOTTEN_S = 30.0
 """What a caller's jobs cost longer ago does not count: as long as it is refused, nothing corrects its prediction."""
 MAX_BOOKED_SHARE = 0.25
@@ -41,16 +43,25 @@ class CostModel:
         self._of_callers.clear()
         self._of_all.clear()
 
-    def predict(self, stage: str, kind: str, flow: Flow, now_s: float) -> float:
-        """Predicted seconds; for an unknown kind, what is typical of all kinds in the stage."""
+    def predict(self, stage: str, kind: str, flow: Flow, now_s: float, is_certain: bool = True) -> float:
+        """Predicted seconds; for an unknown kind, what is typical of all kinds in the stage.
+
+        Unless it `is_certain` that the job reaches the stage, jobs that did not count as well, with nothing.
+        """
+        stage += "" if is_certain else _EXPECTED
         _, mean_s, seen_s = self._of_callers.get((stage, kind, flow), (0, 0.0, -math.inf))
         if now_s - seen_s <= FORGOTTEN_S:
             return mean_s
         known = self._of_all.get((stage, kind)) or self._of_all.get((stage, ""))
         return median_low(known) if known else FIRST_GUESS_S
 
-    def observe(self, stage: str, kind: str, flow: Flow, seconds: float, now_s: float) -> None:
-        """Records the computing time of a job; its share, if it was computed with others."""
+    def observe(self, stage: str, kind: str, flow: Flow, seconds: float | None, now_s: float) -> None:
+        """Records the computing time of a job, its share if it was computed with others; None if it was not reached."""
+        if seconds is not None:
+            self._observe(stage, kind, flow, seconds, now_s)
+        self._observe(stage + _EXPECTED, kind, flow, seconds or 0.0, now_s)
+
+    def _observe(self, stage: str, kind: str, flow: Flow, seconds: float, now_s: float) -> None:
         count, mean_s, seen_s = self._of_callers.pop((stage, kind, flow), (0, 0.0, -math.inf))
         if now_s - seen_s > FORGOTTEN_S:
             known = self._of_all.get((stage, kind))

@@ -278,12 +278,12 @@ class Scheduler:
                 job.end(Ending.FAILED, error)
 
     def _learn(self, job: Job, stage: Stage, seconds: float, is_done: bool, now_s: float) -> None:
-        """Records what a job took in a stage, and that one that is done takes nothing in those that usually follow."""
+        """Records what a job took in a stage, and that one that is done does not reach those that usually follow."""
         kind = job.step.kind
         self.costs.observe(stage.name, kind, job.flow, seconds, now_s)
         while is_done and stage.then:
             stage, kind = self._stages[stage.then], job.step.later_kind or kind
-            self.costs.observe(stage.name, kind, job.flow, 0.0, now_s)
+            self.costs.observe(stage.name, kind, job.flow, None, now_s)
 
     @contextmanager
     def _refusals_reported(self) -> Iterator[None]:
@@ -305,11 +305,12 @@ class Scheduler:
         """Predicted computing time, by lane, of a caller's step and of those that usually follow."""
         cost_s: Counter[str] = Counter()
         stage: Stage | None = self._stages[step.stage]
-        kind = step.kind
+        kind, is_certain = step.kind, True
         while stage is not None:
-            cost_s[stage.lane] += self.costs.predict(stage.name, kind, flow, now_s)  # type: ignore[assignment]  # not int
+            predicted_s = self.costs.predict(stage.name, kind, flow, now_s, is_certain)
+            cost_s[stage.lane] += predicted_s  # type: ignore[assignment]  # not int
             stage = self._stages[stage.then] if stage.then else None
-            kind = step.later_kind or step.kind
+            kind, is_certain = step.later_kind or step.kind, False
         return cost_s
 
     def _step_s(self, job: Job, now_s: float) -> float:

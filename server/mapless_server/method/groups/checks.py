@@ -57,9 +57,9 @@ def check_mounting(estimate: RigEstimate, alone: Sequence[Answer]) -> RigEstimat
 
 
 def check_tracking(
-    estimate: SequenceEstimate, session_from_camera: Sequence[RigidTransform]
+    estimate: SequenceEstimate, session_from_camera: Sequence[RigidTransform], unit: str = "m"
 ) -> SequenceEstimate | Rejection:
-    """Checks that the session agrees with the photographs somewhere.
+    """Checks that the session agrees with the photographs somewhere; `unit` is the scene's, in messages.
 
     It does not in wrong axes, inverse, or in a unit that is wrong by far. Returns a rejection GATE if all of
     `ALL_JUMPS` steps or more are jumps.
@@ -70,16 +70,16 @@ def check_tracking(
     tracked, shown_m = (sum(_distance(*ends) for ends in pairwise(it)) for it in (session_from_camera, poses))
     message = (
         f"the tracked poses contradict the photographs between all {len(poses)} of them: the session's path is "
-        f"{tracked:.2f} long, that of the photographs {shown_m:.2f} m"
+        f"{tracked:.2f} long, that of the photographs {shown_m:.2f} {unit}"
     )
     advice = "Check session_from_camera: metres, the axes of the request, and the camera's pose, not its inverse."
     return Rejection(RejectionReason.GATE, message, Hint(STAGE, Advice.CHECK_CALIBRATION, advice))
 
 
 def check_unit(
-    estimate: SequenceEstimate, session_from_camera: Sequence[RigidTransform]
+    estimate: SequenceEstimate, session_from_camera: Sequence[RigidTransform], unit: str = "m"
 ) -> SequenceEstimate | Rejection:
-    """Checks the unit of a session that is said to be metric, by the length of the photographs' path without jumps.
+    """Checks the unit of a session that is said to be the scene's, by the length of the path without jumps.
 
     Returns a rejection SCALE_UNRELIABLE with the estimated unit, if the two lengths differ significantly.
     """
@@ -97,10 +97,10 @@ def check_unit(
     if 1 / UNIT_TOLERANCE <= unit_m <= UNIT_TOLERANCE:
         return estimate
     message = (
-        f"the session's path is {tracked_m:.2f} long, that of the photographs {path_m:.2f} m: its unit is "
-        f"{unit_m:.2f} m, and not a metre as the request says"
+        f"the session's path is {tracked_m:.2f} long, that of the photographs {path_m:.2f} {unit}: its unit is "
+        f"{unit_m:.2f} {unit} instead of 1 {unit}, as the request says"
     )
-    advice = "Ask for the session's scale (estimate_session_scale), or send its poses in metres."
+    advice = "Ask for the session's scale (estimate_session_scale), or send its poses in the scene's unit of length."
     return Rejection(RejectionReason.SCALE_UNRELIABLE, message, Hint(STAGE, Advice.CHECK_CALIBRATION, advice))
 
 
