@@ -167,11 +167,7 @@ def view_of(extractor: FeatureExtractor, frame: Frame) -> View:
 
 
 def right_pairs(
-    place: Place,
-    reference_count: int | None,
-    ks: Sequence[int] = KS,
-    frames_apart: int = 0,
-    features: str = "sift",
+    place: Place, reference_count: int | None, ks: Sequence[int] = KS, frames_apart: int = 0, features: str = "sift"
 ) -> Iterator[Pair]:
     """Queries of a scene with k of its references each, or all where it has fewer.
 

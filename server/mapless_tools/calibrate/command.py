@@ -31,8 +31,7 @@ def calibrate_command(
         typer.Option(help="Without --scene: references, evenly spread over the photographs; default: leave one out."),
     ] = None,
     query_count: Annotated[
-        int | None,
-        typer.Option(help="Photographs to localize, evenly spread; default: all, or 40 with --references."),
+        int | None, typer.Option(help="Photographs to localize, evenly spread; default: all, or 40 with --references.")
     ] = None,
     k: Annotated[int, typer.Option(help="References that a photograph is compared with.")] = 10,
     variant: Annotated[str, typer.Option(help="Form of the method: coarse, no_structure, full or best.")] = "best",

@@ -176,10 +176,7 @@ def _share(share: Share) -> dict[str, Any]:
 def _reliability(report: CalibrationReport, kind: str) -> dict[str, Any]:
     found = report.found
     before, after = getattr(found.sample, kind), getattr(found.after, kind) if found.after else ()
-    return {
-        "before": reliability(before) if before else [],
-        "after": reliability(after) if after else [],
-    }
+    return {"before": reliability(before) if before else [], "after": reliability(after) if after else []}
 
 
 def _query(it: Outcome, unit: str) -> dict[str, Any]:

@@ -72,8 +72,7 @@ def evaluate_command(
         typer.Option(help="cameras.json: references, evenly spread over the frames; default: leave one out."),
     ] = None,
     queries: Annotated[
-        int | None,
-        typer.Option(help="cameras.json: queries; default: 40, or every frame when one is left out."),
+        int | None, typer.Option(help="cameras.json: queries; default: 40, or every frame when one is left out.")
     ] = None,
     json: Annotated[Path | None, typer.Option(help="cameras.json: file to write the figures to.")] = None,
 ) -> None:

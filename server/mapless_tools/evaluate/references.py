@@ -67,10 +67,7 @@ def check_images(frames: Iterable[Frame], limits: ImageLimits) -> None:
 
 
 def choose_references(
-    query: View,
-    candidates: Sequence[PosedView],
-    count: int,
-    ratio: float = CorrespondOptions.query_ratio,
+    query: View, candidates: Sequence[PosedView], count: int, ratio: float = CorrespondOptions.query_ratio
 ) -> list[int]:
     """Indices of at most `count` candidates, most similar first; `ratio` is that of the features."""
     matches = [len(mutual_matches(query.features, c.view.features, ratio)) for c in candidates]

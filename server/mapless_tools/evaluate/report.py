@@ -52,11 +52,7 @@ def to_json(evaluation: Evaluation) -> dict[str, Any]:
         "recall": dict(summary.recall) if metric else dict.fromkeys(summary.recall),
         "relative": _relative(evaluation, summary),
         "claimed_68_held": summary.claim_held,
-        "latency_ms": {
-            "p50": summary.latency_p50_ms,
-            "p95": summary.latency_p95_ms,
-            "first": summary.latency_first_ms,
-        },
+        "latency_ms": {"p50": summary.latency_p50_ms, "p95": summary.latency_p95_ms, "first": summary.latency_first_ms},
         "stage_share": dict(summary.stage_share),
         "rejections": dict(summary.rejections),
         "rules": [*RULES] if metric else [*RULES, SCALE_FREE],

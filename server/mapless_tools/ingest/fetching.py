@@ -29,11 +29,7 @@ class Export:
 
 
 def fetch_all(
-    client: Client,
-    scene: str,
-    take: Callable[[Reference], T],
-    progress: Progress,
-    pictures: int | None = None,
+    client: Client, scene: str, take: Callable[[Reference], T], progress: Progress, pictures: int | None = None
 ) -> tuple[list[T], dict[str, str]]:
     """Calls `take`, in threads, for each reference; returns its results in order, and messages about damaged ones.
 

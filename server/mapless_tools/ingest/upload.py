@@ -75,12 +75,7 @@ class Uploader:
     """Stores frames, and writes the results into a report."""
 
     def __init__(
-        self,
-        client: Client,
-        known: KnownReferences,
-        report: ImportReport,
-        options: UploadOptions,
-        progress: Progress,
+        self, client: Client, known: KnownReferences, report: ImportReport, options: UploadOptions, progress: Progress
     ) -> None:
         self._client = client
         self._known = known

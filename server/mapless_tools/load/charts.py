@@ -71,8 +71,7 @@ def draw_load(result: PipelineResult) -> Figure:
     most = max(step.account.offered_per_s for step in steps)
     lower.set(xlim=(0, 1.04 * most), ylim=(0, 1.12 * max(result.saturation_per_s, *_values(RATES, steps))))
     lower.secondary_xaxis(
-        -0.18,
-        functions=(lambda x: 100 * x / result.saturation_per_s, lambda x: x * result.saturation_per_s / 100),
+        -0.18, functions=(lambda x: 100 * x / result.saturation_per_s, lambda x: x * result.saturation_per_s / 100)
     ).set_xlabel("% of saturation")
     for axes in (upper, lower):
         axes.axvline(result.saturation_per_s, **grey)

@@ -212,10 +212,7 @@ async def churning(workers: Workers, seed: int) -> AsyncIterator[Outcomes]:
 
 
 def _channel(address: str) -> grpc.aio.Channel:
-    options = [
-        ("grpc.use_local_subchannel_pool", 1),
-        ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
-    ]
+    options = [("grpc.use_local_subchannel_pool", 1), ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES)]
     return grpc.aio.insecure_channel(address, options)
 
 

@@ -163,11 +163,4 @@ async def open_step(
         async with beside():
             return await send_open_loop(target, plan)
 
-    return await run_step(
-        name,
-        server.under_load,
-        send,
-        seconds,
-        asked_per_s=rate_per_s,
-        settle_s=settle_s,
-    )
+    return await run_step(name, server.under_load, send, seconds, asked_per_s=rate_per_s, settle_s=settle_s)
