@@ -157,16 +157,12 @@ def auroc(scores: Sequence[float], right: Sequence[bool]) -> float:
 
 def risk_coverage(scores: Sequence[float], right: Sequence[bool]) -> list[Operating]:
     """An operating point for each different score, the highest first; answers of equal score are accepted together."""
-    order = np.argsort(-np.asarray(scores, float), kind="stable")
-    sorted_scores, is_right = np.asarray(scores, float)[order], np.asarray(right, bool)[order]
-    all_right = max(1, int(is_right.sum()))
-    points = []
-    for i in range(len(order)):
-        if i + 1 < len(order) and sorted_scores[i + 1] == sorted_scores[i]:
-            continue
-        rights = int(is_right[: i + 1].sum())
-        wrong = i + 1 - rights
-        points.append(Operating(float(sorted_scores[i]), rights / all_right, wrong / (i + 1), i + 1, wrong))
+    values, is_right = np.asarray(scores, float), np.asarray(right, bool)
+    all_right, points = max(1, int(is_right.sum())), []
+    for score in np.unique(values)[::-1].tolist():
+        accepted = values >= score
+        count, rights = int(accepted.sum()), int(is_right[accepted].sum())
+        points.append(Operating(score, rights / all_right, (count - rights) / count, count, count - rights))
     return points
 
 

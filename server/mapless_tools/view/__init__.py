@@ -3,6 +3,6 @@
     command > viewer > scenery (the references' layout)          > stage (the page) > drawing
                      > feed (WatchQueries) ----------------------^
 
-It is a client like any other: all that it shows comes from calls to a server. Only `stage`, `drawing` and `guarded`
+It is a client like any other: all that it shows comes from calls to a server. Only `stage` and `guarded`
 import viser. Begin reading with `viewer`.
 """

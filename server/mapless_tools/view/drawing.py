@@ -1,6 +1,6 @@
 """Drawing on viser's scene: cameras, points, the ellipsoid of a covariance and lines of matches, placed and scaled."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,8 +9,10 @@ from mapless.answers import LocalizationResult
 from mapless.geometry import Array, Camera, RigidTransform
 
 from .feed import Picture
-from .guarded import GuardedViser
 from .scenery import Scenery
+
+if TYPE_CHECKING:
+    from .guarded import GuardedViser
 
 CHI2_95_IN_SPACE = 7.8147279
 """Square of how many standard deviations an ellipsoid of 95 % reaches in three dimensions."""
@@ -74,7 +76,7 @@ MAX_RAYS = 90
 class Drawing:
     """Draws shapes; returns viser's handles, to change or remove them."""
 
-    def __init__(self, server: GuardedViser, scenery: Scenery) -> None:
+    def __init__(self, server: "GuardedViser", scenery: Scenery) -> None:
         self._scene, self._scenery = server.scene, scenery
         self._set_the_view(server)
 
@@ -162,7 +164,7 @@ class Drawing:
                 drawn.append(shown)
         return drawn
 
-    def _set_the_view(self, server: GuardedViser) -> None:
+    def _set_the_view(self, server: "GuardedViser") -> None:
         scenery = self._scenery
         up = -scenery.down
         server.scene.set_up_direction(tuple(up.tolist()))
