@@ -28,7 +28,7 @@ from mapless_server.scenes.calibration.fit import FitOptions, LeftOut, fit
 from mapless_server.services.messages.answers import Factors, scaled_accuracy
 from mapless_server.store import SelfCalibration
 
-from .places import KITCHEN, QUERIES, Measured, Pair, Place, answered, read_places, samples_of_command, spread
+from .places import KITCHEN, QUERIES, Pair, Place, answered, read_places, samples_of_command, spread
 
 SETTINGS: dict[str, tuple[int | None, ...]] = {
     KITCHEN: (30, 10, 5),
@@ -79,7 +79,7 @@ def collect(data: Path, features: str, extractor: FeatureExtractor) -> Iterator[
             for is_reference, asked in ((True, spread(references, SAMPLE)), (False, queries)):
                 pairs = [_pair(place, scene, i, references, features) for i in asked]
                 for i, it in zip(asked, answered(pairs, LocalizeOptions(coverage=1.0), features), strict=True):
-                    yield Sample(scene, features, is_reference, it.right, _result(place, i, it))
+                    yield Sample(scene, features, is_reference, it.right, left_out(place.posed([i])[0], it.answer))
 
 
 def _settings(indices: Sequence[int], count: int | None) -> Iterator[tuple[str, list[int], list[int]]]:
@@ -95,10 +95,6 @@ def _pair(place: Place, title: str, index: int, references: Sequence[int], featu
     others = [i for i in references if i != index]
     chosen = place.posed(place.most_matching(place.views[index], others, min(K, len(others)), features))
     return Pair(title, K, place.views[index], chosen, place.poses[index], metric=place.metric)
-
-
-def _result(place: Place, index: int, it: Measured) -> LeftOut | None:
-    return left_out(place.posed([index])[0], it.answer)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,6 @@ accepted where 97 % were promised. To test them each place is left out once, and
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -202,13 +201,11 @@ def _share(part: NDArray[np.bool_], whole: NDArray[np.bool_]) -> str:
     return f"{part.sum()} of {whole.sum()} ({100 * part.sum() / whole.sum():.1f} %)" if whole.any() else "-"
 
 
-def _read(content: dict[str, Any]) -> Sample:
-    return Sample(**{**content, "evidence": Evidence(**content["evidence"])})
-
-
 def main() -> None:
     """Fits and prints."""
-    samples = samples_of_command(__doc__, collect, _read, LEARNED)
+    samples = samples_of_command(
+        __doc__, collect, lambda it: Sample(**{**it, "evidence": Evidence(**it["evidence"])}), LEARNED
+    )
     print(f"scores = {tuple(np.round(fit(samples), 3).tolist())}\n")
     print("\n".join(left_out(samples)))
 

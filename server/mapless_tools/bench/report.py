@@ -4,7 +4,7 @@ For people it is Markdown, as in BENCHMARKS.md, and for programs JSON.
 """
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -152,7 +152,10 @@ def markdown(result: BenchResult) -> list[str]:
     for evaluation in [*(e for _, e in result.scenes), *result.others]:
         rejections = summarize(evaluation.results).rejections
         if rejections:
-            lines += [f"Rejected in {evaluation.dataset.name}, {_split(evaluation)}: {_counts(rejections)}.", ""]
+            counts = ", ".join(f"{count} {reason}" for reason, count in rejections.items())
+            chosen = evaluation.options.reference_count
+            split = "leave one out" if chosen is None else f"{chosen} references"
+            lines += [f"Rejected in {evaluation.dataset.name}, {split}: {counts}.", ""]
     if result.latency is not None:
         lines += _latency_lines(result.latency)
     scale_free = any(not evaluation.dataset.metric for evaluation in result.others)
@@ -204,15 +207,6 @@ def _other_row(evaluation: Evaluation) -> list[str]:
         format_share(summary.median_translation / evaluation.trajectory_radius),
         format_share(summary.median_relative),
     ]
-
-
-def _split(evaluation: Evaluation) -> str:
-    chosen = evaluation.options.reference_count
-    return "leave one out" if chosen is None else f"{chosen} references"
-
-
-def _counts(rejections: Mapping[str, int]) -> str:
-    return ", ".join(f"{count} {reason}" for reason, count in rejections.items())
 
 
 def _figures(figures: Figures) -> str:

@@ -96,7 +96,7 @@ class _Bench:
 
     def _runner(self, name: str, weights_on: torch.device | str) -> NetworkRunner:
         """The network as the server runs it, compiled for a query with ten references."""
-        options = RunnerOptions(compile_backend=self._backend)
+        options = RunnerOptions(compile_backend=None if self.quick else "inductor")
         runner = NetworkRunner(make_network(name, device=weights_on), name, "random weights", self.device, options)
         runner.warm_up([CompiledShape(GRID, REFERENCES + 1)])
         return runner
@@ -117,10 +117,6 @@ class _Bench:
             yield from figures
         except Exception as error:  # what comes after can still be measured
             yield Figure(part, "failed", None, "", note=reason_of(error))
-
-    @property
-    def _backend(self) -> str | None:
-        return None if self.quick else "inductor"
 
     def write(self, output: Path) -> None:
         content = as_json(self.title, self.figures)

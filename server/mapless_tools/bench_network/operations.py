@@ -107,7 +107,8 @@ class _Traffic(TorchFunctionMode):
         inputs = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
         outputs = [leaf for leaf in tree_leaves(result) if isinstance(leaf, Tensor)]
         # What a product gives may be a view of what it computed.
-        made = outputs if func in PRODUCTS else [it for it in outputs if _is_new(it, inputs)]
+        new = [it for it in outputs if not it._is_view() and all(it is not given for given in inputs)]
+        made = outputs if func in PRODUCTS else new
         if made:
             self.counted += _counted(func, inputs, made)
         return result
@@ -132,10 +133,6 @@ def _counted(func: Any, inputs: Sequence[Tensor], made: Sequence[Tensor]) -> Ope
         return replace(operations, float32_flop=2 * made[0].numel() * weight.shape[1])
     positions = x.numel() if func in (F.conv_transpose2d, torch.conv_transpose2d) else made[0].numel()
     return replace(operations, tf32_flop=2 * positions * prod(weight.shape[1:]))
-
-
-def _is_new(tensor: Tensor, inputs: Sequence[Tensor]) -> bool:
-    return not tensor._is_view() and all(tensor is not it for it in inputs)
 
 
 def compiled_graphs() -> int:

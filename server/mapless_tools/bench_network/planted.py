@@ -81,7 +81,9 @@ class PlantedReconstructor:
             for view, key in zip(outcome.references, keys, strict=False)
         ]
         parts = zip((*views, outcome.query), poses, strict=True)
-        posed: list[ReconstructedView] = [_posed(view, pose) for view, pose in parts]
+        posed: list[ReconstructedView] = [
+            replace(view, local_from_camera=RigidTransform(pose[:3, :3], pose[:3, 3])) for view, pose in parts
+        ]
         return Reconstruction(posed[-1], tuple(posed[:-1]))
 
     def _on_device(self, outcome: DeviceReconstruction, keys: Sequence[str], poses: Array) -> DeviceReconstruction:
@@ -116,7 +118,3 @@ def _sha256(view: View) -> str:
     if view.photograph is None:
         raise ValueError("a network looks at photographs")
     return view.photograph.sha256
-
-
-def _posed(view: ReconstructedView, pose: Array) -> ReconstructedView:
-    return replace(view, local_from_camera=RigidTransform(pose[:3, :3], pose[:3, 3]))

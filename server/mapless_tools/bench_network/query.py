@@ -135,7 +135,8 @@ def measure_queries(
     runs, again = (_runs(bench, planted, options.rounds) for _ in range(2))
     outcomes = f"{_outcomes([*runs, *again])}; {note}"
     yield Figure(part, "p50", _p50_ms(runs), "ms", _p50_ms(again), target=LATENCY_MS, note=outcomes)
-    yield Figure(part, "localized", 100 * _localized_share([*runs, *again]), "%")
+    localized = [isinstance(answer.outcome, Localization) for answer, _ in (*runs, *again)]
+    yield Figure(part, "localized", 100 * statistics.mean(localized), "%")
     yield from _stages(part, [*runs, *again])
     yield _throughput(part, bench, planted, options)
     alone = _runs(bench, Pipeline(network, bench.tier.pipeline.matcher), 1)
@@ -168,10 +169,6 @@ def _outcomes(runs: Runs) -> str:
     outcomes = [answer.outcome for answer, _ in runs]
     names = ["localized" if isinstance(it, Localization) else it.reason.name for it in outcomes]
     return ", ".join(f"{names.count(name)} {name}" for name in sorted(set(names)))
-
-
-def _localized_share(runs: Runs) -> float:
-    return sum(isinstance(answer.outcome, Localization) for answer, _ in runs) / len(runs)
 
 
 def _throughput(part: str, bench: Bench, pipeline: Pipeline, options: QueryOptions) -> Figure:

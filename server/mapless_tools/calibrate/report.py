@@ -17,7 +17,7 @@ from mapless_tools.dataset import Dataset
 from mapless_tools.output_files import finite, render
 
 from .claims import MIN_QUERIES, PRIOR_QUERIES, Claim
-from .findings import DIAGRAM, Findings, Held, RightRule, Share, reliability
+from .findings import DIAGRAM, Findings, RightRule, Share, reliability
 from .queries import Outcome
 
 RULES = (
@@ -150,7 +150,9 @@ def to_json(report: CalibrationReport) -> dict[str, Any]:
         "factors": asdict(found.factors) if found.factors else None,
         "refusal": found.refusal,
         "stored": report.stored,
-        "held": [_held(it) for it in found.held],
+        "held": [
+            asdict(it) | {"before": _share(it.before), "after": it.after and _share(it.after)} for it in found.held
+        ],
         "reliability": {kind: _reliability(report, kind) for kind in ("position", "rotation")},
         "right": asdict(report.right) | _share(found.right),
         "auroc": finite(found.auroc),
@@ -163,10 +165,6 @@ def to_json(report: CalibrationReport) -> dict[str, Any]:
 def _excess(outcome: Outcome) -> float:
     claims = [claim for claim in (outcome.position, outcome.rotation) if claim]
     return max(claim.error / max(claim.radius_95, 1e-300) for claim in claims)
-
-
-def _held(it: Held) -> dict[str, Any]:
-    return asdict(it) | {"before": _share(it.before), "after": it.after and _share(it.after)}
 
 
 def _share(share: Share) -> dict[str, Any]:

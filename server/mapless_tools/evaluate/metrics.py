@@ -86,13 +86,14 @@ def summarize(results: Sequence[QueryResult]) -> Summary:
     claims = [r.translation_error <= r.position_68 for r in results if r.position_68 is not None]
     latencies = [r.latency_ms for r in results]
     steady = latencies[1:] or latencies
+    relative = [r.translation_error / r.reference_distance if r.reference_distance > 0 else math.inf for r in results]
     return Summary(
         query_count=len(results),
         localized_count=sum(r.localized for r in results),
         median_translation=quantile(translations, 0.5),
         median_rotation_deg=quantile(rotations, 0.5),
         p90_translation=quantile(translations, 0.9),
-        median_relative=quantile([_ratio(r.translation_error, r.reference_distance) for r in results], 0.5),
+        median_relative=quantile(relative, 0.5),
         recall={
             name: sum(t <= metres and d <= degrees for t, d in zip(translations, rotations, strict=True)) / len(results)
             for name, (metres, degrees) in RECALL_BARS.items()
@@ -128,7 +129,3 @@ def stage_share(results: Sequence[QueryResult]) -> dict[str, float]:
 def trajectory_radius(centres: Array) -> float:
     """Root mean square distance of camera centres (N, 3) from their centroid: the paper's r."""
     return float(np.sqrt(((centres - centres.mean(axis=0)) ** 2).sum(axis=1).mean()))
-
-
-def _ratio(value: float, whole: float) -> float:
-    return value / whole if whole > 0 else math.inf

@@ -5,7 +5,6 @@ the error is after matching. None: the two photographs do not overlap.
 """
 
 import base64
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -144,17 +143,13 @@ def _side_by_side(query: _Shown, reference: _Shown, matches: NDArray[np.int32], 
     gap: Picture = np.full((HEIGHT_PX, GAP_PX, 3), 128, np.uint8)
     canvas = np.ascontiguousarray(np.concatenate([query.image, gap, reference.image], axis=1))
     offset = np.array([query.image.shape[1] + GAP_PX, 0])
-    for i in _some(len(matches)):
+    for i in np.linspace(0, len(matches) - 1, min(len(matches), MAX_DRAWN)).round().astype(int).tolist():
         a, b = query.keypoints[matches[i, 0]], reference.keypoints[matches[i, 1]] + offset
         colour = GREEN if fits[i] else RED
         cv2.line(canvas, _pixel(a), _pixel(b), colour, 1, cv2.LINE_AA)
         for end in (a, b):
             cv2.circle(canvas, _pixel(end), 2, colour, -1, cv2.LINE_AA)
     return canvas
-
-
-def _some(count: int) -> Sequence[int]:
-    return [int(i) for i in np.unique(np.linspace(0, count - 1, min(count, MAX_DRAWN)).round())] if count else []
 
 
 def _pixel(place: Array) -> tuple[int, int]:

@@ -162,13 +162,9 @@ def _query(result: QueryResult, metric: bool) -> dict[str, Any]:
         f"reference_distance_{unit}": result.reference_distance,
         "inliers": result.inlier_count,
         "matches": result.match_count,
-        "rejection": _rejection(result),
+        "rejection": None if result.localized else {"reason": result.rejection, "message": result.message},
         "features": result.features,
         "latency_ms": result.latency_ms,
         "stage_ms": dict(result.stage_ms),
         "references": list(result.references),
     }
-
-
-def _rejection(result: QueryResult) -> Mapping[str, str] | None:
-    return None if result.localized else {"reason": result.rejection, "message": result.message}

@@ -161,7 +161,8 @@ class _File:
         if view.thumbnail is not None:
             picture = self._picture(reference, view.thumbnail)
             children.append(self._node(Node(name=f"photograph of {reference.reference_id}", mesh=picture)))
-        about = {"reference": reference.reference_id, "camera": _plain(reference.camera)}
+        intrinsics = {name: value for name, value in asdict(reference.camera).items() if value is not None}
+        about = {"reference": reference.reference_id, "camera": intrinsics}
         about |= {"world_from_camera": reference.world_from_camera.matrix().tolist()}
         node = Node(
             name=reference.reference_id,
@@ -269,7 +270,3 @@ def _material(name: str, **colour: Any) -> Material:
     return Material(
         name=name, pbrMetallicRoughness=metallic, doubleSided=True, extensions={_UNLIT: {}}, alphaCutoff=None
     )
-
-
-def _plain(camera: Any) -> dict[str, Any]:
-    return {name: value for name, value in asdict(camera).items() if value is not None}

@@ -69,7 +69,8 @@ def draw_load(result: PipelineResult) -> Figure:
     lower.axhline(result.saturation_per_s, linestyle="--", label=capacity, **grey)
     lower.axline((0, 0), slope=1, linestyle=":", label="every call answered", **grey)
     most = max(step.account.offered_per_s for step in steps)
-    lower.set(xlim=(0, 1.04 * most), ylim=(0, 1.12 * max(result.saturation_per_s, *_values(RATES, steps))))
+    rates = [rate for step in steps for _, of in RATES.values() if (rate := of(step)) is not None]
+    lower.set(xlim=(0, 1.04 * most), ylim=(0, 1.12 * max(result.saturation_per_s, *rates)))
     lower.secondary_xaxis(
         -0.18, functions=(lambda x: 100 * x / result.saturation_per_s, lambda x: x * result.saturation_per_s / 100)
     ).set_xlabel("% of saturation")
@@ -93,10 +94,6 @@ def draw_soak(states: Sequence[ServerState], slopes: Mapping[str, Slope]) -> Fig
             axes.plot(ends, (found.level - half, found.level + half))
     figure.axes[-1].remove()
     return figure
-
-
-def _values(curves: Mapping[str, tuple[str, Value]], steps: Sequence[Step]) -> list[float]:
-    return [value for step in steps for _, of in curves.values() if (value := of(step)) is not None]
 
 
 def _curves(axes: Axes, curves: Mapping[str, tuple[str, Value]], steps: Sequence[Step], last: str) -> None:

@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from statistics import fmean
 from typing import Any
 
@@ -82,19 +82,19 @@ class Step:
 
     def as_json(self) -> dict[str, Any]:
         """All figures, for programs."""
-        longest_lag_s = None if self.scraped is None else self.scraped.longest_lag_s
+        lag_s: float | str | None = None if self.scraped is None else self.scraped.longest_lag_s
         return {
             "name": self.name,
             "asked_per_s": self.asked_per_s,
             "duration_s": self.duration_s,
             "settle_s": self.settle_s,
-            **{name: _plain(value) for name, value in vars(self.account).items()},
+            **asdict(self.account),
             "server_cpu_s": self.cpu_s,
             "server_cpu_s_per_answer": self.cpu_s_per_answer if self.answers else None,
             "server_start": vars(self.samples[0]),
             "server_end": vars(self.samples[-1]),
             "server_trends_per_minute": {name: self._trend_json(name) for name in TREND_FIELDS},
-            "event_loop_lag_below_s": _finite(longest_lag_s),
+            "event_loop_lag_below_s": "beyond the widest bucket" if lag_s == math.inf else lag_s,
             "server_handled": None if self.scraped is None else dict(self.scraped.handled),
             "server_terminated": None if self.scraped is None else dict(self.scraped.terminated),
             "generator_cpu_share_of_a_core": self.own_share,
@@ -149,12 +149,3 @@ async def closed_loop_step(
         seconds,
         settle_s=CLOSED_SETTLE_SHARE * seconds,
     )
-
-
-def _plain(value: Any) -> Any:
-    return vars(value) if hasattr(value, "__dict__") else value
-
-
-def _finite(value: float | None) -> float | str | None:
-    """The value, as text if it is infinite, since JSON has no infinity."""
-    return value if value is None or math.isfinite(value) else "beyond the widest bucket"

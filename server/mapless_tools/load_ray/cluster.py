@@ -144,7 +144,8 @@ def running_cluster(environment: Mapping[str, str] | None = None) -> Iterator[Cl
     """A cluster without an application, with variables for all its processes; ClusterFailed if it did not start."""
     # It holds sockets, whose paths are limited to 107 bytes.
     folder = Path(tempfile.mkdtemp(prefix="mr-", dir="/tmp"))
-    ports = _free_ports(8)
+    with _bound([0] * 8) as sockets:
+        ports = [it.getsockname()[1] for it in sockets]
     given = os.environ | variables(leaving_s=LEAVING_S) | _own_places(folder, ports) | dict(environment or {})
     options = {"folder": str(folder / "ray"), "cpus": CPUS, "http_port": ports[0], "grpc_port": ports[1]}
     with (folder / "log").open("w") as log:
@@ -197,11 +198,6 @@ def _own_places(folder: Path, ports: list[int]) -> dict[str, str]:
         # One thread, to leave the cores to the replicas.
         "RAY_SERVE_HAPROXY_NBTHREAD": "1",
     }
-
-
-def _free_ports(count: int) -> list[int]:
-    with _bound([0] * count) as sockets:
-        return [it.getsockname()[1] for it in sockets]
 
 
 def _free_block(count: int) -> int:

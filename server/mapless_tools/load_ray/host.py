@@ -65,7 +65,8 @@ def deploy(client: ServeControllerClient, application: Json, limit_s: float) -> 
         if found["status"] == "RUNNING" and not _is_changing(found):
             return {}
         if found["status"] in ("DEPLOY_FAILED", "UNHEALTHY") or time.monotonic() > give_up_s:
-            return {"error": f"{found['status']}: {found['message']}: {_messages(found)}"}
+            messages = "; ".join(str(it["message"]) for it in found["deployments"].values())
+            return {"error": f"{found['status']}: {found['message']}: {messages}"}
 
 
 def replicas(client: ServeControllerClient) -> Json:
@@ -90,10 +91,6 @@ def _is_changing(application: Json) -> bool:
         or len(deployment["replicas"]) != deployment["target_num_replicas"]
         for deployment in application["deployments"].values()
     )
-
-
-def _messages(application: Json) -> str:
-    return "; ".join(str(deployment["message"]) for deployment in application["deployments"].values())
 
 
 def main() -> None:

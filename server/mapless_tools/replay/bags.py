@@ -116,7 +116,8 @@ def replay_bag(
                 progress("localizing", report.images, total)
                 if options.rate_hz and not localizer.is_due(stamp_ns):
                     continue
-                outcome = localizer.localize(_framed(message, images.frame), ros_camera)
+                message.header.frame_id = images.frame  # tf needs a name
+                outcome = localizer.localize(message, ros_camera)
                 report.add(outcome)
                 writer.write(time_ns, outcome, tree, images)
                 _compare(report, outcome, poses, options, images)
@@ -142,11 +143,6 @@ def _with_frames(options: LocalizerOptions, images: Images, poses: Poses | None)
     odom = options.odom_frame or poses.world
     base = options.base_frame or poses.body or images.frame
     return replace(options, base_frame=base, odom_frame="" if odom == options.map_frame else odom)
-
-
-def _framed(message: Any, frame: str) -> Any:
-    message.header.frame_id = frame
-    return message
 
 
 def _looked_up(images: Images, tree: FrameTree, target: str, source: str, stamp_ns: int) -> RigidTransform:

@@ -29,13 +29,12 @@ from mapless_server.engine.references import QueryRun, QueryViews
 from mapless_server.engine.stages import Method, QueryStages
 from mapless_server.errors import DataLoss
 from mapless_server.images import decode_image
-from mapless_server.method.answer import Answer
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.groups.rig import RigEstimate
 from mapless_server.method.groups.sequence import SequenceEstimate
 from mapless_server.method.localize import refine
 from mapless_server.method.options import StageContext
-from mapless_server.method.pipeline import Coarse, coarse_answer
+from mapless_server.method.pipeline import coarse_answer
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.views import Photograph, PosedView, View
 from mapless_server.observability.metrics import Metrics
@@ -226,7 +225,8 @@ class _Recomputing:
         stages = {field: [it.stage for it in about.stages] for field, about in described}
         self._unfinished = {field: _unfinished(names) for field, names in stages.items()}
         self._described = {field for field, names in stages.items() if RETRIEVAL in names}
-        self._method = _unrefined() if _is_cut_short(request, then) else Method()
+        unrefined = Method(refine=lambda coarse: coarse_answer(coarse) or refine(coarse))
+        self._method = unrefined if _is_cut_short(request, then) else Method()
 
     def query_job(self, query: Query, caller: Caller, source: object = None, on_coarse: object = None) -> Job:
         field = query.photo.field
@@ -288,10 +288,3 @@ def _is_cut_short(request: Any, then: Response) -> bool:
         return False
     is_coarse = then.localization.pose_stage == pb.POSE_STAGE_COARSE
     return is_coarse and request.options.variant != pb.VARIANT_COARSE
-
-
-def _unrefined() -> Method:
-    def answer(coarse: Coarse) -> Answer:
-        return coarse_answer(coarse) or refine(coarse)
-
-    return Method(refine=answer)

@@ -1,6 +1,5 @@
 """Computes a folder of captured calls again: which calls, and what has changed since."""
 
-from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -34,13 +33,15 @@ class Selection:
     def files(self, folder: Path) -> list[Path]:
         """Files of the tenant and the scene, the latest first; CaptureError if a folder cannot be read."""
         try:
-            found = [it for it in calls_of(folder) if self._takes(*it.relative_to(folder).parts)]
+            found = {it: it.relative_to(folder).parts for it in calls_of(folder)}
         except OSError as error:
             raise CaptureError(f"{error.filename} cannot be read: {error.strerror}") from error
-        return sorted(found, key=lambda it: it.name, reverse=True)
-
-    def _takes(self, _tenants: str, tenant: str, _calls: str, scene_id: str, _name: str) -> bool:
-        return self.tenant in ("", tenant) and self.scene_id in ("", scene_id)
+        chosen = [
+            path
+            for path, (_, tenant, _, scene_id, _) in found.items()
+            if self.tenant in ("", tenant) and self.scene_id in ("", scene_id)
+        ]
+        return sorted(chosen, key=lambda it: it.name, reverse=True)
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,10 @@ def select(folder: Path, selection: Selection, unreadable: list[str]) -> list[Pa
     """Files of the calls, the oldest first; files that cannot be read are added to `unreadable`, selected or not."""
     found: list[Path] = []
     ids: set[str] = set()
-    for path, call in _read(selection.files(folder), folder, unreadable):
+    for path in selection.files(folder):
+        call = _call_in(path, folder, unreadable)
+        if call is None:
+            continue
         if not selection.request_ids or call.request_id in selection.request_ids:
             found.append(path)
             ids.add(call.request_id)
@@ -130,13 +134,6 @@ def select(folder: Path, selection: Selection, unreadable: list[str]) -> list[Pa
     if selection.request_ids:
         unreadable.clear()  # all selected calls are there
     return found[::-1]
-
-
-def _read(paths: list[Path], folder: Path, unreadable: list[str]) -> Iterator[tuple[Path, CapturedCall]]:
-    for path in paths:
-        call = _call_in(path, folder, unreadable)
-        if call is not None:
-            yield path, call
 
 
 def _call_in(path: Path, folder: Path, unreadable: list[str]) -> CapturedCall | None:
