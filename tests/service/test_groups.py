@@ -24,6 +24,7 @@ from mapless import (
     MaplessError,
     NewReference,
     NotFound,
+    PosePrior,
     PositionPrior,
     Priors,
     RigidTransform,
@@ -103,6 +104,35 @@ def test_rigs_and_sequences_say_that_the_unit_is_arbitrary(corner: Client, queri
     assert isinstance(sequence, SequenceLocalization)
     assert rig.arbitrary_unit
     assert sequence.arbitrary_unit
+
+
+def test_soft_priors_of_another_place_do_not_cost_the_answer(corner: Client, queries: list[bytes]) -> None:
+    """The references are then those of the whole scene, and the priors are said to be wrong; a hard one stays."""
+    there = [RigidTransform(it.rotation, it.translation + [100.0, 0.0, 0.0]) for it in WALK[:2]]
+    noise = np.random.default_rng(0).integers(0, 255, (len(there), 240, 320, 3), np.uint8)
+    shown = [encode(".png", it) for it in noise]
+    corner.add_references(
+        "corner", [NewReference(f"far{i}", it, CORNER, at) for i, (it, at) in enumerate(zip(shown, there, strict=True))]
+    )
+    soft = [Priors(pose=PosePrior.from_sigmas(at, 0.5, 5.0)) for at in there]
+    hard = Priors(position=PositionPrior(there[0].translation, 5.0))
+    try:
+        images = [replace(it, priors=prior) for it, prior in zip(as_rig(queries)[:2], soft, strict=True)]
+        rig = corner.localize_rig(images, "corner")
+        frames = [
+            SequenceFrame(image, CORNER, at, priors=p) for image, at, p in zip(queries[:2], WALK[:2], soft, strict=True)
+        ]
+        sequence = corner.localize_sequence(frames, "corner")
+        limited = corner.localize_rig([replace(as_rig(queries)[0], priors=hard)], "corner")
+    finally:
+        for i in range(len(there)):
+            corner.delete_reference("corner", f"far{i}")
+    assert isinstance(rig, RigLocalization), rig
+    assert_pose_close(rig.world_from_rig, WORLD_FROM_RIG, metres=0.01, degrees=0.5)
+    assert all(check.conflict for report in rig.images for check in report.prior_checks)
+    assert isinstance(sequence, SequenceLocalization), sequence
+    assert_pose_close(sequence.world_from_camera[-1], WALK[1], metres=0.01, degrees=0.5)
+    assert isinstance(limited, GroupRejected)
 
 
 @pytest.mark.parametrize("axes", ["", "unity"])

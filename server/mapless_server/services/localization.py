@@ -3,15 +3,17 @@
 
 import asyncio
 import time
-from collections.abc import AsyncGenerator, Callable, Coroutine, Sequence
+from collections.abc import AsyncGenerator, Awaitable, Callable, Coroutine, Sequence
+from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import localization_service_pb2_grpc as rpcs
 from mapless_server.engine.groups import MAX_FRAMES, MAX_RIG_IMAGES, MIN_FRAMES, GroupResult, PhotoGroup
 from mapless_server.engine.interface import Engine
 from mapless_server.engine.query import TRACK, Query, Result
+from mapless_server.errors import DeadlineExceeded, Overloaded
 from mapless_server.method.answer import Localization
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.results import MetricScale
@@ -33,6 +35,8 @@ from .messages.groups import (
 )
 from .messages.queries import needs_attributes, query_from_message, scene_key_from_name
 from .watching import Watcher, Watchers
+
+Joint = TypeVar("Joint")
 
 FutureCoarseAnswer = asyncio.Future[pb.LocalizeResponse]
 """Is set to the coarse answer, on the event loop, if there is one."""
@@ -141,8 +145,13 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         rig_from_camera = poses_from_message(request.images, "images", "rig_from_camera")
         session_from_rig = session_from_rig_from_message(request)
         with engine.hold(queries, call.caller):
-            group = await localize_photographs(engine, queries, call, "images")
-            outcome = await engine.pose_rig(queries, group.results, rig_from_camera, call.caller)
+            group, outcome = await localize_group(
+                engine,
+                queries,
+                call,
+                "images",
+                lambda asked, results: engine.pose_rig(asked, results, rig_from_camera, call.caller),
+            )
         response = rig_to_message(outcome, group, queries, request, session_from_rig)
         self._finish_group(request, response, outcome, queries, group.results, call)
         return response
@@ -154,9 +163,14 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         axes, session_from_camera = session_poses_from_message(request)
         scale_is_free = request.estimate_session_scale
         with engine.hold(queries, call.caller):
-            group = await localize_photographs(engine, queries, call, "frames")
-            outcome = await engine.pose_sequence(
-                queries, group.results, session_from_camera, scale_is_free, call.caller
+            group, outcome = await localize_group(
+                engine,
+                queries,
+                call,
+                "frames",
+                lambda asked, results: engine.pose_sequence(
+                    asked, results, session_from_camera, scale_is_free, call.caller
+                ),
             )
         response = sequence_to_message(outcome, group, queries, request, axes)
         self._finish_group(request, response, outcome, queries, group.results, call)
@@ -230,6 +244,31 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
     def _capture(self, request: Request, response: Response, call: Call, parts: Sequence[tuple[Query, Result]]) -> None:
         if self._recorder is not None and not request.options.confidential:
             self._recorder.record(request, response, call, parts, self._engine().tiers)
+
+
+async def localize_group(
+    engine: Engine,
+    queries: Sequence[Query],
+    call: Call,
+    list_name: str,
+    pose: Callable[[Sequence[Query], Sequence[Result]], Awaitable[Joint]],
+) -> tuple[GroupResult, Joint]:
+    """Localizes the photographs of a rig or a sequence, and computes their joint `pose`.
+
+    If it is rejected, the soft priors that chose the references may be wrong: with a pose from references of the whole
+    scene they are. That is tried while there is time; otherwise the rejection stays.
+    """
+    group = await localize_photographs(engine, queries, call, list_name)
+    outcome = await pose(queries, group.results)
+    if not isinstance(outcome, Rejection) or not any(it.chooses and it.narrowing.has_likely for it in queries):
+        return group, outcome
+    elsewhere = [replace(it, narrowing=it.narrowing.limits) for it in queries]
+    try:
+        again = await localize_photographs(engine, elsewhere, call, list_name)
+        found = await pose(elsewhere, again.results)
+    except (DeadlineExceeded, Overloaded):
+        return group, outcome
+    return (group, outcome) if isinstance(found, Rejection) else (again, found)
 
 
 async def localize_photographs(engine: Engine, queries: Sequence[Query], call: Call, list_name: str) -> GroupResult:
