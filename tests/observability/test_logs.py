@@ -21,7 +21,6 @@ from mapless_server.observability.logs import (
     JsonFormatter,
     RepeatFilter,
     TextFormatter,
-    as_extra,
     configure_logging,
     plain,
 )
@@ -46,12 +45,11 @@ class Level(IntEnum):
 def record_of(
     message: object = "m", /, *args: object, levelno: int = logging.INFO, **fields: object
 ) -> logging.LogRecord:
-    extra = as_extra(fields)
-    return logging.getLogger("a.b").makeRecord("a.b", levelno, "file.py", 7, message, args, None, extra=extra)
+    return logging.getLogger("a.b").makeRecord("a.b", levelno, "file.py", 7, message, args, None, extra=fields)
 
 
 def written(message: object = "m", /, *args: object, **fields: Any) -> dict[str, Any]:
-    line = JsonFormatter().format(record_of(message, *args, **fields))
+    line = JsonFormatter().format(record_of(message, *args, fields=fields))
     assert line.isascii()
     assert line.isprintable()  # one line, and nothing that a terminal obeys
     read: dict[str, Any] = json.loads(line)
@@ -137,7 +135,7 @@ def test_a_list_that_holds_itself_and_large_ones_are_cut() -> None:
 def test_fields_cannot_replace_those_of_every_line() -> None:
     line = written("m", level="fake", ts="fake", logger="fake", name="scene", message="x", args="y", exception="z")
     assert (line["level"], line["logger"], line["message"]) == ("info", "a.b", "m")
-    assert (line["level_"], line["name_"], line["message_"], line["exception_"]) == ("fake", "scene", "x", "z")
+    assert (line["level_"], line["name"], line["message_"], line["exception_"]) == ("fake", "scene", "x", "z")
 
 
 @pytest.mark.parametrize("formatter", [JsonFormatter(), TextFormatter()])

@@ -98,7 +98,7 @@ def test_every_call_is_one_line_in_the_log(stubs: Stubs, caplog: pytest.LogCaptu
     failure_of(stubs.localization.Localize, request, metadata=[("x-request-id", "logged")])
 
     def records() -> list[logging.LogRecord]:
-        return [record for record in caplog.records if vars(record).get("request_id") == "logged"]
+        return [record for record in caplog.records if vars(record).get("fields", {}).get("request_id") == "logged"]
 
     wait_until(lambda: bool(records()))
     (record,) = records()

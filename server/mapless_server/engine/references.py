@@ -187,7 +187,8 @@ class QueryRun:
     @property
     def first_step(self) -> Step:
         """The first step of the query in its tier."""
-        return Step(PREPARE, self.kind, self.kind, self)
+        kind = self.kind
+        return Step(PREPARE, kind, kind, self)
 
     def choose(self, narrowing: Narrowing) -> Choice:
         """Chooses the shortlist of references within limits and likely values of the pose."""

@@ -238,7 +238,8 @@ class QueryStages:
             raise part
         if isinstance(part, Answer):
             return self._conclude(run, part)
-        step = Step(REFINE, run.kind, run.kind, run.but(part=part))
+        kind = run.kind
+        step = Step(REFINE, kind, kind, run.but(part=part))
         if run.earlier is not None or not (run.query.allow_coarse or run.on_coarse is not None):
             return self._next(run, step)
         answer = self._method.coarse_answer(part)

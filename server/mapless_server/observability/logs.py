@@ -1,7 +1,8 @@
 """The log: one JSON object a line for programs, or text for people; repeated warnings are counted, not written.
 
-A record's fields besides its message are given by `extra=`. No value of a field can break the line, and bytes are never
-written. The thread that logs writes the line at once, so that the last lines before a crash are not lost.
+A record's fields besides its message are given by `extra=`, or together, which is faster, as `extra={"fields": {...}}`.
+No value of a field can break the line, and bytes are never written. The thread that logs writes the line at once, so
+that the last lines before a crash are not lost.
 """
 
 import json
@@ -118,18 +119,13 @@ def configure_logging(settings: Settings, stream: TextIO | None = None) -> None:
     logging.captureWarnings(True)
 
 
-def as_extra(fields: Mapping[str, object]) -> dict[str, object]:
-    """Renames fields for `extra=`, which rejects some names: these get an underscore."""
-    return {f"{name}_" if name in _OWN_ATTRIBUTES else name: value for name, value in fields.items()}
-
-
 def fields_of(record: logging.LogRecord) -> dict[str, object]:
-    """The fields of a record besides its message, as JSON values."""
-    return {
-        name: plain(value)
-        for name, value in vars(record).items()
-        if name not in _OWN_ATTRIBUTES and not name.startswith("_")  # those are marks of other libraries
-    }
+    """The fields of a record besides its message, as JSON values: those of its dictionary `fields`, if it has one."""
+    fields = vars(record).get("fields")
+    if not isinstance(fields, dict):
+        names = (name for name in vars(record) if name not in _OWN_ATTRIBUTES)
+        fields = {name: vars(record)[name] for name in names if not name.startswith("_")}  # marks of other libraries
+    return {name: plain(value) for name, value in fields.items()}
 
 
 def plain(value: object) -> object:

@@ -14,7 +14,6 @@ from google.protobuf.message import DecodeError
 
 from mapless.wire import FieldError
 from mapless_server.errors import DeadlineExceeded, InvalidArgument, RequestError, Unavailable
-from mapless_server.observability.logs import as_extra
 from mapless_server.observability.tracing import CallSpan, Metadata, Tracer
 from mapless_server.scheduling import Flow
 from mapless_server.security import ENDLESS_METHODS, OPEN_METHODS, Principal
@@ -309,7 +308,7 @@ class CallGuard:
             fields["queue_ms"] = _ms(record.queue_s)
             fields["stages_ms"] = {name: _ms(spent_s) for name, spent_s in record.stage_seconds.items()}
         fields |= {"method": method, "code": result.code, "duration_ms": _ms(seconds)}
-        log.info("%s %s", method.rpartition("/")[2], result.code, extra=as_extra(fields))
+        log.info("%s %s", method.rpartition("/")[2], result.code, extra={"fields": fields})
 
 
 def _ms(seconds: float) -> float:

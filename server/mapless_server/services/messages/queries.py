@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from enum import Enum
+from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -38,6 +39,7 @@ from mapless_server.store import SceneAttributes
 E = TypeVar("E", bound=Enum)
 
 
+@cache
 def enum_to_message(value: Enum, enum: wire.ProtoEnum) -> Any:
     """The protobuf number of a value."""
     return enum.Value(wire.enum_prefix(enum) + value.name)
@@ -133,14 +135,13 @@ def query_from_message(
     most = MAX_CANDIDATES if request.options.rerank_references else MAX_REFERENCES
     narrowing, priors = priors_from_message(request, attributes)
     photo = photo_from_message(request, "", engine.image_limits)
-    options = replace(options_from_message(request.options, engine.coverage), intrinsics=_sigma_from(request, photo))
     return Query(
         scene_key=key_of(tenant, scene_id),
         reference_ids=reference_ids_from_names(request.references, scene_id, most),
         photo=photo,
         narrowing=narrowing,
         reference_count=reference_count_from_message(request.options),
-        options=options,
+        options=options_from_message(request.options, engine.coverage, _sigma_from(request, photo)),
         allow_coarse=request.options.allow_coarse,
         rerank=request.options.rerank_references and bool(request.references),
         priors=priors,
@@ -176,17 +177,20 @@ def reference_count_from_message(message: pb.LocalizeOptions) -> int:
     return count or DEFAULT_REFERENCE_COUNT
 
 
-def options_from_message(message: pb.LocalizeOptions, coverage: float) -> LocalizeOptions:
+def options_from_message(
+    message: pb.LocalizeOptions, coverage: float, intrinsics: IntrinsicsSigma | None = None
+) -> LocalizeOptions:
     """Reads the options of the method, with the server's default `coverage`; FieldError names a wrong field."""
     if not 0 <= message.coverage < 1:
         raise FieldError("options.coverage", f"must be above 0 and below 1, or 0, is {message.coverage:g}")
-    defaults = LocalizeOptions()
+    defaults = LocalizeOptions
     return LocalizeOptions(
         variant=enum_from_message(message.variant, pb.Variant, defaults.variant, "options.variant"),
         scale_strategy=enum_from_message(
             message.scale_strategy, pb.ScaleStrategy, defaults.scale_strategy, "options.scale_strategy"
         ),
         coverage=message.coverage or coverage,
+        intrinsics=intrinsics,
     )
 
 
@@ -233,7 +237,8 @@ def priors_from_message(request: Any, attributes: SceneAttributes) -> tuple[Narr
     if _has(request, "pose_prior"):
         soft["pose"] = _pose(request.pose_prior, "pose_prior")
     priors = Priors(**soft)
-    return replace(Narrowing.of(priors), **limits), priors
+    narrowing = Narrowing.of(priors)
+    return (replace(narrowing, **limits) if limits else narrowing), priors
 
 
 def _has(request: Any, field: str) -> bool:
