@@ -176,10 +176,8 @@ class RigidTransform:
 
     def compose(self, source_from_other: RigidTransform) -> RigidTransform:
         """``target_from_other``."""
-        return RigidTransform(
-            self.rotation @ source_from_other.rotation,
-            self.rotation @ source_from_other.translation + self.translation,
-        )
+        translation = self.rotation @ source_from_other.translation + self.translation
+        return RigidTransform(self.rotation @ source_from_other.rotation, translation)
 
     def shifted(self, offset: ArrayLike) -> RigidTransform:
         """The same motion seen from a target frame in which everything lies ``offset`` (3,) further."""
@@ -233,13 +231,9 @@ class RadialTangential:
         x, y = ideal[..., 0], ideal[..., 1]
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
-        return np.stack(
-            [
-                x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x),
-                y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y,
-            ],
-            axis=-1,
-        )
+        x_distorted = x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x)
+        y_distorted = y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y
+        return np.stack([x_distorted, y_distorted], axis=-1)
 
 
 @dataclass(frozen=True)

@@ -7,21 +7,15 @@ from typing import Any
 import numpy as np
 
 from . import wire
-from .answers import (
-    Accuracy,
-    Diagnostics,
-    Hint,
-    Hypothesis,
-    PriorCheck,
+from .answer_messages import (
     accuracy_from_message,
     covariance_from_message,
     diagnostics_from_message,
     geo_pose_from_message,
-    pose_lines,
     prior_checks_from_messages,
     rejection_fields,
-    rejection_text,
 )
+from .answers import Accuracy, Diagnostics, Hint, Hypothesis, PriorCheck, pose_lines, rejection_text
 from .axes import Axes, pose_to
 from .geodesy import GeoPose
 from .geometry import Array, Camera, RigidTransform, Similarity

@@ -106,32 +106,23 @@ class ConnectOptions:
 
         `host` is the name for which the server has its certificate, if it is not that of the address.
         """
-        credentials, options = self._credentials(), self.channel_options()
+        options = self.channel_options()
         if host:
             options.append(("grpc.ssl_target_name_override", host))
-        address = _checked(address)
-        channel: grpc.Channel = (
-            grpc.secure_channel(address, credentials, options=options)
-            if credentials is not None
-            else grpc.insecure_channel(address, options=options)
-        )
+        channel: grpc.Channel = self._made(grpc, address, options)
         return channel
 
     def aio_channel(self, address: str) -> grpc.aio.Channel:
         """An asynchronous channel of the running event loop; otherwise as `channel`."""
-        credentials, options = self._credentials(), self.channel_options()
-        address = _checked(address)
-        if credentials is not None:
-            return grpc.aio.secure_channel(address, credentials, options=options)
-        return grpc.aio.insecure_channel(address, options=options)
+        channel: grpc.aio.Channel = self._made(grpc.aio, address, self.channel_options())
+        return channel
 
-    def _credentials(self) -> grpc.ChannelCredentials | None:
+    def _made(self, library: Any, address: str, options: list[tuple[str, int | str]]) -> Any:
+        address = _checked(address)
         if not self.tls:
-            return None
-        credentials: grpc.ChannelCredentials = grpc.ssl_channel_credentials(
-            self.root_certificates, self.client_key, self.client_certificate
-        )
-        return credentials
+            return library.insecure_channel(address, options=options)
+        certificates = self.root_certificates, self.client_key, self.client_certificate
+        return library.secure_channel(address, grpc.ssl_channel_credentials(*certificates), options=options)
 
     def metadata(self) -> tuple[tuple[str, str], ...]:
         """Metadata of every call; not as call credentials, which grpc sends on encrypted channels only."""

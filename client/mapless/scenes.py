@@ -67,13 +67,13 @@ class Calibration:
     create_time: datetime | None = None
 
     def __post_init__(self) -> None:
-        for name in ("position_factor_68", "position_factor_95", "rotation_factor_68", "rotation_factor_95"):
+        for name in FACTORS:
             factor = getattr(self, name)
             if not MIN_FACTOR <= factor <= MAX_FACTOR:
                 raise ValueError(f"{name} must be {MIN_FACTOR:g} to {MAX_FACTOR:g}, is {factor:g}")
         if self.query_count < 1:
             raise ValueError(f"query_count must be at least 1, is {self.query_count}")
-        for name in ("features", "backend", "variant", "server_version"):
+        for name in (*TEXTS, "variant"):
             if len(getattr(self, name)) > MAX_TEXT:
                 raise ValueError(f"{name} must have at most {MAX_TEXT} characters, has {len(getattr(self, name))}")
 
@@ -157,18 +157,12 @@ def calibration_from_message(message: pb.SceneCalibration, field: str) -> Calibr
 
     FieldError if a number is out of range, or a text too long.
     """
-    for name in FACTORS:
-        factor = getattr(message, name)
-        if not MIN_FACTOR <= factor <= MAX_FACTOR:
-            raise FieldError(joined(field, name), f"must be {MIN_FACTOR:g} to {MAX_FACTOR:g}, is {factor:g}")
-    if message.query_count < 1:
-        raise FieldError(joined(field, "query_count"), f"must be at least 1, is {message.query_count}")
-    for name in TEXTS:
-        length = len(getattr(message, name))
-        if length > MAX_TEXT:
-            raise FieldError(joined(field, name), f"must have at most {MAX_TEXT} characters, has {length}")
-    return Calibration(
-        **{name: getattr(message, name) for name in (*FACTORS, *TEXTS, "query_count")},
-        variant=wire.value_name(_VARIANT, message.variant),
-        create_time=wire.optional(message, "create_time", wire.time_from_message),
-    )
+    try:
+        return Calibration(
+            **{name: getattr(message, name) for name in (*FACTORS, *TEXTS, "query_count")},
+            variant=wire.value_name(_VARIANT, message.variant),
+            create_time=wire.optional(message, "create_time", wire.time_from_message),
+        )
+    except ValueError as error:
+        name, _, fault = str(error).partition(" ")
+        raise FieldError(joined(field, name), fault) from None

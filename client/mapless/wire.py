@@ -43,24 +43,22 @@ def joined(path: str, field: str) -> str:
 
 def scene_id_from_name(name: str, field: str) -> str:
     """The id in "scenes/{scene}"; FieldError if it has another form."""
-    try:
-        return names.parse_scene_name(name)
-    except ValueError as error:
-        raise FieldError(field, str(error)) from None
+    return _parsed(names.parse_scene_name, name, field)
 
 
 def reference_ids_from_name(name: str, field: str) -> tuple[str, str]:
     """The ids in "scenes/{scene}/references/{reference}"; FieldError if it has another form."""
-    try:
-        return names.parse_reference_name(name)
-    except ValueError as error:
-        raise FieldError(field, str(error)) from None
+    return _parsed(names.parse_reference_name, name, field)
 
 
 def checked_id(value: str, field: str) -> str:
     """The id, unchanged; FieldError if it is invalid."""
+    return _parsed(names.check_id, value, field)
+
+
+def _parsed(parse: Callable[[str], T], text: str, field: str) -> T:
     try:
-        return names.check_id(value)
+        return parse(text)
     except ValueError as error:
         raise FieldError(field, str(error)) from None
 

@@ -32,7 +32,7 @@ from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.scenes.stored_pairs import Matching, PairFinder
 from mapless_server.security import SceneKey
-from mapless_server.store import NewReference, Store, matching_use, pairs
+from mapless_server.store import NewReference, Store, matching_use, pairs, rows
 from mapless_server.store.pairs import PairStore
 
 SCENE = SceneKey("s")
@@ -139,8 +139,8 @@ def compared(monkeypatch: pytest.MonkeyPatch) -> Counter[int]:
 
 
 def let_pass(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
-    now_us = pairs._now_us
-    monkeypatch.setattr(pairs, "_now_us", lambda: now_us() + round(seconds * 1e6))
+    now_us = rows.now_us
+    monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(seconds * 1e6))
 
 
 class TestResults:
@@ -332,8 +332,8 @@ class TestUnused:
         monkeypatch.setattr(background, "_USE_IS_RECORDED_S", 0.0)
 
     def pass_days(self, monkeypatch: pytest.MonkeyPatch, share: float) -> None:
-        now_us = matching_use._now_us
-        monkeypatch.setattr(matching_use, "_now_us", lambda: now_us() + round(1e6 * share * matching_use.KEPT_S))
+        now_us = rows.now_us
+        monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(1e6 * share * matching_use.KEPT_S))
 
     def test_servers_with_other_settings_keep_one_anothers_pairs(
         self, store: Store, monkeypatch: pytest.MonkeyPatch

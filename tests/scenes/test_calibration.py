@@ -28,7 +28,7 @@ from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import Closed, ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import SceneKey
-from mapless_server.store import NewReference, SelfCalibration, Store, calibration_kind, calibrations
+from mapless_server.store import NewReference, SelfCalibration, Store, calibration_kind, rows
 
 SCENE = SceneKey("s")
 EXTRACTOR, DESCRIPTOR = StandInExtractor(), StandInDescriptor()
@@ -284,8 +284,8 @@ class TestServers:
         with ThreadPoolExecutor(2) as pool:
             list(pool.map(lambda it: it.run(), (first, second)))
         assert first.counts.calibrated + second.counts.calibrated == 1
-        now_us = calibrations._now_us
-        monkeypatch.setattr(calibrations, "_now_us", lambda: now_us() + 10**12)
+        now_us = rows.now_us
+        monkeypatch.setattr(rows, "now_us", lambda: now_us() + 10**12)
         first.run()
         assert first.counts.calibrated + second.counts.calibrated == 1
         store.delete_reference(SCENE, "r0")
@@ -336,8 +336,8 @@ class TestServers:
         assert (server.counts.failures, server.counts.calibrated, server.counts.waits) == (1, 0, 1)
         server.run()
         assert server.counts.calibrated == 0  # not before 30 s
-        now_us = calibrations._now_us
-        monkeypatch.setattr(calibrations, "_now_us", lambda: now_us() + 31 * 10**6)
+        now_us = rows.now_us
+        monkeypatch.setattr(rows, "now_us", lambda: now_us() + 31 * 10**6)
         server.run()
         assert server.counts.calibrated == 1
 

@@ -53,7 +53,7 @@ class SlowExtractor(StandInExtractor):
 def store(tmp_path: Path) -> Iterator[CountingStore]:
     """Four references with features of the old extractor."""
     opened = Store.open(tmp_path)
-    store = CountingStore(opened._database, opened._described)
+    store = CountingStore(opened.database, opened.reference_cache)
     store.images_read = 0
     with store:
         store.create_scene(SCENE)

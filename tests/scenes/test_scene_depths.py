@@ -18,7 +18,7 @@ from mapless_server.scenes.depth.scene_depths import SceneDepths
 from mapless_server.scenes.library import Closed, ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import SceneKey
-from mapless_server.store import Store, pairs
+from mapless_server.store import Store, pairs, rows
 from mapless_server.store.depths import depth_kind, load_depths
 from mapless_server.store.pairs import FIRST_RETRY_S, PairStore
 from mapless_server.store.tables import reference_matching
@@ -140,8 +140,8 @@ def test_a_failure_is_tried_again_later(store: Store, error: Exception, monkeypa
     assert it.maker.asked.count("b") == 1
     assert it.events.count(("depth_failures", 1, "")) == 1
     it.maker._answers.clear()
-    now_us = pairs._now_us
-    monkeypatch.setattr(pairs, "_now_us", lambda: now_us() + round(1e6 * (FIRST_RETRY_S + 1)))
+    now_us = rows.now_us
+    monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(1e6 * (FIRST_RETRY_S + 1)))
     it.run()
     assert it.kept() == {"a", "b", "c"}
 
@@ -166,7 +166,7 @@ def test_the_end_of_the_server_stores_nothing_more(store: Store, is_abandoned: b
         it.depths.make_next(close)
     assert it.kept() == set()
     (due_us,) = due_times_us(store)
-    assert (due_us <= pairs._now_us()) != is_abandoned
+    assert (due_us <= rows.now_us()) != is_abandoned
     it.run()
     assert len(it.kept()) == (2 if is_abandoned else 3)
 
@@ -234,4 +234,4 @@ def test_claims_end_by_themselves_long_after_those_of_pairs(store: Store) -> Non
     claims = PairStore(store.database, claim_s=1800.0)
     assert claims.claim("depth-1/x", pairs.Progress()) is not None
     (due_us,) = due_times_us(store)
-    assert 1700e6 < due_us - pairs._now_us() < 1900e6
+    assert 1700e6 < due_us - rows.now_us() < 1900e6

@@ -23,7 +23,7 @@ from mapless_server.scenes.background import BackgroundMatching
 from mapless_server.security import RateLimiter
 from mapless_server.serve.assembly import make_engine
 from mapless_server.settings import Settings
-from mapless_server.store import Store, calibrations, pairs
+from mapless_server.store import Store, calibrations, pairs, rows
 from mapless_tools.child import child_server
 from mapless_tools.demo import room
 
@@ -151,8 +151,8 @@ def test_what_a_killed_server_began_is_finished(
         os.kill(child.process_id, signal.SIGKILL)
     begun = count_pairs(data_dir)
     assert 0 < begun < 2 * PAIRS
-    now_us = pairs._now_us
-    monkeypatch.setattr(pairs, "_now_us", lambda: now_us() + round(1e6 * pairs.CLAIM_S))
+    now_us = rows.now_us
+    monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(1e6 * pairs.CLAIM_S))
     with serving(data_dir) as served:
         wait_until(lambda: served.value("mapless_background_pairs_total") == 2 * PAIRS - begun)
     assert count_pairs(data_dir) == 2 * PAIRS
@@ -174,8 +174,8 @@ def test_a_killed_servers_scene_is_calibrated_by_the_next(
         wait_until(lambda: claims() == 1)
         os.kill(child.process_id, signal.SIGKILL)
     assert claims() == 1
-    now_us = calibrations._now_us
-    monkeypatch.setattr(calibrations, "_now_us", lambda: now_us() + round(1e6 * calibrations.CLAIM_S))
+    now_us = rows.now_us
+    monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(1e6 * calibrations.CLAIM_S))
     with serving(matched) as served:
         wait_until(lambda: served.value("mapless_calibrations_total") == 1)
         assert served.value("mapless_calibration_failures_total") == 0

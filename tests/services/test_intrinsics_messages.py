@@ -8,7 +8,8 @@ import pytest
 from support.servers import CAMERA, PHOTO
 
 from mapless import Fisheye, RadialTangential, wire
-from mapless.answers import Rejected, answer_from_message
+from mapless.answer_messages import answer_from_message
+from mapless.answers import Rejected
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server.engine.interface import EngineOptions

@@ -220,7 +220,7 @@ def test_a_store_without_a_cache_sees_every_change(place: Place) -> None:
         store.delete_scene(OFFICE)
         with pytest.raises(errors.NotFound):
             other.get_attributes(OFFICE)
-        assert [it.used for it in (other._described, other._resolved, other._attributes)] == [0, 0, 0]
+        assert [it.used for it in (other.reference_cache, other._resolved, other._attributes)] == [0, 0, 0]
 
 
 factor = st.floats(0.01, 1000)

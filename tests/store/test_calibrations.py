@@ -7,7 +7,7 @@ import pytest
 from support.stores import Place, make_reference
 
 from mapless_server.security import SceneKey
-from mapless_server.store import SceneAttributes, SelfCalibration, Store, calibration_kind, calibrations
+from mapless_server.store import SceneAttributes, SelfCalibration, Store, calibration_kind, rows
 from mapless_server.store.calibrations import (
     CLAIM_S,
     CalibrationClaim,
@@ -35,8 +35,8 @@ def store(place: Place) -> Iterator[Store]:
 
 
 def let_pass(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
-    now_us = calibrations._now_us
-    monkeypatch.setattr(calibrations, "_now_us", lambda: now_us() + round(seconds * 1e6))
+    now_us = rows.now_us
+    monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(seconds * 1e6))
 
 
 def of(store: Store, factor: float = 2.0, kind: str = KIND) -> SelfCalibration:

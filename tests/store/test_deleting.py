@@ -299,7 +299,7 @@ class TestMemory:
     """Of scenes that are deleted nothing is held; of others all."""
 
     def used_bytes(self, store: Store) -> tuple[int, ...]:
-        return tuple(it.used for it in (store._described, store._resolved, store._attributes))
+        return tuple(it.used for it in (store.reference_cache, store._resolved, store._attributes))
 
     def ask(self, store: Store, key: SceneKey) -> None:
         store.load_references(key, ["r1", "r0"], EXTRACTOR)

@@ -9,7 +9,7 @@ from support.stores import Place, faults_of, make_reference
 from mapless.geometry import Camera
 from mapless_server.method.views import KeptDepth
 from mapless_server.security import SceneKey
-from mapless_server.store import Store, codec, depths, matching_use
+from mapless_server.store import Store, codec, depths, matching_use, rows
 from mapless_server.store.depths import (
     depth_kind,
     discard_depths,
@@ -174,8 +174,8 @@ def test_those_without_use_are_deleted(store: Store, place: Place, monkeypatch: 
     assert claim is not None
     claims.add(OTHER, claim, {}, is_complete=True)
     record_use(store.database, [OTHER])
-    now_us = matching_use._now_us
-    monkeypatch.setattr(matching_use, "_now_us", lambda: now_us() + round(1e6 * (matching_use.KEPT_S + 1)))
+    now_us = rows.now_us
+    monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(1e6 * (matching_use.KEPT_S + 1)))
     keep_depths(store.database, KIND, {key_of(store, "c"): kept()})
     record_use(store.database, [KIND])
     delete_unused(store.database, lambda: None)

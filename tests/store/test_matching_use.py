@@ -8,7 +8,7 @@ import pytest
 from support.stores import Place, make_reference
 
 from mapless_server.security import SceneKey
-from mapless_server.store import Store, matching_use
+from mapless_server.store import Store, matching_use, rows
 from mapless_server.store.matching_use import KEPT_S, delete_unused, record_use
 from mapless_server.store.pairs import PairStore, Progress
 
@@ -45,8 +45,8 @@ def count_pairs(place: Place) -> Counter[str]:
 
 
 def let_pass(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
-    now_us = matching_use._now_us
-    monkeypatch.setattr(matching_use, "_now_us", lambda: now_us() + round(seconds * 1e6))
+    now_us = rows.now_us
+    monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(seconds * 1e6))
 
 
 def nothing() -> None:

@@ -9,7 +9,7 @@ import pytest
 from support.stores import Place, assert_same_bits, faults_of, make_reference
 
 from mapless_server.security import SceneKey
-from mapless_server.store import Store, pairs
+from mapless_server.store import Store, pairs, rows
 from mapless_server.store.backup import back_up, restore
 from mapless_server.store.pairs import Claim, PairStore, Progress
 
@@ -43,8 +43,8 @@ def claim_all(stored: PairStore, progress: Progress | None = None) -> list[Claim
 
 
 def let_pass(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
-    now_us = pairs._now_us
-    monkeypatch.setattr(pairs, "_now_us", lambda: now_us() + round(seconds * 1e6))
+    now_us = rows.now_us
+    monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(seconds * 1e6))
 
 
 def complete(store: Store, stored: PairStore) -> dict[tuple[str, str], np.ndarray]:

@@ -36,7 +36,7 @@ class TestFaults:
         store.add_references(OFFICE, [make_reference("a")])
         before = store.get_scene(OFFICE)
         store.observer = observer = CountingStoreObserver()
-        with store._database.read() as connection:
+        with store.database.read() as connection:
             pages = connection.exec_driver_sql("PRAGMA page_count").scalar()
             unlimited = connection.exec_driver_sql("PRAGMA max_page_count").scalar()
             connection.exec_driver_sql(f"PRAGMA max_page_count={pages}")
@@ -45,7 +45,7 @@ class TestFaults:
         assert caught.value.reason == "STORE_FULL"
         assert (observer.operations, observer.failures) == (["add_references"], 1)
         assert store.get_scene(OFFICE) == before
-        with store._database.read() as connection:
+        with store.database.read() as connection:
             connection.exec_driver_sql(f"PRAGMA max_page_count={unlimited}")
         store.add_references(OFFICE, [make_reference(it, count=200) for it in "bcd"])
         assert store.get_scene(OFFICE).reference_count == 4
@@ -77,7 +77,7 @@ class TestOpening:
     def settings_in_use(self, store: Store) -> dict[str, object]:
         names = ("journal_mode", "synchronous", "foreign_keys", "busy_timeout", "trusted_schema", "cell_size_check")
         more = ("mmap_size", "journal_size_limit")
-        with store._database.read() as connection:
+        with store.database.read() as connection:
             return {name: connection.exec_driver_sql(f"PRAGMA {name}").scalar() for name in (*names, *more)}
 
     def test_settings_of_every_connection(self, store: Store) -> None:
@@ -88,7 +88,7 @@ class TestOpening:
             barrier = threading.Barrier(3, timeout=10)
 
             def look(_: int) -> dict[str, object]:
-                with store._database.read():
+                with store.database.read():
                     barrier.wait()
                     return self.settings_in_use(store)
 
@@ -111,14 +111,14 @@ class TestOpening:
         assert found() == 0
 
     def test_transactions_really_begin(self, store: Store, data_dir: Path) -> None:
-        with store._database.write() as writer:
+        with store.database.write() as writer:
             assert writer.connection.driver_connection.in_transaction  # type: ignore[union-attr]
             # A second write transaction, past our own queue, must be refused by SQLite itself.
             other = Folder(data_dir).connect()
             with pytest.raises(sqlite.choose_library().OperationalError, match="locked"):
                 other.execute("BEGIN IMMEDIATE")
             other.close()
-        with store._database.read() as reader:
+        with store.database.read() as reader:
             assert reader.connection.driver_connection.in_transaction  # type: ignore[union-attr]
 
     def test_affected_library_runs_in_safe_mode(

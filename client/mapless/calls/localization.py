@@ -7,7 +7,8 @@ from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
 from .. import wire
-from ..answers import LocalizationResult, Rejected, answer_from_message
+from ..answer_messages import answer_from_message
+from ..answers import LocalizationResult, Rejected
 from ..axes import Axes
 from ..exchange import Call, Exchange
 from ..geometry import Camera, RigidTransform

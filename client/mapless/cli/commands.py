@@ -3,14 +3,11 @@
 import argparse
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ..calls.health import SERVICES
 from ..cameras import read_camera, read_pose
 from ..client import Client
-from ..errors import NotFound
 from ..geodesy import Datum
 from ..geometry import Quaternion, RigidTransform, lens_model_of
 from ..names import check_id
@@ -18,22 +15,17 @@ from ..requests import NewReference
 from ..results import Reference, Scene
 from .folder import EXIT_FAILED, EXIT_REJECTED
 from .localize import limits
-from .output import card, show, table
+from .output import card, serving_states, show, table
 
 _BLANK = "nothing can be matched with it; it is blank, dark or blurred"
-_STATE = {True: "SERVING", False: "NOT_SERVING"}
 
 
 def health(client: Client, arguments: argparse.Namespace) -> int:
     """State of the server and of each service: changes can be rejected while queries are answered."""
-    serving = client.is_serving()
-    states = {"server": _STATE[serving]}
-    for service in SERVICES:
-        # A proxy may answer for the whole server only.
-        with suppress(NotFound):
-            states[service.rpartition(".")[2]] = _STATE[client.is_serving(service)]
+    serving = serving_states(client, "server")
+    states = {name: "SERVING" if it else "NOT_SERVING" for name, it in serving.items()}
     show(arguments, states, card(**states))
-    return 0 if serving else EXIT_FAILED
+    return 0 if serving["server"] else EXIT_FAILED
 
 
 def create_scene(client: Client, arguments: argparse.Namespace) -> int:

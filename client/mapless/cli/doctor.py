@@ -5,7 +5,7 @@ import socket
 import ssl
 import time
 from collections.abc import Callable
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 
@@ -13,15 +13,14 @@ import grpc
 import numpy as np
 
 from ..answers import Rejected
-from ..calls.health import SERVICES
 from ..client import Client
 from ..connecting import explained
-from ..errors import DeadlineExceeded, MaplessError, NotFound, from_rpc_error
+from ..errors import DeadlineExceeded, MaplessError, from_rpc_error
 from ..options import ConnectOptions
 from ..results import Reference
 from ..v1 import reference_service_pb2 as pb
 from .folder import EXIT_FAILED
-from .output import show
+from .output import serving_states, show
 from .suggesting import suggesting
 
 OK, WRONG, NOTE, SKIPPED = "ok", "wrong", "note", "skipped"
@@ -131,17 +130,11 @@ def _check_protocol(session: _Session) -> _Result:
         failed = explained(error, session.address, session.options).message.partition(": ")[2]
         speaks_tls = _speaks_tls(session.address)
         if speaks_tls and not tls:
-            return (
-                WRONG,
-                "the server uses TLS, and --tls is not given",
-                "give --tls, or --ca FILE with the authority's certificate",
-            )
+            advice = "give --tls, or --ca FILE with the authority's certificate"
+            return WRONG, "the server uses TLS, and --tls is not given", advice
         if tls and not speaks_tls and "SETTINGS" not in failed:
-            return (
-                WRONG,
-                "the server does not use TLS",
-                "leave out --tls, --ca and --cert, or give the server a certificate",
-            )
+            advice = "leave out --tls, --ca and --cert, or give the server a certificate"
+            return WRONG, "the server does not use TLS", advice
         advice = "give --cert and --key where the server requires a client certificate" if "closes" in failed else ""
         return WRONG, failed, advice
     host, _ = _host_and_port(session.address)
@@ -149,19 +142,13 @@ def _check_protocol(session: _Session) -> _Result:
         return OK, "gRPC, encrypted, and the server's certificate is valid", ""
     if session.options.token is None or host == "localhost" or host.startswith(_LOOPBACK):
         return OK, "gRPC, not encrypted", ""
-    return (
-        NOTE,
-        "gRPC, not encrypted: the token is sent in clear text",
-        "serve with TLS (settings tls_certificate and tls_key)",
-    )
+    advice = "serve with TLS (settings tls_certificate and tls_key)"
+    return NOTE, "gRPC, not encrypted: the token is sent in clear text", advice
 
 
 def _check_services(session: _Session) -> _Result:
     """Asks for the state of the server and its services."""
-    states = {"the server": session.client.is_serving()}
-    for service in SERVICES:
-        with suppress(NotFound):  # a proxy may answer for the whole server only
-            states[service.rpartition(".")[2]] = session.client.is_serving(service)
+    states = serving_states(session.client, "the server")
     silent = [name for name, is_serving in states.items() if not is_serving]
     if not silent:
         return OK, "serving", ""
@@ -220,11 +207,8 @@ def _check_version(session: _Session) -> _Result:
         return NOTE, f"client {client} ({libraries}); the server's is not known", ""
     if server == client:
         return OK, f"client and server {client} ({libraries})", ""
-    return (
-        NOTE,
-        f"client {client}, server {server} ({libraries})",
-        "they work together; what only one of them knows is ignored",
-    )
+    advice = "they work together; what only one of them knows is ignored"
+    return NOTE, f"client {client}, server {server} ({libraries})", advice
 
 
 def _check_query(session: _Session) -> _Result:
@@ -234,30 +218,21 @@ def _check_query(session: _Session) -> _Result:
     known: Reference | None = next(client.list_references(scene, page_size=1), None) if scene else None
     if scene is None or known is None:
         there = f"scene {scene} has no references" if scene else "no scene has references"
-        return (
-            NOTE,
-            f"{there}, so nothing can be localized",
-            "add some: mapless reference add, or mapless-server import",
-        )
+        advice = "add some: mapless reference add, or mapless-server import"
+        return NOTE, f"{there}, so nothing can be localized", advice
     reference = client.get_reference(scene, known.reference_id, include_image=True)
     start_s = time.monotonic()
     answer = client.localize(reference.image or b"", reference.camera, scene, timeout_s=_QUERY_LIMIT_S)
     took = f"in {time.monotonic() - start_s:.2f} s"
     what = f"the photograph of reference {reference.reference_id} of scene {scene}"
     if isinstance(answer, Rejected):
-        return (
-            WRONG,
-            f"{what} was not localized: {answer.reason}, {answer.message}",
-            answer.hint.message if answer.hint else "",
-        )
+        advice = answer.hint.message if answer.hint else ""
+        return WRONG, f"{what} was not localized: {answer.reason}, {answer.message}", advice
     error = float(np.linalg.norm(answer.world_from_camera.translation - reference.world_from_camera.translation))
     unit = "units" if answer.arbitrary_unit else "m"
     if error > _MAX_ERROR:
-        return (
-            NOTE,
-            f"{what} was localized {error:.3f} {unit} from its stored pose, {took}",
-            f"mapless-server audit {scene}",
-        )
+        message = f"{what} was localized {error:.3f} {unit} from its stored pose, {took}"
+        return NOTE, message, f"mapless-server audit {scene}"
     return OK, f"{what} was localized {took}, {error:.3f} {unit} from its stored pose", ""
 
 

@@ -7,6 +7,7 @@ import math
 import re
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import datetime
 from enum import Enum
 from typing import Any
@@ -17,6 +18,9 @@ from google.protobuf.message import Message
 
 from .. import wire
 from ..answers import LocalizationResult, Rejected
+from ..calls.health import SERVICES
+from ..client import Client
+from ..errors import NotFound
 from ..geometry import Camera, RigidTransform
 
 _NUMBER = re.compile(r"-?[\d.]+")
@@ -31,6 +35,15 @@ def show(arguments: argparse.Namespace, value: object, text: Sequence[str]) -> i
     """Prints a value as JSON or as its text, see `is_json`; returns exit code 0."""
     print(json.dumps(plain(value), indent=2) if is_json(arguments) else "\n".join(text), flush=True)
     return 0
+
+
+def serving_states(client: Client, whole: str) -> dict[str, bool]:
+    """Whether the server as a whole, under this name, and each of its services accept calls."""
+    states = {whole: client.is_serving()}
+    for service in SERVICES:
+        with suppress(NotFound):  # a proxy may answer for the whole server only
+            states[service.rpartition(".")[2]] = client.is_serving(service)
+    return states
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> list[str]:

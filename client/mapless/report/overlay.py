@@ -54,10 +54,14 @@ def overlay(debug: Debug, camera: Camera, world_from_camera: RigidTransform | No
         _layer("inlier halo", _dots(debug.query_px[inlier]), 6.4 * dot),
         _layer("inlier", _dots(debug.query_px[inlier]), 4.6 * dot),
     ]
+    switches = _switch("outlier", f"{len(inlier)} matches, none verified")
+    if inlier.any():
+        switches = _switch("inlier", f"{inlier.sum()} agree with the pose")
+        switches += _switch("outlier", f"{(~inlier).sum()} do not")
     view = f"-0.5 -0.5 {camera.width_px} {camera.height_px}"
     return (
         '<figure class="overlay">'
-        f"{_switches(inlier)}"
+        f"{switches}"
         f'<svg viewBox="{view}" role="img" aria-label="The photograph and its matches">'
         f'<use href="#{PHOTO_ID}"/>{"".join(layers)}</svg>'
         f"<figcaption>{text(residuals)}</figcaption></figure>"
@@ -100,12 +104,6 @@ def histogram(debug: Debug) -> str:
         f'{"".join(bars)}<path class="axis" d="M0 100H320"/>{ticks}</svg>'
         f"<figcaption>Reprojection errors, pixels of the processed photograph.{more}</figcaption></figure>"
     )
-
-
-def _switches(inlier: NDArray[np.bool_]) -> str:
-    if not inlier.any():
-        return _switch("outlier", f"{len(inlier)} matches, none verified")
-    return _switch("inlier", f"{inlier.sum()} agree with the pose") + _switch("outlier", f"{(~inlier).sum()} do not")
 
 
 def _switch(layer: str, label: str) -> str:

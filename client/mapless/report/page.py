@@ -49,20 +49,23 @@ def report_html(
     """The page; see `write_report`."""
     by_name = {f"scenes/{it.scene_id}/references/{it.reference_id}": it for it in references}
     photograph = picture(image, PHOTOGRAPH_BYTES)
-    pictures = _pictures(answer, by_name)
     diagnostics = answer.diagnostics
+    shown = {_hinted(answer), *best_references(answer.debug, diagnostics.references)} & by_name.keys()
+    images = {name: by_name[name].image for name in shown}
+    pictures = {name: picture(it, REFERENCE_BYTES) for name, it in images.items() if it is not None}
     if isinstance(answer, LocalizationResult):
         first = [sections.pose_section(answer), sections.accuracy_section(answer)]
-        further = [sections.priors_section(answer.prior_checks)]
+        further, whereabouts = [sections.priors_section(answer.prior_checks)], "Where it is"
     else:
         first, further = [], [sections.hypotheses_section(answer)]
+        whereabouts = "Where it could be, from above" if answer.hypotheses else "Where the references stand"
     body = [
         _header(answer, title),
         define(photograph, camera),
         _photograph_section(answer, camera, photograph),
         _best_reference(answer, by_name, pictures),
         section("Beside the references", pairs(answer.debug, diagnostics.references, camera, by_name, pictures)),
-        section(_whereabouts(answer), _plan(answer, by_name, camera, down_in_world)),
+        section(whereabouts, _plan(answer, by_name, camera, down_in_world)),
         *first,
         *further,
         sections.references_section(diagnostics),
@@ -71,17 +74,14 @@ def report_html(
         f"<footer>Written {datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC. This page holds the photograph itself and "
         "needs nothing else.</footer>",
     ]
+    style = Path(__file__).with_name("style.css").read_text(encoding="utf-8")
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         f'<meta http-equiv="Content-Security-Policy" content="{text(_POLICY)}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{text(_verdict(answer))}{': ' + text(title) if title else ''}</title><style>{_style()}</style></head>"
+        f"<title>{text(_verdict(answer))}{': ' + text(title) if title else ''}</title><style>{style}</style></head>"
         f"<body>{''.join(body)}</body></html>\n"
     )
-
-
-def _style() -> str:
-    return Path(__file__).with_name("style.css").read_text(encoding="utf-8")
 
 
 def _verdict(answer: LocalizationResult | Rejected) -> str:
@@ -141,13 +141,6 @@ def _best_reference(
     return section("Point the camera at this" if is_target else "What it shares most with", figure)
 
 
-def _whereabouts(answer: LocalizationResult | Rejected) -> str:
-    """Title of the plan."""
-    if isinstance(answer, LocalizationResult):
-        return "Where it is"
-    return "Where it could be, from above" if answer.hypotheses else "Where the references stand"
-
-
 def _hinted(answer: LocalizationResult | Rejected) -> str:
     """Name of the reference in a rejection's hint; empty if there is none."""
     hint = answer.hint if isinstance(answer, Rejected) else None
@@ -174,13 +167,3 @@ def _plan(
     if not used and not poses:
         return ""
     return plan_view(references, used, poses, camera, covariance, points, down_in_world)
-
-
-def _pictures(answer: LocalizationResult | Rejected, references: Mapping[str, Reference]) -> dict[str, Picture]:
-    """Pictures of the references that are shown beside the photograph."""
-    found = {}
-    for name in {_hinted(answer), *best_references(answer.debug, answer.diagnostics.references)}:
-        image = references[name].image if name in references else None
-        if image is not None:
-            found[name] = picture(image, REFERENCE_BYTES)
-    return found

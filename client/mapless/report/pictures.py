@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 REDUCED_SIDE_PX = 1600
 _SEGMENTS_WITHOUT_LENGTH = {0x01, *range(0xD0, 0xD9)}
-_START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
+_START_OF_SCAN, _END_OF_IMAGE, _COMMENT = 0xDA, 0xD9, 0xFE
 _KEPT_SEGMENTS = {0xE0: b"JFIF\0", 0xE2: b"ICC_PROFILE\0", 0xEE: b"Adobe"}
 """Application segments that decoders need, with their first bytes; a phone's index of further pictures is E2, too."""
 _AFTER_SCAN = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
@@ -83,17 +83,14 @@ def _clean_jpeg(image: bytes) -> bytes:
         if marker == _START_OF_SCAN:  # of which a progressive file has several, with tables between them
             after = _AFTER_SCAN.search(image, position + size)
             segment = image[position : after.start() if after else len(image)]
-        if _is_needed(marker, segment):
+        is_application = 0xE0 <= marker <= 0xEF
+        if marker in _KEPT_SEGMENTS:
+            is_application = not segment[4:].startswith(_KEPT_SEGMENTS[marker])
+        if not is_application and marker != _COMMENT:
             parts.append(segment)
         position += len(segment)
         if marker == _START_OF_SCAN and position == len(image):
             return b"".join([*parts, b"\xff\xd9"])
-
-
-def _is_needed(marker: int, segment: bytes) -> bool:
-    if marker in _KEPT_SEGMENTS:
-        return segment[4:].startswith(_KEPT_SEGMENTS[marker])
-    return not (0xE0 <= marker <= 0xEF or marker == 0xFE)
 
 
 def _clean_png(image: bytes) -> bytes:

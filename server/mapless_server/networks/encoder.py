@@ -32,49 +32,6 @@ class PatchEmbedding(nn.Module):
         return patches.flatten(2).transpose(1, 2)
 
 
-class Encoder(nn.Module):
-    """Normalized images to patch tokens."""
-
-    def __init__(self, width: int, heads: int, depth: int) -> None:
-        super().__init__()
-        self.cls_token = nn.Parameter(torch.empty(1, 1, width))
-        self.pos_embed = nn.Parameter(torch.empty(1, 1 + POSITION_SIDE**2, width))
-        self.register_tokens = nn.Parameter(torch.empty(1, REGISTERS, width))
-        self.patch_embed = PatchEmbedding(3, width)
-        self.blocks = nn.ModuleList(Block(width, heads) for _ in range(depth))
-        self.norm = LayerNorm(width, eps=BLOCK_EPS)
-
-    def forward(self, images: Tensor) -> Tensor:
-        """Images (V, 3, H, W), sides multiples of 14, to tokens (V, P, C) float32, P = H/14 * W/14, row by row."""
-        grid = (images.shape[2] // PATCH_PX, images.shape[3] // PATCH_PX)
-        of_class, of_patches = self.positions(grid).split([1, grid[0] * grid[1]], dim=1)
-        views = len(images)
-        x = torch.cat(
-            [
-                (self.cls_token + of_class).expand(views, -1, -1),
-                self.register_tokens.expand(views, -1, -1),
-                self.patch_embed(images) + of_patches,
-            ],
-            dim=1,
-        )
-        for block in self.blocks:
-            x = block(x)
-        tokens: Tensor = self.norm(x)
-        return tokens[:, 1 + REGISTERS :]
-
-    def positions(self, grid: tuple[int, int]) -> Tensor:
-        """Position embeddings (1, 1 + P, C): of the class token, and of the patches of a grid (rows, columns).
-
-        The learned grid is resized bicubically with antialiasing, to the size itself rather than by a factor.
-        """
-        if grid == (POSITION_SIDE, POSITION_SIDE):
-            return self.pos_embed
-        of_class, of_patches = self.pos_embed.split([1, POSITION_SIDE**2], dim=1)
-        learned = of_patches.transpose(1, 2).unflatten(2, (POSITION_SIDE, POSITION_SIDE))
-        resized = F.interpolate(learned, grid, mode="bicubic", antialias=True, align_corners=False)
-        return torch.cat([of_class, resized.flatten(2).transpose(1, 2)], dim=1)
-
-
 class PlainEncoder(nn.Module):
     """Normalized images to tokens of all blocks, without registers and without a final normalization."""
 
@@ -96,14 +53,45 @@ class PlainEncoder(nn.Module):
         return x
 
     def positions(self, grid: tuple[int, int]) -> Tensor:
-        """Position embeddings (1, 1 + P, C) of the class token and of a grid (rows, columns) of patches.
-
-        The learned grid is resized bicubically without antialiasing, see POSITION_OFFSET.
-        """
+        """Position embeddings (1, 1 + P, C): of the class token, and of the patches of a grid (rows, columns)."""
         if grid == (POSITION_SIDE, POSITION_SIDE):
             return self.pos_embed
         of_class, of_patches = self.pos_embed.split([1, POSITION_SIDE**2], dim=1)
         learned = of_patches.transpose(1, 2).unflatten(2, (POSITION_SIDE, POSITION_SIDE))
+        return torch.cat([of_class, self.resized(learned, grid).flatten(2).transpose(1, 2)], dim=1)
+
+    def resized(self, learned: Tensor, grid: tuple[int, int]) -> Tensor:
+        """The learned positions (1, C, 37, 37) for a grid, bicubically without antialiasing, see POSITION_OFFSET."""
         factors = [(cells + POSITION_OFFSET) / POSITION_SIDE for cells in grid]
-        resized = F.interpolate(learned, scale_factor=factors, mode="bicubic", align_corners=False)
-        return torch.cat([of_class, resized.flatten(2).transpose(1, 2)], dim=1)
+        return F.interpolate(learned, scale_factor=factors, mode="bicubic", align_corners=False)
+
+
+class Encoder(PlainEncoder):
+    """Normalized images to patch tokens, with registers and a final normalization."""
+
+    def __init__(self, width: int, heads: int, depth: int) -> None:
+        super().__init__(width, heads, depth)
+        self.register_tokens = nn.Parameter(torch.empty(1, REGISTERS, width))
+        self.norm = LayerNorm(width, eps=BLOCK_EPS)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Images (V, 3, H, W), sides multiples of 14, to tokens (V, P, C) float32, P = H/14 * W/14, row by row."""
+        grid = (images.shape[2] // PATCH_PX, images.shape[3] // PATCH_PX)
+        of_class, of_patches = self.positions(grid).split([1, grid[0] * grid[1]], dim=1)
+        views = len(images)
+        x = torch.cat(
+            [
+                (self.cls_token + of_class).expand(views, -1, -1),
+                self.register_tokens.expand(views, -1, -1),
+                self.patch_embed(images) + of_patches,
+            ],
+            dim=1,
+        )
+        for block in self.blocks:
+            x = block(x)
+        tokens: Tensor = self.norm(x)
+        return tokens[:, 1 + REGISTERS :]
+
+    def resized(self, learned: Tensor, grid: tuple[int, int]) -> Tensor:
+        """The learned positions for a grid, bicubically with antialiasing, to the size itself rather than a factor."""
+        return F.interpolate(learned, grid, mode="bicubic", antialias=True, align_corners=False)

@@ -14,6 +14,7 @@ Written from a description of the official network; modules are named as the ent
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -98,17 +99,6 @@ class MapAnythingSizes:
     scale_width: int = 196
 
 
-@dataclass(frozen=True)
-class PatchLayout:
-    """The arrangement of the T = P + 1 tokens of one view: its patches by rows, then the class token.
-
-    Attributes:
-        grid: rows and columns of patches.
-    """
-
-    grid: tuple[int, int]
-
-
 @dataclass(frozen=True, eq=False)
 class Decoded:
     """The network's output for B scenes with N views each, in the frame of view 0 of each scene, before the scale.
@@ -176,18 +166,18 @@ class MapAnything(Network):
         """See Network.token_count."""
         return grid[0] * grid[1] + 1
 
-    def layout(self, grid: tuple[int, int]) -> PatchLayout:
-        """See Network.layout."""
-        return PatchLayout(grid)
+    def layout(self, grid: tuple[int, int]) -> tuple[int, int]:
+        """See Network.layout: a view's patches come by rows, then its class token."""
+        return grid
 
-    def encode(self, images: Tensor, layout: PatchLayout, intrinsics: Tensor | None = None) -> Tensor:
+    def encode(self, images: Tensor, layout: tuple[int, int], intrinsics: Tensor | None = None) -> Tensor:
         """See Network.encode; without intrinsics, the views' rays are unknown."""
         if intrinsics is None:
             return self.encode_views(images)
         # Elsewhere (0.5, 0.5) is the centre of the top-left pixel, here it is (0, 0).
         shift = intrinsics.new_zeros(3, 3)
         shift[:2, 2] = 0.5
-        rays = pinhole_rays(intrinsics - shift, layout.grid[0] * PATCH_PX, layout.grid[1] * PATCH_PX)
+        rays = pinhole_rays(intrinsics - shift, layout[0] * PATCH_PX, layout[1] * PATCH_PX)
         return self.encode_views(images, GivenMaps(rays, rays.new_ones(len(rays), dtype=torch.bool)))
 
     def encode_views(self, images: Tensor, given: GivenMaps | None = None) -> Tensor:
@@ -220,7 +210,7 @@ class MapAnything(Network):
     def reconstruct(
         self,
         tokens: Tensor,
-        layout: PatchLayout,
+        layout: tuple[int, int],
         mapped: int,
         poses: Tensor | None = None,
         posed: Tensor | None = None,
@@ -232,7 +222,7 @@ class MapAnything(Network):
     def query_pose(
         self,
         tokens: Tensor,
-        layout: PatchLayout,
+        layout: tuple[int, int],
         poses: Tensor | None = None,
         posed: Tensor | None = None,
         metric: Tensor | None = None,
@@ -247,7 +237,7 @@ class MapAnything(Network):
     def decode(
         self,
         tokens: Tensor,
-        layout: PatchLayout,
+        layout: tuple[int, int],
         mapped: int,
         relative: RelativePoses | None = None,
         posed: Tensor | None = None,
@@ -273,7 +263,7 @@ class MapAnything(Network):
         fused = self.fusion_norm_layer(patches)
         joined = torch.cat([fused, of_class], dim=2)
         taps, last, scale = self.info_sharing(joined, self.scale_token, 1 if last_pose_only else tokens.shape[1])
-        dense = self._dense([fused, *(tap[:, :, :-1] for tap in taps), last[:, :, :-1]], mapped, layout.grid)
+        dense = self._dense([fused, *(tap[:, :, :-1] for tap in taps), last[:, :, :-1]], mapped, layout)
         rays, log_depth, confidence, mask = dense.split([3, 1, 1, 1], dim=2)
         translations, quaternions = self.pose_head(last[:, :, :-1])
         return Decoded(
@@ -352,7 +342,7 @@ class PoseHead(nn.Module):
     def __init__(self, width_in: int, width: int) -> None:
         super().__init__()
         self.proj = nn.Conv2d(width_in, width, 1)
-        self.res_conv = nn.ModuleList(ResidualMlp(width, _pointwise) for _ in range(2))
+        self.res_conv = nn.ModuleList(ResidualMlp(width, partial(nn.Conv2d, kernel_size=1)) for _ in range(2))
         self.more_mlps = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU())
         self.fc_t = nn.Linear(width, 3)
         self.fc_rot = nn.Linear(width, 4)
@@ -402,10 +392,6 @@ def _relative(poses: Tensor | None, posed: Tensor | None) -> RelativePoses | Non
     if poses is None or posed is None:
         return None
     return relative_poses(quaternions_from_rotations(poses[..., :3, :3]), poses[..., :3, 3], posed)
-
-
-def _pointwise(width_in: int, width: int) -> nn.Module:
-    return nn.Conv2d(width_in, width, 1)
 
 
 def _where(mask: Tensor, features: Tensor) -> Tensor:

@@ -8,7 +8,6 @@ that lost its claim, because it was too slow or the scene was deleted, stores no
 """
 
 import random
-import time
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,7 +28,6 @@ CLAIM_S = 120.0
 """Far longer than one reference takes, also on a busy server; it is renewed after each."""
 
 _CANDIDATES = 16
-_MICROSECONDS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,7 @@ def claim_scene(database: Database, kind: str) -> CalibrationClaim | None:
     with database.read() as connection:
         due = connection.execute(_select_due(kind).limit(_CANDIDATES)).all()
     for row in random.sample(due, len(due)):
-        claim = CalibrationClaim(SceneKey(row.scene_id), kind, _now_us() + _us(CLAIM_S))
+        claim = CalibrationClaim(SceneKey(row.scene_id), kind, rows.now_us() + round(CLAIM_S * 1e6))
         with database.write() as connection:
             if _try_claim(connection, claim):
                 return claim
@@ -58,7 +56,7 @@ def claim_scene(database: Database, kind: str) -> CalibrationClaim | None:
 
 def renew(database: Database, claim: CalibrationClaim) -> CalibrationClaim | None:
     """Renews a claim, so that it ends later; None if it was lost."""
-    renewed = replace(claim, until_us=max(_now_us() + _us(CLAIM_S), claim.until_us + 1))
+    renewed = replace(claim, until_us=max(rows.now_us() + round(CLAIM_S * 1e6), claim.until_us + 1))
     with database.write() as connection:
         is_ours = connection.execute(_of(claim).values(due_time_us=renewed.until_us)).rowcount == 1
     return renewed if is_ours else None
@@ -66,12 +64,11 @@ def renew(database: Database, claim: CalibrationClaim) -> CalibrationClaim | Non
 
 def postpone(database: Database, claim: CalibrationClaim) -> float:
     """Ends the claim of a scene that failed; returns the seconds until it may be claimed again."""
-    column = scene_calibration.c
-    count = select(column.failure_count).where(column.scene_id == claim.scene_key, column.kind == claim.kind)
+    count = select(scene_calibration.c.failure_count).where(_is_it(claim))
     with database.write() as connection:
         failure_count = connection.scalar(count) or 0
         wait_s = min(LONGEST_RETRY_S, FIRST_RETRY_S * 2.0 ** min(failure_count, 20))
-        values = {"due_time_us": _now_us() + _us(wait_s), "failure_count": failure_count + 1}
+        values = {"due_time_us": rows.now_us() + round(wait_s * 1e6), "failure_count": failure_count + 1}
         connection.execute(_of(claim).values(values))
     return wait_s
 
@@ -79,7 +76,7 @@ def postpone(database: Database, claim: CalibrationClaim) -> float:
 def release(database: Database, claim: CalibrationClaim) -> None:
     """Ends the claim of a server that is closed, so that others may claim the scene at once."""
     with database.write() as connection:
-        connection.execute(_of(claim).values(due_time_us=_now_us()))
+        connection.execute(_of(claim).values(due_time_us=rows.now_us()))
 
 
 def add(store: Store, claim: CalibrationClaim, calibration: SelfCalibration, wait_s: float) -> bool:
@@ -90,7 +87,7 @@ def add(store: Store, claim: CalibrationClaim, calibration: SelfCalibration, wai
     """
     data = codec.encode_calibration(calibration)
     sha256 = codec.sha256_for(rows.calibration_owner(claim.scene_key, claim.kind), data)
-    due_us = _now_us() + _us(wait_s)
+    due_us = rows.now_us() + round(wait_s * 1e6)
     values = {"generation": calibration.generation, "data": data, "sha256": sha256, "due_time_us": due_us}
     with store.changing() as connection:
         return connection.execute(_of(claim).values(**values, failure_count=0)).rowcount == 1
@@ -140,7 +137,7 @@ def _select_changed(kind: str) -> Select[Any]:
 
 def _select_due(kind: str) -> Select[Any]:
     column = scene_calibration.c
-    return _select_changed(kind).where(or_(column.due_time_us.is_(None), column.due_time_us <= _now_us()))
+    return _select_changed(kind).where(or_(column.due_time_us.is_(None), column.due_time_us <= rows.now_us()))
 
 
 def _try_claim(connection: Connection, claim: CalibrationClaim) -> bool:
@@ -149,23 +146,17 @@ def _try_claim(connection: Connection, claim: CalibrationClaim) -> bool:
         queries.read_generation(connection, claim.scene_key)
     except NotFound:
         return False
-    of_it = (column.scene_id == claim.scene_key) & (column.kind == claim.kind)
-    free = update(scene_calibration).where(of_it, column.due_time_us <= _now_us())
+    free = update(scene_calibration).where(_is_it(claim), column.due_time_us <= rows.now_us())
     if connection.execute(free.values(due_time_us=claim.until_us)).rowcount == 1:
         return True
     row = {"scene_id": claim.scene_key, "kind": claim.kind, "due_time_us": claim.until_us}
     return queries.insert_new(connection, scene_calibration, row)
 
 
-def _of(claim: CalibrationClaim) -> Any:
+def _is_it(claim: CalibrationClaim) -> ColumnElement[bool]:
     column = scene_calibration.c
-    of_it = (column.scene_id == claim.scene_key) & (column.kind == claim.kind)
-    return update(scene_calibration).where(of_it, column.due_time_us == claim.until_us)
+    return (column.scene_id == claim.scene_key) & (column.kind == claim.kind)
 
 
-def _us(seconds: float) -> int:
-    return round(seconds * _MICROSECONDS)
-
-
-def _now_us() -> int:
-    return round(time.time() * _MICROSECONDS)
+def _of(claim: CalibrationClaim) -> Any:
+    return update(scene_calibration).where(_is_it(claim), scene_calibration.c.due_time_us == claim.until_us)

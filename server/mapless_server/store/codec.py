@@ -81,8 +81,7 @@ def decode_geometry(owner: str, data: bytes, sha256: str) -> tuple[Camera, Rigid
 
     Damaged if the checksum or the form of the data is wrong.
     """
-    check(owner, data, sha256, "camera and pose")
-    with _checked_form("camera and pose"):
+    with _checked(owner, data, sha256, "camera and pose"):
         content = json.loads(data)
         pose = content["world_from_camera"]
         rotation, translation = np.array(pose["rotation"], float), np.array(pose["translation"], float)
@@ -107,9 +106,8 @@ def decode_attributes(owner: str, data: bytes | None, sha256: str | None) -> Sce
     """The attributes that `encode_attributes` was given; Damaged if the checksum or the form of the data is wrong."""
     if data is None and sha256 is None:
         return SceneAttributes()
-    check(owner, data, sha256 or "", "datum, down and calibration")
-    assert data is not None
-    with _checked_form("datum, down and calibration"):
+    with _checked(owner, data, sha256 or "", "datum, down and calibration"):
+        assert data is not None
         content = json.loads(data)
         datum, down, calibration = content["datum"], content["down_in_world"], content["calibration"]
         if calibration and calibration["create_time"]:
@@ -133,8 +131,7 @@ def decode_calibration(owner: str, data: bytes, sha256: str) -> SelfCalibration:
 
     Damaged if the checksum or the form of the data is wrong.
     """
-    check(owner, data, sha256, "calibration")
-    with _checked_form("calibration"):
+    with _checked(owner, data, sha256, "calibration"):
         return _calibration_from_dict(json.loads(data))
 
 
@@ -180,8 +177,7 @@ def decode_view(owner: str, blob: bytes, sha256: str) -> View:
 
     Damaged if the checksum does not match, or the format is unknown.
     """
-    check(owner, blob, sha256, "features")
-    with _checked_form("features"):
+    with _checked(owner, blob, sha256, "features"):
         version, header_length = _PREFIX.unpack_from(blob)
         if version not in (VIEW_FORMAT_VERSION, SMALL_VIEW_FORMAT_VERSION):
             raise Damaged(f"features (format {version} is unknown)")
@@ -257,8 +253,7 @@ def decode_matches(owner: str, data: bytes, sha256: str) -> Matches:
 
     Damaged if the checksum or the form of the data is wrong.
     """
-    check(owner, data, sha256, "matches")
-    with _checked_form("matches"):
+    with _checked(owner, data, sha256, "matches"):
         return np.frombuffer(data, _INT32).reshape(-1, 2)
 
 
@@ -290,8 +285,7 @@ def decode_depth(owner: str, blob: bytes, sha256: str) -> KeptDepth:
 
     Damaged if the checksum or the form of the data is wrong, or the format is unknown.
     """
-    check(owner, blob, sha256, "depth")
-    with _checked_form("depth"):
+    with _checked(owner, blob, sha256, "depth"):
         version, header_length = _PREFIX.unpack_from(blob)
         if version != DEPTH_FORMAT_VERSION:
             raise Damaged(f"depth (format {version} is unknown)")
@@ -318,8 +312,9 @@ def check(owner: str, data: object, sha256: str, what: str) -> None:
 
 
 @contextmanager
-def _checked_form(what: str) -> Iterator[None]:
-    """Raises Damaged for data that have a correct checksum, but a wrong form."""
+def _checked(owner: str, data: object, sha256: str, what: str) -> Iterator[None]:
+    """Raises Damaged as of `check`, and for data that have a correct checksum, but a wrong form."""
+    check(owner, data, sha256, what)
     try:
         yield
     except (AttributeError, KeyError, TypeError, ValueError, RecursionError, struct.error, zlib.error) as error:

@@ -84,8 +84,11 @@ class PendingDeletions:
                     return
                 count, was_full = at_most, False
             except DamagedPages:
+                if count == 1 and not keys:  # not the reference is damaged, but what it is looked up in
+                    raise
                 if count == 1:
-                    self._move_aside(keys)
+                    with self._database.write() as connection:
+                        move_aside(connection, keys[0])
                 count, was_full = 1 if count > 1 else at_most, False
             except Overloaded:
                 if was_full:
@@ -105,12 +108,6 @@ class PendingDeletions:
             delete_references(connection, *keys)
             delete_empty(connection)
             return bool(keys) and is_pending(connection)
-
-    def _move_aside(self, keys: list[str]) -> None:
-        if not keys:  # not the reference is damaged, but the table or index in which it is looked up
-            raise DamagedPages
-        with self._database.write() as connection:
-            move_aside(connection, keys[0])
 
     def _run_thread(self) -> None:
         try:

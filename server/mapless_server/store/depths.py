@@ -5,7 +5,6 @@ network and its weights. Depths of another version are never read. Finished refe
 (see `pairs`), under the kind's name; if a finished one has no depth, this was found wrong, or could not be checked.
 """
 
-import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +13,7 @@ from sqlalchemy import Select, delete, select, update
 
 from mapless_server.method.views import KeptDepth
 
-from . import codec, queries
+from . import codec, queries, rows
 from .database import Database
 from .tables import reference, reference_depth, reference_matching
 
@@ -87,7 +86,7 @@ def discard_depths(database: Database, damaged: Collection[tuple[str, str]]) -> 
         for kind, key in sorted(damaged):
             connection.execute(delete(reference_depth).where(column.reference_key == key, column.kind == kind))
             of_it = (progress.reference_key == key) & (progress.matching == kind) & progress.due_time_us.is_(None)
-            connection.execute(update(reference_matching).where(of_it).values(due_time_us=round(time.time() * 1e6)))
+            connection.execute(update(reference_matching).where(of_it).values(due_time_us=rows.now_us()))
 
 
 def list_kinds(database: Database) -> list[str]:

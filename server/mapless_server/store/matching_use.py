@@ -8,12 +8,11 @@ its pairs are made again.
 """
 
 import logging
-import time
 from collections.abc import Callable, Collection
 
 from sqlalchemy import Connection, delete, or_, select, update
 
-from . import queries
+from . import queries, rows
 from .database import Database
 from .tables import matching_use, reference_depth, reference_matching, reference_pair, scene_calibration
 
@@ -30,14 +29,14 @@ def record_use(database: Database, matchings: Collection[str]) -> None:
     """Records that a server uses these matchings now; to be called much more often than every `KEPT_S`."""
     with database.write() as connection:
         for name in sorted(matchings):
-            row = {"matching": name, "used_time_us": _now_us()}
+            row = {"matching": name, "used_time_us": rows.now_us()}
             if not queries.insert_new(connection, matching_use, row):
                 connection.execute(update(matching_use).where(matching_use.c.matching == name).values(row))
 
 
 def delete_unused(database: Database, check: Callable[[], None]) -> None:
     """Deletes pairs of matchings that were not used for `KEPT_S`, in portions; calls `check` between portions."""
-    limit_us = _now_us() - round(KEPT_S * 1e6)
+    limit_us = rows.now_us() - round(KEPT_S * 1e6)
     with database.read() as connection:
         unused = list(connection.scalars(select(matching_use.c.matching).where(matching_use.c.used_time_us < limit_us)))
     for name in unused:
@@ -69,7 +68,3 @@ def _delete_portion(connection: Connection, name: str, limit_us: int) -> bool:
     connection.execute(delete(reference_depth).where(depth.kind == name, depth.reference_key.in_(keys)))
     connection.execute(delete(reference_matching).where(progress.matching == name, progress.reference_key.in_(keys)))
     return True
-
-
-def _now_us() -> int:
-    return round(time.time() * 1e6)

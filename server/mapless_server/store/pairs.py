@@ -9,7 +9,6 @@ after `CLAIM_S`, so the unfinished work of a killed server is done by another se
 """
 
 import random
-import time
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,7 +19,7 @@ from mapless_server.errors import NotFound
 from mapless_server.method.views import Matches
 from mapless_server.security import SceneKey
 
-from . import codec, queries
+from . import codec, queries, rows
 from .database import Database
 from .faults import unless_damaged
 from .queries import is_detached
@@ -34,8 +33,6 @@ FIRST_RETRY_S, LONGEST_RETRY_S = 30.0, 3600.0
 
 _CANDIDATES = 16
 """Servers that claim at the same time choose among so many, so that they seldom choose the same."""
-
-_MICROSECONDS = 1_000_000
 
 Pair = tuple[str, str]
 """The keys of two references, in the order of the matches' columns."""
@@ -97,8 +94,8 @@ class PairStore:
                     return Claim(SceneKey(row.scene_id), row.reference_id, row.key)
 
     def _claim(self, matching: str, key: str) -> bool:
-        column, begin_us = reference_matching.c, _now_us()
-        until_us = begin_us + round(self._claim_s * _MICROSECONDS)
+        column, begin_us = reference_matching.c, rows.now_us()
+        until_us = begin_us + round(self._claim_s * 1e6)
         row = {"reference_key": key, "matching": matching, "due_time_us": until_us}
         with self._database.write() as connection:
             try:
@@ -142,7 +139,7 @@ class PairStore:
                 row = {"first_key": pair[0], "second_key": pair[1], "matching": matching, "data": data[pair]}
                 row["sha256"] = codec.sha256_for(_owner(matching, pair), data[pair])
                 queries.insert_new(connection, reference_pair, row)
-            due_us = None if is_complete else _now_us()
+            due_us = None if is_complete else rows.now_us()
             connection.execute(_of_claim(matching, claim).values(due_time_us=due_us, failure_count=0))
 
     def postpone(self, matching: str, claim: Claim) -> float:
@@ -152,7 +149,7 @@ class PairStore:
         with self._database.write() as connection:
             failure_count = connection.scalar(count) or 0
             wait_s = min(LONGEST_RETRY_S, FIRST_RETRY_S * 2.0 ** min(failure_count, 20))
-            due_us = _now_us() + round(wait_s * _MICROSECONDS)
+            due_us = rows.now_us() + round(wait_s * 1e6)
             values = {"due_time_us": due_us, "failure_count": failure_count + 1}
             connection.execute(_of_claim(matching, claim).values(values))
         return wait_s
@@ -166,7 +163,7 @@ class PairStore:
                 connection.execute(delete(reference_pair).where(is_it))
                 of_them = progress.reference_key.in_([first, second]) & (progress.matching == matching)
                 again = update(reference_matching).where(of_them, progress.due_time_us.is_(None))
-                connection.execute(again.values(due_time_us=_now_us()))
+                connection.execute(again.values(due_time_us=rows.now_us()))
 
     def count_waiting(self, matching: str) -> int:
         """Number of references whose pairs are not all stored."""
@@ -187,7 +184,7 @@ def _due(connection: Connection, matching: str) -> Sequence[Row[Any]]:
     due: Select[Any] = (
         select(reference.c.key, reference.c.scene_id, reference.c.reference_id)
         .join(reference_matching, column.reference_key == reference.c.key)
-        .where(column.matching == matching, column.due_time_us <= _now_us(), ~is_detached(reference.c.scene_id))
+        .where(column.matching == matching, column.due_time_us <= rows.now_us(), ~is_detached(reference.c.scene_id))
     )
     return connection.execute(due.limit(_CANDIDATES)).all()
 
@@ -253,7 +250,3 @@ def _decoded(matching: str, row: Row[Any]) -> Matches | None:
 def _owner(matching: str, pair: Pair) -> str:
     """Owner of a pair's matches, for `codec.sha256_for`."""
     return f"{pair[0]}+{pair[1]} {matching}"
-
-
-def _now_us() -> int:
-    return round(time.time() * _MICROSECONDS)

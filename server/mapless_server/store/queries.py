@@ -125,21 +125,14 @@ def forget_removals(connection: Connection, scene_key: SceneKey, until_generatio
         connection.execute(known.values(first_generation=until_generation))
 
 
-def find_keys(connection: Connection, scene_key: SceneKey, reference_ids: Sequence[str]) -> dict[str, str]:
-    """Keys, by id, of those of these references that exist."""
-    statement = select(reference.c.reference_id, reference.c.key).where(reference.c.scene_id == scene_key)
-    keys: dict[str, str] = {}
-    for ids in _portions(reference_ids):
-        rows = connection.execute(statement.where(reference.c.reference_id.in_(ids)))
-        keys.update((row.reference_id, row.key) for row in rows)
-    return keys
-
-
-def list_keys(connection: Connection, scene_key: SceneKey) -> dict[str, str]:
-    """Keys by id of all references of a scene, ordered by id."""
-    statement = select(reference.c.reference_id, reference.c.key).where(reference.c.scene_id == scene_key)
-    rows = connection.execute(statement.order_by(reference.c.reference_id))
-    return {row.reference_id: row.key for row in rows}
+def find_keys(connection: Connection, scene_key: SceneKey, reference_ids: Sequence[str] | None) -> dict[str, str]:
+    """Keys, by id, of those of these references that exist; of all, ordered by id, for None."""
+    column = reference.c
+    statement = select(column.reference_id, column.key).where(column.scene_id == scene_key)
+    parts = [statement.order_by(column.reference_id)]
+    if reference_ids is not None:
+        parts = [statement.where(column.reference_id.in_(ids)) for ids in _portions(reference_ids)]
+    return {row.reference_id: row.key for part in parts for row in connection.execute(part)}
 
 
 def find_key(connection: Connection, scene_key: SceneKey, reference_id: str) -> str:
@@ -215,12 +208,6 @@ def has_features(connection: Connection, key: str, extractor: str) -> bool:
         connection.scalar(statement.where(_exists(key), column.extractor.in_(rows.feature_names(extractor))))
         is not None
     )
-
-
-def has_descriptor(connection: Connection, key: str, name: str) -> bool:
-    """Whether a reference has a global descriptor of this name."""
-    column = global_descriptor.c
-    return connection.scalar(select(column.name).where(column.reference_key == key, column.name == name)) is not None
 
 
 def is_detached(scene_id: ColumnElement[str]) -> ColumnElement[bool]:
@@ -326,7 +313,7 @@ def _read(connection: Connection, scene_key: SceneKey, after_generation: int, de
         damaged: list[str] = []
         for row in connection.execute(changed).all():
             one = indexed.where(column.key == row.key)
-            found = unless_damaged(connection, partial(_all, connection, one), lambda: None)
+            found = unless_damaged(connection, partial(all_rows, connection, one), lambda: None)
             if found is None:
                 damaged.append(row.reference_id)
                 continue
@@ -338,5 +325,6 @@ def _read(connection: Connection, scene_key: SceneKey, after_generation: int, de
     return unless_damaged(connection, read_together, read_each)
 
 
-def _all(connection: Connection, statement: Select[Any]) -> Sequence[Row[Any]]:
+def all_rows(connection: Connection, statement: Select[Any]) -> Sequence[Row[Any]]:
+    """The rows of a statement."""
     return connection.execute(statement).all()

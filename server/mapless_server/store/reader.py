@@ -75,17 +75,17 @@ class StoreReader:
     """Reads scenes and references; each method sees one moment of the database.
 
     The observer, if there is one, receives an event for every operation. `write_fault` says why the last change could
-    not be written, one of `UNWRITABLE`; it is empty if it could.
+    not be written, one of `UNWRITABLE`; it is empty if it could. `reference_cache` is the cache of features.
     """
 
     def __init__(
         self, database: Database, described: LruCache[DescribedReference], name_cache_bytes: int = NAME_CACHE_BYTES
     ) -> None:
-        self._database = database
+        self.database = database
         self.observer: StoreObserver | None = None
         self.write_fault = ""
         # By (key, extractor): references never change and keys are never reused, so no entry is ever stale.
-        self._described = described
+        self.reference_cache = described
         # By scene key and ids. Where this process alone writes, an entry is valid until anything is written (`_state`),
         # and the database is not asked at all; where others write too, as long as the generation is the same.
         self._resolved: LruCache[_Resolved] = LruCache(name_cache_bytes)
@@ -93,21 +93,11 @@ class StoreReader:
         self._state = object()
         self._last_deletion = object()
 
-    @property
-    def database(self) -> Database:
-        """The database underneath."""
-        return self._database
-
-    @property
-    def reference_cache(self) -> LruCache[DescribedReference]:
-        """The cache of features in memory."""
-        return self._described
-
     @contextmanager
     def changing(self) -> Iterator[Connection]:
         """A transaction that writes; invalidates the cached `_state`, however it ends."""
         try:
-            with self._database.write() as connection:
+            with self.database.write() as connection:
                 yield connection
             self.write_fault = ""
         except RequestError as error:
@@ -120,13 +110,13 @@ class StoreReader:
     @observed
     def get_scene(self, scene_key: SceneKey) -> SceneRecord:
         """Returns a scene; NotFound if there is no such scene; DataLoss if its attributes are damaged."""
-        with self._database.read() as connection:
+        with self.database.read() as connection:
             return rows.scene_record(queries.find_scene(connection, scene_key))
 
     @observed
     def get_generation(self, scene_key: SceneKey) -> int:
         """Generation of a scene, also if its attributes are damaged; raises NotFound."""
-        with self._database.read() as connection:
+        with self.database.read() as connection:
             return queries.read_generation(connection, scene_key)
 
     @observed
@@ -137,14 +127,14 @@ class StoreReader:
         DataLoss if the attributes are damaged.
         """
         state = self._state
-        cached = None if self._database.is_shared else self._attributes.get(scene_key)
+        cached = None if self.database.is_shared else self._attributes.get(scene_key)
         if cached is not None and cached[0] is state:
             return cached[1]
-        with self._database.read() as connection:
+        with self.database.read() as connection:
             row = queries.find_attributes(connection, scene_key)
             found = queries.find_calibrations(connection, scene_key)
         attributes = replace(rows.scene_attributes(row), self_calibrations=rows.self_calibrations(found))
-        if not self._database.is_shared:
+        if not self.database.is_shared:
             self._attributes.put(scene_key, (state, attributes), ATTRIBUTES_BYTES)
         return attributes
 
@@ -155,13 +145,13 @@ class StoreReader:
         DataLoss if the attributes of one of them are damaged.
         """
         page = queries.select_scenes_of(tenant, after).limit(limit)
-        with self._database.read() as connection:
+        with self.database.read() as connection:
             return [rows.scene_record(row) for row in connection.execute(page)]
 
     @observed
     def has_features(self, key: str, extractor: str) -> bool:
         """Whether a reference has features of this extractor; False if it was deleted."""
-        with self._database.read() as connection:
+        with self.database.read() as connection:
             return queries.has_features(connection, key, extractor)
 
     @observed
@@ -170,7 +160,7 @@ class StoreReader:
 
         NotFound if there is no such scene or reference; DataLoss if its camera and pose are damaged.
         """
-        with self._database.read() as connection:
+        with self.database.read() as connection:
             key = queries.find_key(connection, scene_key, reference_id)
             row = connection.execute(select(tables.reference).where(tables.reference.c.key == key)).one()
         return rows.reference_record(row)
@@ -181,7 +171,7 @@ class StoreReader:
 
         NotFound if there is no such scene or reference; DataLoss if the bytes are damaged.
         """
-        with self._database.read() as connection:
+        with self.database.read() as connection:
             return _read_image(connection, queries.find_key(connection, scene_key, reference_id))
 
     @observed
@@ -190,7 +180,7 @@ class StoreReader:
 
         NotFound if the reference was deleted; DataLoss if the bytes are damaged.
         """
-        with self._database.read() as connection:
+        with self.database.read() as connection:
             return _read_image(connection, key)
 
     @observed
@@ -211,7 +201,7 @@ class StoreReader:
     def _read_page(self, statement: Select[Any], scene_key: SceneKey, limit: int, after: str) -> Sequence[Row[Any]]:
         column = tables.reference.c
         page = statement.where(column.scene_id == scene_key, column.reference_id > after)
-        with self._database.read() as connection:
+        with self.database.read() as connection:
             queries.read_generation(connection, scene_key)
             return connection.execute(page.order_by(column.reference_id).limit(limit)).all()
 
@@ -221,7 +211,7 @@ class StoreReader:
 
         NotFound if there is no such scene.
         """
-        with self._database.read() as connection:
+        with self.database.read() as connection:
             queries.read_generation(connection, scene_key)
             return queries.find_keys(connection, scene_key, reference_ids)
 
@@ -239,26 +229,23 @@ class StoreReader:
         names = None if reference_ids is None else tuple(reference_ids)
         resolved = None if names is None else self._resolved.get((scene_key, names))
         cached: dict[str, DescribedReference | None] = {}  # each is looked up once: hits and misses are counted
-        if resolved is not None and resolved.state is state and not self._database.is_shared:
+        if resolved is not None and resolved.state is state and not self.database.is_shared:
             cached, snapshot = self._cached(resolved, extractor)
             if snapshot is not None:
                 return snapshot
-        with self._database.read() as connection:
+        with self.database.read() as connection:
             generation = queries.read_generation(connection, scene_key)
-            if resolved is not None and resolved.generation == generation and self._database.is_shared:
+            if resolved is not None and resolved.generation == generation and self.database.is_shared:
                 cached, snapshot = self._cached(resolved, extractor)
                 if snapshot is not None:
                     return snapshot
-            if reference_ids is None:
-                key_of = queries.list_keys(connection, scene_key)
-                reference_ids = list(key_of)
-            else:
-                key_of = queries.find_keys(connection, scene_key, reference_ids)
+            key_of = queries.find_keys(connection, scene_key, reference_ids)
+            reference_ids = list(key_of) if reference_ids is None else reference_ids
             for index, reference_id in enumerate(reference_ids):
                 if reference_id not in key_of:
                     raise queries.reference_not_found(scene_key, reference_id, field=f"references[{index}]")
             wanted = [key_of[reference_id] for reference_id in reference_ids]
-            cached |= {key: self._described.get((key, extractor)) for key in wanted if key not in cached}
+            cached |= {key: self.reference_cache.get((key, extractor)) for key in wanted if key not in cached}
             described = {key: it for key, it in cached.items() if it is not None}
             id_of = {key_of[it]: it for it in reference_ids}
             read = _read_features(connection, {key: id_of[key] for key in wanted if key not in described}, extractor)
@@ -269,11 +256,11 @@ class StoreReader:
             self._resolved.put((scene_key, names), _Resolved(state, generation, tuple(wanted)), size_bytes)
         for key, row in read.items():
             described[key] = rows.described_reference(row)
-            self._described.put(
+            self.reference_cache.put(
                 (key, extractor), described[key], described[key].view.features.size_bytes + RECORD_BYTES
             )
         if self._last_deletion is not last_deletion:  # these may have been deleted, and dropped from the caches before
-            self._described.forget(lambda key, _: key[0] in read)
+            self.reference_cache.forget(lambda key, _: key[0] in read)
             self._resolved.forget(lambda key, _: key == (scene_key, names))
         return SceneSnapshot(
             generation,
@@ -287,14 +274,14 @@ class StoreReader:
 
         NotFound if there is no such scene.
         """
-        with self._database.read() as connection:
+        with self.database.read() as connection:
             return read_changes(connection, scene_key, since_generation, descriptor_name)
 
     def _cached(
         self, resolved: _Resolved, extractor: str
     ) -> tuple[dict[str, DescribedReference | None], SceneSnapshot | None]:
         """The cached features of references, by key; also as a snapshot, if all of them are cached."""
-        cached = {key: self._described.get((key, extractor)) for key in resolved.keys}
+        cached = {key: self.reference_cache.get((key, extractor)) for key in resolved.keys}
         found = tuple(it for it in map(cached.get, resolved.keys) if it is not None)
         is_complete = len(found) == len(resolved.keys)
         return cached, SceneSnapshot(resolved.generation, found) if is_complete else None

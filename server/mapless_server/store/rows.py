@@ -1,6 +1,7 @@
 """Conversion between the rows of the tables and `records`; checks everything that is read."""
 
 import hashlib
+import time
 import uuid
 from collections.abc import Sequence
 from datetime import datetime, timedelta, timezone
@@ -40,6 +41,11 @@ def time_us(time: datetime) -> int:
 def time_of(time_us: int) -> datetime:
     """Inverse of `time_us`."""
     return _EPOCH + time_us * _MICROSECOND
+
+
+def now_us() -> int:
+    """The present time, microseconds since 1970."""
+    return round(time.time() * 1e6)
 
 
 def scene_record(row: Row[Any]) -> SceneRecord:
@@ -148,23 +154,15 @@ def features_row(key: str, extractor: str, view: View) -> dict[str, Any]:
     data = codec.encode_view(view)
     small, large = feature_names(extractor)
     name = small if view.features.descriptors.dtype.itemsize == 1 else large
-    return {
-        "reference_key": key,
-        "extractor": name,
-        "data": data,
-        "sha256": codec.sha256_for(features_owner(key, name), data),
-    }
+    sha256 = codec.sha256_for(features_owner(key, name), data)
+    return {"reference_key": key, "extractor": name, "data": data, "sha256": sha256}
 
 
 def descriptor_row(key: str, name: str, vector: NDArray[np.float32]) -> dict[str, Any]:
     """Makes a row of the table `global_descriptor`; raises ValueError unless it is a finite vector."""
     data = codec.encode_descriptor(vector)
-    return {
-        "reference_key": key,
-        "name": name,
-        "data": data,
-        "sha256": codec.sha256_for(descriptor_owner(key, name), data),
-    }
+    sha256 = codec.sha256_for(descriptor_owner(key, name), data)
+    return {"reference_key": key, "name": name, "data": data, "sha256": sha256}
 
 
 def features_owner(key: str, extractor: str) -> str:

@@ -89,12 +89,12 @@ class Store(StoreReader):
         It is valid as long as this store, and need not be closed. Only features are written through it, which does not
         invalidate this store's caches. It may have a cache of features of its own, of `cache_bytes`.
         """
-        return Store(self._database, LruCache(cache_bytes), name_cache_bytes=0)
+        return Store(self.database, LruCache(cache_bytes), name_cache_bytes=0)
 
     def close(self) -> None:
         """Releases the data folder; no call may be in progress or follow."""
         self._pending_deletions.close()
-        self._database.close()
+        self.database.close()
 
     def __enter__(self) -> Store:
         return self
@@ -165,14 +165,14 @@ class Store(StoreReader):
         try:
             with self.changing() as connection:
                 queries.begin_change(connection, scene_key)
-                self._database.lift_limits(connection)
+                self.database.lift_limits(connection)
                 deletion.detach_scene(connection, scene_key)
         except NotFound:
             self._pending_deletions.run()
             raise
         self._last_deletion = object()
         # The keys are never used again; their entries would only take room until they are evicted.
-        gone = self._described.forget(lambda _, it: it.record.scene_key == scene_key)
+        gone = self.reference_cache.forget(lambda _, it: it.record.scene_key == scene_key)
         self._resolved.forget(lambda key, _: key[0] == scene_key)
         self._attributes.forget(lambda key, _: key == scene_key)
         self._pending_deletions.run()
@@ -231,9 +231,13 @@ class Store(StoreReader):
         """
         row = rows.descriptor_row(key, name, vector)
         reference = tables.reference
-        with self._database.read() as connection:
+        with self.database.read() as connection:
             scene_key = SceneKey(queries.find_by_key(connection, key, reference.c.scene_id).scene_id)
-            if queries.has_descriptor(connection, key, name):
+            column = tables.global_descriptor.c
+            if (
+                connection.scalar(select(column.name).where(column.reference_key == key, column.name == name))
+                is not None
+            ):
                 return
         with self.changing() as connection:
             generation = queries.begin_change(connection, scene_key)
@@ -252,7 +256,7 @@ class Store(StoreReader):
         except DamagedPages:
             key = self._delete_reference(scene_key, reference_id, deletion.move_aside)
         self._last_deletion = object()
-        self._described.forget(lambda _, it: it.record.key == key)
+        self.reference_cache.forget(lambda _, it: it.record.key == key)
         return key
 
     def _delete_reference(

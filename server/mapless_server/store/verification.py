@@ -1,7 +1,7 @@
 """Verification: reads every row of a store and lists damaged ones."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -207,13 +207,9 @@ def _stream(
     listed: Select[Any] = select(column.key, column.scene_id, column.reference_id).where(~is_detached(column.scene_id))
     for done, it in enumerate(connection.execute(listed).all(), 1):
         one = statement.where(column.key == it.key)
-        found = unless_damaged(connection, partial(_all, connection, one), lambda: [None])
+        found = unless_damaged(connection, partial(queries.all_rows, connection, one), lambda: [None])
         yield from ((_reference_name(it), row) for row in found)
         on_progress(f"checking {what} one by one", done, total)
-
-
-def _all(connection: Connection, statement: Select[Any]) -> Sequence[Row[Any] | None]:
-    return connection.execute(statement).all()
 
 
 def _rows(

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless import ConnectOptions, MaplessError, wire
-from mapless.answers import LocalizationResult, Rejected, answer_from_message
+from mapless.answer_messages import answer_from_message
+from mapless.answers import LocalizationResult, Rejected
 from mapless.errors import Internal, from_rpc_error
 from mapless.geometry import Array, Camera, RigidTransform, resized_pixel
 from mapless.names import scene_name
