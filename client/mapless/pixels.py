@@ -1,63 +1,93 @@
-"""The size of a JPEG, PNG or WebP image from its header, without decoding."""
+"""The size of a JPEG, PNG or WebP image from its header, without decoding; the server rejects images by it, too."""
 
-# Frame headers of JPEG: all SOF markers; the others in 0xC0 to 0xCF are tables.
-_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_JPEG_ALONE = frozenset({0x01, *range(0xD0, 0xD9)})  # markers that no segment follows
+_MAX_JPEG_SEGMENTS = 2000  # 64 KiB each; bounds the walk through a file of nothing but empty ones
+# Start-of-frame markers: C0 to CF without DHT (C4), JPG (C8) and DAC (CC).
+JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_JPEG_WITHOUT_LENGTH = frozenset(range(0xD0, 0xD8)) | {0x01}
 
 
-def size_of_image(data: bytes) -> tuple[int, int]:
+class BadHeader(ValueError):
+    """An image's size cannot be read from its header; the reason is that of the server's error."""
+
+    def __init__(self, message: str, reason: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+def size_of_image(data: bytes, what: str = "photograph") -> tuple[int, int]:
     """Width and height of the raster as it is stored, pixels; EXIF orientation is not applied.
 
-    ValueError for neither a JPEG nor a PNG nor a WebP file, or one without its header.
+    BadHeader, which says `what` it is, for neither a JPEG nor a PNG nor a WebP file, or one without a whole header.
     """
     try:
-        if data.startswith(b"\xff\xd8"):
+        if data.startswith(b"\xff\xd8\xff"):
             return _size_of_jpeg(data)
-        if data.startswith(b"\x89PNG\r\n\x1a\n") and data[12:16] == b"IHDR":
-            return _big(data, 16, 4), _big(data, 20, 4)
-        if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        if data.startswith(b"\x89PNG\r\n\x1a\n"):
+            return _size_of_png(data)
+        if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
             return _size_of_webp(data)
     except IndexError:
-        raise ValueError("the photograph ends within its header") from None
-    raise ValueError("the photograph is not a JPEG, PNG or WebP file")
+        raise BadHeader(f"the {what} ends within its header", "IMAGE_TRUNCATED") from None
+    raise BadHeader(f"the {what} is not a JPEG, PNG or WebP file", "IMAGE_UNKNOWN_FORMAT")
 
 
 def _size_of_jpeg(data: bytes) -> tuple[int, int]:
+    """Reads the segments up to the frame header, which precedes the first scan."""
     position = 2
-    while True:
-        while data[position] != 0xFF or data[position + 1] in (0x00, 0xFF):
+    for _ in range(_MAX_JPEG_SEGMENTS):
+        first, marker = data[position], data[position + 1]
+        if first != 0xFF:
+            raise BadHeader("the JPEG is damaged: no marker where one must stand", "IMAGE_UNDECODABLE")
+        if marker == 0xFF:  # padding
             position += 1
-        marker = data[position + 1]
-        position += 2
-        if marker in _JPEG_FRAMES:
-            return _big(data, position + 5, 2), _big(data, position + 3, 2)
-        if marker not in _JPEG_ALONE:
-            position += _big(data, position, 2)
+        elif marker in _JPEG_WITHOUT_LENGTH:
+            position += 2
+        elif marker in JPEG_FRAMES:
+            return _big(data, position + 7, 2), _big(data, position + 5, 2)
+        elif marker in (0xDA, 0xD9):
+            raise BadHeader("the JPEG has no frame header", "IMAGE_UNDECODABLE")
+        else:
+            position += 2 + (data[position + 2] << 8 | data[position + 3])
+    raise BadHeader("the JPEG has too many segments before its frame header", "IMAGE_TOO_COMPLEX")
+
+
+def _size_of_png(data: bytes) -> tuple[int, int]:
+    """Reads the chunk IHDR, which is always the first."""
+    width, height = _big(data, 16, 4), _big(data, 20, 4)
+    if data[12:16] != b"IHDR":
+        raise BadHeader("the PNG does not begin with its header", "IMAGE_UNDECODABLE")
+    return width, height
 
 
 def _size_of_webp(data: bytes) -> tuple[int, int]:
-    """The three kinds of a first chunk: extended, lossless, lossy (RFC 9649)."""
+    """Reads the first chunk: the frame itself (lossy or lossless) or the extended header."""
     kind = data[12:16]
-    if kind == b"VP8X":
-        return 1 + _little(data, 24, 3), 1 + _little(data, 27, 3)
+    if kind == b"VP8 ":
+        width, height = _little(data, 26, 2) & 0x3FFF, _little(data, 28, 2) & 0x3FFF
+        if data[23:26] != b"\x9d\x01\x2a":
+            raise BadHeader("the WebP does not begin with a key frame", "IMAGE_UNDECODABLE")
+        return width, height
     if kind == b"VP8L":
         bits = _little(data, 21, 4)
-        return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
-    if kind == b"VP8 ":
-        return _little(data, 26, 2) & 0x3FFF, _little(data, 28, 2) & 0x3FFF
-    raise ValueError("the photograph is a WebP file without an image")
-
-
-def _big(data: bytes, start: int, count: int) -> int:
-    return int.from_bytes(_exactly(data, start, count), "big")
-
-
-def _little(data: bytes, start: int, count: int) -> int:
-    return int.from_bytes(_exactly(data, start, count), "little")
-
-
-def _exactly(data: bytes, start: int, count: int) -> bytes:
-    part = data[start : start + count]
-    if len(part) != count:
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    if kind == b"VP8X":
+        if data[20] & 0x02:
+            raise BadHeader("the WebP is an animation", "IMAGE_UNKNOWN_FORMAT")
+        return _little(data, 24, 3) + 1, _little(data, 27, 3) + 1
+    if len(data) < 16:
         raise IndexError
-    return part
+    raise BadHeader("the WebP holds no image", "IMAGE_UNDECODABLE")
+
+
+def _big(data: bytes, position: int, length: int) -> int:
+    return int.from_bytes(_take(data, position, length), "big")
+
+
+def _little(data: bytes, position: int, length: int) -> int:
+    return int.from_bytes(_take(data, position, length), "little")
+
+
+def _take(data: bytes, position: int, length: int) -> bytes:
+    if position + length > len(data):
+        raise IndexError
+    return data[position : position + length]

@@ -214,5 +214,5 @@ def test_truncated_and_other_files_are_refused_by_name(ending: str) -> None:
         with contextlib.suppress(ValueError):
             assert size_of_image(data[:length]) == (50, 40)
     for junk in (b"", b"GIF89a", b"\xff\xd8" + bytes(100), b"\xff\xd8\xff\xe0\0\0", b"RIFF\0\0\0\0WEBPXXXX"):
-        with pytest.raises(ValueError, match="photograph"):
+        with pytest.raises(ValueError, match=r"photograph|the JPEG is damaged|the WebP holds no image"):
             size_of_image(junk)

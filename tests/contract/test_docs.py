@@ -19,7 +19,7 @@ from support.images import encode, textured
 from support.servers import pose, serving
 from test_imports import LADDER
 
-from mapless import Camera, Client, NewReference, RigidTransform
+from mapless import Camera, Client, NewReference, RigidTransform, pixels
 from mapless import errors as client_errors
 from mapless.cli.arguments import make_parser
 from mapless.exchange import MALFORMED_ANSWER
@@ -222,8 +222,8 @@ def test_the_table_of_methods_is_complete() -> None:
 
 def test_the_table_of_errors_has_every_reason() -> None:
     """And none that is not; a class's own reason is its status's name, which stands in the table in any case."""
-    sources = "".join(path.read_text() for path in SERVER.rglob("*.py"))
-    there = set(re.findall(r'(?:reason=|_Malformed\(".*", )"([A-Z_]+)"', sources))
+    sources = "".join(path.read_text() for path in (*SERVER.rglob("*.py"), Path(pixels.__file__)))
+    there = set(re.findall(r'(?:reason=|BadHeader\(f?".*", )"([A-Z_]+)"', sources))
     there |= {refusal.name for refusal in Refusal} | {MALFORMED_ANSWER}
     assert {"QUEUE_FULL", "IMAGE_UNKNOWN_FORMAT", "TOKEN_EXPIRED", "STORE_FULL"} <= there
     named = {name for row in rows(DOCS / "reference/errors.md", "status") for name in row}

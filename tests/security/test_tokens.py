@@ -246,7 +246,7 @@ class TestReloading:
                 return False
 
         async def watch() -> None:
-            task = asyncio.create_task(keep_fresh([Source(), Source()], interval_s=0.001))
+            task = asyncio.create_task(keep_fresh([Source().refresh, Source().refresh], interval_s=0.001))
             while len(threads) < 4:
                 await asyncio.sleep(0.001)
             task.cancel()

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapless.pixels import JPEG_FRAMES, BadHeader, size_of_image
 from mapless_server.errors import InvalidArgument
 
 from .png_chunks import BadChunks, essential_png
@@ -27,7 +28,6 @@ _DECODE_FLAGS = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
 _DEEP_FLAGS = _DECODE_FLAGS | cv2.IMREAD_ANYDEPTH
 _PNG_DEPTH = 24  # position of the bits of a channel
 _PNG = b"\x89PNG\r\n\x1a\n"
-_MAX_JPEG_SEGMENTS = 2000  # 64 KiB each; bounds the walk through a file of nothing but empty ones
 _JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd9-\xfe]", re.DOTALL)
 _MAX_JPEG_SCANS = 100  # a progressive file has about ten; thousands make a small file decode for minutes
 
@@ -36,10 +36,6 @@ _JPEG_RESTART = re.compile(rb"\xff[\xd0-\xd7]")
 # The data that could follow a scan that is cut off; several, since few bits may be missing.
 _JPEG_DATA = (b"\x5a\x96\x35\xc7" * 64, b"\xaa\x35\xe1" * 64, b"\xff\x00\xc7" * 64)
 _MAX_UNENDED_PIXELS = 16_000_000  # are decoded four times
-
-# Start-of-frame markers: C0 to CF without DHT (C4), JPG (C8) and DAC (CC).
-_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_JPEG_WITHOUT_LENGTH = frozenset(range(0xD0, 0xD8)) | {0x01}
 
 
 @dataclass(frozen=True)
@@ -67,10 +63,8 @@ def image_size(data: bytes, limits: ImageLimits, field: str = "image") -> tuple[
             field=field,
         )
     try:
-        width, height = _read_header(data)
-    except IndexError:
-        raise InvalidArgument("the image ends within its header", reason="IMAGE_TRUNCATED", field=field) from None
-    except _Malformed as error:
+        width, height = size_of_image(data, "image")
+    except BadHeader as error:
         raise InvalidArgument(str(error), reason=error.reason, field=field) from None
     if min(width, height) < limits.min_side_px:
         raise InvalidArgument(
@@ -155,7 +149,7 @@ def _unended_scan(data: bytes) -> int:
         kind, start = marker[0][-1], marker.end()
         if kind == 0xD9 or scan_start or start + 8 > len(data):
             return 0
-        if kind in _JPEG_FRAMES:
+        if kind in JPEG_FRAMES:
             if kind > 0xC1:  # progressive: later scans may be missing, too
                 return 0
             components = data[start + 7]
@@ -178,82 +172,3 @@ def _has_many_scans(data: bytes) -> bool:
         scans += marker[0][-1] == 0xDA
         position = marker.end() + int.from_bytes(data[marker.end() : marker.end() + 2], "big")
     return True
-
-
-class _Malformed(Exception):
-    def __init__(self, message: str, reason: str) -> None:
-        super().__init__(message)
-        self.reason = reason
-
-
-def _read_header(data: bytes) -> tuple[int, int]:
-    """Width and height; raises IndexError if the bytes end too early."""
-    if data.startswith(b"\xff\xd8\xff"):
-        return _read_jpeg_header(data)
-    if data.startswith(_PNG):
-        return _read_png_header(data)
-    if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
-        return _read_webp_header(data)
-    raise _Malformed("the image is not a JPEG, PNG or WebP file", "IMAGE_UNKNOWN_FORMAT")
-
-
-def _read_jpeg_header(data: bytes) -> tuple[int, int]:
-    """Reads the segments up to the frame header, which precedes the first scan."""
-    position = 2
-    for _ in range(_MAX_JPEG_SEGMENTS):
-        first, marker = data[position], data[position + 1]
-        if first != 0xFF:
-            raise _Malformed("the JPEG is damaged: no marker where one must stand", "IMAGE_UNDECODABLE")
-        if marker == 0xFF:  # padding
-            position += 1
-        elif marker in _JPEG_WITHOUT_LENGTH:
-            position += 2
-        elif marker in _JPEG_FRAMES:
-            return _big_endian(data, position + 7, 2), _big_endian(data, position + 5, 2)
-        elif marker in (0xDA, 0xD9):
-            raise _Malformed("the JPEG has no frame header", "IMAGE_UNDECODABLE")
-        else:
-            position += 2 + (data[position + 2] << 8 | data[position + 3])
-    raise _Malformed("the JPEG has too many segments before its frame header", "IMAGE_TOO_COMPLEX")
-
-
-def _read_png_header(data: bytes) -> tuple[int, int]:
-    """Reads the chunk IHDR, which is always the first."""
-    width, height = _big_endian(data, 16, 4), _big_endian(data, 20, 4)
-    if data[12:16] != b"IHDR":
-        raise _Malformed("the PNG does not begin with its header", "IMAGE_UNDECODABLE")
-    return width, height
-
-
-def _read_webp_header(data: bytes) -> tuple[int, int]:
-    """Reads the first chunk: the frame itself (lossy or lossless) or the extended header."""
-    kind = data[12:16]
-    if kind == b"VP8 ":
-        width, height = _little_endian(data, 26, 2) & 0x3FFF, _little_endian(data, 28, 2) & 0x3FFF
-        if data[23:26] != b"\x9d\x01\x2a":
-            raise _Malformed("the WebP does not begin with a key frame", "IMAGE_UNDECODABLE")
-        return width, height
-    if kind == b"VP8L":
-        bits = _little_endian(data, 21, 4)
-        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
-    if kind == b"VP8X":
-        if data[20] & 0x02:
-            raise _Malformed("the WebP is an animation", "IMAGE_UNKNOWN_FORMAT")
-        return _little_endian(data, 24, 3) + 1, _little_endian(data, 27, 3) + 1
-    if len(data) < 16:
-        raise IndexError
-    raise _Malformed("the WebP holds no image", "IMAGE_UNDECODABLE")
-
-
-def _big_endian(data: bytes, position: int, length: int) -> int:
-    return int.from_bytes(_take(data, position, length), "big")
-
-
-def _little_endian(data: bytes, position: int, length: int) -> int:
-    return int.from_bytes(_take(data, position, length), "little")
-
-
-def _take(data: bytes, position: int, length: int) -> bytes:
-    if position + length > len(data):
-        raise IndexError
-    return data[position : position + length]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from mapless_server.errors import DataLoss, NotFound, RequestError
 from mapless_server.method.features import FeatureExtractor
@@ -15,7 +15,7 @@ from mapless_server.security import SceneKey
 from mapless_server.store import Store
 
 from .library import Loaded, ReferenceLibrary, load_usable
-from .retrieval.descriptor import GlobalDescriptor, Vector
+from .retrieval.descriptor import GlobalDescriptor
 from .retrieval.index import Entries, SceneIndex
 
 log = logging.getLogger(__name__)
@@ -140,7 +140,8 @@ class SceneIndexes:
                 cached.undescribable.add(key)
                 self.report_damaged(scene_key, reference_id, error)
                 return
-        cached.describe({key: vector})
+        with cached.updating:
+            cached.index.describe({key: vector})
 
     def _refresh(self, scene_key: SceneKey, cached: _CachedIndex) -> Entries:
         try:
@@ -185,7 +186,7 @@ class SceneIndexes:
 
 
 class _CachedIndex:
-    """An index with its size when last counted, and the lock of the thread that updates it.
+    """An index with its size when last counted, and the lock `updating` of the thread that updates it.
 
     `damaged_ids` are of references that are not in the index, of which some may have been deleted; `undescribable` are
     keys of references found damaged when they were to be described; of `reported_ids` the damage has been logged.
@@ -197,14 +198,14 @@ class _CachedIndex:
         self.damaged_ids: set[str] = set()
         self.undescribable: set[str] = set()
         self.reported_ids: set[str] = set()
-        self._updating = threading.Lock()
+        self.updating = threading.Lock()
 
     def describable(self, entries: Entries) -> list[tuple[str, str]]:
         """Id and key of the entries that have no descriptor but may get one."""
         return [(reference_id, key) for reference_id, key in entries.undescribed() if key not in self.undescribable]
 
     def refresh(self, store: Store, scene_key: SceneKey, descriptor: str) -> Entries:
-        with self._updating:
+        with self.updating:
             since = self.index.generation
             changes = store.list_changes(scene_key, since if since >= 0 else None, descriptor)
             for reference_id in changes.damaged:
@@ -221,7 +222,3 @@ class _CachedIndex:
             if changes.is_whole or changes.generation != since:
                 self.index.apply(changes)
             return self.index.entries()
-
-    def describe(self, vectors: Mapping[str, Vector]) -> None:
-        with self._updating:
-            self.index.describe(vectors)

@@ -1,6 +1,7 @@
 """The protection of a server, made from its settings."""
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from mapless_server.settings import Settings
@@ -8,7 +9,7 @@ from mapless_server.settings import Settings
 from .access import Authenticator
 from .binding import assess_binding
 from .rate import RateLimiter
-from .reloading import Refreshable, Reloading, SecurityError
+from .reloading import Reloading, SecurityError
 from .tls import Tls, TlsFiles
 from .tokens import Tokens, read_tokens
 
@@ -17,7 +18,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Protection:
-    """TLS, tokens and quota of a server; `refreshable` follows changes of their files."""
+    """TLS, tokens and quota of a server; `refreshes` follow changes of their files."""
 
     tls: Tls | None
     tokens: Reloading[Tokens] | None
@@ -45,9 +46,9 @@ class Protection:
         return Authenticator(None if tokens is None else lambda: tokens.value)
 
     @property
-    def refreshable(self) -> list[Refreshable]:
-        """The parts that are read from files."""
-        return [it for it in (self.tls, self.tokens) if it is not None]
+    def refreshes(self) -> list[Callable[[], bool]]:
+        """Functions that read a changed file again, see `Reloading.refresh`."""
+        return [it.refresh for it in (self.tls, self.tokens) if it is not None]
 
 
 def _make_quota(settings: Settings, tokens: Reloading[Tokens] | None) -> RateLimiter | None:

@@ -5,7 +5,7 @@ import logging
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 log = logging.getLogger(__name__)
 
@@ -18,13 +18,6 @@ Stamp = tuple[tuple[int, int, int, int], ...]
 
 class SecurityError(Exception):
     """A file cannot be used, or a token cannot be created; the message is one sentence for the operator."""
-
-
-class Refreshable(Protocol):
-    """A value that is read from files."""
-
-    def refresh(self) -> bool:
-        """Reads the files if they have changed, and returns whether they have; it blocks."""
 
 
 class Reloading(Generic[T]):
@@ -74,12 +67,12 @@ class Reloading(Generic[T]):
         return tuple((it.st_ino, it.st_size, it.st_mtime_ns, it.st_ctime_ns) for it in found)
 
 
-async def keep_fresh(sources: Sequence[Refreshable], interval_s: float = CHECK_INTERVAL_S) -> None:
-    """Refreshes the values in a thread, until it is cancelled, so that the event loop never waits for the disk."""
+async def keep_fresh(refreshes: Sequence[Callable[[], bool]], interval_s: float = CHECK_INTERVAL_S) -> None:
+    """Calls each `refresh` in a thread, until it is cancelled, so that the event loop never waits for the disk."""
     while True:
         await asyncio.sleep(interval_s)
-        for source in sources:
-            await asyncio.to_thread(source.refresh)
+        for refresh in refreshes:
+            await asyncio.to_thread(refresh)
 
 
 def read_file(path: Path) -> bytes:

@@ -125,9 +125,14 @@ async def _start(
     _observe_engine(engine, metrics)
     engine.queue.on_fatal = lambda fatal: _on_fatal(fatal, failed, metrics)
     _run_task(stack, watch_event_loop(metrics, lambda: engine.queue.is_alive_within(_HEARTBEAT_LIMIT_S)))
-    _run_task(stack, keep_fresh(protection.refreshable))
+    _run_task(stack, keep_fresh(protection.refreshes))
     _run_task(stack, watch_store(store, services.set_changeable))
-    _run_task(stack, _stop_serving(services, failed))
+
+    async def stop_serving() -> None:
+        await asyncio.wait({failed})
+        await services.set_serving(False)
+
+    _run_task(stack, stop_serving())
     await _warm_up(settings, engine, metrics)
     await services.open(engine)
     if settings.warm_up:
@@ -138,12 +143,6 @@ async def _start(
     stack.push_async_callback(listener.stop)
     stack.push_async_callback(services.drain, settings.drain_delay_s, settings.drain_grace_s)
     return Running(listener.address, metrics_address, engine, failed)
-
-
-async def _stop_serving(services: Services, failed: asyncio.Future[Fatal]) -> None:
-    """Reports NOT_SERVING after the server has failed."""
-    await asyncio.wait({failed})
-    await services.set_serving(False)
 
 
 def _make_tracer(settings: Settings) -> Tracer:

@@ -6,13 +6,15 @@ A damaged page fails every statement that reads it, so one damaged photograph wo
 together with it. Where a statement about many rows fails like this, the rows are read one by one (`unless_damaged`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 
 from sqlalchemy import Connection
 from sqlalchemy.exc import DBAPIError
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
-from mapless_server.errors import DataLoss, Overloaded, Unavailable
+from mapless_server.errors import DataLoss, Overloaded, RequestError, Unavailable
 
 T = TypeVar("T")
 
@@ -57,3 +59,17 @@ def disk_full() -> Overloaded:
 def unavailable(message: str) -> Unavailable:
     """The error of a database that may be available again soon."""
     return Unavailable(message, reason="STORE_UNAVAILABLE", retry_after_s=RETRY_AFTER_S)
+
+
+@contextmanager
+def translating(translated: Callable[[DBAPIError], RequestError | None]) -> Iterator[None]:
+    """Converts a database's faults in the block to errors that a caller can act on, where there is one."""
+    try:
+        yield
+    except PoolTimeoutError as error:
+        raise unavailable("the store is busy") from error
+    except DBAPIError as error:
+        found = translated(error)
+        if found is None:
+            raise
+        raise found from error

@@ -15,12 +15,11 @@ from typing import Any
 
 from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError
-from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
 from mapless_server.errors import RequestError
 
 from .database import StoreError
-from .faults import DamagedPages, disk_full, is_damage, unavailable
+from .faults import DamagedPages, disk_full, is_damage, translating, unavailable
 from .migrations import migrate, read_version
 from .tables import SCHEMA_VERSION
 
@@ -92,7 +91,8 @@ class PostgresqlDatabase:
             database._prepare(migrates)
         except (DBAPIError, RequestError, ValueError) as error:
             database.close()
-            cause = error.orig if isinstance(error, DBAPIError) else error.__cause__ or error
+            fault = error if isinstance(error, DBAPIError) else error.__cause__
+            cause = fault.orig if isinstance(fault, DBAPIError) else fault or error
             raise StoreError(f"database {database.name} cannot be used: {_first_line(cause)}") from None
         except BaseException:
             database.close()
@@ -102,13 +102,13 @@ class PostgresqlDatabase:
     @contextmanager
     def read(self) -> Iterator[Connection]:
         """Implements Database."""
-        with _faults_translated(), self._engine.begin() as connection:
+        with translating(_translated), self._engine.begin() as connection:
             yield connection
 
     @contextmanager
     def write(self) -> Iterator[Connection]:
         """Implements Database."""
-        with _faults_translated(), self._writing_engine.begin() as connection:
+        with translating(_translated), self._writing_engine.begin() as connection:
             yield connection
 
     def lift_limits(self, connection: Connection) -> None:
@@ -199,20 +199,6 @@ def _create_engine(url: URL, cursors_are_binary: bool = True) -> Engine:
 
 def _first_line(error: object) -> str:
     return str(error).partition("\n")[0].strip()
-
-
-@contextmanager
-def _faults_translated() -> Iterator[None]:
-    """Converts faults of PostgreSQL to RequestError where a caller can act on them."""
-    try:
-        yield
-    except PoolTimeoutError as error:
-        raise unavailable("the store is busy") from error
-    except DBAPIError as error:
-        translated = _translated(error)
-        if translated is None:
-            raise
-        raise translated from error.orig
 
 
 def _translated(error: DBAPIError) -> RequestError | None:

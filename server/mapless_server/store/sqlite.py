@@ -24,7 +24,7 @@ from sqlalchemy.exc import DBAPIError
 from mapless_server.errors import FailedPrecondition, RequestError, Unavailable
 
 from .database import StoreError
-from .faults import RETRY_AFTER_S, DamagedPages, disk_full, is_damage, unavailable
+from .faults import RETRY_AFTER_S, DamagedPages, disk_full, is_damage, translating, unavailable
 from .folder_lock import FolderLock
 from .migrations import migrate, read_version
 from .tables import SCHEMA_VERSION
@@ -180,7 +180,7 @@ class SqliteDatabase:
     def read(self) -> Iterator[Connection]:
         """Implements Database."""
         # Rolled back, as closing does: after a damaged page SQLite refuses to commit even an empty transaction.
-        with _faults_translated(), self._engine.connect() as connection:
+        with translating(_translated), self._engine.connect() as connection:
             connection.begin()
             yield connection
 
@@ -189,7 +189,7 @@ class SqliteDatabase:
         """Implements Database."""
         if self.only_reads:
             raise FailedPrecondition("the store can only be read", reason="STORE_READ_ONLY")
-        with _faults_translated(), self._write_lock, self._writing_engine.begin() as connection:
+        with translating(_translated), self._write_lock, self._writing_engine.begin() as connection:
             yield connection
 
     def lift_limits(self, connection: Connection) -> None:
@@ -198,7 +198,7 @@ class SqliteDatabase:
     def free_space(self) -> None:
         """Implements Database."""
         suppressed = suppress(self._engine.dialect.loaded_dbapi.Error)  # the journal then stays as it is
-        with _faults_translated(), self._write_lock, self._engine.connect() as connection, suppressed:
+        with translating(_translated), self._write_lock, self._engine.connect() as connection, suppressed:
             # Writers wait while this waits for readers.
             _execute(connection, f"PRAGMA busy_timeout={FREE_SPACE_TIMEOUT_MS}")
             try:
@@ -304,18 +304,6 @@ def choose_library() -> ModuleType:
     with suppress(ImportError):
         libraries.insert(0, importlib.import_module("pysqlite3.dbapi2"))
     return next((it for it in libraries if not has_wal_reset_bug(it.sqlite_version_info)), libraries[0])
-
-
-@contextmanager
-def _faults_translated() -> Iterator[None]:
-    """Converts faults of SQLite to RequestError where a caller can act on them."""
-    try:
-        yield
-    except DBAPIError as error:
-        translated = _translated(error)
-        if translated is None:
-            raise
-        raise translated from error
 
 
 def _translated(error: DBAPIError) -> RequestError | None:

@@ -190,7 +190,13 @@ def _part_to_dict(part: CapturedPart) -> dict[str, Any]:
             "descriptor": choice.descriptor,
             "generation": choice.generation,
             "references": [
-                {"reference_id": it.reference_id, "key": it.key, "similarity": it.similarity, **_pose_to_dict(it)}
+                {
+                    "reference_id": it.reference_id,
+                    "key": it.key,
+                    "similarity": it.similarity,
+                    "rotation": it.world_from_camera.rotation.tolist(),
+                    "translation": it.world_from_camera.translation.tolist(),
+                }
                 for it in choice.references
             ],
         },
@@ -230,11 +236,6 @@ def _text(value: object) -> str:
     if not isinstance(value, str):
         raise TypeError(f"{type(value).__name__} in place of text")
     return value
-
-
-def _pose_to_dict(ranked: RankedReference) -> dict[str, Any]:
-    pose = ranked.world_from_camera
-    return {"rotation": pose.rotation.tolist(), "translation": pose.translation.tolist()}
 
 
 def _pose_of(content: Mapping[str, Any]) -> RigidTransform:

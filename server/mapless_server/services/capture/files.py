@@ -97,8 +97,12 @@ def unfinished_in(folder: Path) -> Iterator[Path]:
 
 def foreign_in(folder: Path) -> Iterator[Path]:
     """Yields files that are not part of a capture folder; the server never deletes them."""
-    kinds = (_is_call, _is_blob, _is_unfinished, _is_about_the_folder)
-    return (it for it in _all(folder) if not (_is_regular(it) and any(kind(*_parts(folder, it)) for kind in kinds)))
+    own = {(LOCK_FILE,), (MARKER_FILE,), (MARKER_FILE + UNFINISHED_SUFFIX,)}
+    for path in _all(folder):
+        parts = _parts(folder, path)
+        is_ours = parts in own or any(kind(*parts) for kind in (_is_call, _is_blob, _is_unfinished))
+        if not (is_ours and _is_regular(path)):
+            yield path
 
 
 def call_path(folder: Path, tenant: str, scene_id: str, name: str) -> Path:
@@ -130,17 +134,16 @@ def write_whole(path: Path, data: bytes) -> None:
 
 def do_each(actions: Iterable[Callable[[], object]]) -> None:
     """Executes all of the actions, then raises the first OSError, if any failed."""
-    faults = [fault for it in actions if (fault := _fault_of(it)) is not None]
-    if faults:
+
+    def fault_of(action: Callable[[], object]) -> OSError | None:
+        try:
+            action()
+        except OSError as error:
+            return error
+        return None
+
+    if faults := [fault for it in actions if (fault := fault_of(it)) is not None]:
         raise faults[0]
-
-
-def _fault_of(action: Callable[[], object]) -> OSError | None:
-    try:
-        action()
-    except OSError as error:
-        return error
-    return None
 
 
 def _files(folder: Path) -> Iterator[Path]:
@@ -183,10 +186,6 @@ def _is_blob(*parts: str) -> bool:
 def _is_unfinished(*parts: str) -> bool:
     whole = (*parts[:-1], parts[-1].removesuffix(UNFINISHED_SUFFIX))
     return whole != parts and (_is_call(*whole) or _is_blob(*whole))
-
-
-def _is_about_the_folder(*parts: str) -> bool:
-    return parts in ((LOCK_FILE,), (MARKER_FILE,), (MARKER_FILE + UNFINISHED_SUFFIX,))
 
 
 def _is_marked(folder: Path) -> bool:
