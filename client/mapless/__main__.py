@@ -8,7 +8,7 @@ from pathlib import Path
 
 from .cli.arguments import connect_options, make_parser
 from .cli.folder import EXIT_FAILED, EXIT_USAGE
-from .cli.suggesting import suggesting
+from .cli.output import suggesting
 from .client import Client
 from .errors import MaplessError
 

@@ -14,10 +14,9 @@ import grpc
 
 from .calls import health, localization
 from .calls import references as reference_calls
-from .connecting import explained
 from .errors import from_rpc_error
 from .exchange import Attempt, Exchange, Methods, Pages, Pause, Reader, attempts
-from .options import ConnectOptions
+from .options import ConnectOptions, explained
 from .requests import NewReference
 from .results import Reference
 from .v1 import reference_service_pb2 as pb

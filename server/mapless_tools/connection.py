@@ -91,7 +91,7 @@ def connected(connection: Connection, settings: Settings) -> Iterator[Client]:
     ValueError if the connection's options do not fit together, or the settings' server would reject the client.
     """
     from mapless import Client
-    from mapless.cli.suggesting import suggesting
+    from mapless.cli.output import suggesting
 
     with reachable(connection, settings) as (address, options), Client(address, options) as client, suggesting(client):
         yield client

@@ -11,8 +11,8 @@ import pytest
 from support.certificates import authority, signed
 
 from mapless import Client, ConnectOptions, MaplessError
-from mapless.connecting import explained
 from mapless.errors import REFUSED, _message
+from mapless.options import explained
 
 OURS, ANOTHER = authority(), authority("another")
 CERTIFICATE = signed(OURS, "server")

@@ -27,8 +27,8 @@ from mapless_server.networks.weights import (
     WeightsMissing,
     catalogue,
     find_weights,
+    install,
     named,
-    sources,
 )
 from mapless_server.networks.weights.catalogue import HubFile, Licence, LookAlike, TorchFile, Weights, WheelMember
 from mapless_server.networks.weights.folder import Status, look_up, temporary_folder
@@ -111,7 +111,7 @@ def test_a_link_without_a_file_counts_as_missing(tmp_path: Path) -> None:
 def test_a_folder_in_place_of_a_file_is_reported_first(
     monkeypatch: pytest.MonkeyPatch, weights: Weights, file: Path, folder: Path
 ) -> None:
-    monkeypatch.setattr(sources, "download_from_hub", None)
+    monkeypatch.setattr(install, "download_from_hub", None)
     path = folder / weights.file_name
     path.mkdir(parents=True)
     assert look_up(weights, folder).status is Status.NO_FILE
@@ -294,7 +294,7 @@ def fetched(weights: Weights, folder: Path) -> Path:
 
 
 def test_a_fetched_file_is_the_official_one(monkeypatch: pytest.MonkeyPatch, weights: Weights, folder: Path) -> None:
-    monkeypatch.setattr(sources, "download_from_hub", hub_giving(CONTENT))
+    monkeypatch.setattr(install, "download_from_hub", hub_giving(CONTENT))
     assert fetched(weights, folder).read_bytes() == CONTENT
     assert names_in(folder) == ["net.safetensors", "net.safetensors.sha256"]
 
@@ -306,7 +306,7 @@ def test_a_fetched_file_is_the_official_one(monkeypatch: pytest.MonkeyPatch, wei
 def test_another_file_from_the_hub_is_refused(
     monkeypatch: pytest.MonkeyPatch, weights: Weights, folder: Path, content: bytes, words: str
 ) -> None:
-    monkeypatch.setattr(sources, "download_from_hub", hub_giving(content))
+    monkeypatch.setattr(install, "download_from_hub", hub_giving(content))
     with pytest.raises(CheckpointError, match=words):
         fetched(weights, folder)
     assert names_in(folder) == []
@@ -506,5 +506,5 @@ def test_without_torch_the_reason_for_no_comparison_is_given(
 def test_missing_converters_are_reported_before_a_download(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(FetchError, match=r"cannot be converted: .* torch is not installed: pip install"):
-        sources.require_converter(named("aliked"))
-    sources.require_converter(named("pi3"))
+        install.require_converter(named("aliked"))
+    install.require_converter(named("pi3"))

@@ -32,7 +32,7 @@ from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.scenes.stored_pairs import Matching, PairFinder
 from mapless_server.security import SceneKey
-from mapless_server.store import NewReference, Store, matching_use, pairs, rows
+from mapless_server.store import NewReference, Store, pairs, rows
 from mapless_server.store.pairs import PairStore
 
 SCENE = SceneKey("s")
@@ -333,7 +333,7 @@ class TestUnused:
 
     def pass_days(self, monkeypatch: pytest.MonkeyPatch, share: float) -> None:
         now_us = rows.now_us
-        monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(1e6 * share * matching_use.KEPT_S))
+        monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(1e6 * share * pairs.KEPT_S))
 
     def test_servers_with_other_settings_keep_one_anothers_pairs(
         self, store: Store, monkeypatch: pytest.MonkeyPatch

@@ -20,8 +20,7 @@ from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.trust.judge import LEVELS, trust_in_scene
 from mapless_server.method.uncertainty.radii import USUAL_GAP, Accuracy, growth
 from mapless_server.method.views import PosedView
-from mapless_server.scenes.calibration.calibrations import SceneCalibrations
-from mapless_server.scenes.calibration.calibrator import Calibrator, CalibratorOptions
+from mapless_server.scenes.calibration.calibrator import Calibrator, CalibratorOptions, SceneCalibrations
 from mapless_server.scenes.calibration.fit import FitOptions, LeftOut, fit
 from mapless_server.scenes.calibration.lens import SharedErrors, lens_contradiction, without_errors
 from mapless_server.scenes.indexes import SceneIndexes

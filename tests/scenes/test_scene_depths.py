@@ -13,8 +13,7 @@ from mapless.geometry import Camera
 from mapless_server.errors import DataLoss, NotFound, Unavailable
 from mapless_server.method.views import KeptDepth, PosedView
 from mapless_server.scenes.depth.finder import DepthFinder
-from mapless_server.scenes.depth.maker import DepthMakerOptions
-from mapless_server.scenes.depth.scene_depths import SceneDepths
+from mapless_server.scenes.depth.scene_depths import DepthMakerOptions, SceneDepths
 from mapless_server.scenes.library import Closed, ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import SceneKey

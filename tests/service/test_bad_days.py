@@ -46,7 +46,7 @@ from mapless.geometry import Camera
 from mapless_server.method.answer import Answer
 from mapless_server.method.views import PosedView, View
 from mapless_server.serve import running
-from mapless_server.serve.store_health import watch_store
+from mapless_server.serve.running import watch_store
 from mapless_server.services.handlers import SERVICE_NAMES
 from mapless_server.store import StoreError
 from mapless_server.store.folder_lock import LOCK_FILE

@@ -55,7 +55,7 @@ from mapless.geometry import Camera
 from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.rpc import receiving
-from mapless_server.serve import listening as grpc_server
+from mapless_server.serve import running as grpc_server
 from mapless_tools.load.driving import free_port
 from mapless_tools.load.watch import Scrape, read_metrics
 

@@ -17,7 +17,7 @@ import typer
 from support.safetensors_files import safetensors
 from typer.testing import CliRunner, Result
 
-from mapless_server.networks.weights import catalogue, sources
+from mapless_server.networks.weights import catalogue, install
 from mapless_server.networks.weights.catalogue import HubFile, Licence, Weights
 from mapless_tools.cli import weights as command
 from mapless_tools.cli.app import app
@@ -62,7 +62,7 @@ def fetched(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         path.write_bytes(CONTENT)
         return path
 
-    monkeypatch.setattr(sources, "download_from_hub", download)
+    monkeypatch.setattr(install, "download_from_hub", download)
     monkeypatch.setattr(catalogue, "CATALOGUE", (FREE, BOUND))
     monkeypatch.setattr(command, "CATALOGUE", (FREE, BOUND))
     return asked

@@ -20,7 +20,7 @@ from mapless_server.store.calibrations import (
     release,
     renew,
 )
-from mapless_server.store.matching_use import delete_unused, record_use
+from mapless_server.store.pairs import delete_unused, record_use
 
 OFFICE = SceneKey("office")
 KIND, OTHER = calibration_kind("sift", "geometric", "1"), calibration_kind("aliked", "geometric", "1")

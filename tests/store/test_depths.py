@@ -9,7 +9,7 @@ from support.stores import Place, faults_of, make_reference
 from mapless.geometry import Camera
 from mapless_server.method.views import KeptDepth
 from mapless_server.security import SceneKey
-from mapless_server.store import Store, codec, depths, matching_use, rows
+from mapless_server.store import Store, codec, depths, pairs, rows
 from mapless_server.store.depths import (
     depth_kind,
     discard_depths,
@@ -18,8 +18,7 @@ from mapless_server.store.depths import (
     list_without,
     load_depths,
 )
-from mapless_server.store.matching_use import delete_unused, record_use
-from mapless_server.store.pairs import PairStore, Progress
+from mapless_server.store.pairs import PairStore, Progress, delete_unused, record_use
 
 SCENE = SceneKey("office")
 KIND = depth_kind("mapanything", "a" * 64)
@@ -175,7 +174,7 @@ def test_those_without_use_are_deleted(store: Store, place: Place, monkeypatch: 
     claims.add(OTHER, claim, {}, is_complete=True)
     record_use(store.database, [OTHER])
     now_us = rows.now_us
-    monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(1e6 * (matching_use.KEPT_S + 1)))
+    monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(1e6 * (pairs.KEPT_S + 1)))
     keep_depths(store.database, KIND, {key_of(store, "c"): kept()})
     record_use(store.database, [KIND])
     delete_unused(store.database, lambda: None)

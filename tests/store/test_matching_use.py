@@ -8,9 +8,8 @@ import pytest
 from support.stores import Place, make_reference
 
 from mapless_server.security import SceneKey
-from mapless_server.store import Store, matching_use, rows
-from mapless_server.store.matching_use import KEPT_S, delete_unused, record_use
-from mapless_server.store.pairs import PairStore, Progress
+from mapless_server.store import Store, pairs, rows
+from mapless_server.store.pairs import KEPT_S, PairStore, Progress, delete_unused, record_use
 
 SCENE = SceneKey("office")
 OURS, THEIRS = "aliked/strict", "sift/strict"
@@ -19,7 +18,7 @@ OURS, THEIRS = "aliked/strict", "sift/strict"
 @pytest.fixture
 def store(place: Place, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
     """Every pair of three references, matched in two ways, both used now."""
-    monkeypatch.setattr(matching_use, "_REFERENCES_AT_A_TIME", 2)
+    monkeypatch.setattr(pairs, "_REFERENCES_AT_A_TIME", 2)
     with place.open() as store:
         store.create_scene(SCENE)
         store.add_references(SCENE, [make_reference(name, seed) for seed, name in enumerate("abc")])

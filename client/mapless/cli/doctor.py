@@ -14,14 +14,12 @@ import numpy as np
 
 from ..answers import Rejected
 from ..client import Client
-from ..connecting import explained
 from ..errors import DeadlineExceeded, MaplessError, from_rpc_error
-from ..options import ConnectOptions
+from ..options import ConnectOptions, explained
 from ..results import Reference
 from ..v1 import reference_service_pb2 as pb
 from .folder import EXIT_FAILED
-from .output import serving_states, show
-from .suggesting import suggesting
+from .output import serving_states, show, suggesting
 
 OK, WRONG, NOTE, SKIPPED = "ok", "wrong", "note", "skipped"
 

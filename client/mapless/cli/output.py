@@ -2,26 +2,28 @@
 
 import argparse
 import dataclasses
+import difflib
 import json
 import math
 import re
 import sys
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from enum import Enum
+from itertools import islice
 from typing import Any
 
 import numpy as np
 from google.protobuf import json_format
 from google.protobuf.message import Message
 
-from .. import wire
-from ..answers import LocalizationResult, Rejected
-from ..calls.health import SERVICES
-from ..client import Client
-from ..errors import NotFound
-from ..geometry import Camera, RigidTransform
+from mapless import wire
+from mapless.answers import LocalizationResult, Rejected
+from mapless.calls.health import SERVICES
+from mapless.client import Client
+from mapless.errors import MaplessError, NotFound
+from mapless.geometry import Camera, RigidTransform
 
 _NUMBER = re.compile(r"-?[\d.]+")
 
@@ -109,3 +111,31 @@ def line(name: str, answer: LocalizationResult | Rejected) -> str:
 def heading(width: int) -> str:
     """Heading of the table of `line`, for names of this width."""
     return f"{'photograph':{width}}  {'x':>9} {'y':>9} {'z':>9}    {'95 % within':>10} {'trust':>6}  {'inliers':>9}"
+
+
+_MAX_COMPARED = 10_000
+
+
+@contextmanager
+def suggesting(client: Client) -> Iterator[None]:
+    """Adds to a NotFound of the block the existing scene or reference whose name resembles the given one."""
+    try:
+        yield
+    except NotFound as error:
+        nearest: list[str] = []
+        with suppress(MaplessError):  # such as that of a token that may not list them
+            nearest = difflib.get_close_matches(error.resource.rpartition("/")[2], _existing(client, error.resource), 1)
+        if not nearest:
+            raise
+        message = f"{error.message}; did you mean {nearest[0]!r}?"
+        raise NotFound(
+            error.code, message, reason=error.reason, resource=error.resource, request_id=error.request_id
+        ) from error
+
+
+def _existing(client: Client, resource: str) -> list[str]:
+    """Ids of the existing resources of the same kind and parent as a resource that does not exist."""
+    parent, _, _ = resource.rpartition("/references/")
+    if parent:
+        return [it.reference_id for it in islice(client.list_references(parent), _MAX_COMPARED)]
+    return [it.scene_id for it in islice(client.list_scenes(), _MAX_COMPARED)]

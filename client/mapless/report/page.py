@@ -12,8 +12,7 @@ from ..geometry import Camera, RigidTransform
 from ..results import Reference
 from . import sections
 from .markup import reference_id, section, text
-from .overlay import define, histogram, image_of, overlay
-from .pairs import best_references, pairs
+from .overlay import best_references, define, histogram, image_of, overlay, pairs
 from .pictures import Picture, picture
 from .plan import plan_view
 

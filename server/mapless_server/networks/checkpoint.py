@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from .weights.errors import CheckpointError
+from .weights.catalogue import CheckpointError
 from .weights.safetensors_header import Entry, Header, check_fit, opened, read_header
 
 IMAGE_NORMALIZATION: Mapping[str, Sequence[float]] = {

@@ -21,9 +21,8 @@ from torch import Tensor, nn
 
 from .blocks import BLOCK_EPS, Block, LayerNorm
 from .checkpoint import FileNames
-from .dpt import DenseFeatures, DenseRegression
 from .encoder import PATCH_PX, PlainEncoder
-from .heads import ResidualMlp
+from .heads import DenseFeatures, DenseRegression, ResidualMlp
 from .network import IMAGE_MEAN, IMAGE_STD, Network, NetworkOutput
 from .view_conditions import (
     MIN_LENGTH,

@@ -6,6 +6,6 @@ May import observability and everything below it. Begin with `guard.CallGuard`, 
 
 from .call import CLIENT_ID_KEY, REQUEST_ID_KEY, Call
 from .guard import Authenticate, CallGuard
-from .status import to_status
+from .sending import to_status
 
 __all__ = ["CLIENT_ID_KEY", "REQUEST_ID_KEY", "Authenticate", "Call", "CallGuard", "to_status"]

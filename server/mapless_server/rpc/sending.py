@@ -10,13 +10,14 @@ from collections.abc import Coroutine
 from typing import Any
 
 import grpc
+from google.protobuf.message import Message
+from google.rpc import error_details_pb2, status_pb2
 from grpc_status import rpc_status
 
-from mapless_server.errors import DeadlineExceeded, RequestError
+from mapless_server.errors import AlreadyExists, DeadlineExceeded, NotFound, RequestError
 
 from .call import REQUEST_ID_KEY, Call
 from .receiving import Context, has_ended, retrieve
-from .status import to_status
 
 SEND_LIMIT_S = 10.0
 """For the caller of a finite stream to read a message that is ready. Answers of unary calls wait in grpc and cost only
@@ -93,3 +94,31 @@ class Sender:
     def _forget(self, task: asyncio.Task[None]) -> None:
         self._sending.discard(task)
         retrieve(task)
+
+
+_DOMAIN = "mapless"
+_MAX_MESSAGE_CHARACTERS = 1000  # trailers hold about 8 KB, and they hold the text twice
+
+
+def to_status(error: RequestError, request_id: str = "") -> status_pb2.Status:
+    """Converts an error to google.rpc.Status: one ErrorInfo, the details of its kind, and the request id if given."""
+    message = str(error)[:_MAX_MESSAGE_CHARACTERS]
+    field = {} if error.field is None else {"field": error.field}
+    details: list[Message] = [error_details_pb2.ErrorInfo(reason=error.reason, domain=_DOMAIN, metadata=field)]
+    if isinstance(error, NotFound | AlreadyExists):
+        kind = "Reference" if "/references/" in error.resource else "Scene"
+        resource = {"resource_type": f"mapless.v1.{kind}", "resource_name": error.resource} if error.resource else {}
+        details.append(error_details_pb2.ResourceInfo(**resource, description=message))
+    elif error.field is not None:
+        violation = error_details_pb2.BadRequest.FieldViolation(field=error.field, description=message)
+        details.append(error_details_pb2.BadRequest(field_violations=[violation]))
+    if error.retry_after_s is not None:
+        retry = error_details_pb2.RetryInfo()
+        retry.retry_delay.FromMilliseconds(round(1000 * error.retry_after_s))
+        details.append(retry)
+    if request_id:
+        details.append(error_details_pb2.RequestInfo(request_id=request_id))
+    status = status_pb2.Status(code=grpc.StatusCode[error.code].value[0], message=message)
+    for detail in details:
+        status.details.add().Pack(detail)
+    return status

@@ -21,10 +21,9 @@ from mapless_server.method.options import StageContext, check_bounds
 from mapless_server.method.views import Matches, PosedView
 from mapless_server.store import Store
 from mapless_server.store.compaction import compact_features
-from mapless_server.store.matching_use import delete_unused, record_use
-from mapless_server.store.pairs import CLAIM_S, Claim, Pair, PairStore, Progress
+from mapless_server.store.pairs import CLAIM_S, Claim, Pair, PairStore, Progress, delete_unused, record_use
 
-from .calibration.calibrations import SceneCalibrations
+from .calibration.calibrator import SceneCalibrations
 from .depth.scene_depths import SceneDepths
 from .indexes import SceneIndexes
 from .library import Closed, ReferenceLibrary

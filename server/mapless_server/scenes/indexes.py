@@ -15,8 +15,7 @@ from mapless_server.security import SceneKey
 from mapless_server.store import Store
 
 from .library import Loaded, ReferenceLibrary, load_usable
-from .retrieval.descriptor import GlobalDescriptor
-from .retrieval.index import Entries, SceneIndex
+from .retrieval.index import Entries, GlobalDescriptor, SceneIndex
 
 log = logging.getLogger(__name__)
 

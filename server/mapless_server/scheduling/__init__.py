@@ -29,6 +29,7 @@ from .jobs import (
     Flow,
     Job,
     Next,
+    Observer,
     Refusal,
     Refused,
     Stage,
@@ -37,7 +38,6 @@ from .jobs import (
     StageResult,
     Step,
 )
-from .observer import Observer
 from .options import WorkQueueOptions
 from .scheduler import Quota
 from .work_queue import ComputeItem, Failure, Fatal, ItemList, WorkQueue, compute_items

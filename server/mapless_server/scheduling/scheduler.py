@@ -26,6 +26,7 @@ from .jobs import (
     Job,
     Lane,
     Next,
+    Observer,
     Refusal,
     Refused,
     Stage,
@@ -34,7 +35,6 @@ from .jobs import (
     StageResult,
     Step,
 )
-from .observer import Observer
 from .options import WorkQueueOptions
 
 _TRY_ONE_IN = 8

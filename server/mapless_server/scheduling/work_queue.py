@@ -11,8 +11,7 @@ from contextlib import contextmanager
 from enum import Enum
 from typing import Any, Generic, TypeVar
 
-from .jobs import Batch, Done, Ending, Flow, Job, Next, Stage, StageLoad, StageResult, Step
-from .observer import Observer
+from .jobs import Batch, Done, Ending, Flow, Job, Next, Observer, Stage, StageLoad, StageResult, Step
 from .options import WorkQueueOptions
 from .scheduler import Quota, Scheduler
 

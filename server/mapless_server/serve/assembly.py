@@ -27,11 +27,9 @@ from mapless_server.scenes import GlobalDescriptor
 from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.audit.scene_auditor import AuditTools
 from mapless_server.scenes.background import BackgroundMatching
-from mapless_server.scenes.calibration.calibrations import SceneCalibrations
-from mapless_server.scenes.calibration.calibrator import Calibrator
+from mapless_server.scenes.calibration.calibrator import Calibrator, SceneCalibrations
 from mapless_server.scenes.depth.finder import DepthFinder
-from mapless_server.scenes.depth.maker import DepthMaker
-from mapless_server.scenes.depth.scene_depths import SceneDepths
+from mapless_server.scenes.depth.scene_depths import DepthMaker, SceneDepths
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver

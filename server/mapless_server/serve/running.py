@@ -3,8 +3,8 @@
 import asyncio
 import logging
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine
-from contextlib import AsyncExitStack, asynccontextmanager
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -12,7 +12,7 @@ import grpc
 
 from mapless_server import __version__
 from mapless_server.engine.queue_engine import QueueEngine
-from mapless_server.observability.event_loop import watch_event_loop
+from mapless_server.errors import RequestError
 from mapless_server.observability.exporter import MetricsServer
 from mapless_server.observability.metrics import Metrics
 from mapless_server.observability.scraped import gpu_memory
@@ -28,9 +28,77 @@ from mapless_server.settings import Settings
 from mapless_server.store import Store
 
 from .assembly import MakeEngine, StartupError, make_engine, open_store, what_is_missing
-from .listening import AddressTaken, GrpcServer
-from .store_health import watch_store
 from .warm_up import warm_up, warm_up_stronger
+
+MAX_CONCURRENT_RPCS = 2048
+"""Calls at a time, of all connections. Far above what the queue admits: health probes count, and calls of which only
+the headers have come, whose time `rpc.receiving` limits."""
+MAX_CALLS_PER_CONNECTION = 128
+"""Far below that, so that one connection cannot take all; a client sends further calls as earlier ones end."""
+
+_LAST_BYTES_S = 0.5
+"""Time for answers in transit when the last call has ended."""
+
+
+class AddressTaken(Exception):
+    """The address cannot be listened on; the message is for the operator."""
+
+
+class GrpcServer:
+    """Receives the calls of the services at its address, "host:port"."""
+
+    def __init__(
+        self, settings: Settings, services: Services, credentials: grpc.ServerCredentials | None = None
+    ) -> None:
+        """Binds its port; AddressTaken if another server uses the address, or it is not an address of this machine."""
+        self._server = grpc.aio.server(options=_options(settings), maximum_concurrent_rpcs=MAX_CONCURRENT_RPCS)
+        services.add_to(self._server)
+        host = f"[{settings.host}]" if ":" in settings.host else settings.host
+        self.address = f"{host}:{self._bind(f'{host}:{settings.port}', credentials)}"
+
+    def _bind(self, address: str, credentials: grpc.ServerCredentials | None) -> int:
+        try:
+            if credentials is None:
+                return int(self._server.add_insecure_port(address))
+            return int(self._server.add_secure_port(address, credentials))
+        except RuntimeError as error:
+            raise AddressTaken(f"cannot listen on {address}: in use, or not an address of ours") from error
+
+    async def start(self) -> None:
+        """Accepts calls."""
+        await self._server.start()
+
+    async def stop(self) -> None:
+        """Stops accepting calls; answers that are being sent get a moment."""
+        await self._server.stop(_LAST_BYTES_S)
+
+    async def close(self) -> None:
+        """Ends immediately."""
+        await self._server.stop(0)
+
+
+def _options(settings: Settings) -> list[tuple[str, int]]:
+    max_message_bytes = settings.max_message_mib * 2**20
+    return [
+        ("grpc.max_receive_message_length", max_message_bytes),
+        ("grpc.max_send_message_length", max_message_bytes),
+        # With reuseport, the default, a second server shares the port silently and gets half of the calls.
+        ("grpc.so_reuseport", 0),
+        ("grpc.max_concurrent_streams", MAX_CALLS_PER_CONNECTION),
+        ("grpc.max_metadata_size", 16 * 1024),
+        # Clients may ping every 30 s, but only while they have a call.
+        ("grpc.http2.min_ping_interval_without_data_ms", 30_000),
+        ("grpc.http2.max_ping_strikes", 2),
+        ("grpc.keepalive_permit_without_calls", 0),
+        # Detects clients that vanished, so that their queries are not computed.
+        ("grpc.keepalive_time_ms", 60_000),
+        ("grpc.keepalive_timeout_ms", 20_000),
+        ("grpc.max_connection_idle_ms", 15 * 60_000),
+        # Clients connect again, perhaps to a server that was added meanwhile.
+        ("grpc.max_connection_age_ms", 30 * 60_000),
+        ("grpc.max_connection_age_grace_ms", round(1000 * settings.max_deadline_s)),
+    ]
+
 
 log = logging.getLogger(__name__)
 
@@ -226,3 +294,57 @@ def _run_task(stack: AsyncExitStack, work: Coroutine[Any, Any, None]) -> None:
 
     task.add_done_callback(log_failure)
     stack.push_async_callback(end)
+
+
+TICK_S = 0.01
+"""The timer's period, by which a lag may be underestimated; waking up so often costs 1 to 2 % of a core."""
+WARN_S = 1.0
+"""Less is usual where other processes take the processors; the metric has all."""
+
+
+async def watch_event_loop(metrics: Metrics, is_alive: Callable[[], bool] = lambda: True) -> None:
+    """Measures until it is cancelled, and calls `beat` as long as the scheduler is alive."""
+    while True:
+        due_s = time.monotonic() + TICK_S
+        await asyncio.sleep(TICK_S)
+        lag_s = max(0.0, time.monotonic() - due_s)
+        metrics.loop_lagged(lag_s)
+        if lag_s > WARN_S:
+            log.warning("the event loop was blocked", extra={"lag_ms": round(1000 * lag_s)})
+        if is_alive():
+            metrics.beat()
+
+
+CHECK_INTERVAL_S = 5.0
+"""A check writes to the store only if its last change failed."""
+
+
+async def watch_store(
+    store: Store, notify: Callable[[bool], Awaitable[None]], interval_s: float = CHECK_INTERVAL_S
+) -> None:
+    """Reports each change of whether the store can be written, until it is cancelled.
+
+    The store is written to once at the beginning; `notify` is called with the new value, which is True at first.
+    """
+    if store.database.is_shared:
+        return
+    could = True
+    await _try(store)
+    while True:
+        can = not store.write_fault
+        if can is not could:
+            log.log(
+                logging.INFO if can else logging.ERROR,
+                "the store %s",
+                "can be changed again" if can else f"cannot be changed: {store.write_fault}",
+            )
+            await notify(can)
+        could = can
+        await asyncio.sleep(interval_s)
+        if store.write_fault:
+            await _try(store)
+
+
+async def _try(store: Store) -> None:
+    with suppress(RequestError):  # the store keeps it as its write_fault
+        await asyncio.to_thread(store.try_writing)

@@ -11,11 +11,18 @@ from rich.progress import BarColumn, DownloadColumn, TextColumn, TransferSpeedCo
 from rich.progress import Progress as Bars
 from rich.table import Table
 
-from mapless_server.networks.weights.catalogue import CATALOGUE, Weights, WheelMember, named
-from mapless_server.networks.weights.errors import FetchError, LicenceNotAccepted, UnknownWeights, WeightsError
+from mapless_server.networks.weights.catalogue import (
+    CATALOGUE,
+    FetchError,
+    LicenceNotAccepted,
+    UnknownWeights,
+    Weights,
+    WeightsError,
+    WheelMember,
+    named,
+)
 from mapless_server.networks.weights.folder import Status, Stored, look_up, path_of, temporary_folder
-from mapless_server.networks.weights.install import Installed, Progress, add, check, fetch
-from mapless_server.networks.weights.sources import require_converter
+from mapless_server.networks.weights.install import Installed, Progress, add, check, fetch, require_converter
 from mapless_server.serve.command import fail
 from mapless_server.serve.signals import terminable
 from mapless_server.settings import ConfigError, load_settings

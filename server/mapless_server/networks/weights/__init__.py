@@ -1,7 +1,16 @@
 """Weights of networks: their catalogue and folder, fetching and checking. Imports no torch."""
 
-from .catalogue import CATALOGUE, Weights, named
-from .errors import CheckpointError, FetchError, FolderError, UnknownWeights, WeightsError, WeightsMissing
+from .catalogue import (
+    CATALOGUE,
+    CheckpointError,
+    FetchError,
+    FolderError,
+    UnknownWeights,
+    Weights,
+    WeightsError,
+    WeightsMissing,
+    named,
+)
 from .folder import find_weights
 
 __all__ = [

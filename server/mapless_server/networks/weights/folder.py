@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
-from .catalogue import Weights, named
-from .errors import FolderError, WeightsMissing
+from .catalogue import FolderError, Weights, WeightsMissing, named
 
 _RECORD_SUFFIX = ".sha256"
 _RECORD = re.compile(r"([0-9a-f]{64})  \S+\n?")

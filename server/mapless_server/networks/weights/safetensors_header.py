@@ -13,7 +13,7 @@ from typing import BinaryIO
 
 from safetensors import SafetensorError, safe_open
 
-from .errors import CheckpointError
+from .catalogue import CheckpointError
 
 FLOATS = frozenset({"F64", "F32", "F16", "BF16"})
 

@@ -16,8 +16,7 @@ from mapless_server.security import SceneKey, scene_id_of
 
 from ..indexes import SceneIndexes
 from ..library import ReferenceLibrary
-from ..retrieval.descriptor import GlobalDescriptor
-from ..retrieval.index import Entries, Rows
+from ..retrieval.index import Entries, GlobalDescriptor, Rows
 from ..retrieval.ranking import RankOptions, Selection, rank_references
 from .auditor import Auditor
 from .comparison import AuditOptions

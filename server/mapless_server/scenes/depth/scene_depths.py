@@ -4,16 +4,128 @@ import logging
 import time
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import dataclass, field, replace
 
 from mapless_server.errors import DataLoss, NotFound
+from mapless_server.method.coarse import Reconstructor, Request, Triangulation
+from mapless_server.method.correspond import Matcher
+from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.options import StageContext, check_bounds
+from mapless_server.method.rejection import Rejection
+from mapless_server.method.scale import estimate_scale
+from mapless_server.method.views import KeptDepth, PosedView, Reconstruction
+from mapless_server.security import SceneKey
 from mapless_server.store import Store
-from mapless_server.store.depths import discard_depths, keep_depths, list_kinds, list_without
+from mapless_server.store.depths import depth_kind, discard_depths, keep_depths, list_kinds, list_without
 from mapless_server.store.pairs import Claim, PairStore, Progress
 
+from ..indexes import SceneIndexes
 from ..library import Closed, ReferenceLibrary
 from ..observer import BackgroundObserver
+from ..retrieval.ranking import rank_beside, spread_choice
+from .check import DepthCheckOptions, checked_depths
 from .finder import DepthFinder
-from .maker import DepthMaker
+
+
+@dataclass(frozen=True)
+class DepthMakerOptions:
+    """Options of making depths.
+
+    Attributes:
+        neighbours: largest number of references that the network gets besides the wanted one; as many as in a query of
+            ten references need half of its memory.
+        shortlist: number of references that are matched with it, as a multiple of `neighbours`; the best are used.
+        check: options of the check.
+    """
+
+    neighbours: int = 7
+    shortlist: int = 2
+    check: DepthCheckOptions = field(default_factory=DepthCheckOptions)
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "neighbours", at_least=2)
+        check_bounds(self, "shortlist", at_least=1)
+
+
+class DepthMaker:
+    """Makes and checks depths with one network, of references with one extractor's features."""
+
+    def __init__(
+        self,
+        indexes: SceneIndexes,
+        extractor: FeatureExtractor,
+        matcher: Matcher,
+        network: Reconstructor,
+        options: DepthMakerOptions | None = None,
+    ) -> None:
+        """`matcher` is that of the extractor's features."""
+        self._indexes = indexes
+        self._extractor = extractor
+        self._matcher = matcher
+        self._network = network
+        self.options = options or DepthMakerOptions()
+
+    @property
+    def kind(self) -> str:
+        """Kind of the depths."""
+        return depth_kind(self._network.name, self._network.weights_sha256)
+
+    def make(
+        self, scene_key: SceneKey, library: ReferenceLibrary, reference_id: str, check: Callable[[], None]
+    ) -> dict[str, KeptDepth | None]:
+        """Makes the depths of a reference and of its neighbours that the network gets with it, by key.
+
+        A depth that is not kept is None. The result is empty if the reference has fewer than two neighbours that share
+        matches with it. `check` is called between the steps, and may raise, which ends it. NotFound if the reference or
+        the scene was deleted, DataLoss if the reference is damaged, or any exception of the network.
+        """
+        context = StageContext(check)
+        _, (subject,) = library.load(scene_key, [reference_id], self._extractor, context)
+        neighbours = self._neighbours(scene_key, library, subject, reference_id, context)
+        if len(neighbours) < 2:
+            return {}
+        origin = subject.world_from_camera.translation
+        query, *others = neighbours
+        given = [replace(it, world_from_camera=it.world_from_camera.shifted(-origin)) for it in (subject, *others)]
+        correspondences = self._matcher.correspond(query.view, (subject, *others), False, check)
+        is_metric = not library.attributes(scene_key).arbitrary_unit
+        request = Request(query.view, given, correspondences, is_metric=is_metric)
+        (outcome,) = self._network.reconstruct_many([request])
+        check()
+        if isinstance(outcome, Exception):
+            raise outcome
+        nothing = dict.fromkeys(it.key for it in given)
+        if isinstance(outcome, Rejection | Triangulation):  # only a network predicts depths
+            return nothing
+        reconstruction = outcome if isinstance(outcome, Reconstruction) else outcome.fetch()
+        scale = estimate_scale(reconstruction, given, correspondences)
+        if isinstance(scale, Rejection):
+            return nothing
+        true_pose = query.world_from_camera.shifted(-origin)
+        depths = checked_depths(reconstruction, scale, given, true_pose, correspondences, self.options.check)
+        return dict(zip(nothing, depths, strict=True))
+
+    def _neighbours(
+        self,
+        scene_key: SceneKey,
+        library: ReferenceLibrary,
+        subject: PosedView,
+        reference_id: str,
+        context: StageContext,
+    ) -> list[PosedView]:
+        """The references that share most matches with one, from different places, the best first."""
+        entries = self._indexes.entries(scene_key, context)
+        if reference_id not in entries:
+            raise NotFound("the reference was deleted")
+        count = self.options.neighbours
+        wanted = [it.reference_id for it in rank_beside(entries, reference_id, self.options.shortlist * count)]
+        others = self._indexes.load_existing(library, scene_key, wanted, self._extractor, context)
+        matches = [self._matcher.match_references(subject, other) for other in others]
+        context.check()
+        sharing = [i for i, found in enumerate(matches) if len(found) >= self.options.check.min_points]
+        centres = [others[i].world_from_camera.translation for i in sharing]
+        return [others[sharing[i]] for i in spread_choice([len(matches[i]) for i in sharing], centres, count)]
+
 
 log = logging.getLogger(__name__)
 

@@ -25,7 +25,7 @@ from mapless_server.networks.blocks import Attention
 from mapless_server.networks.checkpoint import load_strictly
 from mapless_server.networks.megaloc import MegaLoc, MegaLocSizes
 
-from .descriptor import Vector
+from .index import Vector
 
 log = logging.getLogger(__name__)
 

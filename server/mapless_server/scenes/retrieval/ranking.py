@@ -20,8 +20,7 @@ from mapless.geometry import Array, RigidTransform
 from mapless_server.method.options import check_bounds
 from mapless_server.method.priors.known import PosePrior
 
-from .descriptor import Vector
-from .index import Entries, Rows
+from .index import Entries, Rows, Vector
 from .narrowing import Narrowing
 
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.views import View
 
-from .descriptor import Vector
+from .index import Vector
 
 Floats = NDArray[np.float32]
 
