@@ -13,12 +13,7 @@ from .geometry import Array, RigidTransform
 DOUBTFUL_TRUST = 0.15
 """Below it, an answer looks worse than 17 of 20 right ones of difficult places: the intrinsics may be wrong."""
 
-_FIELDS = {
-    "FOCAL_LENGTH": "focal_x_px",
-    "PRINCIPAL_X": "principal_x_px",
-    "PRINCIPAL_Y": "principal_y_px",
-    "K1": "k1",
-}
+_FIELDS = {"FOCAL_LENGTH": "focal_x_px", "PRINCIPAL_X": "principal_x_px", "PRINCIPAL_Y": "principal_y_px", "K1": "k1"}
 """Of CameraIntrinsics, as rejections name them, by parameter."""
 _CAPTURED = "captured by the server"
 

@@ -106,11 +106,7 @@ def datum_to_message(datum: Datum) -> pb.Datum:
 
 def datum_from_message(message: pb.Datum, field: str) -> Datum:
     """Datum of a message, its quaternion normalized; FieldError if a number is out of range, or its norm is not one."""
-    ranges = (
-        ("latitude_deg", -90.0, 90.0),
-        ("longitude_deg", -180.0, 180.0),
-        ("height_m", MIN_HEIGHT_M, MAX_HEIGHT_M),
-    )
+    ranges = (("latitude_deg", -90.0, 90.0), ("longitude_deg", -180.0, 180.0), ("height_m", MIN_HEIGHT_M, MAX_HEIGHT_M))
     for name, least, most in ranges:
         value = getattr(message, name)
         if not least <= value <= most:

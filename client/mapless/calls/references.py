@@ -137,10 +137,7 @@ def add_reference(scene: str, reference: NewReference, *, timeout_s: float | Non
 
 
 def add_batch(
-    scene: str,
-    requests: Sequence[pb.CreateReferenceRequest],
-    timeout_s: float | None,
-    there: dict[str, pb.Reference],
+    scene: str, requests: Sequence[pb.CreateReferenceRequest], timeout_s: float | None, there: dict[str, pb.Reference]
 ) -> Exchange[list[Reference]]:
     """Stores the references of one message that the scene does not have: either all of them or none.
 

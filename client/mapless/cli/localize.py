@@ -77,10 +77,7 @@ def _folder(client: Client, arguments: argparse.Namespace) -> int:
     as_json = bool(arguments.output) or output.is_json(arguments)
     tally = Tally(len(photos))
     try:
-        with (
-            _opened(arguments.output) as file,
-            contextlib.closing(_all(client, photos, arguments)) as outcomes,
-        ):
+        with _opened(arguments.output) as file, contextlib.closing(_all(client, photos, arguments)) as outcomes:
             if not as_json:
                 print(output.heading(width), file=file)
             tally.draw()

@@ -155,12 +155,7 @@ def best_references(debug: Debug | None, uses: Sequence[ReferenceUse]) -> list[s
 
 
 def pair(
-    debug: Debug,
-    uses: Sequence[ReferenceUse],
-    camera: Camera,
-    reference: Reference,
-    name: str,
-    picture: Picture,
+    debug: Debug, uses: Sequence[ReferenceUse], camera: Camera, reference: Reference, name: str, picture: Picture
 ) -> str:
     """Draws one figure; empty without matches."""
     rows = _rows(debug, uses, name)

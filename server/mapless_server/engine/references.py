@@ -91,13 +91,7 @@ class ReferenceSource(Protocol):
         """Returns the attributes of a scene."""
         ...
 
-    def choose(
-        self,
-        scene_key: SceneKey,
-        views: QueryViews,
-        selection: Selection,
-        context: StageContext,
-    ) -> Choice:
+    def choose(self, scene_key: SceneKey, views: QueryViews, selection: Selection, context: StageContext) -> Choice:
         """Chooses references for a photograph."""
         ...
 
@@ -234,13 +228,7 @@ class References:
         self._audit_tools = audit_tools
         self._limits = limits
 
-    def choose(
-        self,
-        scene_key: SceneKey,
-        views: QueryViews,
-        selection: Selection,
-        context: StageContext,
-    ) -> Choice:
+    def choose(self, scene_key: SceneKey, views: QueryViews, selection: Selection, context: StageContext) -> Choice:
         """Chooses references for a photograph by its global descriptor, or near a pose prior without reading it.
 
         NotFound if there is no such scene (field "scene") or reference (field "references[i]"); DataLoss if a named

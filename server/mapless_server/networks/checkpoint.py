@@ -60,10 +60,7 @@ _DTYPES = {
 
 
 def load_strictly(
-    module: torch.nn.Module,
-    file: Path,
-    *,
-    optional: Mapping[str, Sequence[float] | None] = IMAGE_NORMALIZATION,
+    module: torch.nn.Module, file: Path, *, optional: Mapping[str, Sequence[float] | None] = IMAGE_NORMALIZATION
 ) -> str:
     """Replaces all parameters and persistent buffers of a module by a file's; other buffers are not changed.
 

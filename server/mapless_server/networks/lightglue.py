@@ -191,10 +191,7 @@ def _attend_across(block: CrossBlock, x0: Tensor, x1: Tensor, key_mask: Tensor |
     m0 = scaled_dot_product_attention(qk0, qk1, v1, attn_mask=key_mask)
     m1 = scaled_dot_product_attention(qk1, qk0, v0)
     m0, m1 = (block.to_out(m.transpose(1, 2).flatten(start_dim=-2)) for m in (m0, m1))
-    return (
-        x0 + block.ffn(torch.cat([x0, m0.to(x0.dtype)], -1)),
-        x1 + block.ffn(torch.cat([x1, m1.to(x1.dtype)], -1)),
-    )
+    return (x0 + block.ffn(torch.cat([x0, m0.to(x0.dtype)], -1)), x1 + block.ffn(torch.cat([x1, m1.to(x1.dtype)], -1)))
 
 
 def _log_probabilities(head: MatchAssignment, x0: Tensor, x1: Tensor, mask: Tensor) -> Tensor:

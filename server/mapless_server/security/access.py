@@ -59,9 +59,7 @@ class Authenticator:
     """Authenticates callers by their bearer token; without tokens, every caller has all rights."""
 
     def __init__(
-        self,
-        tokens: Callable[[], Tokens] | None,
-        now: Callable[[], datetime] = lambda: datetime.now(timezone.utc),
+        self, tokens: Callable[[], Tokens] | None, now: Callable[[], datetime] = lambda: datetime.now(timezone.utc)
     ) -> None:
         """The function `tokens` returns the current tokens; None if callers need no token."""
         self._tokens = tokens

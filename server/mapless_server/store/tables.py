@@ -29,9 +29,7 @@ _Matching = String(255)
 _NONE_YET = text("0")
 
 store_version = Table(
-    "store_version",
-    metadata,
-    Column("schema_version", Integer, primary_key=True, autoincrement=False),
+    "store_version", metadata, Column("schema_version", Integer, primary_key=True, autoincrement=False)
 )
 
 # Alembic's own, as it creates it: which of its steps were run.

@@ -145,9 +145,7 @@ class Weights:
 _CC_BY_NC = Licence("CC BY-NC 4.0", "https://creativecommons.org/licenses/by-nc/4.0/", "non-commercial")
 _EDGEPOINT2 = Licence("MIT", "https://github.com/HITCSC/EdgePoint2/blob/main/LICENSE")
 _MAGIC_LEAP = Licence(
-    "Magic Leap",
-    "https://github.com/magicleap/SuperPointPretrainedNetwork/blob/master/LICENSE",
-    "research only",
+    "Magic Leap", "https://github.com/magicleap/SuperPointPretrainedNetwork/blob/master/LICENSE", "research only"
 )
 
 

@@ -142,11 +142,6 @@ def _found(
     known = PointMatches(nothing, nothing, np.empty(0, bool), options.radius_px)
     match_options = MatchOptions(radius_px=options.radius_px, min_similarity=options.min_similarity)
     found = search(
-        subject.view,
-        neighbourhood.references,
-        neighbourhood.structure,
-        subject.world_from_camera,
-        known,
-        match_options,
+        subject.view, neighbourhood.references, neighbourhood.structure, subject.world_from_camera, known, match_options
     )
     return np.isin(visible.point, found.point)

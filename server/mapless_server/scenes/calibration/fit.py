@@ -104,14 +104,7 @@ def fit(results: Sequence[LeftOut], kind: str, generation: int, options: FitOpti
     wrong = [it.trust for it in results if not it.is_right]
     quantiles = _trust_quantiles(np.array([it.trust for it in right]), max(wrong, default=0.0), options)
     return SelfCalibration(
-        kind,
-        generation,
-        len(right),
-        position,
-        rotation,
-        noise_m,
-        noise_deg,
-        tuple(quantiles.tolist()),
+        kind, generation, len(right), position, rotation, noise_m, noise_deg, tuple(quantiles.tolist())
     )
 
 

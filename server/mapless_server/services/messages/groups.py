@@ -204,9 +204,7 @@ def _in_axes(world_from_session: Similarity, axes: Axes) -> RigidTransform:
 
 
 def _set_support(
-    message: pb.RigLocalization | pb.SequenceLocalization,
-    matched: Sequence[PosedImage],
-    covariance: Array,
+    message: pb.RigLocalization | pb.SequenceLocalization, matched: Sequence[PosedImage], covariance: Array
 ) -> None:
     """Sets the fields that both kinds of localizations have: covariance, radii and counts."""
     # Not calibrated: a scene's calibrations are of single photographs.
