@@ -14,14 +14,13 @@ seconds. Begin with `network`, then `pi3`.
 Pi3 and Pi3X:
 
     decoder.py     blocks within views and over the scene in turn
-    heads.py       poses, points and confidence from decoded tokens
+    heads.py       poses, points and confidence from decoded tokens; values for each pixel (DPT)
     conditions.py  the further input of Pi3X: rays, poses
     pi3.py         both
 
 MapAnything:
 
     view_conditions.py  the further input: rays, depths, poses, each for any subset of the views
-    dpt.py              values for each pixel
     mapanything.py
 
 A network for retrieval, which computes one vector for a whole image:
