@@ -186,7 +186,7 @@ class QueryStages:
         query, context, prior = run.query, run.context, run.query.priors.pose
         assert prior is not None
         with context.stage(TRACK):
-            selection = Selection(query.reference_count, near=prior)
+            selection = Selection(min(tracking.REFERENCES, query.reference_count), near=prior)
             near = run.source.choose(query.scene_key, run.views, selection, context)
         if len(near.references) < 2:
             return None
