@@ -26,6 +26,7 @@ from mapless.geometry import Array, RigidTransform
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.evaluate.metrics import QueryResult, pose_error, trajectory_radius
 from mapless_tools.evaluate.plan import MAX_K, EvaluationOptions, split_frames
+from mapless_tools.evaluate.references import PlannedQuery
 from mapless_tools.evaluate.report import SCALE_FREE, format_length, format_rotation, to_json
 from mapless_tools.evaluate.run import Evaluation
 from mapless_tools.ingest.formats.cameras import read_folder
@@ -60,14 +61,9 @@ class Case:
     references: int | None
 
     @property
-    def name(self) -> str:
-        """Of the case, for files."""
-        return self.scene if self.references is None else f"{self.scene}-{self.references}"
-
-    @property
     def file_name(self) -> str:
         """Of its results."""
-        return f"{self.name}.json"
+        return f"{self.scene}.json" if self.references is None else f"{self.scene}-{self.references}.json"
 
 
 def cases_of(scene: str, frame_count: int) -> Iterator[Case]:
@@ -81,20 +77,12 @@ def cases_of(scene: str, frame_count: int) -> Iterator[Case]:
                 yield Case(scene, count)
 
 
-@dataclass(frozen=True, eq=False)
-class Query:
-    """A frame and the references that it is localized with."""
-
-    frame: Frame
-    references: tuple[Frame, ...]
-
-
-def queries_of(dataset: Dataset, case: Case) -> list[Query]:
+def queries_of(dataset: Dataset, case: Case) -> list[PlannedQuery]:
     """Those of `mapless-server evaluate`."""
     split = split_frames(len(dataset.frames), EvaluationOptions(case.references))
     references = [dataset.frames[i] for i in split.references]
     return [
-        Query(query, tuple(frame for frame in references if frame is not query))
+        PlannedQuery(query, tuple(frame for frame in references if frame is not query))
         for query in (dataset.frames[i] for i in split.queries)
     ]
 
@@ -175,7 +163,7 @@ class SceneDatabase:
         output.mkdir(exist_ok=True)
         return pycolmap.triangulate_points(scene, self._path, self._root, output, True, options)
 
-    def localize(self, query: Query, scene: pycolmap.Reconstruction) -> QueryResult:
+    def localize(self, query: PlannedQuery, scene: pycolmap.Reconstruction) -> QueryResult:
         """The pose of a query from its matches with the points of a map."""
         frame = query.frame
         start_s = time.process_time()
@@ -215,7 +203,7 @@ class SceneDatabase:
             features=f"sift-{KEYPOINTS}-{LONG_SIDE_PX}px",
         )
 
-    def _correspondences(self, query: Query, scene: pycolmap.Reconstruction) -> tuple[Array, Array]:
+    def _correspondences(self, query: PlannedQuery, scene: pycolmap.Reconstruction) -> tuple[Array, Array]:
         """Keypoints of the query (N, 2) and the points (N, 3) of keypoints that they match, each pair once."""
         query_id = self._ids[query.frame.name]
         pairs: dict[tuple[int, int], None] = {}
@@ -260,28 +248,12 @@ def measure(dataset: Dataset, case: Case, database: SceneDatabase) -> dict[str, 
     return {**to_json(evaluation), **changed, "triangulation_s": float(np.mean(map_s))}
 
 
-@dataclass(frozen=True)
-class Cells:
-    """What one system reached on a case: medians, infinite where half of the queries are lost, and seconds of a query.
+def cells_of(content: Mapping[str, Any], distances: Mapping[str, float]) -> list[str]:
+    """What a result file says: how many are localized, how many of these wrongly, medians, and seconds of a query.
 
-    Localized queries are wrong if they are off by more than `RIGHT_M`, or `RIGHT_SHARE` of the distance to the
-    references where the unit is arbitrary, or by more than `RIGHT_DEG`.
+    Wrong ones are off by more than `RIGHT_M`, or `RIGHT_SHARE` of the distance to the references (by the query's name)
+    where the unit is arbitrary, or by more than `RIGHT_DEG`. A median is infinite where half of the queries are lost.
     """
-
-    localized: int
-    wrong: int
-    translation: float
-    rotation_deg: float
-    seconds: float
-
-    def texts(self, metric: bool) -> tuple[str, ...]:
-        """For a table."""
-        length, rotation = format_length(self.translation, metric), format_rotation(self.rotation_deg)
-        return str(self.localized), str(self.wrong), f"{length} / {rotation}", f"{self.seconds:.2f}"
-
-
-def cells_of(content: Mapping[str, Any], distances: Mapping[str, float]) -> Cells:
-    """The figures of a result file; `distances` are from a query, by its name, to the references of the scene."""
     metric = content["metric"]
     unit = "m" if metric else "units"
     median = content["median_translation_m"] if metric else content["relative"]["median_translation_units"]
@@ -291,8 +263,9 @@ def cells_of(content: Mapping[str, Any], distances: Mapping[str, float]) -> Cell
         or it["rotation_deg"] > RIGHT_DEG
         for it in found
     ]
-    translation, rotation_deg = (math.inf if it is None else it for it in (median, content["median_rotation_deg"]))
-    return Cells(len(found), sum(wrong), translation, rotation_deg, content["latency_ms"]["p50"] / 1000)
+    length, degrees = (math.inf if it is None else it for it in (median, content["median_rotation_deg"]))
+    medians = f"{format_length(length, metric)} / {format_rotation(degrees)}"
+    return [str(len(found)), str(sum(wrong)), medians, f"{content['latency_ms']['p50'] / 1000:.2f}"]
 
 
 def table(cases: Sequence[Case], results: Path, mapless: Path | None) -> Iterator[str]:
@@ -309,7 +282,7 @@ def table(cases: Sequence[Case], results: Path, mapless: Path | None) -> Iterato
         colmap = json.loads(file.read_text(encoding="utf-8"))
         unit = "m" if colmap["metric"] else "units"
         distances = {it["name"]: it[f"reference_distance_{unit}"] for it in colmap["per_query"]}
-        cells = [*cells_of(colmap, distances).texts(colmap["metric"])]
+        cells = cells_of(colmap, distances)
         if mapless is not None:
             cells += _mapless_texts(mapless / case.file_name, distances)
         references = "leave one out" if case.references is None else str(case.references)
@@ -322,7 +295,7 @@ def _mapless_texts(file: Path, distances: Mapping[str, float]) -> list[str]:
     content = json.loads(file.read_text(encoding="utf-8"))
     if {it["name"] for it in content["per_query"]} != distances.keys():
         raise ValueError(f"{file} has other queries than COLMAP's results of this case")
-    return [*cells_of(content, distances).texts(content["metric"])]
+    return cells_of(content, distances)
 
 
 def main() -> None:
@@ -333,7 +306,7 @@ def main() -> None:
     parser.add_argument("--mapless", type=Path, help="folder of `mapless-server evaluate --json` with the same names")
     parser.add_argument("--only", action="append", help="scenes; all if not given")
     parser.add_argument("--orientations", type=int, default=2, help="of a place, at most; 2 is COLMAP's default")
-    parser.add_argument("--list", action="store_true", help="print folder, name and references of each case and end")
+    parser.add_argument("--list", action="store_true", help="print folder, file and references of each case and end")
     arguments = parser.parse_args()
     folders = [arguments.data / scene for scene in arguments.only or SCENES]
     datasets = [read_folder(folder) for folder in folders]
@@ -341,7 +314,7 @@ def main() -> None:
     if arguments.list:
         for folder, of_scene in zip(folders, cases, strict=True):
             for case in of_scene:
-                print(folder, case.name, case.references or "dense")
+                print(folder, case.file_name, case.references or "dense")
         return
     arguments.results.mkdir(parents=True, exist_ok=True)
     pycolmap.logging.minloglevel = pycolmap.logging.Level.WARNING.value
@@ -351,7 +324,7 @@ def main() -> None:
             for case in of_scene:
                 file = arguments.results / case.file_name
                 if not file.is_file():
-                    print(f"{case.name} ...", file=sys.stderr, flush=True)
+                    print(f"{case.file_name} ...", file=sys.stderr, flush=True)
                     with whole_file(file) as partial:
                         write_json(partial, measure(dataset, case, database))
     for line in table([case for of_scene in cases for case in of_scene], arguments.results, arguments.mapless):

@@ -162,18 +162,17 @@ WORKS = {
 
 
 def count_all(rates: Rates) -> Iterator[Figure]:
-    """Counts operations of forward passes, and bytes on the device."""
-    yield from count_forward(rates)
-    yield from count_memory()
-
-
-def count_forward(rates: Rates) -> Iterator[Figure]:
-    """Counts operations of forward passes of the official networks; yields the least and the predicted times."""
+    """Counts operations of forward passes of the official networks, and bytes on the device."""
     for name in NETWORKS:
         part = f"{name}, {VIEWS} views of 518x392; times are those of {rates.device}, compiled"
         for label, work in WORKS.items():
             if name == "mapanything" or not work.query_only:
                 yield _counted(part, label, operations_of(name, work), rates)
+        network = meta_network(name)
+        weights = sum(it.nbytes for it in network.parameters())
+        tokens = CACHED * network.token_count(GRID) * network.width * torch.bfloat16.itemsize
+        yield Figure(f"{name} memory", "weights, linear layers in bfloat16", weights / 1e9, "GB")
+        yield Figure(f"{name} memory", f"tokens of {CACHED} references of 518x392", tokens / 1e9, "GB")
 
 
 def _counted(part: str, label: str, operations: Operations, rates: Rates) -> Figure:
@@ -186,13 +185,3 @@ def _counted(part: str, label: str, operations: Operations, rates: Rates) -> Fig
         f"{operations.fused_bytes / 1e9:.0f} GB fused"
     )
     return Figure(part, label, operations.flop / 1e12, "TFLOP", None, floor_ms, predicted_ms, note=note)
-
-
-def count_memory() -> Iterator[Figure]:
-    """Counts bytes that remain on the device between queries."""
-    for name in NETWORKS:
-        network = meta_network(name)
-        weights = sum(it.nbytes for it in network.parameters())
-        tokens = CACHED * network.token_count(GRID) * network.width * torch.bfloat16.itemsize
-        yield Figure(f"{name} memory", "weights, linear layers in bfloat16", weights / 1e9, "GB")
-        yield Figure(f"{name} memory", f"tokens of {CACHED} references of 518x392", tokens / 1e9, "GB")

@@ -56,11 +56,6 @@ class KeyframeOptions:
                 f"{self.distance_m:g} and {self.angle_deg:g}"
             )
 
-    @property
-    def takes_all(self) -> bool:
-        """Whether every image is a keyframe."""
-        return self.distance_m == 0 or self.angle_deg == 0
-
 
 @dataclass(frozen=True)
 class ReadOptions:

@@ -115,7 +115,7 @@ def keyframes(
     images: Iterator[tuple[int, Any, RigidTransform]], options: KeyframeOptions
 ) -> Iterator[tuple[int, Any, RigidTransform]]:
     """Yields the images, with time and pose, that are far enough from the last keyframe and the sharpest nearby."""
-    if options.takes_all:
+    if 0 in (options.distance_m, options.angle_deg):
         yield from images
         return
     last: RigidTransform | None = None

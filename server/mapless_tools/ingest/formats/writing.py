@@ -2,10 +2,10 @@
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from mapless import Scene
 from mapless.cameras import FOLDER_FILE
@@ -26,12 +26,8 @@ class PosedImage:
     world_from_camera: RigidTransform
 
 
-class Describe(Protocol):
-    """Function that returns the contents of a layout's files by their paths."""
-
-    def __call__(self, images: Sequence[PosedImage], source: str, scene: Scene | None = None) -> dict[str, str]:
-        """Describes images, with their origin as a text, and the properties of their scene."""
-        ...
+Describe = Callable[..., dict[str, str]]
+"""Returns a layout's files by their paths: of images, their origin as a text, and perhaps their scene."""
 
 
 @dataclass(frozen=True)
