@@ -104,12 +104,11 @@ class _Bench:
     def _query(self, name: str) -> Iterator[Figure]:
         from . import query  # its imports are more than torch and NumPy
 
-        options = query.QueryOptions(query_count=2 if self.quick else 8)
-        tier, note = query.make_tier(options.features, self.device)
-        bench = query.Bench(query.photographs(options.query_count), tier)
+        tier, note = query.make_tier(query.FEATURES, self.device)
+        bench = query.Bench(query.photographs(2 if self.quick else 8), tier)
         runner = self._runner(name, self.device)
         for on_device in (True, False):
-            yield from self._tried(query.measure_queries(runner, bench, options, note, on_device), f"query-{name}")
+            yield from self._tried(query.measure_queries(runner, bench, note, on_device), f"query-{name}")
         runner.close()
 
     def _tried(self, figures: Iterator[Figure], part: str) -> Iterator[Figure]:

@@ -41,13 +41,8 @@ THREADS = 8
 """Queries side by side when it is how many a second that counts; the network takes them one after the other."""
 
 
-@dataclass(frozen=True)
-class QueryOptions:
-    """Options of the measurement; `sift` is used if the weights of the local features are missing."""
-
-    features: str = "aliked"
-    query_count: int = 8
-    rounds: int = 3
+FEATURES, ROUNDS = "aliked", 3
+"""SIFT is used if the weights of these features are missing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,9 +112,7 @@ class Bench:
         return answer, {**stages, **answer.stage_seconds, "total": time.perf_counter() - start_s}
 
 
-def measure_queries(
-    runner: NetworkRunner, bench: Bench, options: QueryOptions, note: str, keep_on_device: bool
-) -> Iterator[Figure]:
+def measure_queries(runner: NetworkRunner, bench: Bench, note: str, keep_on_device: bool) -> Iterator[Figure]:
     """Measures latency, stages and throughput on a planted reconstruction, and with the random network's own output."""
     where = "device" if keep_on_device else "host"
     features = bench.tier.extractor.name.split("-")[0]
@@ -132,13 +125,13 @@ def measure_queries(
     planted = Pipeline(PlantedReconstructor(network, truths, runner.device), bench.tier.pipeline.matcher)
     _runs(bench, planted, 1)  # fills caches
     graphs = compiled_graphs()
-    runs, again = (_runs(bench, planted, options.rounds) for _ in range(2))
+    runs, again = (_runs(bench, planted, ROUNDS) for _ in range(2))
     outcomes = f"{_outcomes([*runs, *again])}; {note}"
     yield Figure(part, "p50", _p50_ms(runs), "ms", _p50_ms(again), target=LATENCY_MS, note=outcomes)
     localized = [isinstance(answer.outcome, Localization) for answer, _ in (*runs, *again)]
     yield Figure(part, "localized", 100 * statistics.mean(localized), "%")
     yield from _stages(part, [*runs, *again])
-    yield _throughput(part, bench, planted, options)
+    yield _throughput(part, bench, planted)
     alone = _runs(bench, Pipeline(network, bench.tier.pipeline.matcher), 1)
     yield Figure(part, "p50, the random network's own answer", _p50_ms(alone), "ms", note=_outcomes(alone))
     yield Figure(part, "compiled after the warm-up", compiled_graphs() - graphs, "graphs", target=0)
@@ -171,8 +164,8 @@ def _outcomes(runs: Runs) -> str:
     return ", ".join(f"{names.count(name)} {name}" for name in sorted(set(names)))
 
 
-def _throughput(part: str, bench: Bench, pipeline: Pipeline, options: QueryOptions) -> Figure:
-    keys = [*bench.room.queries] * (2 * options.rounds)
+def _throughput(part: str, bench: Bench, pipeline: Pipeline) -> Figure:
+    keys = [*bench.room.queries] * (2 * ROUNDS)
     rates = []
     with ThreadPoolExecutor(THREADS) as pool:
         for _ in range(2):

@@ -8,8 +8,8 @@ pixels, so that decoding it costs nothing either.
 import asyncio
 import os
 import sys
-from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import cast
 
 import cv2
@@ -59,18 +59,11 @@ def padded_photo(size_bytes: int) -> bytes:
     return start_of_image + comments + rest
 
 
-@dataclass(frozen=True)
-class Nothing:
-    """The state of a query for which nothing is computed; all such queries are of one bucket."""
-
-    bucket: str = "nothing"
-
-
 def no_op_method() -> Method:
     """A method that goes through all stages, and rejects every photograph."""
     rejected = Answer(Rejection(RejectionReason.LOW_TEXTURE, "nothing was computed"))
     return Method(
-        prepare=lambda *_: cast(Prepared, Nothing()),
+        prepare=lambda *_: cast(Prepared, SimpleNamespace(bucket="nothing")),  # all queries are of one bucket
         reconstruct=lambda batch: [cast(Coarse, part) for part in batch],
         refine=lambda *_: rejected,
         coarse_answer=lambda _: None,

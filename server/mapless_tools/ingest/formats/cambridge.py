@@ -6,8 +6,7 @@ length and radial distortion of each image; its paths end in .jpg, the files in 
 image's centre.
 """
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 from mapless.geometry import Camera, RadialTangential, RigidTransform
@@ -37,37 +36,21 @@ def read(path: Path, options: ReadOptions) -> Dataset:
             if options.intrinsics is not None:
                 camera = options.intrinsics.camera(*size)
             elif _stem(image) in lenses:
-                camera = lenses[_stem(image)].camera(size)
+                camera = _camera(size, *lenses[_stem(image)])
             else:
                 raise ValueError(f"focal length: {RECONSTRUCTION} has no such image")
             collector.add(image, camera, pose, split)
-    return collector.dataset(
-        path.resolve().name,
-        "cambridge",
-        metric=True,
-        source="Cambridge Landmarks",
-        ground_truth="SfM (VisualSFM, original)",
-    )
+    about = {"source": "Cambridge Landmarks", "ground_truth": "SfM (VisualSFM, original)"}
+    return collector.dataset(path.resolve().name, "cambridge", metric=True, **about)
 
 
-@dataclass(frozen=True)
-class Lens:
-    """VisualSFM's lens of an image: its focal length, and its radial distortion k.
+def _camera(size: tuple[int, int], focal_px: float, k: float) -> Camera:
+    """The camera of VisualSFM's lens: a pixel at r focal lengths is seen where an ideal camera sees r (1 + k r^2).
 
-    A pixel at distance r from the centre, in focal lengths, is seen where an ideal camera sees it at r (1 + k r^2).
+    Its distortion is the inverse of that: u = d + k d^3 solved for d = u - k u^3 + 3 k^2 u^5 - 12 k^3 u^7 + ...
     """
-
-    focal_px: float
-    k: float
-
-    def camera(self, size: tuple[int, int]) -> Camera:
-        """Converts the lens to a camera, whose distortion goes from the ideal camera to the lens.
-
-        That is the inverse of VisualSFM's: u = d + k d^3 solved for d = u - k u^3 + 3 k^2 u^5 - 12 k^3 u^7 + ...
-        """
-        k = self.k
-        distortion = RadialTangential(k1=-k, k2=3 * k * k, k3=-12 * k * k * k) if k else None
-        return from_corner(Camera(*size, self.focal_px, self.focal_px, size[0] / 2, size[1] / 2, distortion))
+    distortion = RadialTangential(k1=-k, k2=3 * k * k, k3=-12 * k * k * k) if k else None
+    return from_corner(Camera(*size, focal_px, focal_px, size[0] / 2, size[1] / 2, distortion))
 
 
 def _stem(image: str) -> str:
@@ -86,7 +69,8 @@ def _world_from_camera(words: list[str]) -> RigidTransform:
     return RigidTransform(rotation_of(values[3:], "pose").T, values[:3])
 
 
-def _lenses(file: Path) -> Mapping[str, Lens]:
+def _lenses(file: Path) -> dict[str, tuple[float, float]]:
+    """Focal length and radial distortion k of each image."""
     lines = enumerate(read_text(file).splitlines(), 1)
     _, first = next(lines, (0, ""))
     if not first.startswith("NVM_V3"):
@@ -97,7 +81,7 @@ def _lenses(file: Path) -> Mapping[str, Lens]:
         count = int(line)
     except ValueError as error:
         raise ValueError(f"{file}:{number}: expected the number of cameras, found {line[:60]!r}") from error
-    lenses: dict[str, Lens] = {}
+    lenses = {}
     for _ in range(count):
         number, line = next(filled, (number + 1, ""))
         words = line.rsplit(maxsplit=10)  # a name may have spaces
@@ -107,5 +91,5 @@ def _lenses(file: Path) -> Mapping[str, Lens]:
                 raise ValueError("the focal length must be above 0")
         except ValueError as error:
             raise ValueError(f"{file}:{number}: {error}; {count} cameras are announced") from error
-        lenses[_stem(words[0])] = Lens(float(values[0]), float(values[8]))
+        lenses[_stem(words[0])] = float(values[0]), float(values[8])
     return lenses
