@@ -153,7 +153,8 @@ class RigidTransform:
         if m.shape not in ((4, 4), (3, 4)):
             raise ValueError(f"expected a 4x4 or 3x4 matrix, got shape {m.shape}")
         if m.shape == (4, 4) and not np.abs(m[3] - [0, 0, 0, 1]).max() <= ROTATION_TOLERANCE:
-            raise ValueError("last row of a rigid transform must be 0 0 0 1")
+            turned = "; is the matrix given column by column?" if np.array_equal(m[:, 3], [0, 0, 0, 1]) else ""
+            raise ValueError(f"last row of a rigid transform must be 0 0 0 1{turned}")
         if not np.isfinite(m[:3, 3]).all():
             raise ValueError("translation is not finite")
         return RigidTransform(nearest_rotation(m[:3, :3]), m[:3, 3].copy())

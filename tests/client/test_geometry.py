@@ -145,6 +145,8 @@ def test_refuses_what_is_no_rigid_matrix(change: object) -> None:
     assert callable(change)
     with pytest.raises(ValueError, match=r"rigid|matrix|finite"):
         RigidTransform.from_matrix(change(np.eye(4)))
+    with pytest.raises(ValueError, match="column by column"):
+        RigidTransform.from_matrix(RigidTransform(np.eye(3), np.ones(3)).matrix().T)
 
 
 @given(rigid, rigid, rigid, point)

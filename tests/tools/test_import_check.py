@@ -115,6 +115,34 @@ def test_each_usual_mistake_is_noticed_and_named() -> None:
         assert verdict.explained_px < 1
 
 
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_photographs_turned_without_their_intrinsics_are_named(quarters: int) -> None:
+    """By a gallery or a library that applies EXIF's orientation: pose and intrinsics stay those of the sensor."""
+    views = planted("turned", quarters)
+    pairs, wrong = matched(views), []
+    for posed in views:
+        view, camera = posed.view, posed.view.camera
+        keypoints, size = view.features.keypoints, (camera.width_px, camera.height_px)
+        for _ in range(quarters):  # to the left
+            keypoints, size = np.stack([keypoints[:, 1], size[0] - 1 - keypoints[:, 0]], axis=1), size[::-1]
+        given = replace(camera, width_px=size[0], height_px=size[1])
+        features = replace(view.features, keypoints=keypoints.astype(np.float32))
+        wrong.append(replace(posed, view=replace(view, camera=given, features=features)))
+    verdict = verdict_of(wrong, pairs)
+    assert verdict.is_wrong
+    assert f"turned by {90 * quarters} degrees" in verdict.explanation
+    assert verdict.explained_px < 1
+
+
+def test_intrinsics_of_a_photograph_before_it_was_reduced_are_named() -> None:
+    views = planted("reduced")
+    pairs = matched(views)
+    camera = CAMERA.resized(2 * CAMERA.width_px, 2 * CAMERA.height_px)
+    given = replace(camera, width_px=CAMERA.width_px, height_px=CAMERA.height_px)
+    verdict = verdict_of([replace(view, view=replace(view.view, camera=given)) for view in views], pairs)
+    assert "focal lengths and principal points are 0.50 times" in verdict.explanation
+
+
 @pytest.mark.parametrize("scale", [0.5, 2.0])
 def test_intrinsics_of_another_size_are_named_with_their_factor(scale: float) -> None:
     views = planted("focal", scale)

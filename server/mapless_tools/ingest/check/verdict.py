@@ -21,6 +21,7 @@ from mapless_server.method.views import PosedView
 from .errors import THRESHOLD_PX, MatchedPair, PairError, Views, errors_of, summary, summary_with
 
 Correction = Callable[[RigidTransform], RigidTransform]
+ViewCorrection = Callable[[PosedView], PosedView]
 
 FOCAL_SCALES = np.geomspace(0.2, 5.0, 33)
 """Wrong image sizes are usually wrong by a factor of up to four."""
@@ -80,6 +81,32 @@ CONVENTIONS: Mapping[str, Correction] = {
 """Corrections by what the report says of the mistake."""
 
 
+def _posed(correction: Correction) -> ViewCorrection:
+    return lambda view: replace(view, world_from_camera=correction(view.world_from_camera))
+
+
+def _turned(quarters: int) -> ViewCorrection:
+    """Correction of a photograph that was turned so often to the left, without its pose and its intrinsics."""
+
+    def correct(view: PosedView) -> PosedView:
+        camera = view.view.camera
+        fx, fy, x, y = camera.focal_x_px, camera.focal_y_px, camera.principal_x_px, camera.principal_y_px
+        sides_px = [camera.width_px, camera.height_px]
+        for remaining in range(quarters, 0, -1):
+            fx, fy, x, y = fy, fx, y, sides_px[remaining % 2] - 1 - x
+        camera = replace(camera, focal_x_px=fx, focal_y_px=fy, principal_x_px=x, principal_y_px=y)
+        pose = _turned_camera(np.linalg.matrix_power(_QUARTER, quarters))(view.world_from_camera)
+        return replace(view, view=replace(view.view, camera=camera), world_from_camera=pose)
+
+    return correct
+
+
+_CORRECTIONS: Mapping[str, ViewCorrection] = {text: _posed(it) for text, it in CONVENTIONS.items()} | {
+    f"poses and intrinsics are of images turned by {90 * it} degrees (EXIF orientation)": _turned(it)
+    for it in (1, 2, 3)
+}
+
+
 @dataclass(frozen=True)
 class Explanation:
     """A likely mistake, and the photographs that it concerns, if not all; without text there is none.
@@ -96,29 +123,32 @@ def explain(views: Views, matched: Sequence[MatchedPair], given_px: float) -> Ex
     """Finds the mistake whose correction makes the poses fit best; `given_px` is the median error without it."""
     matched = [MatchedPair(item.pair, item.matches[:: 1 + len(item.matches) // _ENOUGH_MATCHES]) for item in matched]
     candidates = []
-    for text, correction in CONVENTIONS.items():
-        error_px, bad_share = summary_with(views, matched, lambda view, c=correction: _corrected(view, c))  # type: ignore[misc]
+    for text, correction in _CORRECTIONS.items():
+        error_px, bad_share = summary_with(views, matched, correction)
         if bad_share < _BAD_SHARE:
             candidates.append(Explanation(text, error_px))
-    scale, error_px, bad_share = best_focal_scale(views, matched)
-    if abs(scale - 1) > FOCAL_TOLERANCE and FOCAL_SCALES[0] < scale < FOCAL_SCALES[-1] and bad_share < _BAD_SHARE:
-        text = (
-            f"the focal lengths are {scale:.2f} times what is given (intrinsics of another image size, or of a video "
-            "mode that crops?)"
-        )
-        candidates.append(Explanation(text, error_px))
+    for what, change in (("focal lengths are", _focal_scaled), ("focal lengths and principal points are", _scaled)):
+        scale, error_px, bad_share = best_scale(views, matched, change)
+        if abs(scale - 1) > FOCAL_TOLERANCE and FOCAL_SCALES[0] < scale < FOCAL_SCALES[-1] and bad_share < _BAD_SHARE:
+            text = (
+                f"the {what} {scale:.2f} times what is given (intrinsics of another image size, or of a video "
+                "mode that crops?)"
+            )
+            candidates.append(Explanation(text, error_px))
     fitting = [candidate for candidate in candidates if candidate.error_px < _GAIN * given_px]
     if not fitting:  # perhaps it was made with some photographs only
-        mixed = [_mixed(views, matched, text, correction) for text, correction in CONVENTIONS.items()]
+        mixed = [_mixed(views, matched, text, correction) for text, correction in _CORRECTIONS.items()]
         fitting = [explanation for explanation in mixed if explanation.text]
     return min(fitting, key=lambda it: it.error_px, default=Explanation())
 
 
-def best_focal_scale(views: Views, matched: Sequence[MatchedPair]) -> tuple[float, float, float]:
-    """The factor on all focal lengths with the least median error; that error, and the share of bad pairs with it."""
+def best_scale(
+    views: Views, matched: Sequence[MatchedPair], change: Callable[[PosedView, float], PosedView]
+) -> tuple[float, float, float]:
+    """The factor by which to `change` all views with the least median error; that error, and the share of bad pairs."""
 
     def summary_at(scale: float) -> tuple[float, float]:
-        return summary_with(views, matched, lambda view: _focal_scaled(view, scale))
+        return summary_with(views, matched, lambda view: change(view, scale))
 
     scales = FOCAL_SCALES
     for _ in range(_REFINEMENTS):
@@ -129,9 +159,9 @@ def best_focal_scale(views: Views, matched: Sequence[MatchedPair]) -> tuple[floa
     return scale, *summary_at(scale)
 
 
-def _mixed(views: Views, matched: Sequence[MatchedPair], text: str, correction: Correction) -> Explanation:
+def _mixed(views: Views, matched: Sequence[MatchedPair], text: str, correction: ViewCorrection) -> Explanation:
     """Explains pairs by correcting either, both or none of their photographs; empty if that does not fit."""
-    turned = {i: _corrected(view, correction) for i, view in views.items()}
+    turned = {i: correction(view) for i, view in views.items()}
     best: list[PairError] = []
     votes: Counter[int] = Counter()
     for item in matched:
@@ -152,13 +182,15 @@ def _mixed(views: Views, matched: Sequence[MatchedPair], text: str, correction: 
     return Explanation(f"with some photographs, not all, {text}", error_px, concerned)
 
 
-def _corrected(view: PosedView, correction: Correction) -> PosedView:
-    return replace(view, world_from_camera=correction(view.world_from_camera))
-
-
 def _focal_scaled(view: PosedView, scale: float) -> PosedView:
     camera = view.view.camera
     scaled = replace(camera, focal_x_px=scale * camera.focal_x_px, focal_y_px=scale * camera.focal_y_px)
+    return replace(view, view=replace(view.view, camera=scaled))
+
+
+def _scaled(view: PosedView, scale: float) -> PosedView:
+    camera = _focal_scaled(view, scale).view.camera
+    scaled = replace(camera, principal_x_px=scale * camera.principal_x_px, principal_y_px=scale * camera.principal_y_px)
     return replace(view, view=replace(view.view, camera=scaled))
 
 
