@@ -30,7 +30,6 @@ OUTSIDE: dict[str, list[tuple[str, Any]]] = {
     "method.pose_errors.PoseErrorOptions": [("own", ()), ("drift", (0.0,)), ("prior_log", 0.0)]
     + [("drift_inflation", -1.0)],
     "method.priors.gravity.GravityOptions": [("batch", 0), ("max_samples", 0), ("confidence", 1.0), ("refined", 0)],
-    "scenes.retrieval.ranking.RetrieveOptions": [("apart_m", -1.0), ("nearby_weight", 1.5), ("nearby_weight", NAN)],
     "method.scale_equations.ScaleOptions": [("min_baseline_m", 11.0), ("min_ratios", 0), ("max_deviation", NAN)]
     + [("max_pair_cameras", 1)],
     "method.structure.StructureOptions": [("iterations", 0), ("loss_scale_sigma", 0.0), ("max_residual_sigma", -1.0)]
@@ -45,9 +44,7 @@ OUTSIDE: dict[str, list[tuple[str, Any]]] = {
     "method.two_view.solve.TwoViewOptions": [("min_inliers", 3)],
     "method.uncertainty.covariance.UncertaintyOptions": [("region_factor", -0.1), ("rotation_factor", 0.0)]
     + [("max_matches", 0), ("position_factor", 0.0)],
-    "scenes.audit.coverage.CoverageOptions": [("least_matches", 100.0)],
     "scenes.audit.comparison.AuditOptions": [("position_tolerance_m", 0.0)],
-    "scenes.audit.neighbourhood.VisibilityOptions": [("max_scale", 1.0)],
     "scenes.retrieval.ranking.RankOptions": [("apart_m", -1.0), ("apart_deg", 181.0), ("nearby_weight", 1.5)]
     + [("nearby_weight", NAN), ("same_place_m", -1.0), ("per_place", 0), ("pool", 0), ("smallest_pool", 0)],
     "scheduling.options.WorkQueueOptions": [("max_queued_s", 0.0), ("max_bytes", -1), ("flow_share", 1.1)]

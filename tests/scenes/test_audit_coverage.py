@@ -9,7 +9,7 @@ from support.scenes import SceneOptions, SyntheticScene, look_at, make_scene
 
 from mapless.geometry import RigidTransform
 from mapless_server.scenes import Coverage, CoverageVerdict
-from mapless_server.scenes.audit.coverage import CoverageOptions, check_coverage
+from mapless_server.scenes.audit.coverage import REPEATABILITY, check_coverage
 from mapless_server.scenes.audit.neighbourhood import PairMatches
 
 
@@ -30,7 +30,7 @@ def check(scene: SyntheticScene, pairs: PairMatches, world_from_camera: RigidTra
 def test_among_the_references_one_is_localized(scene: SyntheticScene, pairs: PairMatches) -> None:
     coverage = check(scene, pairs, scene.world_from_query)
     assert coverage.verdict is CoverageVerdict.LOCALIZABLE
-    assert 150 < coverage.expected_match_count <= CoverageOptions().repeatability * len(scene.x_in_world)
+    assert 150 < coverage.expected_match_count <= REPEATABILITY * len(scene.x_in_world)
     assert coverage.image_share > 0.3
     assert coverage.position_68_m is not None
     assert 0 < coverage.position_68_m < 0.02

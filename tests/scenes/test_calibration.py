@@ -20,7 +20,7 @@ from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.trust.judge import LEVELS, trust_in_scene
 from mapless_server.method.uncertainty.radii import USUAL_GAP, Accuracy, growth
 from mapless_server.method.views import PosedView
-from mapless_server.scenes.calibration.calibrator import Calibrator, CalibratorOptions, SceneCalibrations
+from mapless_server.scenes.calibration.calibrator import MAX_CPU_S, Calibrator, SceneCalibrations
 from mapless_server.scenes.calibration.fit import FitOptions, LeftOut, fit
 from mapless_server.scenes.calibration.lens import SharedErrors, lens_contradiction, without_errors
 from mapless_server.scenes.indexes import SceneIndexes
@@ -134,10 +134,10 @@ class Counts(BackgroundObserver):
 class Server:
     """What one server has of calibrating, without its queue."""
 
-    def __init__(self, store: Store, options: CalibratorOptions | None = None) -> None:
+    def __init__(self, store: Store, max_cpu_s: float = MAX_CPU_S) -> None:
         self.store, self.counts = store, Counts()
         indexes = SceneIndexes(store, ReferenceLibrary(store), DESCRIPTOR, EXTRACTOR, 2**30)
-        self.calibrator = Calibrator(indexes, EXTRACTOR, Pipeline(), KIND, options)
+        self.calibrator = Calibrator(indexes, EXTRACTOR, Pipeline(), KIND, max_cpu_s)
         self.calibrations = SceneCalibrations(store, self.calibrator, self.counts)
 
     def run(self, pause: Callable[[], None] = lambda: None) -> SelfCalibration | None:
@@ -271,7 +271,7 @@ class TestScenes:
 
     def test_the_time_is_bounded(self, store: Store) -> None:
         add(store, REFERENCES)
-        found = Server(store, CalibratorOptions(max_cpu_s=1e-9)).run()
+        found = Server(store, max_cpu_s=1e-9).run()
         assert found is not None
         assert found.answer_count == 0
 

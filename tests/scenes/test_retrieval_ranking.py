@@ -16,7 +16,7 @@ from mapless_server.method.priors.known import PosePrior
 from mapless_server.method.views import Features, PosedView, View
 from mapless_server.scenes import Cone, Narrowing, RankedReference, RankOptions, Selection, Sphere, rank_references
 from mapless_server.scenes.retrieval.index import Entries, SceneIndex
-from mapless_server.scenes.retrieval.ranking import RetrieveOptions, nearest_references, spread, spread_choice
+from mapless_server.scenes.retrieval.ranking import nearest_references, spread, spread_choice
 from mapless_server.store import IndexedReference, SceneChanges
 from mapless_tools.evaluate.references import choose_references
 
@@ -238,17 +238,13 @@ def bare_view(descriptors: Array) -> View:
     return View(CAMERA, Features(np.zeros((n, 2), np.float32), descriptors.astype(np.float32), np.ones(n, np.float32)))
 
 
-def slow_choice(counts: list[int], centres: Array, count: int, options: RetrieveOptions) -> list[int]:
+def slow_choice(counts: list[int], centres: Array, count: int, apart_m: float, nearby_weight: float) -> list[int]:
     """A slow implementation: best score first, where a reference near a chosen one has a lower score."""
     chosen: list[int] = []
     while len(chosen) < min(count, len(counts)):
         scores = {
             i: counts[i]
-            * (
-                options.nearby_weight
-                if any(np.linalg.norm(centres[i] - centres[c]) < options.apart_m for c in chosen)
-                else 1.0
-            )
+            * (nearby_weight if any(np.linalg.norm(centres[i] - centres[c]) < apart_m for c in chosen) else 1.0)
             for i in range(len(counts))
             if i not in chosen
         }
@@ -267,8 +263,8 @@ def test_the_choice_equals_brute_force(
 ) -> None:
     counts = [matches for matches, _ in candidates]
     centres = np.array([[0.1 * place, 0.0, 0.0] for _, place in candidates]).reshape(-1, 3)
-    options = RetrieveOptions(apart_m, nearby_weight)
-    assert spread_choice(counts, centres, count, options) == slow_choice(counts, centres, count, options)
+    given = counts, centres, count, apart_m, nearby_weight
+    assert spread_choice(*given) == slow_choice(*given)
 
 
 def test_references_that_see_more_of_the_query_are_chosen() -> None:

@@ -13,7 +13,7 @@ from mapless.geometry import Camera
 from mapless_server.errors import DataLoss, NotFound, Unavailable
 from mapless_server.method.views import KeptDepth, PosedView
 from mapless_server.scenes.depth.finder import DepthFinder
-from mapless_server.scenes.depth.scene_depths import DepthMakerOptions, SceneDepths
+from mapless_server.scenes.depth.scene_depths import SceneDepths
 from mapless_server.scenes.library import Closed, ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import SceneKey
@@ -221,12 +221,6 @@ class TestFinder:
         assert [view.key for view in found] == [view.key for view in references]
         assert all(view.depths is None for view in found)
         assert it.events[-1] == ("depth_failures", 1, "")
-
-
-@pytest.mark.parametrize(("name", "value"), [("neighbours", 1), ("shortlist", 0)])
-def test_options_out_of_bounds_are_named(name: str, value: int) -> None:
-    with pytest.raises(ValueError, match=name):
-        DepthMakerOptions(**{name: value})  # type: ignore[arg-type]
 
 
 def test_claims_end_by_themselves_long_after_those_of_pairs(store: Store) -> None:

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mapless_server import __version__
-from mapless_server.scenes.retrieval.ranking import RetrieveOptions
+from mapless_server.scenes.retrieval.ranking import APART_M, NEARBY_WEIGHT
 from mapless_tools.output_files import finite
 
 from .metrics import QueryResult, Summary, summarize
@@ -16,8 +16,8 @@ from .run import Evaluation
 
 RULES = (
     "Medians, p90 and recall are over all queries; one that was rejected counts as infinitely wrong.",
-    f"References of a query: those with the most feature matches; within {RetrieveOptions().apart_m:g} m of one chosen "
-    f"before, matches count {RetrieveOptions().nearby_weight:g}. Its true pose is not looked at.",
+    f"References of a query: those with the most feature matches; within {APART_M:g} m of one chosen "
+    f"before, matches count {NEARBY_WEIGHT:g}. Its true pose is not looked at.",
     "Latency: time of one Localize call as the client sees it, one after the other, on this machine; choosing the "
     "references is not in it, nor is the first call in p50 and p95.",
 )

@@ -19,7 +19,7 @@ import numpy as np
 from mapless_server.method.views import PosedView
 from mapless_server.store import LruCache
 
-from .change import SAME_VIEWPOINT, Change, ChangeOptions, find_change
+from .change import SAME_VIEWPOINT, SEEN_ALIKE, Change, find_change
 from .comparison import AuditOptions, Comparison, Likeness, compare, likeness, pose_difference
 from .finder import ReferenceFinder
 from .neighbourhood import PairMatches
@@ -200,11 +200,11 @@ class Auditor:
 
     def _find_change(self, found: Comparison, verdict: AuditVerdict) -> Change | None:
         """Finds which part of the image does not show what the neighbours show; None if that cannot be decided."""
-        subject, options = found.subject, ChangeOptions()
+        subject, limits = found.subject, SEEN_ALIKE
         if verdict is AuditVerdict.UNVERIFIABLE:
             nearest = self._finder.views(self._finder.near(subject.name, self._options.neighbour_count))
-            found, options = compare(subject, nearest, self._pairs, self._options), SAME_VIEWPOINT
-        change = find_change(found, options)
+            found, limits = compare(subject, nearest, self._pairs, self._options), SAME_VIEWPOINT
+        change = find_change(found, limits)
         if change is None or not change.is_alarm:
             return change
         # Points of neighbours with wrong poses are in wrong places.
@@ -212,7 +212,7 @@ class Auditor:
         trusted = [reference for reference in references if not self._finding(reference.name).is_alarm]
         if len(trusted) == len(references):
             return change
-        return find_change(compare(subject, trusted, self._pairs, self._options), options)
+        return find_change(compare(subject, trusted, self._pairs, self._options), limits)
 
 
 _REPORTED_SHARE = 0.15

@@ -14,51 +14,30 @@ from scipy.special import bdtr
 
 from mapless.geometry import Array
 from mapless_server.method.match import MatchOptions, search
-from mapless_server.method.options import check_bounds
 from mapless_server.method.results import PointMatches
 from mapless_server.method.views import PosedView
 
 from .comparison import Comparison
-from .neighbourhood import Neighbourhood, VisibilityOptions, Visible, visible_points
+from .neighbourhood import Neighbourhood, Visibility, Visible, visible_points
 
-
-@dataclass(frozen=True)
-class ChangeOptions:
-    """Options of detecting changes.
-
-    Attributes:
-        columns, rows: size of the grid of cells.
-        max_turn_deg, max_scale: points are expected only where they are seen about as a neighbour sees them.
-        radius_px: a point is found if a similar keypoint is this near to its projection.
-        min_similarity: smallest cosine of their descriptors.
-        missing_share: a cell has changed if less than this share of the usual share of its points is found,
-        max_chance: and if the probability of that by chance is smaller than this.
-        min_points: with fewer expected points in the whole image nothing is decided.
-        alarm_share: a connected region of changed cells with at least this share of the judged image is an alarm. Of
-            149 unaltered photographs the worst had 0.20, and 0.33 when its best neighbour was faulty; of 12 with 60 %
-            of the image replaced 5 are found, the others reported with their share or as unverifiable.
-    """
-
-    columns: int = 8
-    rows: int = 6
-    max_turn_deg: float = 20.0
-    max_scale: float = 1.5
-    radius_px: float = 6.0
-    min_similarity: float = 0.8
-    missing_share: float = 0.15
-    max_chance: float = 1e-3
-    min_points: int = 100
-    alarm_share: float = 0.35
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "missing_share max_chance alarm_share", above=0, below=1)
-        check_bounds(self, "columns rows radius_px", above=0)
-
-
-SAME_VIEWPOINT = ChangeOptions(max_turn_deg=8.0, max_scale=1.25)
+SEEN_ALIKE = Visibility(max_turn_deg=20.0, max_scale=1.5)
+"""Points are expected only where they are seen about as a neighbour sees them."""
+SAME_VIEWPOINT = Visibility(max_turn_deg=8.0, max_scale=1.25)
 """For a photograph that no pose fits. A wall between it and its neighbours would hide everything they see, so only
 neighbours at its own viewpoint count, which the wall would hide, too."""
 
+_COLUMNS, _ROWS = 8, 6
+"""Of the grid of cells."""
+_RADIUS_PX, _MIN_SIMILARITY = 6.0, 0.8
+"""A point is found if a keypoint whose descriptor has at least this cosine is this near to its projection."""
+_MISSING_SHARE, _MAX_CHANCE = 0.15, 1e-3
+"""A cell has changed if less than this share of the usual share of its points is found, and less probably than this."""
+_MIN_POINTS = 100
+"""With fewer expected points in the whole image nothing is decided."""
+_ALARM_SHARE = 0.35
+"""A connected region of changed cells with at least this share of the judged image is an alarm. Of 149 unaltered
+photographs the worst had 0.20, and 0.33 when its best neighbour was faulty; of 12 with 60 % of the image replaced 5 are
+found, the others reported with their share or as unverifiable."""
 _LEAST_OBSERVERS = 3
 """References that must see what a photograph should show: a single one may itself have changed."""
 
@@ -77,47 +56,43 @@ class Change:
     is_alarm: bool
 
 
-def find_change(comparison: Comparison, options: ChangeOptions | None = None) -> Change | None:
+def find_change(comparison: Comparison, limits: Visibility) -> Change | None:
     """Compares a photograph with its neighbours' points; None with too few of them.
 
     Uses the fitted pose, so that an error of the given one within the tolerance does not matter, or the given one if no
     pose fits.
     """
-    options = options or ChangeOptions()
     neighbourhood, subject = comparison.neighbourhood, comparison.subject
-    if len(neighbourhood.structure.x_in_world) < options.min_points:
+    if len(neighbourhood.structure.x_in_world) < _MIN_POINTS:
         return None
     if comparison.is_usable:
         subject = replace(subject, world_from_camera=comparison.world_from_camera)
-    bounds = VisibilityOptions(options.max_turn_deg, options.max_scale)
-    visible = visible_points(subject.view.camera, subject.world_from_camera, neighbourhood, bounds)
-    if len(visible) < options.min_points or len(np.unique(visible.reference)) < _LEAST_OBSERVERS:
+    visible = visible_points(subject.view.camera, subject.world_from_camera, neighbourhood, limits)
+    if len(visible) < _MIN_POINTS or len(np.unique(visible.reference)) < _LEAST_OBSERVERS:
         return None
-    found = _found(subject, neighbourhood, visible, options)
+    found = _found(subject, neighbourhood, visible)
     camera = subject.view.camera
-    cell = np.floor((visible.pixel + 0.5) / (camera.width_px, camera.height_px) * (options.columns, options.rows))
-    index = (cell[:, 1] * options.columns + cell[:, 0]).astype(np.intp)
-    cells = options.columns * options.rows
+    cell = np.floor((visible.pixel + 0.5) / (camera.width_px, camera.height_px) * (_COLUMNS, _ROWS))
+    index = (cell[:, 1] * _COLUMNS + cell[:, 0]).astype(np.intp)
+    cells = _COLUMNS * _ROWS
     expected_by_cell = np.bincount(index, minlength=cells)
     found_by_cell = np.bincount(index, weights=found.astype(float), minlength=cells).astype(np.float64)
-    missing, judged = _missing(expected_by_cell, found_by_cell, options)
-    grid = missing.reshape(options.rows, options.columns).astype(np.uint8)
+    missing, judged = _missing(expected_by_cell, found_by_cell)
+    grid = missing.reshape(_ROWS, _COLUMNS).astype(np.uint8)
     count, regions = cv2.connectedComponents(grid, connectivity=4)
     largest = max((int((regions == k).sum()) for k in range(1, count)), default=0)
     share = largest / max(int(judged.sum()), 1)
     enough = judged.sum() >= cells / 4
-    return Change(len(visible), int(found.sum()), share, bool(enough and share >= options.alarm_share))
+    return Change(len(visible), int(found.sum()), share, bool(enough and share >= _ALARM_SHARE))
 
 
-def _missing(
-    expected: NDArray[np.intp], found: Array, options: ChangeOptions
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _missing(expected: NDArray[np.intp], found: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which cells have changed, and which have enough points to be judged."""
     usual = _usual_share(expected, found)
-    limit = options.missing_share * usual
+    limit = _MISSING_SHARE * usual
     # A cell can be judged if finding none of its points would be unlikely by chance.
-    judged = bdtr(0, expected, usual) < options.max_chance
-    unlikely = bdtr(found, expected, usual) < options.max_chance
+    judged = bdtr(0, expected, usual) < _MAX_CHANCE
+    unlikely = bdtr(found, expected, usual) < _MAX_CHANCE
     return judged & unlikely & (found <= limit * expected), judged
 
 
@@ -134,14 +109,11 @@ _LEAST_SHARE = 0.15
 """An unchanged photograph shows at least this share of the points that it should show."""
 
 
-def _found(
-    subject: PosedView, neighbourhood: Neighbourhood, visible: Visible, options: ChangeOptions
-) -> NDArray[np.bool_]:
+def _found(subject: PosedView, neighbourhood: Neighbourhood, visible: Visible) -> NDArray[np.bool_]:
     """Which visible points (V,) have a similar keypoint nearby."""
     nothing = np.empty(0, np.intp)
-    known = PointMatches(nothing, nothing, np.empty(0, bool), options.radius_px)
-    match_options = MatchOptions(radius_px=options.radius_px, min_similarity=options.min_similarity)
-    found = search(
-        subject.view, neighbourhood.references, neighbourhood.structure, subject.world_from_camera, known, match_options
-    )
+    known = PointMatches(nothing, nothing, np.empty(0, bool), _RADIUS_PX)
+    options = MatchOptions(radius_px=_RADIUS_PX, min_similarity=_MIN_SIMILARITY)
+    given = subject.view, neighbourhood.references, neighbourhood.structure, subject.world_from_camera
+    found = search(*given, known, options)
     return np.isin(visible.point, found.point)

@@ -4,7 +4,7 @@ It also compares two references: whether they are the same photograph, or show t
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
 
@@ -14,12 +14,11 @@ from mapless.geometry import Array, RigidTransform, rotation_angle_deg
 from mapless_server.method.options import check_bounds
 from mapless_server.method.perturbation import world_covariance
 from mapless_server.method.pnp import PnpOptions, ransac
-from mapless_server.method.structure import StructureOptions
 from mapless_server.method.trust.gate import false_alarms
 from mapless_server.method.views import Matches, PosedView
 
 from .neighbourhood import Neighbourhood, PairMatches, build_neighbourhood, match_points
-from .resection import CameraFit, Free, ObservedPoints, ResectionOptions, fit_camera
+from .resection import CameraFit, Free, ObservedPoints, fit_camera
 from .verdict import AuditVerdict
 
 _RANSAC = PnpOptions(min_iterations=1000, inlier_px=6.0)
@@ -58,8 +57,6 @@ class AuditOptions:
         same_photograph_share: and the share of them that match is larger.
         same_view_share: median shift of the keypoints of equivalent views is smaller, as a share of the image's width,
         same_view_matched_share: and the share of them that match is larger.
-        structure: options of the neighbours' points.
-        resection: options of the reference's fits.
     """
 
     position_tolerance_m: float = 0.035
@@ -79,8 +76,6 @@ class AuditOptions:
     same_photograph_share: float = 0.7
     same_view_share: float = 0.003
     same_view_matched_share: float = 0.3
-    structure: StructureOptions = field(default_factory=StructureOptions)
-    resection: ResectionOptions = field(default_factory=ResectionOptions)
 
     def __post_init__(self) -> None:
         check_bounds(self, "position_tolerance_m rotation_tolerance_deg focal_tolerance epipolar_px", above=0)
@@ -209,14 +204,14 @@ def compare(
     subject: PosedView, neighbours: Sequence[PosedView], pairs: PairMatches, options: AuditOptions
 ) -> Comparison:
     """Compares a reference with neighbours, whose poses are used as far as they agree with one another."""
-    neighbourhood = build_neighbourhood(neighbours, pairs, options.epipolar_px, options.structure)
+    neighbourhood = build_neighbourhood(neighbours, pairs, options.epipolar_px)
     points = match_points(subject, neighbourhood, pairs)
     fits = {}
     if len(points) >= _RANSAC.min_matches:
         camera, given = subject.view.camera, subject.world_from_camera
         found = ransac(camera, points.x_in_world, points.pixel, None, _RANSAC)
         starts = (given,) if found is None else (given, found)
-        fits = {free: fit_camera(points, camera, starts, free, options.resection) for free in Free}
+        fits = {free: fit_camera(points, camera, starts, free) for free in Free}
     return Comparison(subject, neighbourhood, points, fits, options)
 
 

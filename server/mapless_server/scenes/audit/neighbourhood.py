@@ -22,7 +22,6 @@ from mapless_server.method.correspond import Correspondences
 from mapless_server.method.match import vote
 from mapless_server.method.nearest import epipolar_distance_px, mutual_matches
 from mapless_server.method.observations import Observations, triangulate
-from mapless_server.method.options import check_bounds
 from mapless_server.method.results import Structure
 from mapless_server.method.structure import StructureOptions, observe, refine_points
 from mapless_server.method.tracks import Tracks, build_tracks
@@ -67,10 +66,9 @@ class Neighbourhood:
     point_covariance: Array
 
 
-def build_neighbourhood(
-    references: Sequence[PosedView], pairs: PairMatches, epipolar_px: float, options: StructureOptions
-) -> Neighbourhood:
+def build_neighbourhood(references: Sequence[PosedView], pairs: PairMatches, epipolar_px: float) -> Neighbourhood:
     """Triangulates the matches among the references; the result may have no points."""
+    options = StructureOptions()
     if len(references) < 2:
         nothing = np.empty(0, np.intp)
         structure = Structure(np.empty((0, 3)), Tracks(nothing, nothing, nothing), options.first_noise)
@@ -113,20 +111,16 @@ def _point_covariance(observations: Observations, x_in_world: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class VisibilityOptions:
-    """Options of visibility.
+class Visibility:
+    """What counts as seen from about the same direction and distance.
 
     Attributes:
         max_turn_deg: largest angle between the viewing rays of the camera and of a reference that observes the point.
         max_scale: largest ratio of the point's sizes in pixels in both.
     """
 
-    max_turn_deg: float = 40.0
-    max_scale: float = 2.5
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "max_turn_deg", above=0, below=90)
-        check_bounds(self, "max_scale", above=1)
+    max_turn_deg: float
+    max_scale: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +146,7 @@ class Visible:
 
 
 def visible_points(
-    camera: Camera, world_from_camera: RigidTransform, neighbourhood: Neighbourhood, options: VisibilityOptions
+    camera: Camera, world_from_camera: RigidTransform, neighbourhood: Neighbourhood, limits: Visibility
 ) -> Visible:
     """The neighbourhood's points that a pinhole camera at this pose should show."""
     structure = neighbourhood.structure
@@ -172,10 +166,10 @@ def visible_points(
     ratio = (camera.focal_x_px / np.maximum(our_distance, 1e-12)) / (focals[view] / their_distance)
     scale = np.maximum(ratio, 1 / np.maximum(ratio, 1e-12))
 
-    alike: NDArray[np.bool_] = inside[point] & (turn_deg < options.max_turn_deg) & (scale < options.max_scale)
+    alike: NDArray[np.bool_] = inside[point] & (turn_deg < limits.max_turn_deg) & (scale < limits.max_scale)
     rows = np.flatnonzero(alike)
     # Of a point's observations the most similar one, weighing angle and scale by their bounds.
-    unlikeness = turn_deg[rows] / options.max_turn_deg + np.log(scale[rows]) / np.log(options.max_scale)
+    unlikeness = turn_deg[rows] / limits.max_turn_deg + np.log(scale[rows]) / np.log(limits.max_scale)
     rows = rows[np.lexsort((unlikeness, point[rows]))]
     rows = rows[np.diff(point[rows], prepend=-1) != 0]
     return Visible(point[rows], pixel[point[rows]], turn_deg[rows], scale[rows], view[rows])

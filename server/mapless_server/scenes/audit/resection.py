@@ -15,11 +15,17 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian
 from mapless_server.method.optimize import MinimizeOptions, minimize
-from mapless_server.method.options import check_bounds
 from mapless_server.method.resection import Resection
 
 _BEHIND_SIGMA = 1e3
 """Residual of a point behind the camera."""
+_LOSS_SCALE_SIGMA = 2.0
+"""Residual at which the loss flattens; a little wider than in the method's own final adjustment, because the poses of
+neighbours are not adjusted here."""
+_INLIER_SIGMA = 4.0
+"""Largest residual of an inlier."""
+_STEPS = MinimizeOptions(30, 1e-6, damping=1e-3)
+"""From a pose that is off by metres about 20 steps are needed."""
 
 
 class Free(Enum):
@@ -29,27 +35,6 @@ class Free(Enum):
     POSE = (0, 1, 2, 3, 4, 5)
     FOCAL = (6,)
     BOTH = (0, 1, 2, 3, 4, 5, 6)
-
-
-@dataclass(frozen=True)
-class ResectionOptions:
-    """Options of a fit.
-
-    Attributes:
-        loss_scale_sigma: residual at which the loss flattens; a little wider than in the method's own final adjustment,
-            because the neighbours' poses are not adjusted here.
-        iterations: largest number of Levenberg-Marquardt steps; from a pose that is off by metres about 20 are needed.
-        min_decrease: stops when a step lowers the cost by a smaller share.
-        inlier_sigma: largest residual of an inlier.
-    """
-
-    loss_scale_sigma: float = 2.0
-    iterations: int = 30
-    min_decrease: float = 1e-6
-    inlier_sigma: float = 4.0
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "loss_scale_sigma iterations min_decrease inlier_sigma", above=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,32 +83,27 @@ class CameraFit:
         return int(self.inliers.sum())
 
 
-def fit_camera(
-    points: ObservedPoints, camera: Camera, starts: tuple[RigidTransform, ...], free: Free, options: ResectionOptions
-) -> CameraFit:
+def fit_camera(points: ObservedPoints, camera: Camera, starts: tuple[RigidTransform, ...], free: Free) -> CameraFit:
     """Fits from each start and returns the best fit; if the pose is not free, it is the first start."""
     if free in (Free.NOTHING, Free.FOCAL):
         starts = starts[:1]
-    return min((_fit(points, camera, start, free, options) for start in starts), key=lambda fit: fit.cost)
+    return min((_fit(points, camera, start, free) for start in starts), key=lambda fit: fit.cost)
 
 
-def _fit(
-    points: ObservedPoints, camera: Camera, start: RigidTransform, free: Free, options: ResectionOptions
-) -> CameraFit:
-    camera_from_world, loss_scale = start.inverse(), options.loss_scale_sigma
+def _fit(points: ObservedPoints, camera: Camera, start: RigidTransform, free: Free) -> CameraFit:
+    camera_from_world = start.inverse()
     sigma_px = _sigma_px(points, camera, camera_from_world)
     problem = Resection(
         camera,
         points.x_in_world,
         points.pixel,
         sigma_px,
-        loss_scale,
+        _LOSS_SCALE_SIGMA,
         free.value,
         behind_sigma=_BEHIND_SIGMA,
         shorten_all=False,
     )
-    iterations = options.iterations if free.value else 0
-    steps = MinimizeOptions(iterations, options.min_decrease, damping=1e-3)  # a start may be off by metres
+    steps = _STEPS if free.value else replace(_STEPS, iterations=0)
     fit = minimize(problem, problem.at(camera_from_world), steps)
     fitted = with_focal(camera, math.exp(fit.log_ratio))
     # Weighted with the covariances as seen from the fitted pose, so that fits from different starts are comparable.
@@ -134,7 +114,7 @@ def _fit(
         fitted,
         fit.camera_from_world.inverse(),
         problem.cost(fit),
-        length < options.inlier_sigma,
+        length < _INLIER_SIGMA,
         length * problem.sigma_px,
         problem.linearize(fit)[0],
     )

@@ -4,7 +4,7 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import chain, zip_longest
 
@@ -16,7 +16,7 @@ from mapless_server.errors import DataLoss, NotFound
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.localize import prepare, refine
-from mapless_server.method.options import LocalizeOptions, StageContext, check_bounds
+from mapless_server.method.options import LocalizeOptions, StageContext
 from mapless_server.method.pipeline import Pipeline, reconstruct
 from mapless_server.method.uncertainty.radii import accuracy_from_covariance, viewpoint_gap
 from mapless_server.method.views import PosedView
@@ -47,27 +47,14 @@ from .lens import LENS_REFERENCES, SharedErrors, lens_contradiction, shared_erro
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class CalibratorOptions:
-    """Options of localizing references against the others.
-
-    Attributes:
-        sample: largest number of references that are localized.
-        max_cpu_s: processor time of the calling thread after which no further reference is begun, for each (also
-            incomplete) thousand references of the scene. With the matcher's threads the total is at most 2.4 times as
-            much, if the matches of the references are stored.
-        reference_count: number of references that each is localized with, as for queries by default.
-        shortlist: size of the shortlist, as a multiple of `reference_count`, as for queries.
-    """
-
-    sample: int = 40
-    max_cpu_s: float = 8.5
-    reference_count: int = 10
-    shortlist: int = 2
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "sample reference_count shortlist", at_least=1)
-        check_bounds(self, "max_cpu_s", above=0)
+SAMPLE = 40
+"""Largest number of references of a scene that are localized against the others."""
+MAX_CPU_S = 8.5
+"""Processor time of the calling thread after which no further reference is begun, for each (also incomplete) thousand
+references of the scene. With the matcher's threads the total is at most 2.4 times as much, if the matches of the
+references are stored."""
+REFERENCE_COUNT, SHORTLIST = 10, 20
+"""References that each is localized with, and those of which they are chosen; as for queries by default."""
 
 
 class Calibrator:
@@ -79,14 +66,14 @@ class Calibrator:
         extractor: FeatureExtractor,
         pipeline: Pipeline,
         kind: str,
-        options: CalibratorOptions | None = None,
+        max_cpu_s: float = MAX_CPU_S,
     ) -> None:
         """`kind` is that of the tier's answers, see `store.calibration_kind`."""
         self._indexes = indexes
         self._extractor = extractor
         self._pipeline = pipeline
         self.kind = kind
-        self.options = options or CalibratorOptions()
+        self._max_cpu_s = max_cpu_s
 
     def calibrate(
         self, scene_key: SceneKey, library: ReferenceLibrary, newest: Sequence[str], pause: Callable[[], None]
@@ -123,7 +110,7 @@ class Calibrator:
     ) -> list[LeftOut]:
         """Localizes each of a sample against the others, without errors `lens`; appends what it shows to `shared`."""
         begin_s, results = time.thread_time(), []
-        most_s = self.options.max_cpu_s * max(1, -(-len(entries) // 1000))
+        most_s = self._max_cpu_s * max(1, -(-len(entries) // 1000))
         for reference_id in sample:
             if time.thread_time() - begin_s > most_s:
                 break
@@ -140,9 +127,9 @@ class Calibrator:
             return []
         centres = entries.centres(rows)
         nearest_m = KDTree(centres).query(centres, k=2)[0][:, 1]
-        far = [entries.reference(rows[i])[0] for i in np.argsort(-nearest_m, kind="stable")[: self.options.sample]]
+        far = [entries.reference(rows[i])[0] for i in np.argsort(-nearest_m, kind="stable")[:SAMPLE]]
         by_turns = chain.from_iterable(zip_longest([it for it in newest if it in entries], far))
-        return [it for it in dict.fromkeys(by_turns) if it is not None][: self.options.sample]
+        return [it for it in dict.fromkeys(by_turns) if it is not None][:SAMPLE]
 
     def _leave_out(
         self,
@@ -159,17 +146,17 @@ class Calibrator:
         loaded = load(reference_ids=[reference_id])
         if not loaded:
             return None
-        (subject,), count = loaded, self.options.reference_count
+        (subject,) = loaded
         if lens is not None:
             subject = without_errors(subject, lens)
-        wanted = [it.reference_id for it in rank_beside(entries, reference_id, self.options.shortlist * count)]
+        wanted = [it.reference_id for it in rank_beside(entries, reference_id, SHORTLIST)]
         others = [it for it in load(reference_ids=wanted) if not _is_copy(it, subject)]
         if len(others) < 2:
             return None
         context.check()
         matches = self._pipeline.matcher.match_quickly(subject.view, others, context.check)
         centres = [it.world_from_camera.translation for it in others]
-        chosen = spread_choice([len(it) for it in matches], centres, count)
+        chosen = spread_choice([len(it) for it in matches], centres, REFERENCE_COUNT)
         references, chosen_matches = [others[i] for i in chosen], [matches[i] for i in chosen]
         if shared is not None and len(shared) < LENS_REFERENCES:
             found = shared_errors(subject, references, chosen_matches)
@@ -284,7 +271,7 @@ class SceneCalibrations:
             log.info("scene %s is calibrated from %d of its references", claim.scene_key, found.answer_count)
 
     def _localize_references(self, claim: CalibrationClaim, pause: Callable[[], None]) -> SelfCalibration:
-        newest = list_newest(self._store.database, claim.scene_key, self._calibrator.options.sample)
+        newest = list_newest(self._store.database, claim.scene_key, SAMPLE)
         # Of its own, so that references that queries use stay in memory.
         with closing(ReferenceLibrary(self._store.uncached(_CACHE_BYTES), self._depths)) as library:
             return self._calibrator.calibrate(claim.scene_key, library, newest, pause)

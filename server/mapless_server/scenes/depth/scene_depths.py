@@ -4,13 +4,13 @@ import logging
 import time
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.method.coarse import Reconstructor, Request, Triangulation
 from mapless_server.method.correspond import Matcher
 from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.options import StageContext, check_bounds
+from mapless_server.method.options import StageContext
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.scale import estimate_scale
 from mapless_server.method.views import KeptDepth, PosedView, Reconstruction
@@ -26,44 +26,23 @@ from ..retrieval.ranking import rank_beside, spread_choice
 from .check import DepthCheckOptions, checked_depths
 from .finder import DepthFinder
 
-
-@dataclass(frozen=True)
-class DepthMakerOptions:
-    """Options of making depths.
-
-    Attributes:
-        neighbours: largest number of references that the network gets besides the wanted one; as many as in a query of
-            ten references need half of its memory.
-        shortlist: number of references that are matched with it, as a multiple of `neighbours`; the best are used.
-        check: options of the check.
-    """
-
-    neighbours: int = 7
-    shortlist: int = 2
-    check: DepthCheckOptions = field(default_factory=DepthCheckOptions)
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "neighbours", at_least=2)
-        check_bounds(self, "shortlist", at_least=1)
+NEIGHBOURS, SHORTLIST = 7, 14
+"""References that the network gets besides the wanted one, and those that are matched with it, of which the best are
+used. As many as in a query of ten references need half of its memory."""
+_CHECK = DepthCheckOptions()
 
 
 class DepthMaker:
     """Makes and checks depths with one network, of references with one extractor's features."""
 
     def __init__(
-        self,
-        indexes: SceneIndexes,
-        extractor: FeatureExtractor,
-        matcher: Matcher,
-        network: Reconstructor,
-        options: DepthMakerOptions | None = None,
+        self, indexes: SceneIndexes, extractor: FeatureExtractor, matcher: Matcher, network: Reconstructor
     ) -> None:
         """`matcher` is that of the extractor's features."""
         self._indexes = indexes
         self._extractor = extractor
         self._matcher = matcher
         self._network = network
-        self.options = options or DepthMakerOptions()
 
     @property
     def kind(self) -> str:
@@ -102,7 +81,7 @@ class DepthMaker:
         if isinstance(scale, Rejection):
             return nothing
         true_pose = query.world_from_camera.shifted(-origin)
-        depths = checked_depths(reconstruction, scale, given, true_pose, correspondences, self.options.check)
+        depths = checked_depths(reconstruction, scale, given, true_pose, correspondences, _CHECK)
         return dict(zip(nothing, depths, strict=True))
 
     def _neighbours(
@@ -117,14 +96,13 @@ class DepthMaker:
         entries = self._indexes.entries(scene_key, context)
         if reference_id not in entries:
             raise NotFound("the reference was deleted")
-        count = self.options.neighbours
-        wanted = [it.reference_id for it in rank_beside(entries, reference_id, self.options.shortlist * count)]
+        wanted = [it.reference_id for it in rank_beside(entries, reference_id, SHORTLIST)]
         others = self._indexes.load_existing(library, scene_key, wanted, self._extractor, context)
         matches = [self._matcher.match_references(subject, other) for other in others]
         context.check()
-        sharing = [i for i, found in enumerate(matches) if len(found) >= self.options.check.min_points]
+        sharing = [i for i, found in enumerate(matches) if len(found) >= _CHECK.min_points]
         centres = [others[i].world_from_camera.translation for i in sharing]
-        return [others[sharing[i]] for i in spread_choice([len(matches[i]) for i in sharing], centres, count)]
+        return [others[sharing[i]] for i in spread_choice([len(matches[i]) for i in sharing], centres, NEIGHBOURS)]
 
 
 log = logging.getLogger(__name__)

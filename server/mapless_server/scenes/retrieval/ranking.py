@@ -257,45 +257,33 @@ def _ranked(entries: Entries, row: int, similarity: float) -> RankedReference:
     return RankedReference(reference_id, key, similarity, world_from_camera)
 
 
-@dataclass(frozen=True)
-class RetrieveOptions:
-    """Options of the choice.
-
-    Attributes:
-        apart_m: references closer together than this triangulate nothing (the paper's least baseline).
-        nearby_weight: factor on the match count of a reference within `apart_m` of a chosen one. 0 would spread the
-            references at any cost: in a dense sequence such references show so little of the query that a third of
-            the accuracy is lost.
-    """
-
-    apart_m: float = 0.3
-    nearby_weight: float = 0.5
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "apart_m", at_least=0)
-        check_bounds(self, "nearby_weight", at_least=0, at_most=1)
+APART_M = 0.3
+"""References closer together than this triangulate nothing (the paper's least baseline)."""
+NEARBY_WEIGHT = 0.5
+"""Factor on the match count of a reference within `APART_M` of a chosen one. 0 would spread the references at any cost:
+in a dense sequence such references show so little of the query that a third of the accuracy is lost."""
 
 
 def spread_choice(
-    match_counts: ArrayLike, centres: ArrayLike, count: int, options: RetrieveOptions | None = None
+    match_counts: ArrayLike,
+    centres: ArrayLike,
+    count: int,
+    apart_m: float = APART_M,
+    nearby_weight: float = NEARBY_WEIGHT,
 ) -> list[int]:
     """Greedy choice by match count, reduced for candidates near a chosen one; the first of equals.
 
-    Args:
-        match_counts: (N,) matches with the query.
-        centres: (N, 3) camera centres, metres.
-        count: how many to choose.
-        options: options of the choice.
+    `match_counts` (N,) are those with the query, `centres` (N, 3) the cameras' in metres; see `APART_M` and
+    `NEARBY_WEIGHT`.
     """
-    options = options or RetrieveOptions()
     score: NDArray[np.float64] = np.asarray(match_counts, float)
     centre = np.asarray(centres, float).reshape(-1, 3)
     nearby = np.zeros(len(score), bool)
     chosen: list[int] = []
     for _ in range(min(count, len(score))):
-        weighted = np.where(nearby, options.nearby_weight, 1.0) * score
+        weighted = np.where(nearby, nearby_weight, 1.0) * score
         weighted[chosen] = -1.0
         best = int(np.argmax(weighted))
         chosen.append(best)
-        nearby |= np.linalg.norm(centre - centre[best], axis=1) < options.apart_m
+        nearby |= np.linalg.norm(centre - centre[best], axis=1) < apart_m
     return chosen
