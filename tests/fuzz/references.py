@@ -108,6 +108,9 @@ class WatchfulStore:
     def get_scene(self, key: SceneKey) -> SceneRecord:
         return self.create_scene(key)
 
+    def get_attributes(self, key: SceneKey) -> SceneAttributes:
+        return self.create_scene(key).attributes
+
     def create_scene(self, key: SceneKey, attributes: SceneAttributes = NOTHING_KNOWN) -> SceneRecord:
         check_key(key)
         row = rows.attributes_row(key, attributes)
