@@ -89,16 +89,8 @@ def groups_of(suite: Suite) -> tuple[Group, ...]:
             for run in suite.runs
             if run.scene.place.layout == layout
         }
-        groups.append(
-            Group(
-                layout,
-                BENCHMARKS.get(layout),
-                tuple(scene.place.name for scene in scenes),
-                tuple(settings),
-                suite.options.methods(),
-                runs,
-            )
-        )
+        names, methods = tuple(scene.place.name for scene in scenes), suite.options.methods()
+        groups.append(Group(layout, BENCHMARKS.get(layout), names, tuple(settings), methods, runs))
     return tuple(groups)
 
 

@@ -12,32 +12,8 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pygltflib as gl
 from numpy.typing import NDArray
-from pygltflib import (
-    ARRAY_BUFFER,
-    FLOAT,
-    GLTF2,
-    LINES,
-    POINTS,
-    TRIANGLES,
-    UNSIGNED_BYTE,
-    Accessor,
-    Asset,
-    Attributes,
-    Buffer,
-    BufferView,
-    Camera,
-    Material,
-    Mesh,
-    Node,
-    PbrMetallicRoughness,
-    Perspective,
-    Primitive,
-    Scene,
-    Texture,
-    TextureInfo,
-)
-from pygltflib import Image as EmbeddedImage
 
 from mapless import Client, LocalizationResult, MaplessError, Reference
 from mapless import Scene as KnownScene
@@ -137,11 +113,13 @@ class _File:
         datum = scene.datum.to_json() if scene.datum else None
         about = {"scene": scene.scene_id, "arbitrary_unit": scene.arbitrary_unit, "datum": datum}
         about |= {"down_in_world": scene.down_in_world, "origin_in_world": scenery.origin.tolist()}
-        self._gltf = GLTF2(
-            asset=Asset(version="2.0", generator="mapless-server export"),
+        self._gltf = gl.GLTF2(
+            asset=gl.Asset(version="2.0", generator="mapless-server export"),
             scene=0,
-            scenes=[Scene(name=scene.scene_id, nodes=[0])],
-            nodes=[Node(name=scene.scene_id, rotation=_upright(scenery.down), children=self._in_world, extras=about)],
+            scenes=[gl.Scene(name=scene.scene_id, nodes=[0])],
+            nodes=[
+                gl.Node(name=scene.scene_id, rotation=_upright(scenery.down), children=self._in_world, extras=about)
+            ],
             materials=[
                 _material("lines", baseColorFactor=_LINE_COLOUR),
                 _material("points", baseColorFactor=[1.0, 1.0, 1.0, 1.0]),
@@ -157,14 +135,14 @@ class _File:
         q = turned.quaternion()
         camera, mesh = self._frustum(reference)
         # A node of its own, without children: some readers end at a camera.
-        children = [self._node(Node(name=f"camera of {reference.reference_id}", camera=camera))]
+        children = [self._node(gl.Node(name=f"camera of {reference.reference_id}", camera=camera))]
         if view.thumbnail is not None:
             picture = self._picture(reference, view.thumbnail)
-            children.append(self._node(Node(name=f"photograph of {reference.reference_id}", mesh=picture)))
+            children.append(self._node(gl.Node(name=f"photograph of {reference.reference_id}", mesh=picture)))
         intrinsics = {name: value for name, value in asdict(reference.camera).items() if value is not None}
         about = {"reference": reference.reference_id, "camera": intrinsics}
         about |= {"world_from_camera": reference.world_from_camera.matrix().tolist()}
-        node = Node(
+        node = gl.Node(
             name=reference.reference_id,
             translation=turned.translation.tolist(),
             rotation=[q.x, q.y, q.z, q.w],
@@ -175,15 +153,15 @@ class _File:
         self._in_world.append(self._node(node))
 
     def add_points(self, points: Array, colours: NDArray[np.uint8]) -> None:
-        positions = self._array((points - self._scenery.origin).astype(np.float32), FLOAT, "VEC3")
+        positions = self._array((points - self._scenery.origin).astype(np.float32), gl.FLOAT, "VEC3")
         linear = np.rint(255 * (colours / 255) ** _GAMMA).astype(np.uint8)
         rgba = np.concatenate([linear, np.full((len(colours), 1), 255, np.uint8)], axis=1)  # four bytes: aligned
-        colour = self._array(rgba, UNSIGNED_BYTE, "VEC4", normalized=True)
-        mesh = self._mesh("points", Attributes(POSITION=positions, COLOR_0=colour), POINTS, material=1)
-        self._in_world.append(self._node(Node(name="points", mesh=mesh)))
+        colour = self._array(rgba, gl.UNSIGNED_BYTE, "VEC4", normalized=True)
+        mesh = self._mesh("points", gl.Attributes(POSITION=positions, COLOR_0=colour), gl.POINTS, material=1)
+        self._in_world.append(self._node(gl.Node(name="points", mesh=mesh)))
 
     def content(self) -> bytes:
-        self._gltf.buffers = [Buffer(byteLength=len(self._blob))]
+        self._gltf.buffers = [gl.Buffer(byteLength=len(self._blob))]
         self._gltf.set_binary_blob(bytes(self._blob))
         return b"".join(self._gltf.save_to_bytes())
 
@@ -191,17 +169,17 @@ class _File:
         """The camera and the mesh of lines for a reference's intrinsics, which many references share."""
         camera = reference.camera
         if camera not in self._frustums:
-            perspective = Perspective(
+            perspective = gl.Perspective(
                 yfov=float(2 * np.arctan(camera.height_px / 2 / camera.focal_y_px)),
                 aspectRatio=camera.width_px / camera.focal_x_px * camera.focal_y_px / camera.height_px,
                 znear=self._scenery.size_m / 100,
             )
-            self._gltf.cameras.append(Camera(type="perspective", perspective=perspective))
+            self._gltf.cameras.append(gl.Camera(type="perspective", perspective=perspective))
             corners = self._corners(reference)
             apex = np.zeros(3)
             ends = [(apex, it) for it in corners] + [(corners[i], corners[(i + 1) % 4]) for i in range(4)]
-            lines = self._array(np.array(ends, np.float32).reshape(-1, 3), FLOAT, "VEC3")
-            mesh = self._mesh("frustum", Attributes(POSITION=lines), LINES, material=0)
+            lines = self._array(np.array(ends, np.float32).reshape(-1, 3), gl.FLOAT, "VEC3")
+            mesh = self._mesh("frustum", gl.Attributes(POSITION=lines), gl.LINES, material=0)
             self._frustums[camera] = len(self._gltf.cameras) - 1, mesh
         return self._frustums[camera]
 
@@ -214,28 +192,28 @@ class _File:
 
     def _picture(self, reference: Reference, thumbnail: bytes) -> int:
         gltf = self._gltf
-        gltf.images.append(EmbeddedImage(bufferView=self._view(thumbnail), mimeType="image/jpeg"))
-        gltf.textures.append(Texture(source=len(gltf.images) - 1))
-        gltf.materials.append(_material("photograph", baseColorTexture=TextureInfo(index=len(gltf.textures) - 1)))
+        gltf.images.append(gl.Image(bufferView=self._view(thumbnail), mimeType="image/jpeg"))
+        gltf.textures.append(gl.Texture(source=len(gltf.images) - 1))
+        gltf.materials.append(_material("photograph", baseColorTexture=gl.TextureInfo(index=len(gltf.textures) - 1)))
         around = [0, 3, 2, 0, 2, 1]  # counterclockwise where the camera stands
-        positions = self._array(self._corners(reference)[around].astype(np.float32), FLOAT, "VEC3")
+        positions = self._array(self._corners(reference)[around].astype(np.float32), gl.FLOAT, "VEC3")
         uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)[around]
-        attributes = Attributes(POSITION=positions, TEXCOORD_0=self._array(uv, FLOAT, "VEC2"))
-        return self._mesh("photograph", attributes, TRIANGLES, material=len(gltf.materials) - 1)
+        attributes = gl.Attributes(POSITION=positions, TEXCOORD_0=self._array(uv, gl.FLOAT, "VEC2"))
+        return self._mesh("photograph", attributes, gl.TRIANGLES, material=len(gltf.materials) - 1)
 
-    def _node(self, node: Node) -> int:
+    def _node(self, node: gl.Node) -> int:
         self._gltf.nodes.append(node)
         return len(self._gltf.nodes) - 1
 
-    def _mesh(self, name: str, attributes: Attributes, mode: int, material: int) -> int:
+    def _mesh(self, name: str, attributes: gl.Attributes, mode: int, material: int) -> int:
         self._gltf.meshes.append(
-            Mesh(name=name, primitives=[Primitive(attributes=attributes, mode=mode, material=material)])
+            gl.Mesh(name=name, primitives=[gl.Primitive(attributes=attributes, mode=mode, material=material)])
         )
         return len(self._gltf.meshes) - 1
 
     def _array(self, values: NDArray[Any], component: int, kind: str, normalized: bool = False) -> int:
-        accessor = Accessor(
-            bufferView=self._view(values.tobytes(), ARRAY_BUFFER),
+        accessor = gl.Accessor(
+            bufferView=self._view(values.tobytes(), gl.ARRAY_BUFFER),
             componentType=component,
             count=len(values),
             type=kind,
@@ -248,7 +226,7 @@ class _File:
 
     def _view(self, data: bytes, target: int | None = None) -> int:
         self._gltf.bufferViews.append(
-            BufferView(buffer=0, byteOffset=len(self._blob), byteLength=len(data), target=target)
+            gl.BufferView(buffer=0, byteOffset=len(self._blob), byteLength=len(data), target=target)
         )
         self._blob += data + bytes(-len(data) % 4)
         return len(self._gltf.bufferViews) - 1
@@ -264,9 +242,9 @@ def _upright(down: Array) -> list[float]:
     return [q.x, q.y, q.z, q.w]
 
 
-def _material(name: str, **colour: Any) -> Material:
+def _material(name: str, **colour: Any) -> gl.Material:
     """A material that is visible without lights, from both sides."""
-    metallic = PbrMetallicRoughness(metallicFactor=0.0, **colour)
-    return Material(
+    metallic = gl.PbrMetallicRoughness(metallicFactor=0.0, **colour)
+    return gl.Material(
         name=name, pbrMetallicRoughness=metallic, doubleSided=True, extensions={_UNLIT: {}}, alphaCutoff=None
     )

@@ -15,18 +15,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-from mapless import (
-    AlreadyExists,
-    Client,
-    DeadlineExceeded,
-    Internal,
-    InvalidArgument,
-    MaplessError,
-    NewReference,
-    NotFound,
-    ResourceExhausted,
-    Unavailable,
-)
+from mapless import Client, NewReference, errors
 from mapless_server.errors import InvalidArgument as BadImage
 from mapless_server.images import image_size
 from mapless_tools.dataset import Frame, Refusal
@@ -145,9 +134,9 @@ class Uploader:
                 raise _Stopped
             try:
                 stored = self._client.add_references(self._report.scene, [item.reference() for item in left])
-            except AlreadyExists as error:
+            except errors.AlreadyExists as error:
                 left = self._reconcile(left, waiting, error)
-            except ResourceExhausted as error:
+            except errors.ResourceExhausted as error:
                 if error.reason == STORE_FULL:
                     self._end(f"{error.message}: free space, then import again")
                 if error.retry_after_s is None:
@@ -155,14 +144,14 @@ class Uploader:
                     return
                 if not waiting.for_busy(error.retry_after_s):
                     self._end(f"the server stays too busy: {error.message}")
-            except (Unavailable, DeadlineExceeded) as error:
+            except (errors.Unavailable, errors.DeadlineExceeded) as error:
                 waiting.lost_an_answer = True
                 if not waiting.for_return():
                     self._end(f"the server cannot be reached: {error.message}")
-            except (InvalidArgument, Internal) as error:
+            except (errors.InvalidArgument, errors.Internal) as error:
                 self._one_by_one(left, error)
                 return
-            except MaplessError as error:
+            except errors.MaplessError as error:
                 self._end(str(error))
             else:
                 self._add(left)
@@ -170,16 +159,16 @@ class Uploader:
                     self._report.blank += [it.reference_id for it in stored if not it.feature_count]
                 return
 
-    def _reconcile(self, items: Sequence[Item], waiting: Waiting, error: AlreadyExists) -> list[Item]:
+    def _reconcile(self, items: Sequence[Item], waiting: Waiting, error: errors.AlreadyExists) -> list[Item]:
         """The items that do not exist yet, after an id was taken."""
         left = []
         for item in items:
             try:
                 there = stored_of(self._client.get_reference(self._report.scene, item.frame.name))
-            except NotFound:
+            except errors.NotFound:
                 left.append(item)
                 continue
-            except MaplessError as failure:
+            except errors.MaplessError as failure:
                 self._end(str(failure))
             if waiting.lost_an_answer and not difference(there, item.stored):
                 self._add([item])
@@ -191,14 +180,14 @@ class Uploader:
             self._end(str(error))
         return left
 
-    def _one_by_one(self, items: Sequence[Item], error: MaplessError) -> None:
+    def _one_by_one(self, items: Sequence[Item], error: errors.MaplessError) -> None:
         """Sends the references of a rejected message one by one, and refuses one that is rejected alone."""
         if len(items) > 1:
             for item in items:
                 self._send([item])
             return
         field = _REQUEST.sub("", error.field or "").lstrip(".")
-        request = f" (request {error.request_id})" if isinstance(error, Internal) else ""
+        request = f" (request {error.request_id})" if isinstance(error, errors.Internal) else ""
         self._refuse(items[0].frame, f"{f'{field}: ' if field else ''}{error.message}{request}")
         self._known.forget(items[0].stored)
 

@@ -125,17 +125,8 @@ async def _call(target: Target, planned: PlannedCall, begin_s: float) -> CallRec
     finally:
         if hang_up is not None:
             hang_up.cancel()
-    return CallRecord(
-        planned.kind,
-        planned.client,
-        planned.at_s,
-        sent_s - begin_s,
-        ended_s - begin_s,
-        deadline_s,
-        code,
-        detail,
-        retry_after_s,
-    )
+    times_s = (planned.at_s, sent_s - begin_s, ended_s - begin_s)
+    return CallRecord(planned.kind, planned.client, *times_s, deadline_s, code, detail, retry_after_s)
 
 
 def _reason(known: MaplessError) -> str:
