@@ -175,9 +175,7 @@ def test_poses_do_not_depend_on_the_unit_of_length() -> None:
 def test_covariance_is_right_against_planted_noise(pose_noise_px: float) -> None:
     """The mean squared errors of 30 poses, over the mean of what is stated."""
     errors, stated = [], []
-    plain = AdjustOptions(
-        uncertainty=UncertaintyOptions(position_factor=1.0, rotation_factor=1.0, gap_growth=0.0, lone_variance=0.0)
-    )
+    plain = AdjustOptions(uncertainty=UncertaintyOptions(position_factor=1.0, rotation_factor=1.0, gap_growth=0.0))
     for seed in range(30):
         problem = planted((60, 60, 60), 0.5, 0.0, seed, pose_noise_px)
         support = solve_two_view(

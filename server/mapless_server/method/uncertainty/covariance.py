@@ -22,11 +22,9 @@ What all matches share (one lens model, one survey) shows in neither, and what n
 With simulated noise of pixels and of reference poses, each its own, standard deviations are right within a third; where
 the references' errors drift by twice the pixels' noise, errors are up to 1.8 times as large as stated (the tests).
 
-Two things that the references cannot say of themselves enlarge both. Keypoints move with the viewpoint, for all
-references to the same side: within 11 of 12 scenes errors grow more than radii with the gap, the distance to the
-nearest reference by the depth. And where a reference is left out without which hardly anything is known, the change
-says little: where less than 3 % of the information is left, errors are 1.4 times as large as elsewhere in the scene, by
-their radii.
+What the references cannot say of themselves enlarges both: keypoints move with the viewpoint, for all references to the
+same side. Within 11 of 12 scenes errors grow more than radii with the gap, the distance to the nearest reference by the
+depth.
 
 Three factors remain: on the standard deviations of positions and of angles, and on the radii of 95 %, because errors
 have heavier tails than the normal distribution. `research.radii` measures them on scenes with known poses, each tested
@@ -41,7 +39,7 @@ from mapless.geometry import Array, RigidTransform
 
 from ..options import check_bounds
 from ..perturbation import world_jacobian
-from .dispersion import LEAST_LEFT, Dispersion
+from .dispersion import Dispersion
 from .radii import gap_ratio
 
 
@@ -57,8 +55,6 @@ class UncertaintyOptions:
             positions; planted noise with correlated errors of references requires 0.76.
         gap_growth: exponent of the gap in the factor on standard deviations. Larger ones fit a scene's few references
             better, but make radii of the closest too small.
-        lone_variance: a: where the share w of the pose's information is left without one reference, the variance is
-            1 + a / (w + `LEAST_LEFT`) times as large.
         max_matches: largest number of the photograph's matches, evenly thinned; the time is linear in it. Using all
             matches gives no better radii.
     """
@@ -67,12 +63,11 @@ class UncertaintyOptions:
     position_factor: float = 0.76
     rotation_factor: float = 0.78
     gap_growth: float = 0.1
-    lone_variance: float = 0.02
     max_matches: int = 500
 
     def __post_init__(self) -> None:
         check_bounds(self, "region_factor position_factor rotation_factor max_matches", above=0)
-        check_bounds(self, "gap_growth lone_variance", at_least=0)
+        check_bounds(self, "gap_growth", at_least=0)
 
 
 def dispersed_covariance(
@@ -87,7 +82,6 @@ def dispersed_covariance(
         is_offset: whether the pose is known not to be at the optimum.
     """
     grown = gap_ratio(dispersion.gap) ** (2 * options.gap_growth)
-    grown *= 1 + options.lone_variance / (dispersion.left + LEAST_LEFT)
     covariance = grown * dispersion.covariance(options.region_factor)
     if is_offset:
         covariance = covariance + np.outer(dispersion.offset, dispersion.offset)

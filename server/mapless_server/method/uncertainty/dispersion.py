@@ -77,7 +77,6 @@ class Dispersion:
         references: (K, 6) change of the optimum without each reference's observations.
         regions: (G, 6) influence of the matches in each region of the photograph.
         offset: (6,) the Gauss-Newton step from the pose to the optimum.
-        left: least share of the pose's information, 0 to 1, in any direction, that is left without one reference.
         gap: distance to the nearest reference that holds the pose, over the median depth of the points.
         intrinsics: what the data say of errors of the intrinsics; None if the problem has not these unknowns.
     """
@@ -85,7 +84,6 @@ class Dispersion:
     references: Array
     regions: Array
     offset: Array
-    left: float
     gap: float
     intrinsics: IntrinsicsEquations | None = None
 
@@ -132,12 +130,9 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
         others[6 * i : 6 * i + 6] = False  # only the prior is left of its own pose
         matrices[i + 1] += np.where(np.outer(others, others), data - lost @ lost.T, 0)
         gradients[i + 1] += np.where(others, gradient + lost @ misfit[:, part].ravel(), 0)
-    information = np.asarray(np.linalg.inv(to_pose[:, query]), np.float64)
-    matrices[1:, query, query] += LEAST_LEFT * information
-    unit = np.broadcast_to(np.eye(posed.stop)[:, query], (len(matrices), posed.stop, 6))
-    right = np.concatenate([matrices[:, posed, posed.stop :], gradients[:, posed, None], unit], axis=2)
+    matrices[1:, query, query] += LEAST_LEFT * np.linalg.inv(to_pose[:, query])
+    right = np.concatenate([matrices[:, posed, posed.stop :], gradients[:, posed, None]], axis=2)
     solved = np.linalg.solve(matrices[:, posed, posed], right)
-    solved, covariances = solved[:, :, :-6], solved[1:, query, -6:]
     poses = -solved[:, query, -1]
     rest = np.concatenate([matrices[:, posed.stop :, posed.stop :], gradients[:, posed.stop :, None]], axis=2)
     rest -= matrices[:, posed.stop :, posed] @ solved  # of the intrinsics, with the poses eliminated
@@ -148,9 +143,7 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
     influences, known = _by_region(seen, regions, to_both, residual, by_pose, weight, points)
     if not (np.isfinite(poses).all() and np.isfinite(influences).all()):
         return None
-    found = Dispersion(
-        poses[1:] - poses[0], influences[:, :6], poses[0], _left(information, covariances), _gap(seen, bundle)
-    )
+    found = Dispersion(poses[1:] - poses[0], influences[:, :6], poses[0], _gap(seen, bundle))
     if not len(to_rest):
         return found
     observing = [0, *(i + 1 for i, part in enumerate(seen.parts[:-1]) if part.start < part.stop)]
@@ -173,13 +166,6 @@ def _thinned(seen: ViewColumns, bundle: Bundle, max_matches: int) -> tuple[ViewC
     chosen = np.zeros(len(bundle.points), bool)
     chosen[of_query[::thinning]] = True
     return seen.of_points(chosen), Bundle(bundle.poses, bundle.points[chosen], bundle.intrinsics), thinning
-
-
-def _left(information: Array, covariances: Array) -> float:
-    """Least share of the pose's information (6, 6) that is left, by covariances (K, 6, 6) without each reference."""
-    root = np.linalg.cholesky(information)
-    largest = np.linalg.eigvalsh(root.T @ covariances @ root)[:, -1].max(initial=1.0)
-    return float(np.clip(1 / largest - LEAST_LEFT, 0.0, 1.0))
 
 
 def _gap(seen: ViewColumns, bundle: Bundle) -> float:
