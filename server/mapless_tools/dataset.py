@@ -18,7 +18,6 @@ MAX_NAME_LENGTH = 128
 SPLITS = ("", "train", "test")
 _MAX_QUOTED = 1000
 """Characters that messages quote of a file's content, which may be anything and of any length."""
-
 Parsed = TypeVar("Parsed")
 
 

@@ -13,7 +13,6 @@ T = TypeVar("T")
 
 LINES = 10
 """Lines of a step in a log, after that of its beginning."""
-
 Progress = Callable[[str, int, int], None]
 """Called with a step's name, how much of it is done, and how much there is."""
 

@@ -27,10 +27,8 @@ View = tuple[NDArray[np.uint8], Camera]
 ROOMS = range(100, 110)
 PHOTOGRAPHS = 14
 """Of each room."""
-
 EVERY = {"sift": 1, "aliked": 3, "xfeat": 1, "edgepoint2-l64": 1}
 """Of the photographs, the first of so many is looked at: ALIKED takes two seconds each on a CPU."""
-
 DESCRIPTORS = 60_000
 """That are learned from, drawn from all; twice as many change no figure."""
 

@@ -35,7 +35,6 @@ S = TypeVar("S")
 
 EDGEPOINT2 = {"edgepoint2-l64": "edgepoint2-l64.safetensors"}
 """Learned features, and the file of their weights."""
-
 RIGHT_SHARE, RIGHT_M, RIGHT_DEG = 0.05, 0.25, 5.0
 """An answer is wrong that is off by a larger share of the distance to what the photograph shows, by more degrees or,
 in a scene in metres, by more metres."""

@@ -23,10 +23,8 @@ CACHED = 100
 """References whose tokens lie on the device."""
 QK_GAIN = 1.5
 """Selective attention, like a trained network's: with uniform attention everything averages out, rounding too."""
-
 EXPONENTIALS = ("point_head.proj", "conf_head.proj", "metric_head", "dense_head.1.conv2.2", "scale_head.output_proj")
 """Last layers, exponentials of whose output are depths or scales."""
-
 AnySizes = Sizes | MapAnythingSizes
 
 

@@ -33,11 +33,9 @@ LEVELS = np.concatenate([[0.005], np.arange(1, 100) / 100, [0.995, 0.999]])
 """Probabilities for which radii are known; between them they are interpolated."""
 PRIOR_QUERIES = 3.0
 """m. With 5, in the same simulation, the 68 % radius held 53 to 97 % after 10 answers and 62 to 79 % after 26."""
-
 MIN_QUERIES = 10
 """With fewer, one photograph more or less changes the share within the 68 % radius by more than 10 %, which is all that
 a calibration is for."""
-
 _TRIED = np.exp(np.linspace(np.log(MIN_FACTOR), np.log(MAX_FACTOR), 2305))
 """Factors that are tried: steps of half a per cent."""
 

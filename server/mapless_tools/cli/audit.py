@@ -27,14 +27,11 @@ if TYPE_CHECKING:
 
 ALARMS = ("SWAPPED_IMAGE", "WRONG_POSE_AND_INTRINSICS", "WRONG_POSE", "WRONG_INTRINSICS", "SCENE_CHANGED")
 """Findings that cause wrong poses, the worst first."""
-
 MAX_PAGE = 100
 COMPARED = 1000
 """References whose poses are compared with what is known of the scene."""
-
 MAX_TIMEOUT_S = 600.0
 """The default of the server's setting max_deadline_s."""
-
 _ORDER = (*ALARMS, "DUPLICATE", "UNVERIFIABLE", "CONSISTENT")
 
 

@@ -16,7 +16,6 @@ token_app = typer.Typer(help="Tokens that callers must have: create, list and re
 
 DEFAULT_TENANT = "default"
 """That of `mapless_server.security`, whose import takes too long for --help; a test compares."""
-
 TokensFile = Annotated[Path | None, typer.Option(help="The file of tokens; default: the server's setting.")]
 
 

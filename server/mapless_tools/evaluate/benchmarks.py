@@ -19,10 +19,8 @@ from mapless_tools.usage import UsageError
 
 Median = tuple[float, float]
 """Translation in cm, rotation in degrees."""
-
 DENSE = 0
 """Stands for all references where a number of references is asked for."""
-
 VARIANT_OF = {"L3 coarse": "coarse", "L3 w/o optim.": "no_structure", "L3": "full"}
 """The variant here that a method of the paper corresponds to."""
 

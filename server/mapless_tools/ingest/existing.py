@@ -14,7 +14,6 @@ SAME_POSITION_M = 1e-3
 SAME_ROTATION_DEG = 0.01
 """Of one photograph no pose is known better: it is stored, and travels, rounded, and two equal frames of a video that
 stands still were posed one by one."""
-
 _SAME_SHARE = 1e-9
 
 

@@ -25,14 +25,11 @@ from mapless_tools.dataset import Dataset, Frame, finite_numbers
 DISTANCE_SHARE, DISTANCE_M = 0.03, 0.02
 """A measured distance may differ from the scaled model's by 3 %, or by 2 cm if that is more: the precision of a tape
 measure held to a camera, and the drift of a model."""
-
 POSITION_SHARE, POSITION_M = 0.02, 0.05
 """A known position may be off by 2 % of the largest distance between two, or by 5 cm if that is more."""
-
 LINE_SHARE, LINE_RESIDUALS = 0.01, 3.0
 """Positions are collinear if they are nearer to a line than 1 % of their extent along it, or than three times their
 residual: the rotation about the line is then that of the noise."""
-
 PLACE_SHARE = 1e-6
 """Of a model's extent: cameras closer than this are at one place, but for rounding."""
 

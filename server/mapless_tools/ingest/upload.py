@@ -27,10 +27,8 @@ from .report import ALREADY_THERE, ImportReport
 
 BATCH_COUNT = 8
 """References a message: progress shows, and little is sent again when one is refused."""
-
 BATCH_BYTES = 6 * 2**20
 """Of images a message; large ones take the server long to receive, which its other callers feel."""
-
 STORE_FULL = "STORE_FULL"
 _REQUEST = re.compile(r"requests\[\d+\]")
 

@@ -19,7 +19,6 @@ from .calls import CallRecord, Fate, Kind, PlannedCall
 MAX_MESSAGE_BYTES = 64 * 2**20
 REFUSED_PAUSE_S = 0.1
 """Before a refused caller in a closed loop calls again, where the server does not say when."""
-
 ReadAnswer = Callable[[bytes], str]
 """The outcome of an answer, in a few words."""
 

@@ -39,7 +39,6 @@ UNITS: Mapping[str, str] = {
 """Of what slopes are taken of."""
 BOUND = ("resident_mib", "unique_mib", "python_blocks", "threads", "descriptors", "sockets")
 """What must not grow. The others are reported: the data folder grows by what is kept of deleted scenes."""
-
 MIN_SETTLED_S = 300.0
 """In less, what takes minutes, as allocators and caches do, looks like growth."""
 

@@ -29,13 +29,10 @@ START_LIMIT_S = 120.0
 END_LIMIT_S = 20.0
 LEAVING_S = 2.0
 """Short, because on one machine HAProxy learns of changes at once, and tests wait for it."""
-
 CPUS = 4
 """Number that Ray assumes."""
-
 PORTS = 200
 """Ports of replicas, for each of two protocols; a port is reused only minutes after its replica ended."""
-
 _MARK = "TRIAL_CLUSTER"
 _POLL_S = 0.1
 _SERVER = re.compile(r"^ *server SERVE_REPLICA_mapless-mapless-(\w+) .* proto h2", re.MULTILINE)

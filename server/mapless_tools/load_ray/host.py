@@ -19,7 +19,6 @@ from ray.serve.schema import ServeDeploySchema
 
 OBJECT_STORE_BYTES = 100 * 2**20
 """Small, because mapless does not use it."""
-
 APPLICATION = "mapless"
 POLL_S = 0.1
 

@@ -75,7 +75,6 @@ def measure_throughput(place: Place, options: ThroughputOptions, progress: Progr
 
 _ROOM_S = 60.0
 """The default refuses more than two seconds of computing, which on a slow machine is less than three calls."""
-
 _ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
 
 

@@ -21,7 +21,6 @@ from mapless_server.services.capture.calls import Response, diagnostics_of
 
 DESCRIBE = "describe"
 """The stage in which a server extracts the features that a replay already has."""
-
 ABSENT = "-"
 
 MAX_CHANGES = 40

@@ -59,7 +59,6 @@ from mapless_server.store import LruCache, SceneAttributes, Store, codec
 
 RETRIEVAL = "retrieval"
 """The stage in which references are chosen."""
-
 _CACHE_BYTES = 512 * 2**20
 
 

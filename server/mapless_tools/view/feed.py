@@ -55,7 +55,6 @@ def _length(metres: float) -> str:
 THUMBNAIL_PX = 160
 _LIMITS = ImageLimits(max_bytes=1 << 30, max_pixels=200_000_000)
 """The server has checked the photograph; its limits may be higher than its defaults."""
-
 Picture = NDArray[np.uint8]
 
 

@@ -18,7 +18,6 @@ Image = NDArray[np.float32]
 Colour = tuple[float, float, float]
 Shape = tuple[int, int]
 """Height, width."""
-
 HUES = (0.0, 0.02, 0.05, 0.08, 0.10, 0.13, 0.16, 0.25, 0.38, 0.48, 0.55, 0.58, 0.62, 0.68, 0.85, 0.95)
 SYLLABLES = "ba re mi to lu ka son vel dor an thi es gra pol ne sta mor".split(" ")  # noqa: SIM905
 FONTS = (0, 2, 3, 4, 7)

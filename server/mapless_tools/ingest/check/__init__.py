@@ -24,7 +24,6 @@ __all__ = ["Verdict", "check_frames", "implausible_depth"]
 
 MAX_SUSPECTED = 12
 """Photographs of bad pairs that are compared with more neighbours, to find out which of the two it is."""
-
 MORE_PAIRS = 3
 
 LIMITS = ImageLimits(max_bytes=2**28, max_pixels=200_000_000)

@@ -23,16 +23,12 @@ from mapless_server.method.views import Matches, PosedView, View
 
 PAIR_COUNT = 24
 """Enough that a median over them is settled; their features take seconds."""
-
 MAX_TURN_DEG = 40.0
 """Beyond it SIFT finds few matches, and the views may share nothing."""
-
 BASELINE_SHARE = 0.05
 """Of the scene's extent: neighbours in a video stand so close together that almost any pose would fit."""
-
 ORDER_STEPS = (1, 3, 10, 30)
 """How far apart in the folder's order photographs are compared if their poses do not show which are near."""
-
 Pair = tuple[int, int]
 
 
@@ -96,10 +92,8 @@ def _distinct(pairs: Iterable[Pair], count: int) -> list[Pair]:
 
 RATIO = 0.8
 """Lowe's ratio; strict, since few right matches are better here than many with some wrong ones."""
-
 FUNDAMENTAL_PX = 1.5
 """Largest distance from the epipolar lines; keypoints are accurate to about a pixel."""
-
 MIN_MATCHES = 24
 """Fewer inliers are no evidence: any eight matches satisfy some fundamental matrix."""
 

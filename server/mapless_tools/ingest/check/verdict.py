@@ -27,7 +27,6 @@ FOCAL_SCALES = np.geomspace(0.2, 5.0, 33)
 """Wrong image sizes are usually wrong by a factor of up to four."""
 FOCAL_TOLERANCE = 0.03
 """A focal length that would have to change by less is not the reason."""
-
 _GAIN = 0.4  # an explanation must reduce the error to this share, or it explains nothing
 _BAD_SHARE = 0.5  # of the pairs, that may stay bad
 _MIXED_BAD_SHARE = 0.2  # stricter, because each pair is given the choice of which of its two to correct
@@ -196,10 +195,8 @@ def _scaled(view: PosedView, scale: float) -> PosedView:
 
 MIN_PARALLAX_DEG = 1.0
 """Of rays that are intersected: at a pixel's error a fiftieth of the depth, or so."""
-
 MIN_POINTS = 100
 """Fewer give no typical depth."""
-
 MIN_DEPTH_M, MAX_DEPTH_M = 0.05, 500.0
 """Typical depths of photographs of places are 0.3 to 300 m. Those in millimetres come out a thousand times as large, in
 kilometres as small."""

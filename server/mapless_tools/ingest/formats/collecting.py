@@ -78,10 +78,8 @@ class ReadOptions:
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 """Camera axes x right, y up, z back to x right, y down, z forward; its own inverse."""
-
 ANY_SIZE = ImageLimits(max_bytes=2**40, max_pixels=2**40, min_side_px=1, max_side_px=2**30)
 """Headers are read for the sizes alone; the server has limits of its own."""
-
 _HEAD_BYTES = 2**16
 
 

@@ -26,7 +26,6 @@ from .colmap.cameras import PARAMETERS, ColmapCamera
 
 PROPERTIES = "# mapless: "
 """Begins a comment of our own exports in sensors.txt: what kapture has no field for, as JSON."""
-
 _MAX_NESTED = 10  # rigs in rigs, as kapture's own library
 
 

@@ -26,7 +26,6 @@ from .writing import image_name
 
 CANDIDATES = 5
 """Images of which the sharpest becomes a keyframe; at 30 Hz, a sixth of a second."""
-
 SLACK = 0.2
 """Of the distance and the angle: the candidates are no farther from the first of them."""
 
