@@ -11,8 +11,8 @@ from support.scenes import SceneOptions, make_scene
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.method.views import Features, PosedView
 from mapless_server.scenes import AuditVerdict, ReferenceAudit
+from mapless_server.scenes.audit import auditor
 from mapless_server.scenes.audit.auditor import Auditor
-from mapless_server.scenes.audit.comparison import AuditOptions
 from mapless_server.scenes.audit.finder import ReferenceGone
 from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.audit.resection import with_focal
@@ -177,7 +177,9 @@ def test_the_verdict_does_not_depend_on_where_the_world_begins(references: list[
         assert near.position_offset_m == pytest.approx(there.position_offset_m, abs=1e-4)
 
 
-def test_references_are_loaded_as_they_are_needed(references: list[PosedView], pairs: PairMatches) -> None:
+def test_references_are_loaded_as_they_are_needed(
+    references: list[PosedView], pairs: PairMatches, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Of a scene with a far part only the near part is read."""
     far = [moved(replace(r, name=f"{r.name}-far"), (1000.0 + i, 0.0, 0.0)) for i, r in enumerate(references)]
     by_name = {r.name: r for r in [*references, *far]}
@@ -188,8 +190,9 @@ def test_references_are_loaded_as_they_are_needed(references: list[PosedView], p
         return [by_name[name] for name in names]
 
     finder = finder_of(list(by_name.values()), load)
-    options = AuditOptions(candidate_count=4, neighbour_count=4)
-    assert audit_references([references[0].name], finder, options, pairs)[0].verdict is AuditVerdict.CONSISTENT
+    monkeypatch.setattr(auditor, "CANDIDATE_COUNT", 4)
+    monkeypatch.setattr(auditor, "NEIGHBOUR_COUNT", 4)
+    assert audit_references([references[0].name], finder, pairs)[0].verdict is AuditVerdict.CONSISTENT
     assert set(loaded) <= {r.name for r in references}
     assert len(loaded) == len(set(loaded)) == 5
 
@@ -217,7 +220,7 @@ def test_a_neighbour_that_cannot_be_loaded_is_no_witness(references: list[PosedV
 def test_what_is_remembered_of_neighbours_changes_no_verdict(references: list[PosedView], pairs: PairMatches) -> None:
     scene = altered(references, VICTIM, moved(references[VICTIM], (0.05, 0.0, 0.0)))
     names = [r.name for r in scene]
-    forgetful = Auditor(finder_of(scene), AuditOptions(), pairs, cached_findings=1)
+    forgetful = Auditor(finder_of(scene), pairs, cached_findings=1)
     assert [forgetful.audit(name) for name in names] == audit(scene, pairs)
     assert forgetful._findings.used == 1
 

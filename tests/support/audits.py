@@ -8,7 +8,6 @@ from mapless.names import parse_reference_name
 from mapless_server.method.views import PosedView
 from mapless_server.scenes import ReferenceAudit
 from mapless_server.scenes.audit.auditor import Auditor
-from mapless_server.scenes.audit.comparison import AuditOptions
 from mapless_server.scenes.audit.finder import ReferenceFinder
 from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.retrieval.index import Entries, SceneIndex
@@ -45,8 +44,8 @@ def finder_of(references: Sequence[PosedView], load: Load | None = None) -> Refe
 
 
 def audit_references(
-    names: Sequence[str], finder: ReferenceFinder, options: AuditOptions | None = None, pairs: PairMatches | None = None
+    names: Sequence[str], finder: ReferenceFinder, pairs: PairMatches | None = None
 ) -> list[ReferenceAudit]:
     """Audits references in the order named."""
-    auditor = Auditor(finder, options or AuditOptions(), pairs or PairMatches())
+    auditor = Auditor(finder, pairs or PairMatches())
     return [auditor.audit(name) for name in names]

@@ -20,12 +20,30 @@ from mapless_server.method.views import PosedView
 from mapless_server.store import LruCache
 
 from .change import SAME_VIEWPOINT, SEEN_ALIKE, Change, find_change
-from .comparison import AuditOptions, Comparison, Likeness, compare, likeness, pose_difference
+from .comparison import (
+    POSITION_TOLERANCE_M,
+    ROTATION_TOLERANCE_DEG,
+    SIGNIFICANCE_SIGMA,
+    Comparison,
+    Likeness,
+    compare,
+    likeness,
+    pose_difference,
+)
 from .finder import ReferenceFinder
 from .neighbourhood import PairMatches
 from .resection import Free
 from .verdict import AuditVerdict, ReferenceAudit
 
+CANDIDATE_COUNT = 12
+"""References, nearest by position and heading, that are matched."""
+NEIGHBOUR_COUNT = 8
+"""Those of them, with the most matches, that are used. Points need two, a verdict needs more."""
+_WIDE_COUNT = 64
+"""References that are matched if the nearest by pose do not show what the photograph shows."""
+_SWAP_REACH = 4.0
+"""A reference within this many tolerances of where a photograph was taken may be its partner in a swap; many, because
+that pose was fitted to neighbours of the wrong place."""
 _CACHED_COMPARISONS = 10
 
 
@@ -68,7 +86,6 @@ class Auditor:
     def __init__(
         self,
         finder: ReferenceFinder,
-        options: AuditOptions,
         pairs: PairMatches,
         check: Callable[[], None] = lambda: None,
         cached_findings: int = 3000,
@@ -77,7 +94,7 @@ class Auditor:
 
         The pairs cache matches between calls; `cached_findings` is the number of findings that are kept.
         """
-        self._finder, self._options, self._pairs, self._check = finder, options, pairs, check
+        self._finder, self._pairs, self._check = finder, pairs, check
         self._findings: LruCache[_Finding] = LruCache(cached_findings)
         self._comparisons: LruCache[tuple[Comparison, _Twin]] = LruCache(_CACHED_COMPARISONS)
 
@@ -86,7 +103,7 @@ class Auditor:
         found, twin = self._first_comparison(name)
         is_wide = False
         if not found.is_usable:
-            similar = self._finder.similar(name, self._options.wide_count)
+            similar = self._finder.similar(name, _WIDE_COUNT)
             found, wide_twin = self._compare(name, similar)
             twin, is_wide = max(twin, wide_twin, key=lambda it: it.likeness.value), True
         verdict, contradicted = self._judge(found), ""
@@ -115,7 +132,7 @@ class Auditor:
         """Compares a reference with its neighbours by pose; cached."""
         cached = self._comparisons.get(name)
         if cached is None:
-            cached = self._compare(name, self._finder.near(name, self._options.candidate_count))
+            cached = self._compare(name, self._finder.near(name, CANDIDATE_COUNT))
             self._comparisons.put(name, cached)
         return cached
 
@@ -134,12 +151,12 @@ class Auditor:
         counts: dict[str, int] = {}
         for other in self._finder.views(candidates):
             matches = self._pairs.match(subject, other)
-            alike = likeness(subject, other, matches, self._options)
+            alike = likeness(subject, other, matches)
             twin = max(twin, _Twin(other.name, alike), key=lambda it: it.likeness.value)
             if alike is not Likeness.SAME_PHOTOGRAPH:
                 counts[other.name] = len(matches)
-        chosen = sorted(counts, key=lambda n: -counts[n])[: self._options.neighbour_count]
-        return compare(subject, self._finder.views(chosen), self._pairs, self._options), twin
+        chosen = sorted(counts, key=lambda n: -counts[n])[:NEIGHBOUR_COUNT]
+        return compare(subject, self._finder.views(chosen), self._pairs), twin
 
     def _judge(self, found: Comparison) -> AuditVerdict:
         """The verdict of a comparison, tolerating the median offset of the neighbours."""
@@ -164,7 +181,7 @@ class Auditor:
             return found, verdict, ""
         rest = [name for name in names if name not in suspects]
         if not is_wide:
-            wider = self._finder.near(found.subject.name, 2 * self._options.candidate_count)
+            wider = self._finder.near(found.subject.name, 2 * CANDIDATE_COUNT)
             spare = [view.name for view in self._finder.views([n for n in wider if n not in names])]
             rest += [n for n in spare if not self._finding(n).is_alarm]
         second, _ = self._compare(found.subject.name, rest)
@@ -177,9 +194,8 @@ class Auditor:
 
     def _swapped_with(self, found: Comparison) -> str:
         """The reference with which this one has swapped its photograph; empty if there is none."""
-        options, sigma = self._options, self._options.significance_sigma
-        reach_m = options.swap_reach * max(options.position_tolerance_m, sigma * found.largest_sigma_m)
-        reach_deg = options.swap_reach * max(options.rotation_tolerance_deg, sigma * found.sigma_deg)
+        reach_m = _SWAP_REACH * max(POSITION_TOLERANCE_M, SIGNIFICANCE_SIGMA * found.largest_sigma_m)
+        reach_deg = _SWAP_REACH * max(ROTATION_TOLERANCE_DEG, SIGNIFICANCE_SIGMA * found.sigma_deg)
         for name in self._finder.near_pose(found.world_from_camera, 4, found.subject.name):
             apart_m, apart_deg = pose_difference(found.world_from_camera, self._finder.pose(name))
             if apart_m > reach_m or apart_deg > reach_deg:
@@ -191,19 +207,19 @@ class Auditor:
 
     def _fits(self, photographed: PosedView, posed: PosedView) -> bool:
         """Whether one reference's photograph fits another's pose, judged by the neighbours of that pose."""
-        names = self._finder.near(posed.name, self._options.candidate_count)
+        names = self._finder.near(posed.name, CANDIDATE_COUNT)
         others = [view for view in self._finder.views(names) if view.name != photographed.name]
         others.sort(key=lambda other: -len(self._pairs.match(photographed, other)))
         moved = replace(photographed, world_from_camera=posed.world_from_camera)
-        found = compare(moved, others[: self._options.neighbour_count], self._pairs, self._options)
+        found = compare(moved, others[:NEIGHBOUR_COUNT], self._pairs)
         return self._judge(found) is AuditVerdict.CONSISTENT
 
     def _find_change(self, found: Comparison, verdict: AuditVerdict) -> Change | None:
         """Finds which part of the image does not show what the neighbours show; None if that cannot be decided."""
         subject, limits = found.subject, SEEN_ALIKE
         if verdict is AuditVerdict.UNVERIFIABLE:
-            nearest = self._finder.views(self._finder.near(subject.name, self._options.neighbour_count))
-            found, limits = compare(subject, nearest, self._pairs, self._options), SAME_VIEWPOINT
+            nearest = self._finder.views(self._finder.near(subject.name, NEIGHBOUR_COUNT))
+            found, limits = compare(subject, nearest, self._pairs), SAME_VIEWPOINT
         change = find_change(found, limits)
         if change is None or not change.is_alarm:
             return change
@@ -212,7 +228,7 @@ class Auditor:
         trusted = [reference for reference in references if not self._finding(reference.name).is_alarm]
         if len(trusted) == len(references):
             return change
-        return find_change(compare(subject, trusted, self._pairs, self._options), limits)
+        return find_change(compare(subject, trusted, self._pairs), limits)
 
 
 _REPORTED_SHARE = 0.15

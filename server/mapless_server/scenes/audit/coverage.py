@@ -20,8 +20,6 @@ from .verdict import Coverage, CoverageVerdict
 # Repeatability was measured with SIFT on kitchen, office, fountain and church.
 NEIGHBOUR_COUNT = 10
 """References that are used, nearest by position and heading; as many as a query has."""
-EPIPOLAR_PX = 2.0
-"""As for matching references."""
 REPEATABILITY = 0.55
 """Share of the points that are matched when seen from the same direction and distance; with the two below it follows
 what was found of 60,000 points at less than 15 degrees and 15,000 beyond."""
@@ -60,7 +58,7 @@ def check_coverage(
     if len(references) < 2:
         message = f"{len(references)} references, at least 2 are needed"
         return Coverage(CoverageVerdict.NOT_LOCALIZABLE, message, 0, 0.0, None, ())
-    neighbourhood = build_neighbourhood(references, pairs, EPIPOLAR_PX)
+    neighbourhood = build_neighbourhood(references, pairs)
     if not len(neighbourhood.structure.x_in_world):
         message = f"not localizable: {len(neighbourhood.references)} references near by share no points"
         return Coverage(CoverageVerdict.NOT_LOCALIZABLE, message, 0, 0.0, None, ())

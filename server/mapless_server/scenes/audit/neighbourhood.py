@@ -66,7 +66,11 @@ class Neighbourhood:
     point_covariance: Array
 
 
-def build_neighbourhood(references: Sequence[PosedView], pairs: PairMatches, epipolar_px: float) -> Neighbourhood:
+_EPIPOLAR_PX = 2.0
+"""As for matching references."""
+
+
+def build_neighbourhood(references: Sequence[PosedView], pairs: PairMatches) -> Neighbourhood:
     """Triangulates the matches among the references; the result may have no points."""
     options = StructureOptions()
     if len(references) < 2:
@@ -77,7 +81,7 @@ def build_neighbourhood(references: Sequence[PosedView], pairs: PairMatches, epi
     for i, j in combinations(range(len(references)), 2):
         first, second = references[i], references[j]
         found = pairs.match(first, second)
-        matches[i, j] = found[epipolar_distance_px(first, second, found) < epipolar_px]
+        matches[i, j] = found[epipolar_distance_px(first, second, found) < _EPIPOLAR_PX]
     tracks = build_tracks(matches, [len(r.view.features) for r in references])
     observations = observe(tracks, references, options.first_noise)
     refined = refine_points(observations, triangulate(observations), options)

@@ -19,7 +19,6 @@ from ..library import ReferenceLibrary
 from ..retrieval.index import Entries, GlobalDescriptor, Rows
 from ..retrieval.ranking import RankOptions, Selection, rank_references
 from .auditor import Auditor
-from .comparison import AuditOptions
 from .coverage import check_coverage
 from .finder import ReferenceFinder, ReferenceGone
 from .neighbourhood import PairMatches
@@ -125,7 +124,7 @@ class SceneAuditor:
             raise ReferenceGone(name)  # added since the scene was read
         if self._auditor is None:
             finder = self._finder(entries.rows())
-            self._auditor = Auditor(finder, AuditOptions(), self._tools.pairs, lambda: self._check())
+            self._auditor = Auditor(finder, self._tools.pairs, lambda: self._check())
         return self._auditor.audit(name)
 
     def _check_coverage(self, view: Viewpoint) -> Coverage:
