@@ -14,11 +14,10 @@ from support.images import textured
 from support.small_networks import SMALL_MEGALOC, photograph, ruled_megaloc, view_of
 
 from mapless_server.networks import blocks
-from mapless_server.scenes.retrieval.megaloc import MegaLocDescriptor, MegaLocOptions
+from mapless_server.scenes.retrieval.megaloc import MegaLocDescriptor
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")]
 
-OPTIONS = MegaLocOptions(dimension=24, batch=3)
 VIEWS = [view_of(photograph(textured(80 + 8 * i, 60, seed=i))) for i in range(7)]
 
 
@@ -30,7 +29,7 @@ def file(tmp_path: Path) -> Path:
 
 
 def test_vectors_are_the_cpus_but_for_rounding(file: Path) -> None:
-    on_host, on_device = (MegaLocDescriptor(file, device, OPTIONS, SMALL_MEGALOC) for device in ("cpu", "cuda"))
+    on_host, on_device = (MegaLocDescriptor(file, device, SMALL_MEGALOC, 24, 3) for device in ("cpu", "cuda"))
     assert (on_host.dtype, on_device.dtype) == (torch.float32, torch.bfloat16)
     assert on_host.name == on_device.name
     expected, found = on_host.describe_many(VIEWS), on_device.describe_many(VIEWS)
@@ -42,6 +41,6 @@ def test_without_flash_attention_it_computes_in_full_precision(file: Path, monke
         raise RuntimeError("no such kernel")
 
     monkeypatch.setattr(blocks, "flash_attention", missing)
-    on_host, on_device = (MegaLocDescriptor(file, device, OPTIONS, SMALL_MEGALOC) for device in ("cpu", "cuda"))
+    on_host, on_device = (MegaLocDescriptor(file, device, SMALL_MEGALOC, 24, 3) for device in ("cpu", "cuda"))
     assert on_device.dtype == torch.float32
     np.testing.assert_allclose(on_device.describe_many(VIEWS), on_host.describe_many(VIEWS), rtol=0, atol=1e-3)

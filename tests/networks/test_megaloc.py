@@ -25,9 +25,7 @@ from mapless_server.networks.megaloc import Backbone, signed_groups, transport
 from mapless_server.networks.weights import CheckpointError, named
 from mapless_server.networks.weights.install import add
 from mapless_server.scenes import GlobalDescriptor
-from mapless_server.scenes.retrieval.megaloc import SIDE_PX, MegaLocDescriptor, MegaLocOptions
-
-OPTIONS = MegaLocOptions(dimension=24, batch=3)
+from mapless_server.scenes.retrieval.megaloc import SIDE_PX, MegaLocDescriptor
 
 PUBLISHED = {
     (140, 196): (
@@ -52,7 +50,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def descriptor(file: Path) -> MegaLocDescriptor:
-    return MegaLocDescriptor(file, options=OPTIONS, sizes=SMALL_MEGALOC)
+    return MegaLocDescriptor(file, sizes=SMALL_MEGALOC, dimension=24, batch=3)
 
 
 def some_views(count: int, reads: list[str] | None = None) -> list[View]:
@@ -157,7 +155,7 @@ def test_order_and_signs_have_their_known_values() -> None:
 @pytest.mark.parametrize("length", [0, 25, 192])
 def test_a_length_that_is_no_divisor_is_refused(file: Path, length: int) -> None:
     with pytest.raises(ValueError, match=r"which is no divisor|must be"):
-        MegaLocDescriptor(file, options=MegaLocOptions(dimension=length), sizes=SMALL_MEGALOC)
+        MegaLocDescriptor(file, sizes=SMALL_MEGALOC, dimension=length)
 
 
 # ---- the descriptor
@@ -179,7 +177,7 @@ def test_the_name_has_weights_and_length(file: Path, tmp_path: Path) -> None:
     network.aggregator.linear.bias.data[0] += 1
     save_file(network.state_dict(), tmp_path / "other")
     names = {
-        MegaLocDescriptor(of, options=MegaLocOptions(dimension), sizes=SMALL_MEGALOC).name
+        MegaLocDescriptor(of, sizes=SMALL_MEGALOC, dimension=dimension).name
         for of in (file, tmp_path / "other")
         for dimension in (24, 96)
     }
@@ -236,7 +234,7 @@ def test_photographs_are_resized_as_published(descriptor: MegaLocDescriptor, siz
 def test_low_precision_changes_vectors_little(file: Path) -> None:
     views = some_views(4)
     exact, rough = (
-        MegaLocDescriptor(file, options=MegaLocOptions(24, dtype=dtype), sizes=SMALL_MEGALOC).describe_many(views)
+        MegaLocDescriptor(file, sizes=SMALL_MEGALOC, dimension=24, dtype=dtype).describe_many(views)
         for dtype in (torch.float32, torch.bfloat16)
     )
     assert rough.dtype == np.float32

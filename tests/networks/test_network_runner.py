@@ -13,7 +13,7 @@ from mapless_server.networks.blocks import Attention, flash_attention
 from mapless_server.networks.mapanything import MapAnything, MapAnythingSizes
 from mapless_server.networks.network import Network, NetworkOutput
 from mapless_server.networks.pi3 import Pi3, Pi3X, Sizes
-from mapless_server.networks.runner import CompiledShape, NetworkRunner, RunnerOptions, UnsuitableDevice
+from mapless_server.networks.runner import CompiledShape, NetworkRunner, UnsuitableDevice
 
 GRID = (2, 3)
 nightly = partial(pytest.param, marks=pytest.mark.nightly)
@@ -82,7 +82,7 @@ def test_the_runner_has_the_networks_output() -> None:
 def test_a_compiled_runner_does_not_compile_again(name: str) -> None:
     """That it compiles as a whole also shows that nothing in it waits for the device: that would break the graph."""
     plain = NetworkRunner(shallow_network(name), name, "sha")
-    compiled = NetworkRunner(shallow_network(name), name, "sha", options=RunnerOptions(compile_backend="eager"))
+    compiled = NetworkRunner(shallow_network(name), name, "sha", compile_backend="eager")
     compiled.warm_up([CompiledShape(GRID, 3), CompiledShape((3, 2), 3)])
     from torch._dynamo.utils import counters  # takes a second to import
 
@@ -99,7 +99,7 @@ def test_a_compiled_runner_does_not_compile_again(name: str) -> None:
 
 
 def test_tokens_are_rounded_to_the_compute_type_always() -> None:
-    runner = NetworkRunner(ruled_network("pi3"), "pi3", "sha", options=RunnerOptions(dtype=torch.bfloat16))
+    runner = NetworkRunner(ruled_network("pi3"), "pi3", "sha", dtype=torch.bfloat16)
     tokens = runner.encode(some_images(3))
     assert tokens.dtype is torch.bfloat16
     kept = tokens.clone()

@@ -42,21 +42,6 @@ class CompiledShape:
     scenes: int = 1
 
 
-@dataclass(frozen=True)
-class RunnerOptions:
-    """Options of a runner.
-
-    Attributes:
-        dtype: type of the computation in transformer blocks; None for bfloat16 on CUDA, as in the official code, else
-            float32.
-        compile_backend: backend of torch.compile, for the shapes passed to `warm_up`; None compiles nothing. "inductor"
-            fuses the operations between matrix products, about a third of the time on a large GPU.
-    """
-
-    dtype: torch.dtype | None = None
-    compile_backend: str | None = None
-
-
 class NetworkRunner:
     """Runs a network. Safe to call from several threads; a thread of its own computes, in order of arrival.
 
@@ -75,15 +60,20 @@ class NetworkRunner:
         name: str,
         weights_sha256: str,
         device: torch.device | str = "cpu",
-        options: RunnerOptions | None = None,
+        dtype: torch.dtype | None = None,
+        compile_backend: str | None = None,
     ) -> None:
-        """Makes a runner; raises UnsuitableDevice if the device lacks the kernels."""
-        options = options or RunnerOptions()
+        """Makes a runner; raises UnsuitableDevice if the device lacks the kernels.
+
+        Without `dtype` transformer blocks compute in bfloat16 on CUDA, as in the official code, else in float32. The
+        shapes passed to `warm_up` are compiled by a backend of torch.compile, if any: "inductor" fuses the operations
+        between matrix products, about a third of the time on a large GPU.
+        """
         self.name = name
         self.weights_sha256 = weights_sha256
         self.device = torch.device(device)
         cuda = self.device.type == "cuda"
-        self.dtype = options.dtype or (torch.bfloat16 if cuda else torch.float32)
+        self.dtype = dtype or (torch.bfloat16 if cuda else torch.float32)
         self.conditioned = network.conditioned
         self.metre_sigma = network.metre_sigma
         self.network = network.eval().requires_grad_(False)
@@ -94,7 +84,7 @@ class NetworkRunner:
         # CUDA graphs belong to the thread that recorded them.
         self._thread = ThreadPoolExecutor(1, f"network {name}", initializer=_keep_graphs_in_this_thread)
         self._check_kernels(name)
-        self._encode, self._reconstruct = self._compiled(options.compile_backend)
+        self._encode, self._reconstruct = self._compiled(compile_backend)
 
     def _compiled(self, backend: str | None) -> tuple[Callable[..., Tensor], Callable[..., NetworkOutput]]:
         if backend is None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from mapless_server.networks.runner import CompiledShape, NetworkRunner, RunnerOptions
+from mapless_server.networks.runner import CompiledShape, NetworkRunner
 from mapless_server.observability.provenance import cpu_model
 
 from .forward import measure_forward, measure_memory, measure_rates, reason_of
@@ -96,8 +96,8 @@ class _Bench:
 
     def _runner(self, name: str, weights_on: torch.device | str) -> NetworkRunner:
         """The network as the server runs it, compiled for a query with ten references."""
-        options = RunnerOptions(compile_backend=None if self.quick else "inductor")
-        runner = NetworkRunner(make_network(name, device=weights_on), name, "random weights", self.device, options)
+        network, compiler = make_network(name, device=weights_on), None if self.quick else "inductor"
+        runner = NetworkRunner(network, name, "random weights", self.device, compile_backend=compiler)
         runner.warm_up([CompiledShape(GRID, REFERENCES + 1)])
         return runner
 

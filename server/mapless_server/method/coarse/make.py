@@ -91,7 +91,7 @@ def _load(
     import torch
 
     from mapless_server.networks.checkpoint import load_strictly
-    from mapless_server.networks.runner import CompiledShape, NetworkRunner, RunnerOptions
+    from mapless_server.networks.runner import CompiledShape, NetworkRunner
 
     from .grids import fitted_grid
     from .network import NetworkOptions, NetworkReconstructor
@@ -105,8 +105,8 @@ def _load(
     with known.naming_the_licence():
         weights_sha256 = load_strictly(network, weights)
         known.check_terms(weights_sha256, str(weights))
-    runner_options = RunnerOptions(compile_backend="inductor" if compiled_views else None)
-    runner = NetworkRunner(network, backend, weights_sha256, device, runner_options)
+    compiler = "inductor" if compiled_views else None
+    runner = NetworkRunner(network, backend, weights_sha256, device, compile_backend=compiler)
     if compiled_views:
         log.info("backend %s: compiling for %d views", backend, compiled_views)
         grids = (fitted_grid(*aspect, options.grids.pixel_limit) for aspect in COMPILED_ASPECTS)

@@ -10,7 +10,6 @@ eight: 0.42 GB of weights instead of 0.91.
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,6 @@ import torch.nn.functional as F  # noqa: N812  its usual name
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mapless_server.method.options import check_bounds
 from mapless_server.method.views import View
 from mapless_server.networks.blocks import Attention
 from mapless_server.networks.checkpoint import load_strictly
@@ -37,27 +35,11 @@ _BAND_ROWS = 64
 
 _VERSION = 1
 """Version of the computation; part of the name."""
-
-
-@dataclass(frozen=True)
-class MegaLocOptions:
-    """Options of the descriptor.
-
-    Attributes:
-        dimension: length of the vectors, a divisor of 8448, the network's own; the module explains 1056.
-        batch: number of photographs that `describe_many` computes together; 16 are 8,480 tokens, enough to occupy a
-            device, and take about 0.3 GB beside the weights by calculation.
-        dtype: type of the transformer's computation; None for bfloat16 on a CUDA device with flash attention, else
-            float32. Not part of the name, so that servers with and without a GPU can share references: it changes
-            similarities by a thousandth of what they differ by among photographs of one scene (random weights).
-    """
-
-    dimension: int = 1056
-    batch: int = 16
-    dtype: torch.dtype | None = None
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "dimension batch", at_least=1)
+DIMENSION = 1056
+"""Length of the vectors, a divisor of 8448, the network's own; the module explains this one."""
+BATCH = 16
+"""Photographs that `describe_many` computes together: 8,480 tokens, enough to occupy a device, and about 0.3 GB beside
+the weights by calculation."""
 
 
 class MegaLocDescriptor:
@@ -72,8 +54,11 @@ class MegaLocDescriptor:
     Args:
         weights: safetensors file, the names of the authors' checkpoint.
         device: "cpu" or a CUDA device.
-        options: options of the descriptor.
         sizes: sizes of the network; None for those of the authors' weights.
+        dimension, batch: see `DIMENSION` and `BATCH`.
+        dtype: None for bfloat16 on a CUDA device with flash attention, else float32. Not part of the name, so that
+            servers with and without a GPU can share references: it changes similarities by a thousandth of what they
+            differ by among photographs of one scene (random weights).
 
     Raises:
         CheckpointError: the weights do not fit.
@@ -86,16 +71,17 @@ class MegaLocDescriptor:
         self,
         weights: Path,
         device: str = "cpu",
-        options: MegaLocOptions | None = None,
         sizes: MegaLocSizes | None = None,
+        dimension: int = DIMENSION,
+        batch: int = BATCH,
+        dtype: torch.dtype | None = None,
     ) -> None:
-        self.options = options or MegaLocOptions()
-        self._device = torch.device(device)
-        self.dtype = self.options.dtype or _best_dtype(self._device)
+        self._device, self._batch = torch.device(device), batch
+        self.dtype = dtype or _best_dtype(self._device)
         with torch.device("meta"):
             self._network = MegaLoc(sizes)
         sha256 = load_strictly(self._network, weights, optional={})
-        self._network.reduce(self.options.dimension)
+        self._network.reduce(dimension)
         self._network.set_compute_type(self.dtype)
         self._network.to(self._device).eval().requires_grad_(False)
         self.dimension = self._network.length
@@ -116,8 +102,8 @@ class MegaLocDescriptor:
         Batching changes a vector by rounding only. Errors as in `describe`.
         """
         described = np.empty((len(views), self.dimension), np.float32)
-        for begin in range(0, len(views), self.options.batch):
-            pictures = torch.stack([_picture(view) for view in views[begin : begin + self.options.batch]])
+        for begin in range(0, len(views), self._batch):
+            pictures = torch.stack([_picture(view) for view in views[begin : begin + self._batch]])
             vectors = self._network(pictures.to(self._device))
             described[begin : begin + len(pictures)] = vectors.cpu().numpy()
         return described
