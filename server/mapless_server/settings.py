@@ -261,7 +261,7 @@ def _exceeds(settings: Settings, less: str, more: str) -> str:
 
 @dataclass(frozen=True)
 class LoadedSettings:
-    """Settings, and the source of each value: "flag", "environment", "file" or "default"."""
+    """Settings, and the source of each value: "flag", "environment", "file" or "default", or what replaced it."""
 
     settings: Settings
     origins: Mapping[str, str]
@@ -298,7 +298,7 @@ def load_settings(flags: Mapping[str, Any], config: Path | None = None) -> Loade
         values |= given
         origins |= dict.fromkeys(given, origin)
     if origins["data_dir"] == "flag" and origins["database_url"] in ("file", "environment"):
-        values["database_url"], origins["database_url"] = None, "flag"
+        values["database_url"], origins["database_url"] = None, "replaced by the flag data_dir"
     try:
         return LoadedSettings(Settings(**values), origins)
     except ValidationError as error:

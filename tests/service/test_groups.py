@@ -244,6 +244,7 @@ BAD_RIGS: dict[str, Case] = {
     "no image": ("images", None),
     "9 images": ("images", list(rig_request("").images) * 2),
     "no pose": ("images[1].rig_from_camera", None),
+    "time in nanoseconds": ("capture_time.seconds", 1_700_000_000_000_000_000, "capture_time"),
     "pose at NaN": ("images[2].rig_from_camera.translation_m.y", math.nan),
     "pose far away": ("images[2].rig_from_camera.translation_m.y", 1e8),
     "zero rotation": ("images[0].rig_from_camera.rotation", geometry_pb.Quaternion()),
@@ -269,6 +270,7 @@ BAD_SEQUENCES: dict[str, Case] = {
     "NaN rotation": ("frames[1].session_from_camera.rotation.w", math.nan, "frames[1].session_from_camera.rotation"),
     "unknown axes": ("options.axes", 77),
     "other size": ("frames[2].intrinsics.width_px", 97),
+    "time in milliseconds": ("frames[1].capture_time.seconds", 1_700_000_000_000, "frames[1].capture_time"),
 }
 
 

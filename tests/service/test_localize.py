@@ -165,6 +165,8 @@ BAD_REQUESTS: dict[str, Case] = {
     "radius infinite": ("position_prior", prior_at(math.inf), "position_prior.radius_m"),
     "prior at NaN": ("position_prior", prior_at(1.0, math.nan), "position_prior.position_m.x"),
     "prior nowhere": ("position_prior.radius_m", 1, "position_prior.position_m"),
+    "time in milliseconds": ("capture_time.seconds", 1_700_000_000_000, "capture_time"),
+    "time of -5 ns": ("capture_time.nanos", -5, "capture_time"),
     "no scene": ("scene", None),
     "scene id alone": ("scene", "kitchen"),
     "duplicate reference": ("references", ["{scene}/references/r1"] * 2, "references[1]"),

@@ -35,6 +35,7 @@ from .answers import (
 from .queries import (
     MAX_CANDIDATES,
     MAX_REFERENCES,
+    check_capture_time,
     enum_to_message,
     options_from_message,
     photo_from_message,
@@ -65,6 +66,8 @@ def queries_from_message(
     is true for a photograph. FieldError and InvalidArgument name the wrong field, "images[2].intrinsics".
     """
     scene_id = wire.scene_id_from_name(request.scene, "scene")
+    if isinstance(request, pb.LocalizeRigRequest):
+        check_capture_time(request)
     messages = getattr(request, list_name)
     least, most = bounds
     if not least <= len(messages) <= most:
@@ -83,6 +86,8 @@ def queries_from_message(
     for i, message in enumerate(messages):
         path = f"{list_name}[{i}]"
         with _within(path):
+            if isinstance(message, pb.SequenceFrame):
+                check_capture_time(message)
             reference_ids = reference_ids_from_names(message.references, scene_id, most_references)
             narrowing, priors = priors_from_message(message, attributes)
         queries.append(

@@ -36,6 +36,9 @@ from mapless_server.scenes import Cone, Narrowing, Sphere
 from mapless_server.security import SceneKey, key_of
 from mapless_server.store import SceneAttributes
 
+FIRST_TIME_S, LAST_TIME_S = -62_135_596_800, 253_402_300_799
+"""Of google.protobuf.Timestamp."""
+
 E = TypeVar("E", bound=Enum)
 
 
@@ -132,6 +135,7 @@ def query_from_message(
     `attributes` are the scene's; they may be empty unless `needs_attributes` is true.
     """
     scene_id = wire.scene_id_from_name(request.scene, "scene")
+    check_capture_time(request)
     most = MAX_CANDIDATES if request.options.rerank_references else MAX_REFERENCES
     narrowing, priors = priors_from_message(request, attributes)
     photo = photo_from_message(request, "", engine.image_limits)
@@ -147,6 +151,15 @@ def query_from_message(
         priors=priors,
         is_generic=request.options.ignore_calibration,
     )
+
+
+def check_capture_time(message: Any) -> None:
+    """Raises FieldError if the message's `capture_time` is no time: clients could not read it in the answer."""
+    time = message.capture_time
+    if not (FIRST_TIME_S <= time.seconds <= LAST_TIME_S and 0 <= time.nanos < 1_000_000_000):
+        likely = "; are these milliseconds or nanoseconds?" if time.seconds > LAST_TIME_S else ""
+        given = f"is {time.seconds} s and {time.nanos} ns{likely}"
+        raise FieldError("capture_time", f"must be a time of the years 1 to 9999, since 1970, {given}")
 
 
 def _sigma_from(request: pb.LocalizeRequest, photo: Photo) -> IntrinsicsSigma | None:
