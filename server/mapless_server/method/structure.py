@@ -255,15 +255,22 @@ def query_tracks(
 ) -> Tracks:
     """Builds tracks of the query's free keypoints and the references' keypoints that they match and no point has.
 
-    The query is the last view; `free` is (N,) over its keypoints.
+    The query is the last view; `free` is (N,) over its keypoints. Each of these is a point, for no keypoint of a
+    reference matches two.
     """
-    offsets, tracks, pairs = keypoint_offsets(references), structure.tracks, {}
+    offsets, tracks = keypoint_offsets(references), structure.tracks
     is_observed = np.zeros(offsets[-1], bool)
     is_observed[offsets[tracks.view] + tracks.keypoint] = True
-    for view, matches in enumerate(query_matches):
-        unused = free[matches[:, 0]] & ~is_observed[offsets[view] + matches[:, 1]]
-        pairs[view, len(references)] = matches[unused][:, ::-1]
-    return build_tracks(pairs, [*np.diff(offsets), len(free)])
+    view = np.repeat(np.arange(len(query_matches)), [len(it) for it in query_matches])
+    own, theirs = np.concatenate([np.empty((0, 2), np.intp), *query_matches]).T
+    unused = free[own] & ~is_observed[offsets[view] + theirs]
+    own, theirs, view = own[unused], theirs[unused], view[unused]
+    seen, first, point = np.unique(own, return_index=True, return_inverse=True)
+    by_first = np.argsort(offsets[view[first]] + theirs[first])  # the order of `build_tracks`
+    points = np.concatenate([np.argsort(by_first)[point], np.arange(len(seen))])
+    views = np.concatenate([view, np.full(len(seen), len(references))])
+    order = np.lexsort((views, points))
+    return Tracks(points[order], views[order], np.concatenate([theirs, seen[by_first]])[order])
 
 
 def with_query_points(
