@@ -237,7 +237,8 @@ def _shifts_nearby(
         moved = residual + motion @ by_pose
         weight = in_half[chosen] * cauchy_weight(moved[0] ** 2 + moved[1] ** 2, options.loss_scale_px)
         gradient = (weight * moved[0]) @ by_pose[0].T + (weight * moved[1]) @ by_pose[1].T
-        hessian = (weight @ products.T).reshape(-1, 6, 6) * (1 + LEAST_DAMPING * np.eye(6))
+        hessian = (weight @ products.T).reshape(-1, 6, 6)
+        hessian += LEAST_DAMPING * np.eye(6) * (hessian + 1)
         step = np.linalg.solve(hessian, gradient[:, :, None])[:, :, 0]
         motion = np.clip(motion - step, -largest, largest)
     is_small = np.asarray((np.abs(motion) < largest).all(axis=1))
