@@ -306,7 +306,7 @@ def test_the_log_has_the_time_of_the_coarse_answer(server: Serving, caplog: pyte
         assert len(list(call)) == 1
         wait_until(lambda: any(record.getMessage() == "LocalizeProgressively OK" for record in caplog.records))
     (line,) = (it for it in caplog.records if it.getMessage() == "LocalizeProgressively OK")
-    fields: Any = vars(line)
+    fields: Any = vars(line)["fields"]
     assert fields["request_id"] == "logged"
     assert 0 < fields["coarse_ms"] <= fields["duration_ms"]
     assert server.server.value("mapless_coarse_answer_seconds_count") == counted + 1

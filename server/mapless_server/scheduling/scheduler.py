@@ -350,7 +350,10 @@ class Scheduler:
         return self._declined[step.stage, step.kind] % _TRY_ONE_IN == 0
 
     def _enqueue(self, job: Job, cost_s: float, now_s: float) -> None:
-        """Lets a job wait for its step; the cost includes later stages, else a cheap first stage would be unordered."""
+        """Lets a job wait for its step.
+
+        The cost includes later stages: with a cheap first stage the order would otherwise be first in, first out.
+        """
         stage = self._stages[job.step.stage]
         job.waits_since_s = now_s
         self._queues[stage.name].push(job, job.flow, cost_s)

@@ -79,7 +79,7 @@ async def warm_up(engine: QueueEngine) -> None:
         if number == 0:
             engine.queue.forget_costs()
     if first.pipeline.matcher.pair_matching is not None:
-        await asyncio.to_thread(_time_pair, first)
+        await _time_pair(first)
 
 
 async def warm_up_stronger(engine: QueueEngine) -> None:
@@ -89,19 +89,19 @@ async def warm_up_stronger(engine: QueueEngine) -> None:
     the server is ready before. A query that is in doubt meanwhile finds them slower, and its deadline bounds that.
     """
     for tier in engine.tiers[1:]:
-        await asyncio.to_thread(_time_pair, tier)
+        await _time_pair(tier)
 
 
-def _time_pair(tier: Tier) -> None:
+async def _time_pair(tier: Tier) -> None:
     """Describes two references and measures the time of a pair, by which queries compute how many they have time for.
 
-    The two are the farthest apart.
+    The two are the farthest apart. In short steps, because a server that ends waits for the one that is computed.
     """
-    first, second = (_reference(tier.extractor, number) for number in (0, len(_CENTRES_X_M) - 1))
-    matcher = tier.pipeline.matcher
+    matcher, numbers = tier.pipeline.matcher, (0, len(_CENTRES_X_M) - 1)
+    first, second = [await asyncio.to_thread(_reference, tier.extractor, number) for number in numbers]
     for _ in range(ROUNDS if matcher.pair_matching is not None else 0):
         matcher.pair_s = None
-        matcher.rematch(first.view, second)
+        await asyncio.to_thread(matcher.rematch, first.view, second)
 
 
 class _RenderedReferences:
