@@ -12,7 +12,13 @@ from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, Camera, Distortion, Fisheye, RadialTangential
 from mapless_server.method.adjust import adjust_pose
-from mapless_server.method.intrinsics import ContradictionOptions, IntrinsicsEvidence, corrected, keypoint_motion
+from mapless_server.method.intrinsics import (
+    ContradictionOptions,
+    IntrinsicsEquations,
+    IntrinsicsEvidence,
+    corrected,
+    keypoint_motion,
+)
 from mapless_server.method.options import IntrinsicsSigma
 from mapless_server.method.pose_problem import AdjustOptions, pose_problem, with_intrinsics
 from mapless_server.method.priors.known import NO_PRIORS
@@ -92,6 +98,17 @@ def test_what_the_matches_of_a_reference_share_is_in_the_sigma() -> None:
     assert off
     assert off.sigma[0] > 2 * right.sigma[0]
     assert abs(off.value[0]) < 3 * off.sigma[0]
+
+
+def test_matches_that_no_reference_sees_are_as_certain_as_their_regions() -> None:
+    random = np.random.default_rng(0)
+    regions = np.stack([np.eye(4)] * 3), random.normal(size=(3, 4))
+    one, two = (
+        IntrinsicsEquations(np.stack([np.eye(4)] * count), np.ones((count, 4)), *regions, np.zeros((6, 4)))
+        for count in (1, 2)
+    )
+    for ours, theirs in zip(*(it.estimate(np.zeros(4), np.ones(4), 1.0, 1.0) for it in (one, two)), strict=True):
+        np.testing.assert_allclose(ours, theirs)
 
 
 def test_a_flat_wall_does_not_determine_the_focal_length() -> None:

@@ -22,7 +22,7 @@ from mapless_server.method.uncertainty.radii import USUAL_GAP, Accuracy, growth
 from mapless_server.method.views import PosedView
 from mapless_server.scenes.calibration.calibrator import MAX_CPU_S, Calibrator, SceneCalibrations
 from mapless_server.scenes.calibration.fit import FitOptions, LeftOut, fit
-from mapless_server.scenes.calibration.lens import SharedErrors, lens_contradiction, without_errors
+from mapless_server.scenes.calibration.lens import SharedErrors, lens_contradiction, shared_errors, without_errors
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import Closed, ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
@@ -199,6 +199,14 @@ class TestLens:
         planted = REFERENCES[0].view.features.keypoints
         assert np.abs(wrong.view.features.keypoints - planted).max() > 1
         assert np.abs(right.view.features.keypoints - planted).max() < 0.1
+
+    def test_a_reference_without_matches_changes_nothing(self) -> None:
+        subject, *others = REFERENCES
+        matches = Pipeline().matcher.match_quickly(subject.view, others)
+        found, same = (shared_errors(subject, others[i:], [matches[0][:0], *matches[1:]][i:]) for i in (0, 1))
+        assert found is not None
+        assert same is not None
+        assert found.value == pytest.approx(same.value)
 
     def test_errors_that_disagree_are_not_certain(self) -> None:
         own = [SharedErrors(np.array([0.0, it]), np.full(2, 0.001)) for it in (-0.2, 0.0, 0.1, 0.3)]

@@ -374,7 +374,8 @@ class Matcher:
         begin_s = time.monotonic()
         matches = self.pair_matching.match_one(query, reference.view)
         spent_s = time.monotonic() - begin_s
-        self.pair_s = spent_s if self.pair_s is None else self.pair_s + (spent_s - self.pair_s) / _PAIRS_THAT_COUNT
+        usual_s = self.pair_s  # read once: another thread may forget it
+        self.pair_s = spent_s if usual_s is None else usual_s + (spent_s - usual_s) / _PAIRS_THAT_COUNT
         return matches
 
     def close(self) -> None:

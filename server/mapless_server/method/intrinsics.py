@@ -99,9 +99,10 @@ class IntrinsicsEquations:
         change, inverse = changes[..., :1, :], inverses[..., 0, :, :]
         parts = self.region_gradients + (self.region_matrices @ change[..., None])[..., 0]
         regions = parts @ inverse / inflation**2
-        both = (it - it.mean(axis=-2, keepdims=True) for it in (changes[..., 1:, :], region_factor * regions))
+        without = changes[..., 1:, :] if len(matrices) > 1 else change  # no reference sees the matches
+        both = (it - it.mean(axis=-2, keepdims=True) for it in (without, region_factor * regions))
         references, regions = (np.swapaxes(it, -1, -2) @ it for it in both)
-        count, chance = changes.shape[-2] - 1, inverse @ (prior + matrices[0] / inflation**2) @ inverse
+        count, chance = without.shape[-2], inverse @ (prior + matrices[0] / inflation**2) @ inverse
         return removed + change[..., 0, :], (count - 1) / count * references + regions + chance
 
 

@@ -272,7 +272,7 @@ MAX_INCIDENCE_DEG = 80.0
 
 def undistort_pixels(pixels: Array, camera: Camera) -> Array:
     """Undistorts pixels (N, 2) to the ideal pinhole camera with the same K; NaN where the lens model has no inverse."""
-    if camera.distortion is None:
+    if camera.distortion is None or not len(pixels):  # OpenCV returns None for no pixels
         return pixels
     d, k = camera.distortion, camera.matrix()
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)

@@ -76,7 +76,7 @@ def shared_errors(subject: PosedView, others: Sequence[PosedView], matches: Sequ
 
     `matches` (subject keypoint, other keypoint) are from descriptors alone.
     """
-    matches = [it[:: 1 + (len(it) - 1) // MAX_MATCHES] for it in matches]
+    matches = [it[:: max(1, -(-len(it) // MAX_MATCHES))] for it in matches]
     if sum(map(len, matches)) < MIN_MATCHES:
         return None
     rough, exact = (_SharedLens(subject, others, matches, scale_px) for scale_px in (_ROUGHLY_PX, _EXACTLY_PX))
