@@ -47,8 +47,7 @@ class ConnectOptions:
         upload_timeout_s: the same for one message of a bulk upload, which returns when all features are computed.
         max_message_mib: largest message sent or received; the server's own limit (32 by default) holds too.
         batch_mib: largest message of a bulk upload, approximately; at most the server's limit. Receiving a large
-            message
-            delays the server's other callers.
+            message delays the server's other callers.
         batch_count: largest number of references in such a message, so that progress is visible.
         max_attempts: attempts of a call while the server is UNAVAILABLE; 1 for no retries at all. A server that sends
             RetryInfo, because it starts or is at its limit, is retried until the call's deadline.

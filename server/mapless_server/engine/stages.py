@@ -297,11 +297,8 @@ class QueryStages:
 
     def _again(self, run: QueryRun, query: Query, tier: int, best: Result) -> StageResult:
         """Starts another search; if it finds nothing better in time, the best result so far is returned."""
-        begin_s, give_up_s = time.monotonic(), self._give_up_s(run)
-        narrowed = run.query if tier == run.tier else None
-        again = QueryRun(
-            query, run.source, run.views, run.deadline_s, run.on_coarse, tier, best, begin_s, give_up_s, narrowed
-        )
+        limits = time.monotonic(), self._give_up_s(run), run.query if tier == run.tier else None
+        again = QueryRun(query, run.source, run.views, run.deadline_s, run.on_coarse, tier, best, *limits)
         return self._next(again, again.first_step)
 
     def _searches_elsewhere(self, run: QueryRun, answer: Answer) -> bool:
