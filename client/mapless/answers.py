@@ -384,7 +384,6 @@ def _outcome(answer: LocalizationResult) -> str:
 
 
 def _support(answer: LocalizationResult) -> str:
-    """Text of a pose's inliers and references."""
     if answer.pose_stage == "COARSE":
         return "not verified"
     used = sum(use.inlier_count > 0 for use in answer.diagnostics.references)

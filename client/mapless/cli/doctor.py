@@ -145,7 +145,6 @@ def _check_protocol(session: _Session) -> _Result:
 
 
 def _check_services(session: _Session) -> _Result:
-    """Asks for the state of the server and its services."""
     states = serving_states(session.client, "the server")
     silent = [name for name, is_serving in states.items() if not is_serving]
     if not silent:
@@ -198,7 +197,6 @@ def _check_clock(session: _Session) -> _Result:
 
 
 def _check_version(session: _Session) -> _Result:
-    """Compares the versions of client and server."""
     libraries = f"grpcio {version('grpcio')}, protobuf {version('protobuf')}"
     client, server = version("mapless"), session.trailers.get(_VERSION_KEY, "")
     if not server:

@@ -94,7 +94,6 @@ def _folder(client: Client, arguments: argparse.Namespace) -> int:
 
 
 def _print_paths(arguments: argparse.Namespace) -> None:
-    """Prints the names of the files that were written."""
     if arguments.output is not None:
         print(f"answers are in {arguments.output}", file=sys.stderr)
     if arguments.draw is not None:

@@ -124,7 +124,6 @@ def _photograph_section(answer: LocalizationResult | Rejected, camera: Camera, p
 def _best_reference(
     answer: LocalizationResult | Rejected, references: Mapping[str, Reference], pictures: Mapping[str, Picture]
 ) -> str:
-    """The reference that a hint names."""
     name = _hinted(answer)
     shown = pictures.get(name)
     if shown is None:

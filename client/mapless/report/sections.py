@@ -210,7 +210,6 @@ def _deviations(covariance: Array) -> str:
 
 
 def _covariance(covariance: Array) -> str:
-    """The matrix, coloured by correlation."""
     sigma = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     correlation = covariance / np.outer(sigma, sigma)
     rows = []

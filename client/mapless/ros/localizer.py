@@ -269,7 +269,6 @@ class Localizer:
 
 
 def _prior_checks(answer: LocalizationResult | SequenceLocalization) -> tuple[PriorCheck, ...]:
-    """Prior checks of the newest image."""
     return answer.images[-1].prior_checks if isinstance(answer, SequenceLocalization) else answer.prior_checks
 
 

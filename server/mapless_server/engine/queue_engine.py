@@ -292,7 +292,6 @@ async def _unless_refused(submission: Awaitable[Any]) -> Refused | None:
 
 @contextmanager
 def _as_request_errors() -> Iterator[None]:
-    """Converts the queue's exceptions to errors of requests."""
     try:
         yield
     except Refused as refused:

@@ -209,7 +209,6 @@ class QueryStages:
         return result if isinstance(result.answer.outcome, Localization) else None
 
     def _with_named(self, run: QueryRun, tier: Tier) -> QueryRun:
-        """Loads the references that the caller named."""
         # References come first: a wrong name is found before the photograph is described.
         generation, references = run.load(run.query.reference_ids, tier)
         view = run.views.view(tier.extractor, run.context)
@@ -375,7 +374,6 @@ class QueryStages:
 
 
 def _pipeline_in(run: QueryRun, tier: Tier) -> Pipeline:
-    """The tier's pipeline with the trust of the scene."""
     calibration = run.attributes.self_calibration(tier.kind)
     return tier.pipeline.with_trust(calibration.trust_quantiles if calibration else ())
 

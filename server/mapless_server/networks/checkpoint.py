@@ -166,5 +166,4 @@ def _is_finite(tensor: torch.Tensor) -> bool:
 
 
 def _bytes_of(tensor: torch.Tensor) -> memoryview:
-    """A view of the tensor's memory."""
     return tensor.reshape(-1).view(torch.uint8).numpy().data

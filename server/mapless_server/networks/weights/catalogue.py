@@ -150,7 +150,6 @@ _MAGIC_LEAP = Licence(
 
 
 def _edgepoint2(variant: str, original_sha256: str, size_bytes: int, sha256: str) -> Weights:
-    """The weights of a variant of EdgePoint2."""
     repository = "https://github.com/HITCSC/EdgePoint2/raw/c589a5784b3f3fe712e77fad046cc6adf61c1aa7"
     return Weights(
         f"edgepoint2-{variant}",

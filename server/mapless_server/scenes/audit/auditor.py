@@ -129,7 +129,6 @@ class Auditor:
         return _report(found, AuditVerdict.CONSISTENT, change=change)
 
     def _first_comparison(self, name: str) -> tuple[Comparison, _Twin]:
-        """Compares a reference with its neighbours by pose; cached."""
         cached = self._comparisons.get(name)
         if cached is None:
             cached = self._compare(name, self._finder.near(name, CANDIDATE_COUNT))
