@@ -59,6 +59,19 @@ def test_small_motions_of_halves_are_those_of_ransac(monkeypatch: pytest.MonkeyP
     np.testing.assert_allclose(moved, found, rtol=0.1, atol=2e-4)  # a thousandth counts as nothing
 
 
+def test_a_line_of_points_does_not_say_that_halves_agree() -> None:
+    scene = planted("line")
+    support = solved(scene)
+    along = np.linspace(0, 1, len(support.structure.x_in_world))[:, None]
+    x_in_world = scene.world_from_query.apply(np.array([-1.0, 0, 4]) + along * np.array([2.0, 0, 1]))
+    pixels = scene.query.camera.project(scene.world_from_query.inverse().apply(x_in_world)).astype(np.float32)
+    keypoints = scene.query.features.keypoints.copy()
+    keypoints[support.matches.keypoint] = pixels[support.matches.point]
+    query = replace(scene.query, features=replace(scene.query.features, keypoints=keypoints))
+    line = replace(support, query=query, structure=replace(support.structure, x_in_world=x_in_world))
+    assert disagreement_of_matches(line, DISTANCE_M, OPTIONS) > 0.1
+
+
 def test_halves_of_random_matches_disagree() -> None:
     scene = planted("random")
     support = solved(scene)

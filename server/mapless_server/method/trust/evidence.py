@@ -42,10 +42,10 @@ MAJORITY, LEAST_AGREEING = 0.5, 8
 """Where a larger share of a half's matches agree with the pose, and so many, the half's own pose is near it."""
 
 LINEAR_SHARE, LINEAR_STEPS = 0.02, 5
-"""Largest motion (of the distance, and radians) in which residuals are linear, and steps of least squares."""
+"""Largest motion, and standard deviation, in which residuals are linear (of the distance, and radians); steps."""
 
 LEAST_DAMPING = 1e-9
-"""Relative: matches that do not determine a pose move it far."""
+"""Relative: a pose that matches do not determine has a large standard deviation, not none."""
 
 NO_AGREEMENT = 1.0
 """The disagreement of halves that give no pose: as far apart as what they see is away."""
@@ -241,7 +241,8 @@ def _shifts_nearby(
         hessian += LEAST_DAMPING * np.eye(6) * (hessian + 1)
         step = np.linalg.solve(hessian, gradient[:, :, None])[:, :, 0]
         motion = np.clip(motion - step, -largest, largest)
-    is_small = np.asarray((np.abs(motion) < largest).all(axis=1))
+    sigma = np.sqrt(np.diagonal(np.linalg.inv(hessian), axis1=1, axis2=2))  # with a noise of one pixel
+    is_small = np.asarray((np.maximum(np.abs(motion), sigma) < largest).all(axis=1))
     shifts[chosen] = np.where(is_small[:, None], -motion[:, :3] @ pose.rotation.T, np.nan)
     return shifts
 
