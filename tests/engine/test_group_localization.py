@@ -11,6 +11,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 from support.servers import CAMERA
 
@@ -18,10 +19,11 @@ from mapless_server.engine.groups import PhotoGroup
 from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import PREPARE, Caller, Photo, Query, Result
 from mapless_server.engine.queue_engine import JOIN, QueueEngine
-from mapless_server.errors import DeadlineExceeded, Overloaded, RequestError
+from mapless_server.errors import DeadlineExceeded, NotFound, Overloaded, RequestError, Unavailable
 from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.rpc import Call
-from mapless_server.scenes import Narrowing
+from mapless_server.scenes import Cone, Narrowing
 from mapless_server.scheduling import (
     Flow,
     ItemList,
@@ -34,7 +36,7 @@ from mapless_server.scheduling import (
     compute_items,
 )
 from mapless_server.security import SceneKey
-from mapless_server.services.localization import localize_photographs
+from mapless_server.services.localization import localize_group, localize_photographs
 
 LIMIT_S = 30.0
 MAX_BYTES = 1000
@@ -230,6 +232,25 @@ def test_a_failed_group_has_its_stage_times() -> None:
             await localize_photographs(engine, [PART] * 4, call, "images")
         assert call.history.queue_s is not None
         assert call.history.stage_seconds[PREPARE] >= engine.seconds
+
+    run(engine, work())
+
+
+@pytest.mark.parametrize("failure", [Unavailable("planted"), DeadlineExceeded("planted"), NotFound("planted")])
+def test_a_search_elsewhere_that_fails_leaves_the_rejection(failure: RequestError) -> None:
+    engine = Toy()
+    engine.fails_at, engine.failure = 3, failure
+    likely = Narrowing(likely_headings=(Cone(np.array([0.0, 0.0, 1.0]), 10.0),))
+    rejection = Rejection(RejectionReason.GATE, "planted")
+
+    async def reject(*_: object) -> Rejection:
+        return rejection
+
+    async def work() -> None:
+        call = Call("id", time.monotonic(), time.monotonic() + LIMIT_S)
+        group, outcome = await localize_group(engine, [replace(PART, narrowing=likely)] * 2, call, "images", reject)
+        assert (len(group.results), outcome) == (2, rejection)
+        assert next(engine._numbers) > 3  # it was tried
 
     run(engine, work())
 

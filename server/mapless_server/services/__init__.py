@@ -1,7 +1,6 @@
 """The RPCs: requests become values for the engine and the store, and their results become responses.
 
 May import rpc and what is below it. Begin with `localization`, the LocalizationService; `references` is the
-ReferenceService. `messages/` converts requests and responses, `progressive` streams coarse and final answers,
-`watching` sends answers to the watchers of a scene, `capture/` records calls for replay, and `handlers` registers all
-services with gRPC.
+ReferenceService. `messages/` converts requests and responses, `watching` sends answers to the watchers of a scene,
+`capture/` records calls for replay, and `handlers` registers all services with gRPC.
 """

@@ -13,7 +13,7 @@ from mapless.v1 import localization_service_pb2_grpc as rpcs
 from mapless_server.engine.groups import MAX_FRAMES, MAX_RIG_IMAGES, MIN_FRAMES, GroupResult, PhotoGroup
 from mapless_server.engine.interface import Engine
 from mapless_server.engine.query import TRACK, Query, Result
-from mapless_server.errors import DeadlineExceeded, Overloaded
+from mapless_server.errors import RequestError
 from mapless_server.method.answer import Localization
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.results import MetricScale
@@ -266,7 +266,7 @@ async def localize_group(
     try:
         again = await localize_photographs(engine, elsewhere, call, list_name)
         found = await pose(elsewhere, again.results)
-    except (DeadlineExceeded, Overloaded):
+    except RequestError:  # a failed attempt at a better answer must not cost the first one
         return group, outcome
     return (group, outcome) if isinstance(found, Rejection) else (again, found)
 
