@@ -251,7 +251,8 @@ _PLAIN_BOUNDS = {
     "less than": "below",
 }
 _BOUNDS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
-_PASSWORD = re.compile(r"(:/+[^/@:]*:).+(?=@)")  # a path has only one slash of a URL's two; an @ may be in the password
+_PASSWORD = re.compile(r"(:/+[^/@:]*:).+(?=@)", re.DOTALL)
+"""In a URL; a path has only one slash of its two. An @ and a line break may be in the password."""
 _COMPUTED_DEFAULTS = {"workers": "all cores", "weights_dir": "~/.cache/mapless/weights"}
 
 

@@ -303,6 +303,10 @@ def test_the_password_of_a_url_in_another_setting_is_not_shown(tmp_path: Path, n
     assert "hun" not in shown
 
 
+def test_a_password_with_a_line_break_is_not_shown_either() -> None:
+    assert "ter2" not in str(load_settings({"capture_dir": "postgresql://u:hun\nter2@db:5432/mapless"}))
+
+
 @pytest.mark.parametrize(
     "data", [b"", b"{}", b"[]", b"null", b"\xff", b"1" * 5000, b"[" * 100_000, b'{"camera": 1, "world_from_camera": 2}']
 )

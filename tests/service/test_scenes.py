@@ -208,7 +208,8 @@ def test_added_references_that_contradict_their_scene_are_said(client: Client, s
 
 
 def test_a_lens_that_references_contradict_is_said(client: Client, scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    known = SceneAttributes(self_calibrations=tuple(SelfCalibration(kind, 1, 3, lens="a lens") for kind in "ab"))
+    kinds = ("a", 2, "a lens"), ("b", 2, "a lens"), ("outdated", 1, "another lens")
+    known = SceneAttributes(self_calibrations=tuple(SelfCalibration(a, at, 3, lens=lens) for a, at, lens in kinds))
     monkeypatch.setattr(Store, "get_attributes", lambda *_: known)
     assert client.get_scene(scene).warnings == ("a lens",)
 

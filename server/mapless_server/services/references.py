@@ -86,7 +86,9 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         key = scene_key_from_name(request.name, "name", call.principal.tenant)
         scene = await self._stored(self._store.get_scene, key)
         known = await self._stored(self._store.get_attributes, key)
-        warnings = dict.fromkeys(it.lens for it in known.self_calibrations if it.lens)
+        # Older ones may be of a server that is gone, and of references that have been replaced.
+        newest = max((it.generation for it in known.self_calibrations), default=0)
+        warnings = dict.fromkeys(it.lens for it in known.self_calibrations if it.lens and it.generation == newest)
         return pb.GetSceneResponse(scene=scene_to_message(scene), warnings=warnings)
 
     async def UpdateScene(self, request: pb.UpdateSceneRequest, call: Call) -> pb.UpdateSceneResponse:
