@@ -51,8 +51,8 @@ SAMPLE = 40
 """Largest number of references of a scene that are localized against the others."""
 MAX_CPU_S = 8.5
 """Processor time of the calling thread after which no further reference is begun, for each (also incomplete) thousand
-references of the scene. With the matcher's threads the total is at most 2.4 times as much, if the matches of the
-references are stored."""
+references of the scene; twice, if these have a wrong lens. With the matcher's threads the total is at most 2.4 times as
+much, if the matches of the references are stored."""
 REFERENCE_COUNT, SHORTLIST = 10, 20
 """References that each is localized with, and those of which they are chosen; as for queries by default."""
 
