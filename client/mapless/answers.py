@@ -321,7 +321,8 @@ class LocalizationResult:
             text.append("  warning   a single reference: its distance is a network's estimate, as the radius says")
         if self.trust is not None and self.trust < DOUBTFUL_TRUST:
             doubtful = f"fewer than {100 * DOUBTFUL_TRUST:g} % of right answers look as doubtful"
-            text.append(f"  warning   {doubtful}: check the intrinsics")
+            advice = f"check the intrinsics, take another photograph, or ask for --coverage {1 - DOUBTFUL_TRUST:g}"
+            text.append(f"  warning   {doubtful}: {advice}")
         return "\n".join(text)
 
 

@@ -1,9 +1,10 @@
 """The settings of the server: from flags, environment (MAPLESS_...), a TOML file or defaults, in this precedence."""
 
+import difflib
 import os
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
@@ -327,7 +328,7 @@ def _read_environment() -> dict[str, str]:
     ours = {name for name in os.environ if name.upper().startswith(PREFIX) and not _SERVICE_LINKS.fullmatch(name)}
     unknown = {name for name in ours if name.upper() not in known}
     if unknown:
-        raise ConfigError("\n".join(f"environment: {ascii(name)[1:-1]} is not a setting" for name in sorted(unknown)))
+        raise ConfigError("\n".join(_unknown("environment", name, known) for name in sorted(unknown)))
     # In any case; of two spellings the one in capitals, which sort first, counts.
     given = {variable: os.environ[variable] for variable in sorted(ours, reverse=True)}
     values = {variables[name.upper()]: value for name, value in given.items() if name.upper() in variables}
@@ -336,8 +337,18 @@ def _read_environment() -> dict[str, str]:
     return values
 
 
+def _unknown(origin: str, name: str, known: Iterable[str]) -> str:
+    nearest = difflib.get_close_matches(name.upper() if origin == "environment" else name.lower(), known, 1)
+    suggestion = f"; did you mean {nearest[0]}?" if nearest else ""
+    return f"{origin}: {ascii(name)[1:-1]} is not a setting{suggestion}"
+
+
 def _describe(fault: Mapping[str, Any], origins: Mapping[str, str]) -> str:
     name = ascii(".".join(map(str, fault["loc"])))[1:-1]  # a key of a file may be any text
+    if fault["type"] == "extra_forbidden":
+        key = str(fault["loc"][0])
+        table = "; settings are given without tables" if isinstance(fault["input"], dict) else ""
+        return _unknown(origins[key], key, Settings.model_fields) + table
     message = str(fault["msg"]).removeprefix("Value error, ").replace("Input should be", "must be")
     for formal, plain in _PLAIN_BOUNDS.items():
         message = message.replace(formal, plain)

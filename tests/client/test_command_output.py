@@ -63,8 +63,8 @@ def test_an_arbitrary_unit_is_not_called_metres() -> None:
 
 
 def test_low_trust_is_warned_of() -> None:
-    warning = "  warning   fewer than 15 % of right answers look as doubtful: check the intrinsics"
-    assert lines(localized(trust=0.149))[-1] == warning
+    warning = "  warning   fewer than 15 % of right answers look as doubtful: check the intrinsics, "
+    assert lines(localized(trust=0.149))[-1] == f"{warning}take another photograph, or ask for --coverage 0.85"
     for trust in (0.15, 0.9, None):
         assert not [line for line in lines(localized(trust=trust)) if "warning" in line]
 

@@ -91,8 +91,12 @@ def test_three_matches_agree_with_a_pose_by_construction() -> None:
     for k in range(4):
         assert false_alarms(50, k, 1e-6) == math.inf
     assert false_alarms(50, 20, 1.0) == math.inf
-    assert format_false_alarms(math.inf) == "any number of such poses expected"
-    assert format_false_alarms(2.34) == "10^2.3 such poses expected"
+    assert format_false_alarms(math.inf, -3.0) == "many such poses expected by chance, at most 0.001 allowed"
+
+
+@pytest.mark.parametrize(("log10", "number"), [(2.34, "220"), (-1.6, "0.025"), (-14.92, "10^-14.9"), (7.0, "10^7")])
+def test_expected_poses_and_their_bound_in_words(log10: float, number: str) -> None:
+    assert format_false_alarms(log10, -15.0) == f"{number} such poses expected by chance, at most 10^-15 allowed"
 
 
 def test_false_alarms_fall_with_inliers_and_rise_with_matches() -> None:

@@ -70,7 +70,8 @@ def test_the_file_may_be_named_by_the_environment(config: Path, monkeypatch: pyt
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("prot = 1", "prot (file)"),
+        ("featurs = 1", "file: featurs is not a setting; did you mean features?"),
+        ("[server]\nport = 1", "file: server is not a setting; settings are given without tables"),
         ("port = 65536", "port (file): must be at most 65535, is 65536"),
         ("port = [", "mapless.toml"),
         ('workers = "many"', "workers (file)"),
@@ -124,7 +125,7 @@ def test_a_missing_settings_file_is_an_error(tmp_path: Path) -> None:
 
 def test_a_misspelt_variable_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MAPLESS_WORKER", "3")
-    with pytest.raises(ConfigError, match="MAPLESS_WORKER is not a setting"):
+    with pytest.raises(ConfigError, match="MAPLESS_WORKER is not a setting; did you mean MAPLESS_WORKERS"):
         load_settings({})
 
 

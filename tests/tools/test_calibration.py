@@ -340,6 +340,7 @@ class TestFindings:
         stronger = [outcome(f"s{i}", 50.0, conditions=replace(SIFT, features="aliked")) for i in range(5)]
         found = find([*self.outcomes(), *stronger], RightRule())
         assert (found.conditions, found.others, len(found.sample)) == (SIFT, 5, 40)
+        assert "5 answers came from other features (aliked) and are left out" in page(report(found))
 
     def test_a_folder_without_answers_is_reported(self) -> None:
         found = find([rejected("r0", "GATE")], RightRule())

@@ -152,7 +152,7 @@ def one_reference_failure(found: Found, trust: float, coverage: float, gate: Gat
     inliers = found.support.estimate.inliers
     count = f"{inliers.sum()} of {len(inliers)} matches agree on a pose"
     if -found.score > gate.max_log10_false_alarms:
-        return f"{count}, which chance could do ({format_false_alarms(-found.score)})"
+        return f"{count}, which chance could do ({format_false_alarms(-found.score, gate.max_log10_false_alarms)})"
     if trust < 1 - coverage:
         required = f"the {round(1 - coverage, 6):g} that a coverage of {coverage:g} requires"
         return f"its trust of {np.floor(1000 * trust) / 1000:g} is below {required}: {count} with a single reference"

@@ -74,10 +74,25 @@ class CalibrationReport:
             "computed by": "-"
             if conditions is None
             else f"{conditions.variant.lower()}; {conditions.backend}, {conditions.features}; mapless {__version__}"
-            + (f"; {found.others} answers by something else are left out" if found.others else ""),
+            + (f"; {found.others} answers came from {_others(found)} and are left out" if found.others else ""),
             "ground truth": self.dataset.ground_truth or self.dataset.source or "not named",
             "calibration": self.stored,
         }
+
+
+def _others(found: Findings) -> str:
+    """What the answers that are left out were computed by, where that differs from the majority's."""
+    if found.conditions is None:
+        return "a computation without radii"
+    majority = asdict(found.conditions)
+    different = {
+        f"other {name.replace('_', ' ')} ({value})"
+        for it in found.outcomes
+        if it.pose is not None and it.conditions is not None
+        for name, value in asdict(it.conditions).items()
+        if value != majority[name]
+    }
+    return " and ".join(sorted(different)) or "a computation without radii"
 
 
 def share_text(share: Share) -> str:

@@ -135,7 +135,7 @@ class GeometricReconstructor:
             return None, inliers
         message = (
             f"{inliers.sum()} of {len(matches)} matches with the references' points agree on a pose, which chance"
-            f" could do ({format_false_alarms(expected)})"
+            f" could do ({format_false_alarms(expected, self.options.gate.max_log10_false_alarms)})"
         )
         return _no_overlap(message, matches), inliers
 

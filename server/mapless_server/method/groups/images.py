@@ -192,7 +192,7 @@ def group_gate_failure(matched: Sequence[PosedImage], inlier_px: float, options:
     )
     expected = group_log10_false_alarms(matched, inlier_px)
     if expected > options.max_log10_false_alarms:
-        return f"{count}, which chance could do ({format_false_alarms(expected)})"
+        return f"{count}, which chance could do ({format_false_alarms(expected, options.max_log10_false_alarms)})"
     visible = sum(
         findable_count(it.source.query, it.source.structure.x_in_world, it.world_from_camera) for it in matched
     )

@@ -54,7 +54,7 @@ def gate_failure(
     if expected <= options.max_log10_false_alarms:
         return None
     count = f"{inliers.sum()} of {len(matches)} matches agree on a pose"
-    return f"{count}, which chance could do ({format_false_alarms(expected)})"
+    return f"{count}, which chance could do ({format_false_alarms(expected, options.max_log10_false_alarms)})"
 
 
 def log10_false_alarms(camera: Camera, matches: PointMatches, inliers: NDArray[np.bool_], inlier_px: float) -> float:
@@ -93,11 +93,15 @@ def log10_tail(match_count: int, inlier_count: int, chance: float) -> float:
     return float(min(0.0, (np.log(n + 1) + _log_choose(n, k) + k * np.log(chance)) / np.log(10)))
 
 
-def format_false_alarms(log10_expected: float) -> str:
-    """Formats the expected number; it is infinite for three matches, which agree with a pose by construction."""
+def format_false_alarms(log10_expected: float, log10_allowed: float) -> str:
+    """Formats the expected number and its bound; it is infinite for three matches, which agree by construction."""
+    expected, allowed = (
+        f"{float(f'{10**it:.2g}'):g}" if -4 <= it < 5 else f"10^{it:.1f}".removesuffix(".0")
+        for it in (log10_expected, log10_allowed)
+    )
     if log10_expected == np.inf:
-        return "any number of such poses expected"
-    return f"10^{log10_expected:.1f} such poses expected"
+        expected = "many"
+    return f"{expected} such poses expected by chance, at most {allowed} allowed"
 
 
 def _log_choose(n: int, k: int) -> float:

@@ -167,7 +167,7 @@ def format_evidence(evidence: Evidence) -> str:
         f"points that should be found, of which references find {100 * evidence.expected_share:.0f} %, over "
         f"{100 * evidence.hull_share:.0f} % of the image; {100 * math.sqrt(evidence.epipolar_share):.0f} % of the "
         "matches with the two best references lie on their epipolar lines; halves of the data give positions apart by "
-        f"{100 * evidence.disagreement:.2g} % of the distance"
+        f"{100 * evidence.disagreement:.1f} % of the distance"
     )
 
 

@@ -142,7 +142,7 @@ def two_view_failure(evidence: TwoViewEvidence, options: TwoViewGateOptions) -> 
     """Says in one sentence why a pose fails; None if it passes."""
     count = f"{evidence.inlier_count} of {evidence.match_count} matches with references and points agree on a pose"
     if evidence.log10_pose > options.max_log10_pose:
-        return f"{count}, which chance could do ({format_false_alarms(evidence.log10_pose)})"
+        return f"{count}, which chance could do ({format_false_alarms(evidence.log10_pose, options.max_log10_pose)})"
     if lacks_distance(evidence, options):
         return (
             f"{count}, but all except {evidence.other_inliers} of them are with one reference, which determines "

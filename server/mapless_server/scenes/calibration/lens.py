@@ -67,7 +67,7 @@ class SharedErrors:
             parts.append(f"another lens distortion (k1 {k1:+.2g}, standard deviation {k1_sigma:.1g}: is it left out?)")
         if focal:
             change, sigma = 100 * np.expm1(focal), 100 * focal_sigma
-            parts.append(f"another focal length ({change:+.1f} %, standard deviation {sigma:.1g} %)")
+            parts.append(f"another focal length ({change:+.1f} %, standard deviation {sigma:.1f} %)")
         return f"matches between the references show {' and '.join(parts)} than their intrinsics say"
 
 
