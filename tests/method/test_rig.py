@@ -17,6 +17,7 @@ from mapless_server.method.groups.images import rejection_without_matches
 from mapless_server.method.groups.jumps import Jump
 from mapless_server.method.groups.rig import RigEstimate, RigOptions, RigState, solve_rig
 from mapless_server.method.groups.sequence import SequenceEstimate
+from mapless_server.method.groups.start import CHECK_TRACKING
 from mapless_server.method.perturbation import rotation_vector
 from mapless_server.method.priors.known import PositionPrior, Priors
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
@@ -233,6 +234,17 @@ def test_tracking_that_jumps_between_all_photographs_is_wrong(count: int) -> Non
         return
     assert isinstance(found, Rejection)
     assert "session's path is 200.00 long, that of the photographs 2.00 units" in found.message
+    assert found.hint is CHECK_TRACKING
+
+
+def test_the_tracking_is_checked_where_photographs_are_localized_alone() -> None:
+    alone = Localization(RigidTransform.identity(), np.eye(6), PoseStage.REFINED, 50, 60, 0.7)
+    images = [(Answer(alone, reference_match_counts=(400, 9)), SCENE.references)] * 2
+    found = hinted_group(Rejection(RejectionReason.GATE, "planted"), images, is_sequence=True)
+    assert str(found.hint) == str(replace(CHECK_TRACKING, best_reference=NAMES[0]))
+    of_rig = hinted_group(Rejection(RejectionReason.GATE, "planted"), images).hint
+    assert of_rig is not None
+    assert "intrinsics" in of_rig.message
 
 
 SCENE = make_scene(random_for("group hints"))

@@ -95,6 +95,13 @@ def test_auto_uses_the_best_features_whose_weights_are_there(tmp_path: Path, cap
     assert record.getMessage().endswith("run `mapless-server weights fetch aliked aliked-lightglue`")
 
 
+def test_auto_logs_what_it_uses_where_nothing_is_missing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO):
+        for features in ("auto", "sift"):
+            assembly._log_features(settings(tmp_path, features=features), ("edgepoint2-l64", "aliked"), {})
+    assert [it.getMessage() for it in caplog.records] == ["features auto: edgepoint2-l64 and aliked"]
+
+
 def test_features_named_in_the_settings_are_never_replaced(tmp_path: Path) -> None:
     with Store.open(tmp_path / "data") as store, pytest.raises(StartupError, match="weights fetch aliked"):
         make_engine(settings(tmp_path, features="aliked"), store, Metrics(), None)

@@ -43,7 +43,7 @@ def pose_sequence(
     if not isinstance(found, Rejection) and not estimate_scale:
         found = check_unit(found, session_from_camera, unit)
     if isinstance(found, Rejection):
-        return _hinted(found, results)
+        return _hinted(found, results, is_sequence=True)
     since = max((jump.after for jump in found.jumps), default=0)
     poses = {i: pose for i, pose in enumerate(found.world_from_camera) if i >= since}
     return _beyond_limits(queries, poses, "frames") or found
@@ -66,5 +66,6 @@ def _images(queries: Sequence[Query], results: Sequence[Result]) -> list[GroupIm
     return images
 
 
-def _hinted(rejection: Rejection, results: Sequence[Result]) -> Rejection:
-    return hinted_group(rejection, [(result.answer, result.references) for result in results])
+def _hinted(rejection: Rejection, results: Sequence[Result], *, is_sequence: bool = False) -> Rejection:
+    images = [(result.answer, result.references) for result in results]
+    return hinted_group(rejection, images, is_sequence=is_sequence)

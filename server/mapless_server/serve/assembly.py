@@ -222,7 +222,7 @@ def make_tiers(settings: Settings) -> tuple[Tier, ...]:
         else _make_matcher(name, settings, device)
         for name in extractors
     }
-    _log_missing(extractors, missing)
+    _log_features(settings, extractors, missing)
     reconstructor = make_reconstructor(
         settings.backend,
         settings.weights_dir,
@@ -268,7 +268,7 @@ def make_first_features(settings: Settings) -> tuple[str, FeatureExtractor]:
     """Name of the first tier's features, and their extractor; errors as in `make_tiers`."""
     missing = _Missing()
     extractors = _make_extractors(settings, device_for(settings), missing)
-    _log_missing(extractors, missing)
+    _log_features(settings, extractors, missing)
     return next(iter(extractors.items()))
 
 
@@ -347,15 +347,21 @@ def _make_extractors(settings: Settings, device: str, missing: _Missing) -> dict
     return extractors
 
 
-def _log_missing(present: Iterable[str], missing: _Missing) -> None:
-    if missing:
-        package = next((install_hint(it) for it in missing.values() if isinstance(it, ImportError)), "")
-        log.info(
-            "features auto: %s; with %s more photographs are localized where references are few or far apart: %s",
-            " and ".join(present),
-            " and ".join(missing),
-            package or f"run `mapless-server weights fetch {' '.join(missing)}`",
-        )
+def _log_features(settings: Settings, present: Iterable[str], missing: _Missing) -> None:
+    """Logs what `auto` chose, and what it leaves out."""
+    if settings.features != AUTO:
+        return
+    chosen = " and ".join(present)
+    if not missing:
+        log.info("features auto: %s", chosen)
+        return
+    package = next((install_hint(it) for it in missing.values() if isinstance(it, ImportError)), "")
+    log.info(
+        "features auto: %s; with %s more photographs are localized where references are few or far apart: %s",
+        chosen,
+        " and ".join(missing),
+        package or f"run `mapless-server weights fetch {' '.join(missing)}`",
+    )
 
 
 def _make_extractor(name: str, settings: Settings, device: str) -> FeatureExtractor:

@@ -19,6 +19,7 @@ from ..rejection import Advice, Hint, Rejection, RejectionReason
 from ..views import PosedView
 from .rig import RigEstimate
 from .sequence import SequenceEstimate
+from .start import CHECK_TRACKING, STAGE
 
 SURE_INLIERS = 30
 """The pose of a photograph with so many inliers alone is reliable."""
@@ -72,8 +73,7 @@ def check_tracking(
         f"the tracked poses contradict the photographs between all {len(poses)} of them: the session's path is "
         f"{tracked:.2f} long, that of the photographs {shown_m:.2f} {unit}"
     )
-    advice = "Check session_from_camera: metres, the axes of the request, and the camera's pose, not its inverse."
-    return Rejection(RejectionReason.GATE, message, Hint(STAGE, Advice.CHECK_CALIBRATION, advice))
+    return Rejection(RejectionReason.GATE, message, CHECK_TRACKING)
 
 
 def check_unit(
@@ -108,21 +108,21 @@ def _distance(first: RigidTransform, second: RigidTransform) -> float:
     return math.dist(first.translation, second.translation)
 
 
-STAGE = "join"
-"""Name of the stage in which photographs are posed together."""
-
-
 def hinted_group(
-    rejection: Rejection, images: Sequence[tuple[Answer, Sequence[PosedView]]], options: HintOptions | None = None
+    rejection: Rejection, images: Sequence[tuple[Answer, Sequence[PosedView]]], *, is_sequence: bool = False
 ) -> Rejection:
-    """Adds a hint to the rejection of a group, if it has none yet.
+    """Adds a hint to the rejection of a rig or a sequence, if it has none yet.
 
     Each image has its own answer, and the references that were used, in the order of its counts.
     """
     if rejection.hint is not None:
         return rejection
     matches, best = _best(images)
-    advice, message = _advice(rejection.reason, matches, len(images), options or HintOptions())
+    alone = sum(isinstance(answer.outcome, Localization) for answer, _ in images)
+    # Intrinsics and references are right where photographs are localized alone.
+    if is_sequence and alone > 1 and rejection.reason in (RejectionReason.PNP_FAILED, RejectionReason.GATE):
+        return replace(rejection, hint=replace(CHECK_TRACKING, best_reference=best))
+    advice, message = _advice(rejection.reason, matches, len(images), HintOptions())
     return replace(rejection, hint=Hint(STAGE, advice, message, best))
 
 

@@ -14,13 +14,23 @@ from mapless.geometry import Array, RigidTransform, Similarity
 from ..options import check_bounds
 from ..pnp import PnpOptions
 from ..priors.known import Priors
-from ..rejection import Rejection, RejectionReason
+from ..rejection import Advice, Hint, Rejection, RejectionReason
 from ..trust.judge import JudgeOptions
 from .drift import DriftOptions, world_from_session_at
 from .generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
 from .images import GroupGateOptions, MatchedImage
 from .joint import JointOptions
 from .jumps import Chain, Jump, JumpOptions, find_jumps
+
+STAGE = "join"
+"""Name of the stage in which photographs are posed together."""
+
+CHECK_TRACKING = Hint(
+    STAGE,
+    Advice.CHECK_CALIBRATION,
+    "The tracked poses contradict the photographs: check that session_from_camera is camera-to-session (not its "
+    "inverse), in the axes that the request names, and in metres (or set estimate_session_scale).",
+)
 
 
 @dataclass(frozen=True)
@@ -139,7 +149,7 @@ class Session:
         if self.scale_is_free and chain.jumps and chain.link_count < 2:
             jumps = "; ".join(map(str, chain.jumps))
             message = f"the session's steps contradict one another in any unit; in that of one of them, {jumps}"
-            return Rejection(RejectionReason.SCALE_UNRELIABLE, message)
+            return Rejection(RejectionReason.SCALE_UNRELIABLE, message, CHECK_TRACKING)
         return self._cut(matched, {i: own[i][0] for i in chain.frames}, chain)
 
     def _chain(self, own: Mapping[int, tuple[RigidTransform, Array]]) -> Chain | None:

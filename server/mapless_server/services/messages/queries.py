@@ -313,7 +313,9 @@ def _gravity(message: pb.GravityPrior, attributes: SceneAttributes, field: str) 
     _check_within(message.sigma_deg, MIN_SIGMA_DEG, MAX_SIGMA_DEG, f"{field}.sigma_deg")
     in_world = _direction(message, "down_in_world", field) if message.HasField("down_in_world") else attributes.down()
     if in_world is None:
-        raise FieldError(f"{field}.down_in_world", "is required, since the scene has neither it nor a datum")
+        raise FieldError(
+            f"{field}.down_in_world", "is required, since the scene has neither it nor a datum (UpdateScene sets them)"
+        )
     return GravityPrior(in_camera, in_world, message.sigma_deg)
 
 
