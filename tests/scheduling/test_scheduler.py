@@ -201,7 +201,9 @@ class TestAdmission:
         step = toy.jobs[0].step
         toy.scheduler.check_room(Flow("t", "light"), step, toy.now_s)
         toy.admit(client="light", deadline_s=8.0)
-        assert toy.refusal(client="expensive").reason is Refusal.QUEUE_FULL
+        refused = toy.refusal(client="expensive")
+        assert refused.reason is Refusal.QUEUE_FULL
+        assert str(refused).endswith("; this caller's jobs in it: 1")
 
     def test_a_prediction_of_one_caller_is_forgotten(self) -> None:
         """While it is refused, nothing corrects it."""

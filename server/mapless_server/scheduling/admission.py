@@ -216,13 +216,14 @@ class Admission:
         ledger = self._ledger
         if not ledger.jobs:
             return
-        is_first = not ledger.job_count(flow)
+        own_jobs = ledger.job_count(flow)
+        is_first = not own_jobs
         for lane, own_s in (self.bookable(cost_s) if is_first else cost_s).items():
             excess_s = self._excess_s(flow, lane, own_s)
             if is_first:
                 excess_s = min(excess_s, ledger.ahead_s(flow, lane, own_s) + own_s - self._bound_s(lane))
             if excess_s > 0:
-                message = "as much is admitted already as can be computed soon"
+                message = f"as much is admitted already as can be computed soon; this caller's jobs in it: {own_jobs}"
                 raise Refused(Refusal.QUEUE_FULL, message, max(MIN_RETRY_S, excess_s / self._threads[lane]))
 
     def check_memory(self, flow: Flow, size_bytes: int) -> None:
