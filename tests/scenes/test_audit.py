@@ -9,9 +9,10 @@ from support.audits import audit_references, finder_of
 from support.scenes import SceneOptions, make_scene
 
 from mapless.geometry import RigidTransform, rotation_from_vector
+from mapless_server.method.trust.judge import JudgeOptions
 from mapless_server.method.views import Features, PosedView
 from mapless_server.scenes import AuditVerdict, ReferenceAudit
-from mapless_server.scenes.audit import auditor
+from mapless_server.scenes.audit import auditor, comparison
 from mapless_server.scenes.audit.auditor import Auditor
 from mapless_server.scenes.audit.finder import ReferenceGone
 from mapless_server.scenes.audit.neighbourhood import PairMatches
@@ -91,6 +92,33 @@ def test_a_wrong_focal_length_is_named_with_what_puts_it_right(
     assert found.verdict is AuditVerdict.WRONG_INTRINSICS
     assert found.focal_ratio == pytest.approx(1 / ratio, abs=0.005)
     assert f"{100 * (ratio - 1):+.1f} %" in found.message
+
+
+def test_a_focal_length_off_by_less_than_two_per_cent_is_not_named(
+    references: list[PosedView], pairs: PairMatches
+) -> None:
+    view = references[VICTIM].view
+    victim = replace(references[VICTIM], view=replace(view, camera=with_focal(view.camera, 1.015)))
+    assert not any(a.verdict.is_alarm for a in audit(altered(references, VICTIM, victim), pairs))
+
+
+def test_a_pose_that_looks_away_has_no_error_in_pixels(references: list[PosedView], pairs: PairMatches) -> None:
+    pose = references[VICTIM].world_from_camera
+    away = RigidTransform(pose.rotation @ np.diag([-1.0, 1.0, -1.0]), pose.translation)
+    victim = replace(references[VICTIM], world_from_camera=away)
+    found = only_fault(audit(altered(references, VICTIM, victim), pairs), VICTIM)
+    assert (found.verdict, found.error_px) == (AuditVerdict.WRONG_POSE, None)
+
+
+def test_a_pose_that_no_answer_would_have_accuses_nothing(
+    references: list[PosedView], pairs: PairMatches, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(comparison, "JudgeOptions", lambda: JudgeOptions(max_radius_share=1e-9))
+    scene = altered(references, VICTIM, moved(references[VICTIM], (0.4, -0.3, 0.2)))
+    found = only_fault(audit(scene, pairs), VICTIM)
+    assert found.verdict is AuditVerdict.UNVERIFIABLE
+    assert found.message.startswith("contradicted, too weakly to say that it is wrong: another camera fits, but")
+    assert found.position_offset_m == pytest.approx(np.linalg.norm((0.4, -0.3, 0.2)), abs=0.01)
 
 
 def test_a_wrong_pose_and_focal_length_are_both_named(references: list[PosedView], pairs: PairMatches) -> None:

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import datetime, timezone
 from io import StringIO
 from pathlib import Path
@@ -106,6 +107,7 @@ def test_findings_before_the_interruption_are_printed(
 
 def test_figures_that_are_not_known_are_dashes_not_zeros() -> None:
     assert cells_of(finding("dark", "UNVERIFIABLE", focal_ratio=0.0))[2:5] == ("-", "-", "-")
+    assert cells_of(replace(finding("away", "WRONG_POSE"), reprojection_error_px=0.0))[6] == "-"
 
 
 def test_a_wrong_focal_length_is_printed_with_its_factor() -> None:

@@ -176,7 +176,7 @@ def cells_of(audit: ReferenceAudit) -> tuple[str, ...]:
         f"{audit.rotation_offset_deg:.2f}" if is_known else "-",
         f"{100 * (1 / audit.focal_ratio - 1):+.1f}" if is_known else "-",
         f"{audit.inlier_count}/{audit.match_count}",
-        f"{audit.reprojection_error_px:.1f}" if audit.inlier_count else "-",
+        f"{audit.reprojection_error_px:.1f}" if audit.reprojection_error_px else "-",
         audit.message,
     )
 

@@ -114,9 +114,11 @@ class Auditor:
             if partner:
                 return _report(found, AuditVerdict.SWAPPED_IMAGE, other=partner)
         is_same_photograph = twin.likeness is Likeness.SAME_PHOTOGRAPH
+        if verdict is not AuditVerdict.CONSISTENT and found.is_usable and (objection := found.objection(verdict)):
+            return _report(found, AuditVerdict.UNVERIFIABLE, objection=objection)
         if verdict.is_alarm:
             return _report(found, verdict, other=twin.name if is_same_photograph else "")
-        if verdict is AuditVerdict.CONSISTENT and found.verdict().is_alarm:
+        if verdict is AuditVerdict.CONSISTENT and found.verdict() is not AuditVerdict.CONSISTENT:
             # It is off by too much, and so are its neighbours: which of them is wrong is not decidable.
             return _report(found, AuditVerdict.UNVERIFIABLE)
         change = None if contradicted else self._find_change(found, verdict)
@@ -160,7 +162,7 @@ class Auditor:
     def _judge(self, found: Comparison) -> AuditVerdict:
         """The verdict of a comparison, tolerating the median offset of the neighbours."""
         verdict = found.verdict()
-        if not verdict.is_alarm:
+        if verdict is AuditVerdict.CONSISTENT or not found.is_usable:
             return verdict
         findings = [self._finding(reference.name) for reference in found.neighbourhood.references]
         usable = [other for other in findings if other.is_usable]
@@ -240,18 +242,20 @@ def _report(
     other: str = "",
     is_same_photograph: bool = False,
     change: Change | None = None,
+    objection: str = "",
 ) -> ReferenceAudit:
     """Makes the result for a reference, from the comparison on which the verdict is based.
 
     `other` is the partner of a swap or duplicate, or the neighbour that it contradicts; `is_same_photograph` whether a
-    duplicate is more than the same view; `change` the scene's, if one was searched for.
+    duplicate is more than the same view; `change` the scene's, if one was searched for; `objection` why the camera that
+    contradicts the given one is not believed.
     """
     fit = _fitted(comparison, verdict)
     best = comparison.fits.get(Free.BOTH)
     return ReferenceAudit(
         reference=comparison.subject.name,
         verdict=verdict,
-        message=_message(comparison, verdict, fit, other, is_same_photograph, change),
+        message=_message(comparison, verdict, fit, other, is_same_photograph, change, objection),
         neighbour_count=len(comparison.neighbourhood.references),
         match_count=len(comparison.points),
         inlier_count=best.inlier_count if best else 0,
@@ -268,7 +272,7 @@ def _report(
 class _Fitted:
     """Differences between the given camera and the fit that a verdict is based on; see `ReferenceAudit`."""
 
-    error_px: float
+    error_px: float | None
     offset_m: float
     turn_deg: float
     focal_ratio: float
@@ -278,7 +282,8 @@ def _fitted(comparison: Comparison, verdict: AuditVerdict) -> _Fitted | None:
     if not comparison.is_usable:
         return None
     best, given = comparison.fits[Free.BOTH], comparison.fits[Free.NOTHING]
-    error_px = float(np.median(np.nan_to_num(given.error_px[best.inliers], nan=1e6)))
+    median_px = float(np.median(np.nan_to_num(given.error_px[best.inliers], nan=np.inf)))
+    error_px = median_px if np.isfinite(median_px) else None
     if verdict is AuditVerdict.WRONG_INTRINSICS:
         return _Fitted(error_px, 0.0, 0.0, comparison.focal_ratio)
     if verdict is AuditVerdict.WRONG_POSE_AND_INTRINSICS:
@@ -294,13 +299,16 @@ def _message(
     other: str,
     is_same_photograph: bool,
     change: Change | None,
+    objection: str,
 ) -> str:
     best, neighbour_count = comparison.fits.get(Free.BOTH), len(comparison.neighbourhood.references)
     matches = f"{best.inlier_count if best else 0} of {len(comparison.points)} matches"
     seen = f"{matches} with {neighbour_count} neighbours agree"
     if verdict is AuditVerdict.UNVERIFIABLE and other:
         return f"contradicts {other}, and no other neighbours show which of the two is wrong"
-    if verdict is AuditVerdict.UNVERIFIABLE and not (fit and comparison.verdict().is_alarm):
+    if objection:
+        return f"contradicted, too weakly to say that it is wrong: {objection}"
+    if verdict is AuditVerdict.UNVERIFIABLE and not (fit and comparison.verdict() is not AuditVerdict.CONSISTENT):
         return f"too little in common with {neighbour_count} neighbours to judge: {seen}"
     if verdict is AuditVerdict.SCENE_CHANGED:
         assert change is not None

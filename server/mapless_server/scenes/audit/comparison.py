@@ -4,19 +4,22 @@ It also compares two references: whether they are the same photograph, or show t
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
 
 import numpy as np
 
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
+from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.perturbation import world_covariance
 from mapless_server.method.pnp import PnpOptions, ransac
+from mapless_server.method.results import PointMatches, PoseEstimate, PoseStage, Support
 from mapless_server.method.trust.gate import false_alarms
+from mapless_server.method.trust.judge import JudgeOptions, judge
 from mapless_server.method.views import Matches, PosedView
 
-from .neighbourhood import Neighbourhood, PairMatches, build_neighbourhood, match_points
+from .neighbourhood import Neighbourhood, PairMatches, build_neighbourhood, match_points, observed_points
 from .resection import CameraFit, Free, ObservedPoints, fit_camera
 from .verdict import AuditVerdict
 
@@ -55,15 +58,25 @@ _SAME_VIEW_SHARE, _SAME_VIEW_MATCHED_SHARE = 0.003, 0.3
 """The same for equivalent views; the shift as a share of the image's width."""
 
 
+_CHANGED = {
+    AuditVerdict.WRONG_POSE: Free.POSE,
+    AuditVerdict.WRONG_INTRINSICS: Free.FOCAL,
+    AuditVerdict.WRONG_POSE_AND_INTRINSICS: Free.BOTH,
+}
+"""What an alarm says is wrong."""
+
+
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A reference compared with neighbours: the points that are matched in it.
+    """A reference compared with neighbours: the points that are matched in it, and the matches with each neighbour.
 
     The fits are by what they may change; too few matches have none.
     """
 
     subject: PosedView
     neighbourhood: Neighbourhood
+    matches: PointMatches
+    neighbour_matches: tuple[Matches, ...]
     points: ObservedPoints
     fits: dict[Free, CameraFit]
 
@@ -121,11 +134,13 @@ class Comparison:
         """Standard deviation of the rotation, the largest about any axis."""
         return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self._covariance[3:, 3:])[-1])))
 
-    @cached_property
-    def focal_sigma(self) -> float:
-        """Standard deviation of the focal ratio."""
-        information = float(self.fits[Free.FOCAL].information[6, 6])
-        return float(_INFLATION / np.sqrt(max(information, 1e-12)))
+    def focal_is_right(self, free: Free) -> bool:
+        """Whether a fit's focal length is the given one, within the tolerance and its own standard deviation."""
+        fit, rows = self.fits[free], list(free.value)
+        variance = np.linalg.inv(fit.information[np.ix_(rows, rows)] + 1e-9 * np.eye(len(rows)))[-1, -1]
+        sigma = _INFLATION * float(np.sqrt(max(variance, 0.0)))
+        ratio = fit.camera.focal_x_px / self.subject.view.camera.focal_x_px
+        return abs(ratio - 1) <= max(_FOCAL_TOLERANCE, SIGNIFICANCE_SIGMA * sigma)
 
     def excess(self, free: Free) -> float:
         """Robust cost per match of a fit, minus that of the fit that may change everything."""
@@ -136,19 +151,41 @@ class Comparison:
         """Verdict by the smallest change that fits the matches; the noise is the median offset of the neighbours."""
         if not self.is_usable:
             return AuditVerdict.UNVERIFIABLE
-        allowed = max(_FOCAL_TOLERANCE, SIGNIFICANCE_SIGMA * self.focal_sigma)
         focal_could_be = self.excess(Free.FOCAL) < self.excess(Free.POSE)
-        if self.severity(noise_m, noise_deg) <= 1 and not (focal_could_be and abs(self.focal_ratio - 1) > allowed):
+        focal_is_right = self.focal_is_right(Free.FOCAL)
+        if self.severity(noise_m, noise_deg) <= 1 and (focal_is_right or not focal_could_be):
             return AuditVerdict.CONSISTENT
         # With both free, what is right stays, unless the scene is too flat to distinguish them.
-        both = self.fits[Free.BOTH]
-        pose_stays = self.severity(noise_m, noise_deg, both.world_from_camera) <= 1
-        focal_stays = abs(both.camera.focal_x_px / self.subject.view.camera.focal_x_px - 1) <= allowed
-        if pose_stays != focal_stays:
-            return AuditVerdict.WRONG_POSE if focal_stays else AuditVerdict.WRONG_INTRINSICS
-        if not pose_stays and min(self.excess(Free.POSE), self.excess(Free.FOCAL)) > _BOTH_EXCESS:
-            return AuditVerdict.WRONG_POSE_AND_INTRINSICS
-        return AuditVerdict.WRONG_INTRINSICS if focal_could_be else AuditVerdict.WRONG_POSE
+        pose_stays = self.severity(noise_m, noise_deg, self.fits[Free.BOTH].world_from_camera) <= 1
+        focal_stays = self.focal_is_right(Free.BOTH)
+        if not pose_stays and not focal_stays:
+            if min(self.excess(Free.POSE), self.excess(Free.FOCAL)) > _BOTH_EXCESS:
+                return AuditVerdict.WRONG_POSE_AND_INTRINSICS
+        elif pose_stays != focal_stays:
+            focal_could_be = pose_stays
+        if not focal_could_be:
+            return AuditVerdict.WRONG_POSE
+        return AuditVerdict.UNVERIFIABLE if focal_is_right else AuditVerdict.WRONG_INTRINSICS
+
+    def objection(self, verdict: AuditVerdict) -> str:
+        """Why the camera that a verdict is based on does not suffice to contradict the given one; empty if it does.
+
+        It must explain more, and a query with it must pass the checks of answers.
+        """
+        if verdict is AuditVerdict.UNVERIFIABLE:
+            return "another pose fits less well than a focal length that is right within the tolerance"
+        fit = self.fits[_CHANGED[verdict]]
+        if fit.inlier_count < _MIN_INLIERS:
+            return f"{fit.inlier_count} matches agree with another camera, {_MIN_INLIERS} are needed"
+        if fit.inlier_count <= (given := self.fits[Free.NOTHING].inlier_count):
+            return f"{fit.inlier_count} matches agree with another camera, and {given} with the given one"
+        estimate = PoseEstimate(
+            fit.world_from_camera, PoseStage.REFINED, fit.inliers, fit.error_px, self._covariance_of(fit)
+        )
+        query, hood = replace(self.subject.view, camera=fit.camera), self.neighbourhood
+        support = Support(query, hood.references, hood.structure, self.matches, estimate, np.zeros(3))
+        rejection = judge(support, self.neighbour_matches, LocalizeOptions().coverage, JudgeOptions()).rejection
+        return f"another camera fits, but would be rejected as an answer: {rejection.message}" if rejection else ""
 
     def severity(
         self, noise_m: float = 0.0, noise_deg: float = 0.0, world_from_camera: RigidTransform | None = None
@@ -162,21 +199,28 @@ class Comparison:
 
     @cached_property
     def _covariance(self) -> Array:
-        information = self.fits[Free.POSE].information[:6, :6]
-        return _INFLATION**2 * world_covariance(information, self.world_from_camera)
+        return self._covariance_of(self.fits[Free.POSE])
+
+    @staticmethod
+    def _covariance_of(fit: CameraFit) -> Array:
+        return _INFLATION**2 * world_covariance(fit.information[:6, :6], fit.world_from_camera)
 
 
 def compare(subject: PosedView, neighbours: Sequence[PosedView], pairs: PairMatches) -> Comparison:
     """Compares a reference with neighbours, whose poses are used as far as they agree with one another."""
     neighbourhood = build_neighbourhood(neighbours, pairs)
-    points = match_points(subject, neighbourhood, pairs)
-    fits = {}
+    matches, neighbour_matches = match_points(subject, neighbourhood, pairs)
+    points = observed_points(subject, neighbourhood, matches)
+    fits: dict[Free, CameraFit] = {}
     if len(points) >= _RANSAC.min_matches:
         camera, given = subject.view.camera, subject.world_from_camera
         found = ransac(camera, points.x_in_world, points.pixel, None, _RANSAC)
         starts = (given,) if found is None else (given, found)
-        fits = {free: fit_camera(points, camera, starts, free) for free in Free}
-    return Comparison(subject, neighbourhood, points, fits)
+        for free in Free:
+            # Where there are several minima, more freedom can lead to a worse one.
+            narrower = [fits[other] for other in fits if set(other.value) <= set(free.value)]
+            fits[free] = min([fit_camera(points, camera, starts, free), *narrower], key=lambda fit: fit.cost)
+    return Comparison(subject, neighbourhood, matches, neighbour_matches, points, fits)
 
 
 def pose_difference(first: RigidTransform, second: RigidTransform) -> tuple[float, float]:

@@ -22,7 +22,7 @@ from mapless_server.method.correspond import Correspondences
 from mapless_server.method.match import vote
 from mapless_server.method.nearest import epipolar_distance_px, mutual_matches
 from mapless_server.method.observations import Observations, triangulate
-from mapless_server.method.results import Structure
+from mapless_server.method.results import PointMatches, Structure
 from mapless_server.method.structure import StructureOptions, observe, refine_points
 from mapless_server.method.tracks import Tracks, build_tracks
 from mapless_server.method.views import Matches, PosedView
@@ -93,13 +93,23 @@ def build_neighbourhood(references: Sequence[PosedView], pairs: PairMatches) -> 
     return Neighbourhood(tuple(references), structure, covariance[trusted])
 
 
-def match_points(subject: PosedView, neighbourhood: Neighbourhood, pairs: PairMatches) -> ObservedPoints:
-    """Matches the neighbourhood's points with the subject's photograph, by descriptors alone."""
+def match_points(
+    subject: PosedView, neighbourhood: Neighbourhood, pairs: PairMatches
+) -> tuple[PointMatches, tuple[Matches, ...]]:
+    """Matches the neighbourhood's points with the subject's photograph, by descriptors alone.
+
+    The second result has the matches with each reference.
+    """
+    found = tuple(pairs.match(subject, reference) for reference in neighbourhood.references)
     if not len(neighbourhood.structure.x_in_world):
-        return ObservedPoints(np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 3, 3)), np.empty(0))
-    matches = tuple(pairs.match(subject, reference) for reference in neighbourhood.references)
+        nothing = np.empty(0, np.intp)
+        return PointMatches(nothing, nothing, np.empty(0, bool), 0.0), found
     counts = [len(r.view.features) for r in neighbourhood.references]
-    found = vote(neighbourhood.structure, counts, Correspondences({}, matches))
+    return vote(neighbourhood.structure, counts, Correspondences({}, found)), found
+
+
+def observed_points(subject: PosedView, neighbourhood: Neighbourhood, found: PointMatches) -> ObservedPoints:
+    """The points of the matches, where they are seen, and how accurately."""
     features = subject.view.features
     return ObservedPoints(
         features.keypoints[found.keypoint].astype(np.float64),

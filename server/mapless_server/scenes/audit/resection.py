@@ -24,8 +24,9 @@ _LOSS_SCALE_SIGMA = 2.0
 neighbours are not adjusted here."""
 _INLIER_SIGMA = 4.0
 """Largest residual of an inlier."""
-_STEPS = MinimizeOptions(30, 1e-6, damping=1e-3)
-"""From a pose that is off by metres about 20 steps are needed."""
+_STEPS, _ROUNDS = MinimizeOptions(5, 1e-6, damping=1e-3), 6
+"""From a pose that is off by metres about 20 steps are needed. After every few the points' uncertainty is projected
+anew: with that of the start, some fits ended metres away from a right pose, where nothing agreed any better."""
 
 
 class Free(Enum):
@@ -91,32 +92,45 @@ def fit_camera(points: ObservedPoints, camera: Camera, starts: tuple[RigidTransf
 
 
 def _fit(points: ObservedPoints, camera: Camera, start: RigidTransform, free: Free) -> CameraFit:
-    camera_from_world = start.inverse()
-    sigma_px = _sigma_px(points, camera, camera_from_world)
-    problem = Resection(
-        camera,
-        points.x_in_world,
-        points.pixel,
-        sigma_px,
-        _LOSS_SCALE_SIGMA,
-        free.value,
-        behind_sigma=_BEHIND_SIGMA,
-        shorten_all=False,
-    )
-    steps = _STEPS if free.value else replace(_STEPS, iterations=0)
-    fit = minimize(problem, problem.at(camera_from_world), steps)
-    fitted = with_focal(camera, math.exp(fit.log_ratio))
-    # Weighted with the covariances as seen from the fitted pose, so that fits from different starts are comparable.
-    problem = replace(problem, sigma_px=_sigma_px(points, fitted, fit.camera_from_world))
-    fit = problem.at(fit.camera_from_world, fit.log_ratio)
+    """Fits from one start, with weights of the points as seen from there, and again from where that leads."""
+    pose, log_ratio = start.inverse(), 0.0
+    best = _fit_at(points, camera, pose, log_ratio, free)
+    for _ in range(_ROUNDS if free.value else 0):
+        problem = _problem(points, camera, pose, log_ratio, free)
+        fit = minimize(problem, problem.at(pose, log_ratio), _STEPS)
+        pose, log_ratio = fit.camera_from_world, fit.log_ratio
+        found = _fit_at(points, camera, pose, log_ratio, free)
+        if not found.cost < best.cost:
+            break
+        best = found
+    return best
+
+
+def _fit_at(points: ObservedPoints, camera: Camera, pose: RigidTransform, log_ratio: float, free: Free) -> CameraFit:
+    """A camera_from_world and a focal length as a fit, its weights as seen from there, so that costs are comparable."""
+    problem = _problem(points, camera, pose, log_ratio, free)
+    fit = problem.at(pose, log_ratio)
     length = np.linalg.norm(fit.residual, axis=1)
     return CameraFit(
-        fitted,
-        fit.camera_from_world.inverse(),
+        with_focal(camera, math.exp(log_ratio)),
+        pose.inverse(),
         problem.cost(fit),
         length < _INLIER_SIGMA,
         length * problem.sigma_px,
         problem.linearize(fit)[0],
+    )
+
+
+def _problem(points: ObservedPoints, camera: Camera, pose: RigidTransform, log_ratio: float, free: Free) -> Resection:
+    return Resection(
+        camera,
+        points.x_in_world,
+        points.pixel,
+        _sigma_px(points, with_focal(camera, math.exp(log_ratio)), pose),
+        _LOSS_SCALE_SIGMA,
+        free.value,
+        behind_sigma=_BEHIND_SIGMA,
+        shorten_all=False,
     )
 
 

@@ -19,7 +19,7 @@ class AuditVerdict(str, Enum):
     DUPLICATE = "duplicate"
     """Nothing is wrong, but another reference is the same photograph, or the same view from the same place."""
     UNVERIFIABLE = "unverifiable"
-    """It has too little in common with other references to be judged."""
+    """It has too little in common with other references to be judged, or they contradict it too weakly."""
     CONSISTENT = "consistent"
 
     @property
@@ -51,7 +51,7 @@ class ReferenceAudit:
         match_count: matches of its keypoints with points that these references triangulate.
         inlier_count: matches that agree with the best fit.
         error_px: median reprojection error of these inliers with the given pose and intrinsics, pixels of the
-            processed image; None without inliers.
+            processed image; None without inliers, or if most of their points are behind the camera.
         position_offset_m: distance of the fitted pose from the given one; None if not judged.
         rotation_offset_deg: the same for the rotation.
         focal_ratio: fitted over given focal length; 1 if the given one fits.
