@@ -3,6 +3,7 @@
 import asyncio
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -89,8 +90,8 @@ def localize(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Localize]:
             ],
         )
 
-        def answer(priors: Priors = NO_PRIORS, scene: SceneKey = SCENE) -> Result:
-            job = engine.query_job(query(priors, scene, image), caller)
+        def answer(priors: Priors = NO_PRIORS, scene: SceneKey = SCENE, **named: object) -> Result:
+            job = engine.query_job(query(priors, scene, image, **named), caller)
             return loop.run_until_complete(engine.run(job))
 
         yield answer
@@ -172,6 +173,18 @@ def test_a_prior_of_another_place_gives_the_answer_without_it(localize: Localize
     assert found.prior_checks[0].conflict
     free = localized(localize(NO_PRIORS, TWO_PLACES))
     np.testing.assert_allclose(found.world_from_camera.matrix(), free.world_from_camera.matrix(), atol=1e-9)
+
+
+def test_a_rejection_near_the_prior_leads_to_the_whole_scene(localize: Localize) -> None:
+    """Also if the reference that resembles the photograph most is near: here it alone is, which gives no points."""
+    free = localize()
+    assert free.choice is not None
+    alike = free.choice.references[0].world_from_camera.translation
+    priors = Priors(position=PositionPrior(alike, 1e-4 * np.eye(3)))
+    near = localize(priors, narrowing=replace(Narrowing.of(priors), margin_m=0.01))
+    np.testing.assert_allclose(
+        localized(near).world_from_camera.matrix(), localized(free).world_from_camera.matrix(), atol=1e-9
+    )
 
 
 def test_a_search_elsewhere_that_fails_costs_no_answer(localize: Localize, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,6 +21,7 @@ from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.perturbation import moved, rotation_vector
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.pose_problem import AdjustOptions
+from mapless_server.method.priors.known import PosePrior, Priors
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
 from mapless_server.method.results import Support
 from mapless_server.method.structure import StructureOptions
@@ -218,6 +219,47 @@ def test_localize_answers_where_nothing_can_be_triangulated() -> None:
     failed = localize(problem.query, problem.references[:1], pipeline, LocalizeOptions()).outcome
     assert isinstance(failed, Rejection)
     assert failed.reason is RejectionReason.NO_USABLE_REFERENCES
+
+
+def with_doubtful_points(problem: Planted, right: int, wrong: int) -> Planted:
+    """Adds points that references 0 and 1 share; the query's matches with them are right, and then wrong."""
+    count, random = right + wrong, random_for("doubtful points", right, wrong)
+    points = random.uniform([-1.6, -1.1, -1.0], [1.6, 1.1, 1.5], (count, 3))
+    queried = CAMERA.project(TRUE.inverse().apply(points))
+    queried[right:] = random.uniform([0, 0], [959, 719], (wrong, 2))
+
+    def with_pixels(view: View, pixels: Array) -> View:
+        both = np.concatenate([view.features.keypoints, pixels])
+        return view_of(both, random)
+
+    references, matches = list(problem.references), list(problem.correspondences.query_matches)
+    added = np.arange(count)
+    firsts = [len(references[i].view.features) for i in (0, 1)]
+    for i in (0, 1):
+        seen = CAMERA.project(references[i].world_from_camera.inverse().apply(points))
+        references[i] = replace(references[i], view=with_pixels(references[i].view, seen))
+        more = np.stack([len(problem.query.features) + added, firsts[i] + added], axis=1).astype(np.int32)
+        matches[i] = np.concatenate([matches[i], more])
+    shared = np.stack([firsts[0] + added, firsts[1] + added], axis=1).astype(np.int32)
+    pairs = dict(problem.correspondences.reference_pairs) | {(0, 1): shared}
+    query = with_pixels(problem.query, queried)
+    return Planted(query, tuple(references), Correspondences(pairs, tuple(matches)))
+
+
+@pytest.mark.parametrize("sigmas", [(0.05, 1), (0.5, 10), (5, 60)])
+def test_a_right_prior_costs_no_answer_of_two_views(sigmas: tuple[float, float]) -> None:
+    """Points that are too few for a pose of the photograph alone are matched again at the prior's pose."""
+    problem = with_doubtful_points(planted((70, 60, 50), 0.5, 0.3), 5, 30)
+    pipeline = Pipeline(make_reconstructor("geometric", Path()), Given(problem.correspondences))
+    free = localize(problem.query, problem.references, pipeline, LocalizeOptions()).outcome
+    assert isinstance(free, Localization), free
+    deviations = np.repeat([sigmas[0], np.radians(sigmas[1])], 3)
+    priors = Priors(pose=PosePrior(TRUE, np.diag(np.square(deviations))))
+    found = localize(problem.query, problem.references, pipeline, LocalizeOptions(), priors=priors).outcome
+    assert isinstance(found, Localization), found
+    assert np.linalg.norm(error_of(found.world_from_camera)[:3]) < 0.05
+    assert found.trust == free.trust
+    assert [check.conflict for check in found.prior_checks] == [False]
 
 
 def test_references_are_always_matched_at_their_given_poses() -> None:

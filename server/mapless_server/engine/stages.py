@@ -313,8 +313,8 @@ class QueryStages:
     def _may_be_elsewhere(self, run: QueryRun, answer: Answer) -> bool:
         """Whether soft priors may have led to the wrong references.
 
-        That is if the reference that resembles the photograph most is not where they say, and the photograph was not
-        localized, or references elsewhere contradict the pose.
+        That is if the photograph was not localized, and references elsewhere would be chosen without them; or if the
+        reference that resembles it most is not where they say, and references elsewhere contradict the pose.
         """
         outcome, query = answer.outcome, run.query
         is_excluded = isinstance(outcome, Rejection) and bool(outcome.intrinsics_checks)
@@ -323,10 +323,10 @@ class QueryStages:
         with run.context.stage("retrieval"):
             alike = run.choose(query.narrowing.limits).references
         inside = {it.reference_id for it in run.choice.references}
+        if isinstance(outcome, Rejection):
+            return any(it.reference_id not in inside for it in alike)
         if not alike or alike[0].reference_id in inside:
             return False
-        if isinstance(outcome, Rejection):
-            return True
         assert run.view is not None
         tier = self._tiers[run.tier]
         others = [it.reference_id for it in alike if it.reference_id not in inside][: tracking.OTHERS]

@@ -83,12 +83,35 @@ def refine(coarse: Coarse) -> Answer:
 
     If the gate still rejects the pose, its agreement with gravity or heading is counted as evidence for it. If that
     does not help either, the pose is estimated from matches with the references themselves (see `two_view`).
+
+    A pose that is rejected with priors, or weak and from an initial pose that only they gave, is no evidence against
+    what the photograph gives without them: that is computed, too, and is the answer to a photograph rejected with them.
     """
+    prepared = coarse.prepared
     answer = _strict_then_wide(coarse, counts_agreement=False)
     is_gated = isinstance(answer.outcome, Rejection) and answer.outcome.reason is RejectionReason.GATE
-    if is_gated and coarse.prepared.priors.has_directions:
+    if is_gated and prepared.priors.has_directions:
         answer = _strict_then_wide(coarse, counts_agreement=True)
+    is_rejected = isinstance(answer.outcome, Rejection)
+    if not (prepared.priors and prepared.can_improve(answer) and (is_rejected or coarse.rests_on_priors)):
+        return _or_two_views(coarse, answer)
+    alone = _checked(prepared, _strict_then_wide(coarse.without_priors(), counts_agreement=False))
+    alone = _or_two_views(coarse, alone)
+    is_used = is_rejected or is_better(alone, answer, prepared.pipeline.options.max_radius_ratio)
+    return alone if is_used else replace(answer, stage_seconds=alone.stage_seconds)
+
+
+def _or_two_views(coarse: Coarse, answer: Answer) -> Answer:
     return from_two_views(coarse, answer) if coarse.prepared.can_use_two_views(answer) else answer
+
+
+def _checked(prepared: Prepared, answer: Answer) -> Answer:
+    """An answer computed without the priors, compared with them."""
+    outcome = answer.outcome
+    if isinstance(outcome, Rejection) or outcome.covariance is None:
+        return answer
+    checks = prepared.priors.shifted(prepared.origin).check(outcome.world_from_camera, outcome.covariance)
+    return replace(answer, outcome=replace(outcome, prior_checks=tuple(replace(it, used=False) for it in checks)))
 
 
 def _strict_then_wide(coarse: Coarse, counts_agreement: bool) -> Answer:

@@ -186,6 +186,18 @@ class Coarse:
     structure: Structure | None = None
     matches: PointMatches | None = None
 
+    @property
+    def rests_on_priors(self) -> bool:
+        """Whether the photograph alone gives no initial pose."""
+        return isinstance(self.reconstruction, Triangulation) and self.reconstruction.without_priors is not None
+
+    def without_priors(self) -> "Coarse":
+        """What the coarse stage gives without priors."""
+        free = replace(self, prepared=replace(self.prepared, priors=NO_PRIORS))
+        if isinstance(self.reconstruction, Triangulation) and (alone := self.reconstruction.without_priors):
+            return replace(free, reconstruction=alone, scale=alone, structure=None)
+        return free
+
     def answer(self, outcome: Localization | Rejection, support: Support | None = None) -> Answer:
         """Makes the answer in the caller's world from an outcome in the world of `prepared`."""
         prepared, scale = self.prepared, None if isinstance(self.scale, Rejection) else self.scale

@@ -107,6 +107,7 @@ class GeometricReconstructor:
         enough = len(matches) >= options.min_matches
         pose = ransac(query.camera, x_in_world, pixels, None, options) if enough else None
         rejection, inliers = self._judge(query, structure, matches, pose, NO_PRIORS)
+        without_priors = rejection
         if rejection and enough and priors:
             informed = informed_pose(query.camera, x_in_world, pixels, pose, priors, options.informed)
             pose = informed.world_from_camera if informed else None
@@ -118,7 +119,7 @@ class GeometricReconstructor:
             # With too few matches here, the pose prior is the initial pose from which more are searched.
             pose, inliers = known.world_from_camera, np.zeros(len(matches), bool)
         assert pose is not None
-        return Triangulation(structure, pose, matches.point[inliers], matches.keypoint[inliers])
+        return Triangulation(structure, pose, matches.point[inliers], matches.keypoint[inliers], without_priors)
 
     def _judge(
         self, query: View, structure: Structure, matches: PointMatches, pose: RigidTransform | None, priors: Priors
