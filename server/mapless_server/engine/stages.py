@@ -31,7 +31,7 @@ from . import tracking
 from .failures import failure_of
 from .query import COARSE, PREPARE, REFINE, TRACK, UNFINISHED, Query, Result, Tier
 from .references import QueryRun
-from .tiers import EscalationOptions, better_of, is_doubtful, of_two_places, place_of_priors
+from .tiers import EscalationOptions, better_of, inlier_count, is_doubtful, of_two_places, place_of_priors
 
 log = logging.getLogger(__name__)
 
@@ -271,7 +271,9 @@ class QueryStages:
             better = of_two_places(run.best, result, self._escalation)
             if better not in (run.best, result):  # two places: stronger features would search only one of them
                 return Done(replace(better, stage_seconds=result.stage_seconds), _ending(better))
-            query = run.narrowed if better is run.best else query
+            # Stronger features search the whole scene after two rejections, unless the priors' references showed more.
+            is_near = isinstance(run.best.answer.outcome, Localization) or inlier_count(run.best) > inlier_count(result)
+            query = run.narrowed if better is run.best and is_near else query
             result = replace(better, stage_seconds=result.stage_seconds)
         elif run.best is not None:
             result = replace(better_of(run.best, result, self._escalation), stage_seconds=result.stage_seconds)

@@ -127,7 +127,7 @@ def of_two_places(narrowed: Result, elsewhere: Result, options: EscalationOption
     """
     first, second = narrowed.answer.outcome, elsewhere.answer.outcome
     if isinstance(second, Rejection):
-        is_better = isinstance(first, Rejection) and _inlier_count(elsewhere) > _inlier_count(narrowed)
+        is_better = isinstance(first, Rejection) and inlier_count(elsewhere) > inlier_count(narrowed)
         return elsewhere if is_better else narrowed
     if isinstance(first, Rejection):
         other = _rejected_pose(narrowed.answer)
@@ -187,7 +187,8 @@ def place_of_priors(
     return place
 
 
-def _inlier_count(result: Result) -> int:
+def inlier_count(result: Result) -> int:
+    """Inliers of the pose that was estimated, also of one that was rejected; 0 if there is none."""
     support = result.answer.support
     return 0 if support is None or support.estimate is None else support.inlier_count()
 
