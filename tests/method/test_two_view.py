@@ -17,14 +17,15 @@ from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.correspond import Correspondences, Matcher
 from mapless_server.method.localize import localize
 from mapless_server.method.match import MatchOptions
-from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.options import IntrinsicsSigma, LocalizeOptions
 from mapless_server.method.perturbation import moved, rotation_vector
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.pose_problem import AdjustOptions
 from mapless_server.method.priors.known import PosePrior, Priors
-from mapless_server.method.rejection import Advice, Rejection, RejectionReason
+from mapless_server.method.rejection import Advice, IntrinsicsParameter, Rejection, RejectionReason
 from mapless_server.method.results import Support
 from mapless_server.method.structure import StructureOptions
+from mapless_server.method.trust.intrinsics import WrongCameraOptions, wrong_camera_by_lines
 from mapless_server.method.trust.two_view import (
     TwoViewEvidence,
     TwoViewGateOptions,
@@ -260,6 +261,25 @@ def test_a_right_prior_costs_no_answer_of_two_views(sigmas: tuple[float, float])
     assert np.linalg.norm(error_of(found.world_from_camera)[:3]) < 0.05
     assert found.trust == free.trust
     assert [check.conflict for check in found.prior_checks] == [False]
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
+def test_intrinsics_of_another_image_size_are_named(factor: float) -> None:
+    problem = planted((70, 60, 50), 0.5, 0.3)
+    principal = {"principal_x_px": factor * CAMERA.principal_x_px, "principal_y_px": factor * CAMERA.principal_y_px}
+    focal = {"focal_x_px": factor * CAMERA.focal_x_px, "focal_y_px": factor * CAMERA.focal_y_px}
+    problem = replace(problem, query=replace(problem.query, camera=replace(CAMERA, **focal, **principal)))
+    support = problem.solved()
+    assert support is not None
+    matches = problem.correspondences.query_matches
+    rejection = wrong_camera_by_lines(support, matches, IntrinsicsSigma(), WrongCameraOptions())
+    if factor == 1:
+        assert rejection is None
+        return
+    assert rejection is not None
+    found = {it.parameter: it.estimated for it in rejection.intrinsics_checks}
+    assert found[IntrinsicsParameter.FOCAL_LENGTH] == pytest.approx(CAMERA.focal_x_px, rel=0.01)
+    assert found[IntrinsicsParameter.PRINCIPAL_X] == pytest.approx((CAMERA.width_px - 1) / 2)
 
 
 def test_references_are_always_matched_at_their_given_poses() -> None:
