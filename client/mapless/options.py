@@ -143,6 +143,7 @@ class ConnectOptions:
             ("grpc.max_receive_message_length", max_message_bytes),
             ("grpc.initial_reconnect_backoff_ms", min(_FIRST_RECONNECT_MS, max_reconnect_ms)),
             ("grpc.max_reconnect_backoff_ms", max_reconnect_ms),
+            ("grpc.use_local_subchannel_pool", 1),  # servers share their time among connections
             ("grpc.keepalive_time_ms", round(1000 * self.keepalive_s)),
             ("grpc.keepalive_timeout_ms", round(1000 * self.keepalive_timeout_s)),
             # gRPC itself repeats only calls that never reached a server, and only if they fit into this buffer, by
