@@ -266,9 +266,14 @@ def test_a_right_prior_costs_no_answer_of_two_views(sigmas: tuple[float, float])
 @pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
 def test_intrinsics_of_another_image_size_are_named(factor: float) -> None:
     problem = planted((70, 60, 50), 0.5, 0.3)
-    principal = {"principal_x_px": factor * CAMERA.principal_x_px, "principal_y_px": factor * CAMERA.principal_y_px}
-    focal = {"focal_x_px": factor * CAMERA.focal_x_px, "focal_y_px": factor * CAMERA.focal_y_px}
-    problem = replace(problem, query=replace(problem.query, camera=replace(CAMERA, **focal, **principal)))
+    camera = replace(
+        CAMERA,
+        focal_x_px=factor * CAMERA.focal_x_px,
+        focal_y_px=factor * CAMERA.focal_y_px,
+        principal_x_px=factor * CAMERA.principal_x_px,
+        principal_y_px=factor * CAMERA.principal_y_px,
+    )
+    problem = replace(problem, query=replace(problem.query, camera=camera))
     support = problem.solved()
     assert support is not None
     matches = problem.correspondences.query_matches
