@@ -230,6 +230,7 @@ class TestScenes:
         assert found.lens.startswith("matches between the references show another lens distortion (k1 -0.2")
         assert found.answer_count == len(REFERENCES)
 
+    @pytest.mark.nightly
     def test_a_wrong_focal_length_of_all_is_named(self, store: Store) -> None:
         found = found_in(store, with_errors(REFERENCES, [0.1, 0.0, 0.0, 0.0]))
         assert "another focal length (-" in found.lens
@@ -244,6 +245,7 @@ class TestScenes:
         assert theirs.position_factor == pytest.approx(ours.position_factor, rel=0.1)
         assert theirs.rotation_factor == pytest.approx(ours.rotation_factor, rel=0.1)
 
+    @pytest.mark.nightly
     def test_mirrored_ones_say_nothing(self, store: Store) -> None:
         assert found_in(store, REFERENCES[:5], mirrored).answer_count == 0
 

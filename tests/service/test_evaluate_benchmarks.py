@@ -29,6 +29,7 @@ def _same_code(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mapless_tools.evaluate.suite.commit_of", lambda _: "abc1234")
 
 
+@pytest.mark.nightly
 def test_a_failed_scene_stops_no_other_and_is_measured_later(chess: Path, tmp_path: Path) -> None:
     """A photograph is torn behind its header, so that only the server finds out."""
     output = tmp_path / "out"
