@@ -24,7 +24,7 @@ from mapless.axes import Axes
 from mapless.v1 import localization_service_pb2, reference_service_pb2
 from mapless_server.method.options import ScaleStrategy, Variant
 from mapless_server.method.priors.known import PriorKind
-from mapless_server.method.rejection import Advice, RejectionReason
+from mapless_server.method.rejection import Advice, IntrinsicsParameter, RejectionReason
 from mapless_server.method.results import PoseStage, ScaleStage
 from mapless_server.services.localization import LocalizationService
 from mapless_server.services.references import ReferenceService
@@ -48,7 +48,8 @@ def test_every_rpc_is_implemented(servicer: type, rpc: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "here", [Variant, ScaleStrategy, RejectionReason, PoseStage, ScaleStage, Advice, PriorKind, Axes]
+    "here",
+    [Variant, ScaleStrategy, RejectionReason, PoseStage, ScaleStage, Advice, PriorKind, IntrinsicsParameter, Axes],
 )
 def test_enums_have_the_same_values_here_and_on_the_wire(here: type[Enum]) -> None:
     on_the_wire: Any = getattr(localization_service_pb2, here.__name__)

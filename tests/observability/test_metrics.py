@@ -68,15 +68,6 @@ FAMILIES = {
     ("histogram", "op"): "mapless_store_op_seconds",
 }
 """Names by type and labels."""
-NAMES = [name for names in FAMILIES.values() for name in names.split()]
-
-ABBREVIATED = {"s", "ms", "us", "ns", "sec", "b", "kb", "mb", "gb", "tb", "m", "h", "d"}
-"""Units that `promtool check metrics` wants written out."""
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_no_name_abbreviates_its_unit(name: str) -> None:
-    assert not ABBREVIATED & {*name.split("_")}
 
 
 OUTCOMES = (LOCALIZED, *(reason.value for reason in RejectionReason))
@@ -171,11 +162,6 @@ def test_names_types_and_labels_match_the_dashboards(metrics: Metrics) -> None:
     assert all(family.documentation for family in ours.values())
 
 
-def test_metrics_without_events_are_described(metrics: Metrics) -> None:
-    families = {f.name for f in text_string_to_metric_families(generate_latest(metrics.registry).decode())}
-    assert families >= {name.removesuffix("_total") for name in NAMES}
-
-
 EVENTS: list[tuple[str, dict[str, str], Callable[[Metrics], None]]] = [
     *(("admission_rejected", {"reason": it.value}, partial(Metrics.refused, reason=it)) for it in Refusal),
     *(
@@ -246,28 +232,6 @@ def test_stages_of_stronger_features_are_a_tier_not_a_name(metrics: Metrics) -> 
     sums = {dict(labels)["tier"]: value for (name, labels), value in changes.items() if name.endswith("_sum")}
     assert sums == {"0": 0.1, "1": 2.0}
     assert "aliked" not in generate_latest(metrics.registry).decode()
-
-
-@pytest.mark.parametrize(
-    ("histogram", "edge"),
-    [
-        ("grpc_server_handling_seconds", 0.3),
-        ("grpc_server_handling_seconds", 30.0),
-        ("mapless_queue_wait_seconds", 1.0),
-        ("mapless_event_loop_lag_seconds", 0.02),
-        ("mapless_scale_deviation", 0.05),
-        ("mapless_accuracy_radius_metres", 0.2),
-        ("mapless_inliers", 50.0),
-    ],
-)
-def test_buckets_have_an_edge_at_each_limit(metrics: Metrics, histogram: str, edge: float) -> None:
-    edges = {
-        float(dict(labels)["le"])
-        for name, labels in samples_of(metrics)
-        if name == f"{histogram}_bucket" and "le" in dict(labels)
-    }
-    assert edge in edges
-    assert math.inf in edges
 
 
 def test_series_are_bounded_whatever_is_counted(metrics: Metrics) -> None:
@@ -362,11 +326,6 @@ def scrape(port: int, host: str = "127.0.0.1") -> str:
 
 def metrics_threads() -> list[threading.Thread]:
     return [thread for thread in threading.enumerate() if thread.name == "metrics" or "process_request" in thread.name]
-
-
-def test_the_port_serves_what_the_registry_has(metrics: Metrics, server: MetricsServer) -> None:
-    metrics.count("fatal")
-    assert "\nmapless_fatal_total 1.0\n" in scrape(server.port)
 
 
 def ask(port: int, path: str) -> tuple[int, str]:
@@ -485,17 +444,6 @@ def test_the_port_answers_while_the_event_loop_is_blocked(server: MetricsServer)
             return pool.submit(scrape, server.port).result(30)  # waited for on the loop's own thread
 
     assert "mapless_fatal_total" in asyncio.run(block())
-
-
-def test_the_port_listens_on_ipv6(metrics: Metrics) -> None:
-    if not socket.has_ipv6:
-        pytest.skip("no IPv6 on this machine")
-    try:
-        server = MetricsServer(metrics.registry, "::1", 0, metrics)
-    except OSError:
-        pytest.skip("no IPv6 on this machine")
-    assert "mapless_fatal_total" in scrape(server.port, "[::1]")
-    server.close()
 
 
 # The event loop

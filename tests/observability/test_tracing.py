@@ -17,7 +17,6 @@ from opentelemetry.trace import SpanKind, StatusCode
 from support.clients import hosted
 from support.programs import printed
 
-from mapless_server.extras import install_hint
 from mapless_server.observability.otlp import OtlpTracer, make_otlp_tracer
 from mapless_server.observability.tracing import MAX_STAGES
 from mapless_server.scheduling import StageRecord
@@ -152,11 +151,6 @@ def test_opentelemetry_is_imported_only_where_traces_are_wanted() -> None:
 def test_an_endpoint_that_is_no_address_ends_the_start(endpoint: str) -> None:
     with pytest.raises(StartupError, match="otlp_endpoint must be http://host:port"):
         running._make_tracer(Settings(otlp_endpoint=endpoint))
-
-
-def test_a_missing_package_names_its_extra() -> None:
-    error = ModuleNotFoundError("No module named 'opentelemetry'", name="opentelemetry")
-    assert install_hint(error) == "the Python package opentelemetry is not installed: pip install 'mapless[otel]'"
 
 
 # Collectors

@@ -154,16 +154,6 @@ async def test_a_leaving_caller_ends_the_stream() -> None:
         await until(lambda: counted.handled == ["CANCELLED"])
 
 
-async def test_a_leaving_caller_that_reads_nothing_ends_the_stream() -> None:
-    counted, numbers = Counted(), Numbers(10**9, "wait")
-    async with serving(numbers, counted) as (channel, _):
-        call = watching(channel)
-        await call.initial_metadata()
-        await asyncio.sleep(0.1)  # until the buffers are full
-        call.cancel()
-        await until(lambda: numbers.is_closed)
-
-
 class Photographs(Numbers):
     """Messages that are larger than a connection buffers."""
 

@@ -17,7 +17,7 @@ import pytest
 from cryptography.hazmat.primitives.serialization import BestAvailableEncryption, Encoding, PrivateFormat
 from support.certificates import DAY, Pair, authority, options_of, signed
 
-from mapless import Client, ConnectOptions, MaplessError, Unavailable
+from mapless import Client, ConnectOptions
 from mapless.__main__ import main
 from mapless.errors import from_rpc_error
 from mapless_server.security import Authenticator, Role, SecurityError
@@ -135,28 +135,6 @@ class TestConnections:
         with serving(files) as server:
             assert server.is_serving(server.options())
             assert server.who_am_i(server.options()) == ""
-
-    def test_a_client_that_trusts_another_authority_fails(self, files: TlsFiles) -> None:
-        with serving(files) as server:
-            refused(lambda: server.who_am_i(server.options(root=STRANGER)))
-            with pytest.raises(Unavailable):
-                server.is_serving(server.options(root=STRANGER))
-
-    def test_a_client_without_tls_fails(self, files: TlsFiles) -> None:
-        plain = ConnectOptions(max_attempts=1, timeout_s=5)
-        with serving(files) as server, pytest.raises(MaplessError):
-            server.is_serving(plain)
-
-    def test_clients_reject_an_expired_server_certificate(
-        self, files: TlsFiles, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        # It was valid when the server started: the check is replaced by one that accepts it.
-        signed(AUTHORITY, "old", ends=-timedelta(hours=1)).write(files.certificate, files.key)
-        with pytest.raises(SecurityError, match="expired"):
-            Tls(files)
-        monkeypatch.setattr("mapless_server.security.tls._check_time", lambda *_: None)
-        with serving(files) as server:
-            refused(lambda: server.who_am_i(server.options()))
 
     def test_client_certificates_are_checked_and_name_the_caller(self, mutual: TlsFiles) -> None:
         with serving(mutual) as server:

@@ -1,12 +1,10 @@
 """Tokens: the file and its errors, changes while serving, and which role may call which method."""
 
-import asyncio
 import json
 import logging
 import os
 import re
 import stat
-import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime, timedelta, timezone
@@ -38,7 +36,7 @@ from mapless_server.security import (
     revoke_token,
     sha256_of,
 )
-from mapless_server.security.reloading import Reloading, keep_fresh
+from mapless_server.security.reloading import Reloading
 from mapless_tools.cli import tokens as command
 
 NOW = datetime(2030, 1, 1, tzinfo=timezone.utc)
@@ -219,42 +217,6 @@ class TestReloading:
         path.write_bytes(good)
         assert source.refresh()
         assert source.value.find(token) == source.value.tokens[0]
-
-    def test_a_file_is_read_again_after_a_failure(self, path: Path) -> None:
-        path.write_text("{}")
-        failing = [False]
-
-        def read() -> Tokens:
-            if failing[0]:
-                raise SecurityError("too many open files")
-            return read_tokens(path)
-
-        source = Reloading([path], read, "tokens")
-        token = create_token(path, "a", "t", "read", None)
-        failing[0] = True
-        assert not source.refresh()
-        failing[0] = False
-        assert source.refresh()
-        assert source.value.find(token) == source.value.tokens[0]
-
-    def test_the_event_loop_does_not_read_files(self) -> None:
-        threads: list[threading.Thread] = []
-
-        class Source:
-            def refresh(self) -> bool:
-                threads.append(threading.current_thread())
-                return False
-
-        async def watch() -> None:
-            task = asyncio.create_task(keep_fresh([Source().refresh, Source().refresh], interval_s=0.001))
-            while len(threads) < 4:
-                await asyncio.sleep(0.001)
-            task.cancel()
-            with pytest.raises(asyncio.CancelledError):
-                await task
-
-        asyncio.run(watch())
-        assert threading.main_thread() not in threads
 
 
 class TestAccess:

@@ -1,7 +1,6 @@
 """Settings to tiers: what serves, and what is said where something is missing."""
 
 import logging
-import sys
 from pathlib import Path
 
 import pytest
@@ -95,13 +94,6 @@ def test_auto_uses_the_best_features_whose_weights_are_there(tmp_path: Path, cap
     assert record.getMessage().endswith("run `mapless-server weights fetch aliked aliked-lightglue`")
 
 
-def test_auto_logs_what_it_uses_where_nothing_is_missing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.INFO):
-        for features in ("auto", "sift"):
-            assembly._log_features(settings(tmp_path, features=features), ("edgepoint2-l64", "aliked"), {})
-    assert [it.getMessage() for it in caplog.records] == ["features auto: edgepoint2-l64 and aliked"]
-
-
 def test_features_named_in_the_settings_are_never_replaced(tmp_path: Path) -> None:
     with Store.open(tmp_path / "data") as store, pytest.raises(StartupError, match="weights fetch aliked"):
         make_engine(settings(tmp_path, features="aliked"), store, Metrics(), None)
@@ -115,12 +107,6 @@ def test_a_server_without_networks_does_not_load_torch(tmp_path: Path) -> None:
         print('torch' in sys.modules)
     """
     assert printed(program, tmp_path) == "False\n"
-
-
-def test_features_without_a_network_need_no_torch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "torch", None)
-    assert len(make_tiers(settings(tmp_path, features="sift"))) == 1
-    assert len(make_tiers(settings(tmp_path, features="auto"))) == 1
 
 
 def test_on_a_gpu_the_strong_features_answer_alone(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from pydantic import SecretStr, ValidationError
+from pydantic import SecretStr
 
 from mapless_server.method.choices import BACKENDS, BEST_VARIANTS
 from mapless_server.method.features import FEATURES, make_extractor
@@ -142,11 +142,6 @@ def test_variables_of_a_kubernetes_service_are_not_settings(monkeypatch: pytest.
     loaded = load_settings({})
     assert loaded.settings.port == 50051
     assert loaded.origins["port"] == "default"
-
-
-def test_settings_are_frozen() -> None:
-    with pytest.raises(ValidationError, match="frozen"):
-        Settings().port = 3
 
 
 def test_secrets_are_hidden_when_settings_are_shown() -> None:

@@ -558,18 +558,8 @@ def test_store_and_capture_folder_are_apart(tmp_path: Path, capture: str, data: 
         load_settings({"capture_dir": tmp_path / capture, "data_dir": tmp_path / data})
 
 
-@pytest.mark.parametrize("flags", [{"capture_hours": 0}, {"capture_mib": 0}])
-def test_limits_of_zero_are_rejected(flags: dict[str, object]) -> None:
-    with pytest.raises(ConfigError):
-        load_settings(flags)
-
-
 def test_an_invalid_tenant_is_rejected(tmp_path: Path) -> None:
     settings = load_settings({"capture_dir": tmp_path / "captured", "capture_tenants": "a,../b"}).settings
     with pytest.raises(CaptureError, match="capture_tenants"), Store.open(tmp_path / "store") as store:
         open_recorder(settings, store, Metrics())
     assert not (tmp_path / "captured").exists()
-
-
-def test_nothing_is_captured_by_default() -> None:
-    assert load_settings({}).settings.capture_dir is None

@@ -70,12 +70,6 @@ def test_a_rejection_carries_its_checks_to_the_client() -> None:
     assert found.used
 
 
-def test_every_parameter_has_a_number() -> None:
-    known: wire.ProtoEnum = pb.IntrinsicsParameter
-    names = {f"INTRINSICS_PARAMETER_{it.name}" for it in IntrinsicsParameter}
-    assert {known.Name(number) for number in known.values()} == names | {"INTRINSICS_PARAMETER_UNSPECIFIED"}
-
-
 def request(lens: RadialTangential | Fisheye) -> pb.LocalizeRequest:
     return pb.LocalizeRequest(image=PHOTO, intrinsics=wire.camera_to_message(replace(CAMERA, distortion=lens)))
 

@@ -34,12 +34,6 @@ def vector(x: float | str, y: float | str, z: float | str) -> dict[str, float | 
     return {"x": x, "y": y, "z": z}
 
 
-def test_a_request_without_priors_has_none() -> None:
-    narrowing, priors = priors_from_message(request(), NOTHING)
-    assert narrowing.is_empty
-    assert not priors
-
-
 def test_a_position_may_be_limited_and_likely() -> None:
     prior = {"positionM": vector(1, 2, 3), "radiusM": 5, "covarianceM2": [4, 0, 0, 0, 9, 0, 0, 0, 16]}
     narrowing, priors = priors_from_message(request(positionPrior=prior), NOTHING)
@@ -143,15 +137,6 @@ def test_a_radius_of_any_size_keeps_what_is_inside(radius_m: float) -> None:
         narrowing, _ = priors_from_message(message, NOTHING)
         far = np.array([[-1e7, -1e7, 1e7], [0.0, 0, 0]])
         assert narrowing.keeps(far, np.eye(3)[:2]).all()
-
-
-def test_retrieval_takes_what_its_request_has() -> None:
-    message = ParseDict(
-        {"positionPrior": {"positionM": vector(0, 0, 0), "radiusM": 2}}, reference_pb.RetrieveReferencesRequest()
-    )
-    narrowing, _ = priors_from_message(message, NOTHING)
-    assert narrowing.position is not None
-    assert narrowing.position.radius_m == 2
 
 
 GEO = {"latitudeDeg": 47, "longitudeDeg": 8, "horizontalSigmaM": 5}

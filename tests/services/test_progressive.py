@@ -1,4 +1,4 @@
-"""A coarse answer comes once, before the final one; a caller that stops reading cancels the computation."""
+"""A coarse answer comes once, before the final one, and an error in its place."""
 
 import asyncio
 import gc
@@ -32,16 +32,11 @@ class Planted:
     def __init__(self, coarse: Sequence[int] = (), end: Exception | None = None) -> None:
         self._coarse, self._end = coarse, end
         self.may_end = asyncio.Event()
-        self.is_cancelled = False
 
     async def answer(self, coarse: FutureCoarseAnswer) -> pb.LocalizeResponse:
         for number in self._coarse:
             coarse.set_result(message(number))
-        try:
-            await self.may_end.wait()
-        except asyncio.CancelledError:
-            self.is_cancelled = True
-            raise
+        await self.may_end.wait()
         if self._end is not None:
             raise self._end
         return FINAL
@@ -52,14 +47,6 @@ class Planted:
 
 def seen(response: pb.LocalizeProgressivelyResponse) -> tuple[int, bool]:
     return response.answer.localization.inlier_count, response.is_final
-
-
-async def test_the_coarse_answer_does_not_wait_for_the_final_one() -> None:
-    planted = Planted([1])
-    messages = planted.messages()
-    assert seen(await anext(messages)) == (1, False)
-    planted.may_end.set()
-    assert [seen(it) async for it in messages] == [(100, True)]
 
 
 @pytest.mark.parametrize(("coarse", "expected"), [((), []), ((1,), [(1, False)])])
@@ -81,24 +68,6 @@ async def test_an_error_comes_in_the_place_of_the_final_answer(coarse: Sequence[
         assert seen(await anext(messages)) == (number, False)
     with pytest.raises(KeyError, match="planted"):
         await anext(messages)
-
-
-async def test_a_caller_that_stops_reading_ends_the_job() -> None:
-    planted = Planted([1])
-    messages = planted.messages()
-    await anext(messages)
-    await messages.aclose()
-    assert planted.is_cancelled
-
-
-async def test_a_cancelled_caller_ends_the_job() -> None:
-    planted = Planted()
-    waits = asyncio.ensure_future(anext(planted.messages()))
-    await asyncio.sleep(0)
-    waits.cancel()
-    await asyncio.gather(waits, return_exceptions=True)
-    assert waits.cancelled()
-    assert planted.is_cancelled
 
 
 async def test_an_error_of_an_abandoned_call_is_not_logged(caplog: pytest.LogCaptureFixture) -> None:

@@ -7,10 +7,9 @@ import threading
 import time
 import weakref
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
-from datetime import datetime, timezone
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -87,14 +86,6 @@ def test_a_captured_answer_is_marked(served: tuple[Client, LocalizationServiceSt
     assert kept.response == answer.SerializeToString()
     assert kept.request == localize_request("s").SerializeToString()
     assert kept.request_id == answer.diagnostics.request_id
-
-
-def test_a_captured_final_answer_of_a_stream_is_marked(served: tuple[Client, LocalizationServiceStub, Path]) -> None:
-    _, stub, folder = served
-    final = list(stub.LocalizeProgressively(localize_request("s"), timeout=30))[-1].answer
-    assert final.diagnostics.captured
-    wait_until(lambda: captured_in(folder))
-    assert decode_call(captured_in(folder)[0].read_bytes()).response == final.SerializeToString()
 
 
 def test_each_photograph_of_a_captured_group_is_marked(served: tuple[Client, LocalizationServiceStub, Path]) -> None:
@@ -429,42 +420,6 @@ def test_the_start_waits_for_no_store_and_retries_each_round(
         assert len(recorder.folder.entries()) == 3
         let_go.set()
     assert asked[0] == 1
-
-
-class CountingStore:
-    """Counts what is asked of a scene that never changes."""
-
-    def __init__(self, keys: dict[str, str]) -> None:
-        self.keys, self.asked = keys, Counter[str]()
-
-    def get_scene(self, scene_key: SceneKey) -> SceneRecord:
-        self.asked["get_scene"] += 1
-        return SceneRecord(scene_key, 3, len(self.keys), datetime.fromtimestamp(0, timezone.utc))
-
-    def find_keys(self, scene_key: SceneKey, reference_ids: Sequence[str]) -> dict[str, str]:
-        self.asked["find_keys"] += 1
-        return {it: self.keys[it] for it in reference_ids if it in self.keys}
-
-
-def test_an_unchanged_scene_is_asked_for_references_once(tmp_path: Path) -> None:
-    """However many calls are written and deleted; a missing reference is found all the same."""
-    folder, counting = CaptureFolder(tmp_path / "c", Retention(3600.0, 2**24)), CountingStore({"r0": "k0", "r1": "k1"})
-    stale_calls = StaleCalls(cast(Store, counting))
-
-    def add(number: int, key: str) -> None:
-        reference = CapturedReference(f"r{number % 2}", key, CAMERA, pose(0), "0" * 64, {})
-        part = CapturedPart("image", 3, (reference,))
-        folder.add(CapturedCall(f"{number}", time.time(), "Localize", "acme", "s", 0, parts=(part,)), {"0" * 64: b"x"})
-
-    for number in range(20):
-        add(number, f"k{number % 2}")
-        assert stale_calls.delete(folder) == 0
-        if number > 10:
-            folder.remove_all(folder.entries()[:1])
-    assert counting.asked == {"get_scene": 20, "find_keys": 2}
-    add(20, "another key")
-    assert stale_calls.delete(folder) == 1
-    folder.close()
 
 
 @pytest.mark.parametrize("fault", [DataLoss("damaged"), RuntimeError("no such column"), Unavailable("away")])

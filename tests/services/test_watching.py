@@ -33,20 +33,6 @@ def inliers_of(message: pb.WatchQueriesResponse) -> int:
     return int(message.answer.localization.inlier_count)
 
 
-async def test_an_answer_reaches_watchers_with_photo_and_matches() -> None:
-    watchers = Watchers(True)
-    first, second, elsewhere = watchers.watch(HALL), watchers.watch(HALL), watchers.watch(OTHER)
-    waits = asyncio.ensure_future(elsewhere.__anext__())
-    publish(watchers, 7, debug=pb.Debug(error_px=[0.5]))
-    for watch in (first, second):
-        seen = await next_of(watch)
-        assert (seen.image, seen.intrinsics.width_px, inliers_of(seen)) == (b"photograph", 640, 7)
-        assert list(seen.answer.debug.error_px) == [0.5]
-        assert seen.missed_count == 0
-    assert not waits.done()
-    waits.cancel()
-
-
 async def test_a_waiting_answer_keeps_no_more_of_the_request() -> None:
     """A part of a message keeps the whole message, so that each photograph would be in memory twice."""
     watchers = Watchers(True)
@@ -68,20 +54,6 @@ async def test_an_oversized_photograph_is_left_out_of_the_event() -> None:
     assert [len(it.image) for it in seen] == [1000, 0, 5]
     assert [inliers_of(it) for it in seen] == [1000, 1999, 5]
     assert all(it.ByteSize() <= 2000 for it in seen)
-
-
-def test_the_callers_own_answer_stays_as_it_was() -> None:
-    watchers = Watchers(True)
-    response = answer(3)
-
-    async def run() -> None:
-        watch = watchers.watch(HALL)
-        watchers.publish(HALL, REQUEST, response, pb.Debug(error_px=[0.5]))
-        response.localization.inlier_count = 99
-        assert inliers_of(await next_of(watch)) == 3
-
-    asyncio.run(run())
-    assert not response.HasField("debug")
 
 
 async def test_a_slow_reader_misses_the_oldest_and_learns_how_many() -> None:
