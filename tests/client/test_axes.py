@@ -147,13 +147,6 @@ def test_a_session_leads_to_the_same_in_all_axes(
 # Covariances
 
 
-def test_unity_covariance_changes_the_signs_the_mirror_changes() -> None:
-    """A turn about x, from y to z, goes the other way where z does; so does one about y. One about z stays as it is."""
-    covariance = np.arange(36.0).reshape(6, 6)
-    signs = np.array([1, 1, -1, -1, -1, 1])
-    np.testing.assert_array_equal(module.covariance_to(Axes.UNITY, covariance), covariance * np.outer(signs, signs))
-
-
 @given(all_axes, rigid, vector)
 def test_a_small_turn_is_the_same_turn_in_all_axes(axes: Axes, world_from_camera: RigidTransform, w: Array) -> None:
     """What `covariance_to` does to rotation vectors, against turning a pose and converting it."""

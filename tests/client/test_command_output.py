@@ -14,10 +14,8 @@ from mapless.answers import IntrinsicsCheck, LocalizationResult, PriorCheck, Rej
 from mapless.axes import Axes, pose_to
 from mapless.cameras import read_camera
 from mapless.cli.arguments import make_parser
-from mapless.cli.folder import Tally
 from mapless.cli.localize import priors
 from mapless.cli.output import line, plain
-from mapless.errors import Internal
 from mapless.geometry import Camera, Fisheye, RigidTransform, Similarity
 from mapless.groups import GroupRejected, RigLocalization, SequenceLocalization, TrackingJump
 from mapless.priors import Priors
@@ -160,18 +158,6 @@ def test_priors_of_the_command_are_those_of_the_client() -> None:
 def test_wrong_parts_of_a_pose_prior_are_named(values: list[str], message: str) -> None:
     with pytest.raises(ValueError, match=re.escape(message)):
         priors(make_parser().parse_args(["localize", "hall", "a.jpg", "--pose-prior", *values]))
-
-
-def test_progress_counts_each_kind_by_its_name() -> None:
-    tally = Tally(5)
-    for outcome in (localized(), Internal("INTERNAL", "broken"), rejected(), rejected()):
-        tally.count(outcome)
-    assert "] 4/5, 2 not localized, 1 failed, " in tally.progress()
-
-
-@pytest.mark.parametrize("axes", ["arkit", "ARKit", "ARKIT", Axes.ARKIT])
-def test_axes_are_taken_in_any_case_and_as_values(axes: str | Axes) -> None:
-    assert wire.enum_value(pb.Axes, axes) == pb.AXES_ARKIT
 
 
 def test_axes_that_are_none_are_named_among_those_there_are() -> None:

@@ -35,11 +35,6 @@ def asking(**given: Any) -> Exchange[Any]:
     return (yield Call("s/M", Empty(), Empty, **given))
 
 
-def test_a_successful_call_is_sent_once() -> None:
-    played = Played(asking(), [Empty()], ConnectOptions(timeout_s=7))
-    assert (played.result, played.tries, played.pauses) == (Empty(), [7.0], [])
-
-
 def test_pauses_double_up_to_the_longest_and_are_counted() -> None:
     options = ConnectOptions(max_attempts=6, initial_backoff_s=0.2, max_backoff_s=1.0)
     played = Played(asking(), [UNAVAILABLE], options)
@@ -148,18 +143,6 @@ def test_the_error_is_raised_if_the_found_resource_differs() -> None:
         raise error
 
     assert Played(asking(on_repeat=foreign), [UNAVAILABLE, ABSENT, Empty()], ConnectOptions()).result is ABSENT
-
-
-def test_an_exchange_can_go_on_after_an_error() -> None:
-    def two() -> Exchange[str]:
-        try:
-            yield Call("s/A", Empty(), Empty)
-        except NotFound:
-            yield Call("s/B", Empty(), Empty)
-        return "done"
-
-    played = Played(two(), [ABSENT, Empty()], ConnectOptions())
-    assert (played.result, [call.method for call in played.calls]) == ("done", ["s/A", "s/B"])
 
 
 def test_the_lookup_after_a_lost_answer_has_the_remaining_time() -> None:

@@ -15,7 +15,6 @@ from support.planted_answers import CAMERA, NOW, debug, diagnostics, localized, 
 from mapless.answers import Accuracy, Hint, Hypothesis, LocalizationResult, PriorCheck, Rejected
 from mapless.geometry import Array
 from mapless.report import pictures, report_html, write_report
-from mapless.report.overlay import magnification
 from mapless.report.plan import _fit, ellipse_in_plane
 from mapless.results import Reference
 
@@ -106,12 +105,6 @@ def test_residuals_lead_from_observed_to_projected_points() -> None:
     far = numbers_of(html, "outlier far")
     assert len(far) == (~good).sum()
     assert (np.hypot(far[:, 2], far[:, 3]) <= 0.06 * CAMERA.width_px + 0.02).all()
-
-
-def test_small_residuals_are_enlarged_and_large_ones_are_not() -> None:
-    assert magnification(np.full((9, 2), 0.01), 1000) == 200
-    assert magnification(np.full((9, 2), 50.0), 1000) == 1
-    assert magnification(np.empty((0, 2)), 1000) == 1
 
 
 def test_from_above_east_is_to_the_right_and_north_is_up() -> None:

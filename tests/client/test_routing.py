@@ -68,11 +68,6 @@ def test_invalid_names_pass_and_valid_names_fit_a_header(scene: str) -> None:
             assert re.fullmatch(r"[!-~]{8,135}", value)
 
 
-@pytest.mark.parametrize("scene", ["", "kitchen", "scenes/", "scenes/ä", "scenes/a\r\nauthorization: x", "scenes/a/b"])
-def test_malformed_names_have_no_routing_header(scene: str) -> None:
-    assert scene_metadata(localization_pb.LocalizeRequest(scene=scene)) == ()
-
-
 @pytest.mark.parametrize("connect", [Client, awaiting], ids=["blocking", "asyncio"])
 def test_clients_send_it_beside_what_they_always_send(connect: Connect) -> None:
     recording = Recording(refuses=True)

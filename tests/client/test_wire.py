@@ -14,7 +14,6 @@ from mapless.geometry import MAX_COORDINATE_M, Camera, RigidTransform
 from mapless.priors import PositionPrior, set_priors
 from mapless.requests import NewReference, create_request
 from mapless.v1 import geometry_pb2 as pb
-from mapless.v1 import localization_service_pb2 as localization_pb
 
 CAMERA = Camera(640, 480, 500.0, 501.5, 319.5, 239.25)
 
@@ -142,8 +141,3 @@ def test_bad_names(bad: str) -> None:
         names.parse_scene_name(bad)
     with pytest.raises(ValueError, match=r".+"):
         names.parse_reference_name(bad)
-
-
-def test_enum_prefixes() -> None:
-    assert wire.enum_prefix(localization_pb.ScaleStage) == "SCALE_STAGE_"
-    assert wire.enum_prefix(localization_pb.Variant) == "VARIANT_"

@@ -34,12 +34,6 @@ PROJECT = PYPROJECT["project"]
 TARGETS = ["cpu", "cuda"]
 PINNED = re.compile(r"([\w./-]+:v?\d+\.\d+|postgres:\d+)\.\d+[\w.-]*(@sha256:[0-9a-f]{64})?")
 """PostgreSQL's versions have two numbers since 10."""
-SERVICE_KEYS = {
-    *("image", "build", "command", "environment", "ports", "volumes", "tmpfs", "depends_on", "healthcheck", "deploy"),
-    *("read_only", "cap_drop", "security_opt", "restart", "cpus", "mem_limit", "pids_limit", "stop_grace_period"),
-    *("user", "shm_size"),
-}
-"""Of the specification's keys, those in use: a misspelt one would be passed over in silence by some engines."""
 
 Json = dict[str, Any]
 Instruction = tuple[str, str]
@@ -216,28 +210,6 @@ def test_what_an_image_writes_to_is_a_volume(target: str) -> None:
     assert set(volumes) == {word for word in created.split() if word.startswith("/")}
 
 
-@pytest.mark.parametrize("target", TARGETS)
-def test_an_image_has_the_drivers_of_both_databases(target: str) -> None:
-    (extras,) = [value for name, _, value in arguments_of(f"build-{target}") if name == "EXTRAS"]
-    assert {"server", "postgres"} <= set(extras.split(","))
-
-
-def test_what_is_no_code_is_packaged_too() -> None:
-    """Images have the wheel, not the repository: a file that is not named would be missing there, and only there."""
-    packages = PYPROJECT["tool"]["setuptools"]
-    for folder in packages["packages"]["find"]["where"]:
-        roots = [path for glob in packages["packages"]["find"]["include"] for path in (ROOT / folder).glob(glob)]
-        there = [path for root in roots if root.is_dir() for path in root.rglob("*")]
-        files = [path for path in there if path.is_file() and path.suffix not in (".py", ".pyc")]
-        named = {
-            path
-            for package, globs in packages["package-data"].items()
-            for glob in globs
-            for path in (ROOT / folder / package).glob(glob)
-        }
-        assert {path for path in files if not any(it.endswith(".egg-info") for it in path.parts)} <= named
-
-
 def test_versions_and_extras_are_the_projects() -> None:
     arguments = [argument for stage in STAGES for argument in arguments_of(stage)]
     assert [value for name, _, value in arguments if name == "VERSION"] == [PROJECT["version"]]
@@ -248,15 +220,6 @@ def test_versions_and_extras_are_the_projects() -> None:
 
 
 # Compose
-
-
-def test_compose_has_no_key_that_is_none() -> None:
-    for document in (COMPOSE, CUDA, POSTGRES):
-        assert {key for key in document if not key.startswith("x-")} <= {"name", "services", "volumes"}
-        for service in document["services"].values():
-            assert set(service) <= SERVICE_KEYS
-    assert set(CUDA["services"]) <= set(COMPOSE["services"])
-    assert set(POSTGRES["services"]) - set(COMPOSE["services"]) == {"postgres"}
 
 
 def test_what_compose_refers_to_exists() -> None:

@@ -8,12 +8,9 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
-from urllib.error import HTTPError
 from urllib.parse import urlsplit
-from urllib.request import urlopen
 
 import kubernetes_validate  # type: ignore[import-untyped]
 import pytest
@@ -21,8 +18,6 @@ import yaml  # type: ignore[import-untyped]
 from support.manifests import OLDEST, Json, built, check_confined, check_valid, needs_kubectl
 
 from mapless_server.networks.weights.catalogue import CATALOGUE
-from mapless_server.observability.exporter import MetricsServer
-from mapless_server.observability.metrics import Metrics
 from mapless_server.security import assess_binding
 from mapless_server.serve.run import CLOSING_LIMIT_S, NOTIFY_S
 from mapless_server.services.handlers import SERVICE_NAMES
@@ -199,25 +194,7 @@ def test_behind_tls_probes_ask_the_port_of_the_metrics(folder: str) -> None:
     _, container = server(built(KUBERNETES / folder))
     startup, readiness = container["startupProbe"], container["readinessProbe"]
     assert not {"grpc", "exec"} & set(startup | readiness)
-    assert startup["httpGet"] == readiness["httpGet"]
-    assert readiness["httpGet"]["port"] == "metrics"
-    metrics = Metrics()
-
-    def outcome() -> int:
-        url = f"http://127.0.0.1:{exporter.port}{readiness['httpGet']['path']}"
-        with suppress(HTTPError), urlopen(url, timeout=30) as response:
-            return int(response.status)
-        return 0
-
-    exporter = MetricsServer(metrics.registry, "127.0.0.1", 0, metrics)
-    try:
-        assert not 200 <= outcome() < 400  # starting
-        metrics.set_serving(True)
-        assert 200 <= outcome() < 400
-        metrics.set_serving(False)
-        assert not 200 <= outcome() < 400  # draining
-    finally:
-        exporter.close()
+    assert startup["httpGet"] == readiness["httpGet"] == {"port": "metrics", "path": "/ready"}
 
 
 @needs_kubectl
@@ -267,13 +244,6 @@ def test_images_are_those_that_the_dockerfile_makes() -> None:
     for folder, target in zip(BUILDS, ("cpu", "cpu", "cpu", "cuda", "cuda"), strict=True):
         for pod in pods(built(KUBERNETES / folder)):
             assert [container["image"] for container in pod["spec"]["containers"]] == [f"mapless:{VERSION}-{target}"]
-
-
-@needs_kubectl
-def test_the_graphics_card_is_asked_for_once() -> None:
-    pod, container = server(built(KUBERNETES / "overlays/cuda"))
-    assert container["resources"]["limits"]["nvidia.com/gpu"] == "1"
-    assert {"key": "nvidia.com/gpu", "operator": "Exists", "effect": "NoSchedule"} in pod["spec"]["tolerations"]
 
 
 def test_the_job_fetches_weights_of_permissive_licences() -> None:

@@ -27,17 +27,6 @@ ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "deploy" / "ray" / "kubernetes"
 CALLS = Settings.model_fields["port"].default
 RAY, HEAD = {"mapless-ray": "true"}, {"mapless-ray-node": "head"}
-FIELDS = {
-    "spec": {"excludeHeadPodFromServeSvc", "rayClusterConfig", "rayClusterDeletionDelaySeconds", "serveConfigV2"}
-    | {"serveService"},
-    "rayClusterConfig": {"authOptions", "autoscalerOptions", "enableInTreeAutoscaling", "headGroupSpec", "rayVersion"}
-    | {"workerGroupSpecs"},
-    "authOptions": {"mode", "secretName"},
-    "autoscalerOptions": {"idleTimeoutSeconds", "resources", "securityContext", "version"},
-    "headGroupSpec": {"rayStartParams", "template"},
-    "workerGroupSpecs": {"groupName", "maxReplicas", "minReplicas", "rayStartParams", "replicas", "template"},
-}
-"""Of RayService in ray.io/v1."""
 
 
 def read(name: str) -> list[Json]:
@@ -123,17 +112,6 @@ def test_every_pod_has_the_same_ray_settings_that_ray_knows() -> None:
 
 
 # The configuration of KubeRay
-
-
-def test_fields_are_those_of_the_resource() -> None:
-    assert (SERVICE["apiVersion"], SERVICE["kind"]) == ("ray.io/v1", "RayService")
-    assert set(SERVICE["spec"]) <= FIELDS["spec"]
-    assert set(CLUSTER) <= FIELDS["rayClusterConfig"]
-    for name in ("authOptions", "autoscalerOptions", "headGroupSpec"):
-        assert set(CLUSTER[name]) <= FIELDS[name]
-    assert set(WORKERS) <= FIELDS["workerGroupSpecs"]
-    for params in (CLUSTER["headGroupSpec"]["rayStartParams"], WORKERS["rayStartParams"]):
-        assert all(isinstance(value, str) for value in params.values())
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -225,15 +203,6 @@ def test_policies_admit_the_gateway_ray_and_prometheus() -> None:
     assert operator["ports"] == [{"port": 8265}]
     ((source,),) = (operator["from"],)
     assert set(source) == {"namespaceSelector", "podSelector"}  # both at once, not one or the other
-
-
-def test_policies_allow_database_dns_and_the_cluster_api() -> None:
-    def ports(name: str) -> list[set[int]]:
-        return [{port["port"] for port in rule.get("ports", ())} for rule in POLICIES[name]["egress"]]
-
-    assert ports("mapless-ray") == [set(), {5432}, {53}]
-    assert POLICIES["mapless-ray"]["egress"][0]["to"] == [{"podSelector": {"matchLabels": RAY}}]
-    assert ports("mapless-ray-head") == [{443, 6443}]
 
 
 @needs_kubectl

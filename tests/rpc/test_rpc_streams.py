@@ -324,17 +324,6 @@ class TestFiniteStreams:
             gc.collect()
         assert not warned
 
-    async def test_the_caller_is_authenticated_twice_only(self) -> None:
-        asked = []
-
-        def authenticate(*_: Any) -> Principal:
-            asked.append(1)
-            return Principal()
-
-        async with serving(Numbers(2), Counted(), authenticate=authenticate) as (channel, _):
-            assert await read(watching(channel, method=FINITE)) == [1, 2]
-        assert len(asked) == 2  # with the headers, and with the message
-
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> Iterator[None]:

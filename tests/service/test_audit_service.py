@@ -21,7 +21,7 @@ MOVED, BY_M = 3, np.array([0.06, 0.0, 0.08])
 
 @pytest.fixture(scope="module")
 def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
-    with serving_really(tmp_path_factory.mktemp("data")) as address, Client(address) as client:
+    with serving_really(tmp_path_factory.mktemp("data")) as server, Client(server.address) as client:
         client.create_scene("wall")
         for i, (pixels, pose) in enumerate(SHOTS):
             given = RigidTransform(pose.rotation, pose.translation + BY_M) if i == MOVED else pose
@@ -69,7 +69,7 @@ def test_what_is_wrong_with_an_audit_is_named(client: Client) -> None:
 )
 def test_a_damaged_reference_is_reported_by_page_and_by_name(tmp_path: Path, what: str) -> None:
     store = Store.open(tmp_path)
-    with serving_really(tmp_path, store) as address, Client(address) as client:
+    with serving_really(tmp_path, store) as server, Client(server.address) as client:
         client.create_scene("s")
         added = [NewReference(f"r{i}", encode(".png", pixels), CAMERA, pose) for i, (pixels, pose) in enumerate(SHOTS)]
         client.add_references("s", added[:4])

@@ -3,27 +3,21 @@
 import os
 import shutil
 import signal
-from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 
 import grpc
 import pytest
 from support.messages import essence
-from support.servers import listening
+from support.servers import RunningServer, serving_really
 from support.stores import Folder
 from support.waiting import wait_until
 
 from mapless import Client, LocalizationResult, NewReference, wire
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
-from mapless_server.engine.queue_engine import QueueEngine
-from mapless_server.observability.metrics import Metrics
 from mapless_server.scenes.background import BackgroundMatching
-from mapless_server.security import RateLimiter
-from mapless_server.serve.assembly import make_engine
-from mapless_server.settings import Settings
-from mapless_server.store import Store, calibrations, pairs, rows
+from mapless_server.store import calibrations, pairs, rows
 from mapless_tools.child import child_server
 from mapless_tools.demo import room
 
@@ -32,21 +26,10 @@ PAIRS = REFERENCES * (REFERENCES - 1) // 2
 OFF = {"background_matching": False}
 
 
-class Served:
-    """A server with the real method."""
-
-    def __init__(self, address: str, metrics: Metrics) -> None:
-        self._address = address
-        self._metrics = metrics
-
-    def value(self, name: str, **labels: str) -> float:
-        samples = (sample for family in self._metrics.registry.collect() for sample in family.samples)
-        return sum(it.value for it in samples if it.name == name and labels.items() <= it.labels.items())
-
-    def answers(self) -> list[bytes]:
-        """To every query, without what differs from call to call."""
-        with grpc.insecure_channel(self._address) as channel:
-            return [_answer(LocalizationServiceStub(channel), i) for i in range(QUERIES)]
+def answers(server: RunningServer) -> list[bytes]:
+    """To every query, without what differs from call to call."""
+    with grpc.insecure_channel(server.address) as channel:
+        return [_answer(LocalizationServiceStub(channel), i) for i in range(QUERIES)]
 
 
 def _answer(stub: LocalizationServiceStub, index: int) -> bytes:
@@ -58,31 +41,17 @@ def _answer(stub: LocalizationServiceStub, index: int) -> bytes:
     return essence(stub.Localize(request, timeout=60))
 
 
-@contextmanager
-def serving(data_dir: Path, **options: object) -> Iterator[Served]:
-    known = list[Metrics]()
-
-    def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
-        known.append(metrics)
-        return make_engine(settings, store, metrics, quota)
-
-    defaults = {"port": 0, "workers": 2, "metrics": False, "warm_up": False, "data_dir": data_dir}
-    settings = Settings(**(defaults | options))  # type: ignore[arg-type]
-    with listening(settings, Store.open(data_dir), make) as (running, _):
-        yield Served(running.address, known[0])
-
-
 @pytest.fixture(scope="module")
 def unmatched(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[bytes]]:
     """A folder with a scene without stored pairs, and the answers of a server without stored pairs."""
     data_dir = tmp_path_factory.mktemp("unmatched") / "data"
-    with serving(data_dir, **OFF) as served:
-        with Client(served._address) as client:
+    with serving_really(data_dir, **OFF) as served:
+        with Client(served.address) as client:
             client.create_scene("room")
             added = [NewReference(it.name, it.data, it.camera, it.world_from_camera) for it in room().references]
             client.add_references("room", added[1:REFERENCES])
             client.add_references("room", added[:1])  # the last one: it is matched with all others
-        return data_dir, served.answers()
+        return data_dir, answers(served)
 
 
 @pytest.fixture
@@ -94,7 +63,7 @@ def data_dir(unmatched: tuple[Path, list[bytes]], tmp_path: Path) -> Path:
 @pytest.fixture(scope="module")
 def matched_once(unmatched: tuple[Path, list[bytes]], tmp_path_factory: pytest.TempPathFactory) -> Path:
     data_dir = Path(shutil.copytree(unmatched[0], tmp_path_factory.mktemp("matched") / "data"))
-    with serving(data_dir) as served:
+    with serving_really(data_dir) as served:
         wait_until(lambda: served.value("mapless_background_pairs_total") == 2 * PAIRS)
         wait_until(lambda: served.value("mapless_background_waiting") == 0)
         assert served.value("mapless_background_failures_total") == 0
@@ -118,16 +87,16 @@ def count_pairs(data_dir: Path) -> int:
 
 
 def test_answers_are_the_same_with_stored_pairs(matched: Path, expected: list[bytes]) -> None:
-    with serving(matched, **OFF) as served:
-        assert served.answers() == expected
+    with serving_really(matched, **OFF) as served:
+        assert answers(served) == expected
         assert served.value("mapless_stored_pairs_total", result="stored") > 0
         assert served.value("mapless_stored_pairs_total", result="absent") == 0
 
 
 def test_switched_off_nothing_is_made(data_dir: Path, expected: list[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(BackgroundMatching, "_claim", lambda _: pytest.fail("a reference was claimed"))
-    with serving(data_dir, **OFF) as served:
-        assert served.answers() == expected
+    with serving_really(data_dir, **OFF) as served:
+        assert answers(served) == expected
         assert served.value("mapless_stored_pairs_total", result="stored") == 0
         assert served.value("mapless_stored_pairs_total", result="absent") > 0
         assert served.value("mapless_background_failures_total") == 0
@@ -135,8 +104,8 @@ def test_switched_off_nothing_is_made(data_dir: Path, expected: list[bytes], mon
 
 def test_switched_off_damaged_pairs_are_deleted(matched: Path, expected: list[bytes]) -> None:
     Folder(matched).execute("UPDATE reference_pair SET data = zeroblob(16)")
-    with serving(matched, **OFF) as served:
-        assert served.answers() == expected
+    with serving_really(matched, **OFF) as served:
+        assert answers(served) == expected
         damaged = served.value("mapless_stored_pairs_total", result="damaged")
         wait_until(lambda: count_pairs(matched) == 2 * PAIRS - damaged)
         assert served.value("mapless_background_pairs_total") == 0
@@ -153,11 +122,11 @@ def test_what_a_killed_server_began_is_finished(
     assert 0 < begun < 2 * PAIRS
     now_us = rows.now_us
     monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(1e6 * pairs.CLAIM_S))
-    with serving(data_dir) as served:
+    with serving_really(data_dir) as served:
         wait_until(lambda: served.value("mapless_background_pairs_total") == 2 * PAIRS - begun)
     assert count_pairs(data_dir) == 2 * PAIRS
-    with serving(data_dir, **OFF) as served:
-        assert served.answers() == expected
+    with serving_really(data_dir, **OFF) as served:
+        assert answers(served) == expected
 
 
 @pytest.mark.nightly
@@ -176,12 +145,12 @@ def test_a_killed_servers_scene_is_calibrated_by_the_next(
     assert claims() == 1
     now_us = rows.now_us
     monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(1e6 * calibrations.CLAIM_S))
-    with serving(matched) as served:
+    with serving_really(matched) as served:
         wait_until(lambda: served.value("mapless_calibrations_total") == 1)
         assert served.value("mapless_calibration_failures_total") == 0
-        assert served.answers() == expected  # which ask for no calibration
+        assert answers(served) == expected  # which ask for no calibration
         photograph = room().queries[0]
-        with Client(served._address) as client:
+        with Client(served.address) as client:
             answer = client.localize(photograph.data, photograph.camera, "room")
     assert isinstance(answer, LocalizationResult)
     assert answer.accuracy is not None

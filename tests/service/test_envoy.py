@@ -154,16 +154,6 @@ def test_callers_that_name_no_scene_in_metadata_come_to_either(fleet: Fleet) -> 
     assert {answer.localization.inlier_count for answer in answers} == {100, 101}
 
 
-def test_what_one_server_stored_the_other_uses(fleet: Fleet) -> None:
-    """Added through the gateway, found at either server."""
-    fleet.client.create_scene("fresh")
-    fleet.client.add_reference("fresh", NewReference("r", PHOTO, CAMERA, pose(2.0)))
-    for server in fleet.servers:
-        with Client(server.address) as direct:
-            assert isinstance(direct.localize(PHOTO, CAMERA, "fresh"), LocalizationResult)
-    fleet.client.delete_scene("fresh")
-
-
 @contextmanager
 def channel_to(running: Gateway) -> Iterator[grpc.Channel]:
     credentials = grpc.ssl_channel_credentials(running.options.root_certificates)

@@ -195,27 +195,6 @@ def resident_mib(process: Path) -> float:
 
 
 class TestMethods:
-    def test_an_exception_fails_no_other_call(
-        self, server: RunningServer, client: Client, scene: str, caplog: pytest.LogCaptureFixture
-    ) -> None:
-        server.method.failure = RuntimeError("secret path /srv/x")
-        try:
-            with ThreadPoolExecutor(8) as pool:
-                calls = [pool.submit(client.localize, PHOTO, CAMERA, scene) for _ in range(8)]
-                errors = [call.exception(30) for call in calls]
-                assert client.get_scene(scene).reference_count == 3
-        finally:
-            server.method.failure = None
-        ids = set()
-        for error in errors:
-            assert isinstance(error, Internal)
-            assert error.message == f"internal error, id={error.request_id}"
-            ids.add(error.request_id)
-        assert len(ids) == 8
-        assert {vars(record)["request_id"] for record in caplog.records if record.exc_info} <= ids
-        assert "secret path" in caplog.text
-        assert is_served(client, scene)
-
     @pytest.mark.parametrize("where", ["rotation", "translation", "covariance", "reprojection_error_px"])
     @pytest.mark.parametrize("number", [np.nan, np.inf])
     def test_a_backend_with_invalid_output_is_an_internal_error(

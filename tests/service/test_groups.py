@@ -47,7 +47,7 @@ BLANK = encode(".png", np.full((240, 320, 3), 90, np.uint8))
 
 @pytest.fixture(scope="module")
 def corner(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
-    with serving_really(tmp_path_factory.mktemp("corner"), workers=1) as address, Client(address) as client:
+    with serving_really(tmp_path_factory.mktemp("corner"), workers=1) as server, Client(server.address) as client:
         client.create_scene("corner")
         client.add_references(
             "corner", [NewReference(f"p{i}", photograph(it, CORNER), CORNER, it) for i, it in enumerate(STANDPOINTS)]
@@ -248,10 +248,8 @@ BAD_RIGS: dict[str, Case] = {
     "pose at NaN": ("images[2].rig_from_camera.translation_m.y", math.nan),
     "pose far away": ("images[2].rig_from_camera.translation_m.y", 1e8),
     "zero rotation": ("images[0].rig_from_camera.rotation", geometry_pb.Quaternion()),
-    "infinite focal length": ("images[2].intrinsics.focal_x_px", math.inf),
     "no intrinsics": ("images[2].intrinsics", None),
     "not an image": ("images[1].image", b"<svg/>"),
-    "truncated": ("images[1].image", PHOTO[:-100]),
     "reference of another scene": ("images[1].references", ["scenes/other/references/r1"], "images[1].references[0]"),
     "heading without a direction": ("images[1].heading_prior", pb.HeadingPrior(), "images[1].heading_prior.direction"),
     "satellite without a datum": ("images[2].geo_position_prior", pb.GeoPositionPrior(horizontal_sigma_m=1.0)),
@@ -259,7 +257,6 @@ BAD_RIGS: dict[str, Case] = {
     "65 chosen": ("options.reference_count", 65),
     "no scene": ("scene", None),
     "session at NaN": ("session_from_rig", shifted(math.nan), "session_from_rig.translation_m.y"),
-    "session far away": ("session_from_rig", shifted(1.7e308), "session_from_rig.translation_m.y"),
     "other axes": ("options.axes", pb.AXES_UNITY),
     "unknown axes": ("options.axes", 77),
 }

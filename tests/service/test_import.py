@@ -189,17 +189,6 @@ def test_poses_that_do_not_fit_need_an_option_to_be_stored(
     assert len(stored(client, scene)) == len(content["frames"])
 
 
-def test_a_dry_run_finds_images_of_another_size(folder: Path) -> None:
-    file = folder / "cameras.json"
-    content = json.loads(file.read_text())
-    content["frames"][2]["width"] = 640
-    file.write_text(json.dumps(content))
-    done = run("import", folder, "scene", "--dry-run", "--skip-check")
-    assert done.exit_code == 1
-    assert f"{COUNT - 1} references could be imported, 1 are refused" in done.stdout
-    assert "its camera 640x" in done.stdout
-
-
 @pytest.mark.nightly
 def test_after_a_termination_the_next_run_continues(tmp_path: Path) -> None:
     """Without an address: a server of its own on the settings' store, which goes with the command."""

@@ -9,9 +9,8 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import grpc
 import pytest
-from grpc_health.v1 import health_pb2, health_pb2_grpc
+from grpc_health.v1 import health_pb2
 from support.commands import run
 from support.programs import real
 from support.servers import CAMERA, PHOTO, RunningServer, pose, serving
@@ -20,17 +19,7 @@ from mapless import Client, ConnectOptions, NewReference
 from mapless_server.observability import logs
 from mapless_server.serve import command
 
-SERVICES = ["", "mapless.v1.LocalizationService", "mapless.v1.ReferenceService"]
 SERVING, NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
-
-
-def test_health_of_every_service(server: RunningServer) -> None:
-    with grpc.insecure_channel(server.address) as channel:
-        stub = health_pb2_grpc.HealthStub(channel)
-        for service in SERVICES:
-            assert stub.Check(health_pb2.HealthCheckRequest(service=service), timeout=10).status == SERVING
-        with pytest.raises(grpc.RpcError, match="NOT_FOUND"):
-            stub.Check(health_pb2.HealthCheckRequest(service="mapless.v1.Absent"), timeout=10)
 
 
 def test_calls_that_outlast_the_grace_are_cut_off(tmp_path: Path) -> None:

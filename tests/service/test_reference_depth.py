@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.servers import RunningServer, listening
+from support.servers import RunningServer, serving_really
 from support.stores import Folder
 from support.waiting import wait_until
 
@@ -89,18 +89,14 @@ class PlantedNetwork:
 @contextmanager
 def serving(data_dir: Path, network: Reconstructor | None = None, **options: Any) -> Iterator[RunningServer]:
     """A real server of SIFT, with depths by a network if there is one, as the setting says."""
-    known = list[Metrics]()
 
     def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
-        known.append(metrics)
         return engine_over(
             store, make_tiers(settings), engine_options(settings), metrics, quota, None, None, metrics, network
         )
 
-    defaults: dict[str, Any] = {"port": 0, "workers": 2, "metrics": False, "warm_up": False, "features": "sift"}
-    settings = Settings(data_dir=data_dir, **(defaults | options))
-    with listening(settings, Store.open(data_dir), make) as (running, stop):
-        yield RunningServer(running.address, "", None, (), running.engine, known[0], stop)  # type: ignore[arg-type]
+    with serving_really(data_dir, make=make, **({"features": "sift"} | options)) as server:
+        yield server
 
 
 OFF: dict[str, Any] = {"reference_depth": "off", "background_matching": False}

@@ -30,26 +30,11 @@ from mapless.requests import create_request
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.v1.geometry_pb2 import Quaternion
 from mapless_server.errors import Overloaded
-from mapless_server.services import references as reference_service
-from mapless_server.services.messages import references
-from mapless_server.store import ReferenceRecord, Store
+from mapless_server.store import Store
 
 
 def new_reference(reference_id: str) -> pb.CreateReferenceRequest:
     return create_request("", NewReference(reference_id, PHOTO, CAMERA, pose(0.5)))
-
-
-def test_the_life_of_a_scene(client: Client) -> None:
-    created = client.create_scene("life")
-    assert (created.scene_id, created.generation, created.reference_count) == ("life", 1, 0)
-    with pytest.raises(AlreadyExists) as caught:
-        client.create_scene("life")
-    assert caught.value.field == "scene_id"
-    assert client.get_scene("scenes/life") == created
-    client.delete_scene("life")
-    for operation in (client.get_scene, client.delete_scene):
-        with pytest.raises(NotFound):
-            operation("life")
 
 
 @pytest.mark.parametrize("ends", ["late", "full"])
@@ -208,21 +193,6 @@ def test_names_are_checked_everywhere(client: Client, stubs: Stubs) -> None:
         assert (error.code, error.field) == ("INVALID_ARGUMENT", field)
     with pytest.raises(InvalidArgument):
         client.get_scene("a b")
-
-
-def test_a_page_is_made_off_the_event_loop(client: Client, scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A thousand messages take tens of milliseconds, in which no other call would be answered."""
-    to_message, threads = references.reference_to_message, set[str]()
-
-    def recorded(record: ReferenceRecord) -> pb.Reference:
-        threads.add(threading.current_thread().name)
-        return to_message(record)
-
-    monkeypatch.setattr(reference_service, "reference_to_message", recorded)
-    assert [it.reference_id for it in client.list_references(scene)] == ["r0", "r1", "r2"]
-    client.add_references(scene, [NewReference(f"new{i}", PHOTO, CAMERA, pose(i)) for i in range(3)])
-    assert threads
-    assert all(name.startswith("asyncio_") for name in threads)  # the loop's default executor
 
 
 PHOTOS = [encode(".png", textured(seed=i)) for i in range(3)]

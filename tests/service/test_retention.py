@@ -10,7 +10,6 @@ import inspect
 import re
 import shutil
 import subprocess
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -303,19 +302,6 @@ def test_expired_captures_are_deleted_without_any_call(tmp_path: Path, search: S
     with served(tmp_path / "server", capture_dir=captured, capture_hours=4 / 3600) as server:
         capture_one(server, captured, search)
         wait_until(lambda: not [*calls_of(captured), *blobs_of(captured)])
-        assert search.files(captured) == []
-
-
-@pytest.mark.nightly
-def test_captures_that_expired_during_a_stop_are_gone_at_start(tmp_path: Path, search: Search) -> None:
-    captured = tmp_path / "captured"
-    with served(tmp_path / "first", capture_dir=captured) as server:
-        written_s = capture_one(server, captured, search).stat().st_mtime
-    assert search.files(captured)
-    wait_until(lambda: time.time() > written_s + 0.5)
-    with served(tmp_path / "second", capture_dir=captured, capture_hours=0.5 / 3600) as server:
-        assert server.address
-        assert [*calls_of(captured), *blobs_of(captured)] == []
         assert search.files(captured) == []
 
 

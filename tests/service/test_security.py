@@ -23,7 +23,6 @@ from mapless import (
     LocalizationResult,
     NewReference,
     NotFound,
-    PermissionDenied,
     Reference,
     ResourceExhausted,
     Unauthenticated,
@@ -34,7 +33,7 @@ from mapless.requests import create_request
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless.v1.geometry_pb2 import Vector3
-from mapless_server.security import METHOD_ROLES, Role, create_token, revoke_token, sha256_of
+from mapless_server.security import METHOD_ROLES, create_token, revoke_token, sha256_of
 
 LIMIT_S = 30.0
 EXPIRED = "mapless_expired"
@@ -157,21 +156,6 @@ def test_without_a_good_token_no_method_answers(guarded: Guarded, method: str, t
     assert isinstance(failure, Unauthenticated)
     assert failure.reason == reason
     assert failure.request_id
-
-
-@pytest.mark.parametrize(
-    ("caller", "method"),
-    [
-        (caller, method)
-        for caller in ("reader", "robot")
-        for method, role in METHOD_ROLES.items()
-        if role > Role[CALLERS[caller][1].upper()]
-    ],
-)
-def test_a_role_that_is_too_low_is_refused(guarded: Guarded, caller: str, method: str) -> None:
-    failure = guarded.failure(method, ALL_REQUESTS[method], guarded.tokens[caller])
-    assert isinstance(failure, PermissionDenied)
-    assert failure.reason == "ROLE_TOO_LOW"
 
 
 def test_health_and_the_interface_are_open(guarded: Guarded) -> None:

@@ -1,6 +1,5 @@
 """WatchQueries through a real server: events, permission, and how a stream ends."""
 
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -13,7 +12,6 @@ from support.servers import CAMERA, PHOTO, RunningServer, ending, localize_reque
 from mapless import Client, LocalizationResult, NewReference
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
-from mapless_server.services.watching import MAX_WATCHERS_OF_TENANT
 
 LIMIT_S = 30.0
 REQUEST = pb.WatchQueriesRequest(scene="scenes/hall")
@@ -100,27 +98,6 @@ def test_a_scene_that_is_not_there_and_a_name_that_is_none(stub: LocalizationSer
     assert (absent.code, absent.field) == ("NOT_FOUND", "scene")
     senseless = ending(stub.WatchQueries(pb.WatchQueriesRequest(scene="hall"), timeout=LIMIT_S))
     assert (senseless.code, senseless.field) == ("INVALID_ARGUMENT", "scene")
-
-
-def test_watchers_above_the_limit_are_refused(stub: LocalizationServiceStub) -> None:
-    seen = [watching(stub) for _ in range(MAX_WATCHERS_OF_TENANT)]
-    failure = ending(stub.WatchQueries(REQUEST, timeout=LIMIT_S))
-    assert (failure.code, failure.reason) == ("RESOURCE_EXHAUSTED", "TOO_MANY_WATCHERS")
-    assert failure.retry_after_s is not None
-    seen.pop().cancel()
-    end_s = time.monotonic() + LIMIT_S
-    while True:  # the server notices it a moment later
-        again = stub.WatchQueries(REQUEST, timeout=LIMIT_S)
-        try:
-            again.initial_metadata()
-            if again.is_active():
-                break
-            ending(again)
-        except grpc.RpcError:
-            pass
-        assert time.monotonic() < end_s
-    for call in (*seen, again):
-        call.cancel()
 
 
 def test_the_end_of_the_server_ends_it_at_once(tmp_path: Path) -> None:

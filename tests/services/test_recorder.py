@@ -378,28 +378,6 @@ def test_the_time_limit_holds_whatever_the_store_does(
         wait_until(lambda: counts.kept == 2)
 
 
-def test_a_fault_of_the_store_ends_no_check(
-    tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Deleted scenes are found when the store works again; the log has the fault once."""
-    monkeypatch.setattr(deletion_module, "STORE_CHECK_S", 0.01)
-    counts, checks = Counts(), [0]
-
-    def broken(*_: object) -> Any:
-        checks[0] += 1
-        raise RuntimeError("no such table")
-
-    with recording(tmp_path, store, counts) as recorder:
-        answer(recorder)
-        wait_until(lambda: counts.kept == 1)
-        with monkeypatch.context() as patch:
-            patch.setattr(StoreReader, "get_scene", broken)
-            wait_until(lambda: checks[0] >= 5)
-        store.delete_scene(key_of("default", "s"))
-        wait_until(lambda: len(recorder.folder.entries()) == 0)
-    assert caplog.text.count("captured calls cannot be compared with the store: no such table") == 1
-
-
 def test_the_start_waits_for_no_store_and_retries_each_round(
     tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:

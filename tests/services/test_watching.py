@@ -87,8 +87,9 @@ async def test_one_tenant_cannot_keep_the_others_from_watching() -> None:
     watchers = Watchers(True)
     for i in range(MAX_WATCHERS_OF_TENANT):
         watchers.watch(key_of("loud", f"scene-{i}"))
-    with pytest.raises(Overloaded):
+    with pytest.raises(Overloaded) as refused:
         watchers.watch(key_of("loud", "scene-0"))
+    assert refused.value.reason == "TOO_MANY_WATCHERS"
     mine = watchers.watch(key_of("quiet", "scene-0"))
     publish(watchers, 5, key_of("loud", "scene-0"))
     publish(watchers, 6, key_of("quiet", "scene-0"))

@@ -328,12 +328,19 @@ def serving(
 
 
 @contextmanager
-def serving_really(data_dir: Path, store: Store | None = None, **options: Any) -> Iterator[str]:
-    """The address of a server with the real features and the real method, until the block is left."""
+def serving_really(
+    data_dir: Path, store: Store | None = None, make: MakeEngine = make_engine, **options: Any
+) -> Iterator[RunningServer]:
+    """A server with the real features and the real method, or an engine of the test's own, until the block is left."""
     defaults = {"port": 0, "workers": 2, "metrics": False, "warm_up": False}
-    settings = Settings(host="127.0.0.1", data_dir=data_dir, **(defaults | options))
-    with listening(settings, store or Store.open(data_dir), make_engine) as (running, _):
-        yield running.address
+    settings, known = Settings(host="127.0.0.1", data_dir=data_dir, **(defaults | options)), list[Metrics]()
+
+    def noted(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
+        known.append(metrics)
+        return make(settings, store, metrics, quota)
+
+    with listening(settings, store or Store.open(data_dir), noted) as (running, stop):
+        yield RunningServer(running.address, "", StandInMethod(), (), running.engine, known[0], stop)
 
 
 def make_scene(client: Client, scene_id: str = "s", count: int = 1) -> str:

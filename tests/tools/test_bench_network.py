@@ -17,13 +17,12 @@ from mapless_server.method.coarse import reconstruct_one
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.method.views import Features, Reconstruction, View
-from mapless_server.networks.pi3 import Sizes
 from mapless_tools.bench_network import command
 from mapless_tools.bench_network.command import bench_network
 from mapless_tools.bench_network.forward import Forward, max_difference
-from mapless_tools.bench_network.operations import H200, Operations, count_operations
+from mapless_tools.bench_network.operations import Operations, count_operations
 from mapless_tools.bench_network.planted import UNITS_PER_METRE, PlantedReconstructor, Truth, true_points
-from mapless_tools.bench_network.report import Figure, markdown, table
+from mapless_tools.bench_network.report import Figure
 from mapless_tools.bench_network.subject import AnySizes, Work, make_network, operations_of
 
 GRID = (3, 4)
@@ -77,21 +76,6 @@ def test_bytes_between_products_are_read_and_written_once() -> None:
         eager_bytes=2 * wide + 3 * wide,
         fused_bytes=2 * (narrow + wide) + 2 * wide,
     )
-
-
-def test_convolutions_in_single_precision_are_counted_apart() -> None:
-    """Those of Pi3X's heads; what they execute in all is what a counter inside torch says."""
-    x = torch.empty(2, 8, 5, 6, device="meta")
-    kernel, transposed = torch.empty(4, 8, 3, 3, device="meta"), torch.empty(8, 4, 2, 2, device="meta")
-    operations = count_operations(lambda: (F.conv2d(x, kernel, padding=1), F.conv_transpose2d(x, transposed, stride=2)))
-    assert operations.tf32_flop == operations.flop == 2 * 2 * 5 * 6 * 8 * 4 * (9 + 4)
-    low = count_operations(lambda: F.conv2d(x.to(torch.bfloat16), kernel.to(torch.bfloat16)))
-    assert low.tf32_flop == low.float32_flop == 0
-
-
-def test_prediction_is_above_the_floor_and_compiling_is_faster() -> None:
-    operations = operations_of("pi3", Work(1, 2, 3, (5, 7)), Sizes(1024, 16, 1, 4, 1))
-    assert operations.floor_s(H200) < operations.predicted_s(H200, True) <= operations.predicted_s(H200, False)
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -158,37 +142,6 @@ def test_planted_reconstruction_is_the_truth_up_to_scale(keep_on_device: bool) -
             view.local_from_camera.translation / UNITS_PER_METRE, expected.translation, atol=1e-6
         )
     np.testing.assert_array_equal(outcome.references[0].point_map, true_points(plane()))
-
-
-def test_table_shows_every_number_beside_its_floor() -> None:
-    figures = [
-        Figure("forward", "compiled", 50.0, "ms", 51.0, floor_ms=25.0, predicted_ms=48.0, target=60.0),
-        Figure("query", "sustained", 11.0, "queries/s", target=12.0, target_is_least=True),
-        Figure("memory", "peak", None, "GB", target=8.0, note="there is no CUDA device"),
-    ]
-    assert [figure.is_met for figure in figures] == [True, False, None]
-    rows = markdown("a device", figures)[-3:]
-    assert rows[0] == "| forward | compiled | 50 ms | 51 | 25 | 2 | 48 | at most 60 | yes |  |"
-    assert rows[1] == "| query | sustained | 11 queries/s |  |  |  |  | at least 12 | no |  |"
-    assert rows[2] == "| memory | peak | not measured |  |  |  |  | at most 8 |  | there is no CUDA device |"
-
-
-def test_the_table_fits_a_screen_and_names_the_unmeasured() -> None:
-    """Long notes are elsewhere; operations have a floor in another unit, and no ratio to it."""
-    note = "very long " * 16
-    figures = [
-        Figure("pi3, 11 views", "references' tokens kept, references mapped", 34.3, "TFLOP", None, 43.5, 91.0),
-        Figure("pi3, 11 views", "eager", 100.0, "ms", 101.0, 43.5, 115.0, 150.0, note=note),
-        Figure("queries", "sustained, 8 threads", None, "queries/s", target=12.0, target_is_least=True, note=note),
-    ]
-    lines = table(figures)
-    assert max(map(len, lines)) <= 120
-    assert [line for line in lines if "pi3, 11 views" in line] == ["pi3, 11 views"]
-    assert "floor, ms" in lines[0]
-    assert lines[2].split()[-4:] == ["34.3", "TFLOP", "43.5", "91"]
-    assert lines[3].split() == ["eager", "100", "ms", "101", "43.5", "2.3", "115", "at", "most", "150", "yes"]
-    assert " ".join(lines).count("very") == 16
-    assert lines[6].startswith("Not measured: queries, sustained, 8 threads: very long")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")

@@ -11,7 +11,7 @@ import pytest
 from scipy.special import bdtr, bdtrc, gammainc, gammaincinv
 from support.scenes import random_for
 
-from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless.scenes import Calibration
 from mapless_server.method.uncertainty.radii import (
     SELF_TAIL_95,
@@ -39,7 +39,6 @@ from mapless_tools.calibrate.claims import (
 from mapless_tools.calibrate.findings import RightRule, Share, auroc, find, reliability, risk_coverage
 from mapless_tools.calibrate.queries import Outcome, other_world
 from mapless_tools.calibrate.report import CalibrationReport, page, to_json, worst
-from mapless_tools.calibrate.run import calibration_of
 from mapless_tools.dataset import Dataset
 
 SIFT = Conditions("sift", "geometric", "BEST", "1")
@@ -87,11 +86,6 @@ class TestClaims:
         )
         assert twice.probability(np.array([0.0, 1e9])).tolist() == [0.0, 1.0]
 
-    def test_of_no_size_at_all_holds_nothing_but_no_error(self) -> None:
-        nothing = Claim.of(0.1, 0.0, 0.0, np.zeros((3, 3)))
-        assert not nothing.held(0.99)
-        assert replace(nothing, error=0.0).held(0.05)
-
 
 class TestFactors:
     @pytest.mark.parametrize("times", [0.4, 1.0, 2.5])
@@ -123,11 +117,6 @@ class TestFactors:
         share_68, share_95 = np.mean(held, axis=0)
         assert share_95 >= 0.9
         assert (0.5 if count == MIN_QUERIES else 0.6) <= share_68 <= (0.95 if count == MIN_QUERIES else 0.8)
-
-    def test_few_answers_that_are_as_claimed_change_little(self) -> None:
-        exact = [claim(float(length((i + 0.5) / 12))) for i in range(12)]
-        assert factor_for(exact, 0.68) == pytest.approx(1.0, rel=0.05)
-        assert 1.0 <= factor_for(exact, 0.95) < 1.4
 
     def test_the_wider_radius_stays_the_wider_one(self) -> None:
         """All errors are the same, so the quantiles are too, and the radii would change places."""
@@ -177,12 +166,6 @@ class TestApplying:
             assert after.rotation_95_deg / after.rotation_68_deg == pytest.approx(tails[-1])
         assert 2.0 > tails[0] > tails[1] > tails[2] == pytest.approx(2.0 * SELF_TAIL_95 / TAIL_95, rel=1e-2)
 
-    def test_the_smallest_factor_of_references_has_radii(self) -> None:
-        smallest = replace(self.own(), position_factor=0.01, rotation_factor=0.01)
-        attributes, before = SceneAttributes(self_calibrations=(smallest,)), Accuracy(1.0, 1.0, 1.0, 1.0)
-        after = reported_radii(before, self.COVARIANCE, SIFT, attributes, gap=0.0).accuracy
-        assert after == Accuracy(0.01, 0.01, 0.01, 0.01)
-
     def test_errors_of_references_are_below_no_radius(self) -> None:
         noisy = SceneAttributes(self_calibrations=(replace(self.own(), reference_noise_m=0.01),))
         for radius_m in (1e-4, 1e-2, 1.0):
@@ -203,14 +186,6 @@ class TestApplying:
         assert after.position_68_m == pytest.approx(2 * before.position_68_m)
         assert after.rotation_68_deg == pytest.approx(0.5 * before.rotation_68_deg)
         assert np.linalg.eigvalsh(covariance).min() > -1e-12
-
-    def test_the_covariance_keeps_its_correlations(self) -> None:
-        def correlation(covariance: Array) -> Any:
-            sigma = np.sqrt(np.diag(covariance))
-            return covariance / np.outer(sigma, sigma)
-
-        scaled = scaled_covariance(self.COVARIANCE, self.FACTORS)
-        np.testing.assert_allclose(correlation(scaled), correlation(self.COVARIANCE), atol=1e-12)
 
     @pytest.mark.parametrize("field", ["features", "backend", "variant", "server_version"])
     def test_what_something_else_computed_stays_uncalibrated(self, field: str) -> None:
@@ -330,11 +305,6 @@ class TestFindings:
         assert found.auroc == 1.0
         assert found.trusted[-1].coverage == 1.0
         assert found.trusted[-1].risk == pytest.approx(1 - found.right.value)
-
-    def test_what_is_stored_says_what_was_measured(self) -> None:
-        stored = calibration_of(find(self.outcomes(), RightRule()))
-        assert (stored.features, stored.backend, stored.variant) == ("sift", "geometric", "BEST")
-        assert (stored.query_count, stored.server_version) == (40, SIFT.server_version)
 
     def test_answers_of_other_features_are_left_out(self) -> None:
         stronger = [outcome(f"s{i}", 50.0, conditions=replace(SIFT, features="aliked")) for i in range(5)]

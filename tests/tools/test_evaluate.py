@@ -4,7 +4,6 @@ import io
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,16 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 from support.evaluations import query_result
-from support.images import encode, textured
 
-from mapless.geometry import Camera, RigidTransform, rotation_from_vector
-from mapless_server.images import ImageLimits
+from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_tools.bench.report import BenchResult, BenchScene, Figures, Latency, as_json, markdown, met
 from mapless_tools.child import Memory
-from mapless_tools.dataset import Dataset, Frame
-from mapless_tools.evaluate.metrics import QueryResult, pose_error, quantile, stage_share, summarize, trajectory_radius
+from mapless_tools.dataset import Dataset
+from mapless_tools.evaluate.metrics import QueryResult, pose_error, quantile, summarize
 from mapless_tools.evaluate.plan import EvaluationOptions, Split, split_frames
-from mapless_tools.evaluate.references import check_images
 from mapless_tools.evaluate.report import print_report, to_json
 from mapless_tools.evaluate.run import Evaluation
 
@@ -40,13 +36,6 @@ MISSED = result(math.inf)
 
 
 class TestSplit:
-    def test_follows_the_stated_formula(self) -> None:
-        split = split_frames(600, EvaluationOptions(reference_count=30))
-        assert split.references == tuple(round(i * 599 / 29) for i in range(30))
-        assert split.queries == tuple(round(3 + i * 593 / 39) for i in range(40))
-        assert split.queries[0] == 3
-        assert split.queries[-1] == 596
-
     def test_small_ones_are_as_derived_by_hand(self) -> None:
         """Half is rounded to even; each frame is left out once, or some; without room for a margin there is none."""
         assert split_frames(10, EvaluationOptions(reference_count=3, query_count=2)).references == (0, 4, 9)
@@ -85,35 +74,6 @@ class TestSplit:
             split_frames(frames, options)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("reference_count", 1), ("query_count", 0), ("k", 0), ("k", 65), ("variant", "bset"), ("scale_strategy", "")],
-)
-def test_options_outside_their_bounds_are_refused(name: str, value: object) -> None:
-    with pytest.raises(ValueError, match=str(value) or "scale"):
-        EvaluationOptions(**{name: value})  # type: ignore[arg-type]
-
-
-class TestCheckImages:
-    def frame(self, folder: Path, width: int, height: int) -> Frame:
-        file = folder / "a.png"
-        file.write_bytes(encode(".png", textured(96, 64)))
-        return Frame("a", file, Camera(width, height, 80.0, 80.0, 48.0, 32.0), RigidTransform.identity())
-
-    def test_passes_an_image_of_its_cameras_size(self, tmp_path: Path) -> None:
-        check_images([self.frame(tmp_path, 96, 64)], ImageLimits())
-
-    def test_names_the_image_of_another_size(self, tmp_path: Path) -> None:
-        with pytest.raises(ValueError, match=r"a\.png has 96x64 pixels, cameras\.json says 64x96"):
-            check_images([self.frame(tmp_path, 64, 96)], ImageLimits())
-
-    def test_names_what_is_no_image(self, tmp_path: Path) -> None:
-        frame = self.frame(tmp_path, 96, 64)
-        frame.image_path.write_bytes(b"GIF89a")
-        with pytest.raises(ValueError, match=r"a\.png: the image"):
-            check_images([frame], ImageLimits())
-
-
 class TestMetrics:
     def test_pose_error_is_of_the_camera_centre_and_the_orientation(self) -> None:
         true = RigidTransform(rotation_from_vector([0.3, -0.2, 0.1]), np.array([1.0, 2.0, 3.0]))
@@ -146,18 +106,9 @@ class TestMetrics:
         assert rejected.p90_translation >= bad.p90_translation
         assert all(rejected.recall[name] <= bad.recall[name] for name in bad.recall)
 
-    def test_the_first_call_is_not_in_the_latency(self) -> None:
-        summary = summarize([result(0.01, latency_ms=ms) for ms in (900.0, 100.0, 200.0, 300.0)])
-        assert (summary.latency_p50_ms, summary.latency_first_ms) == (200.0, 900.0)
-        assert summarize([result(0.01, latency_ms=7.0)]).latency_p50_ms == 7.0
-
     def test_share_of_claimed_radii_that_held(self) -> None:
         assert summarize([result(0.005), result(0.02), MISSED]).claim_held == 0.5
         assert summarize([MISSED]).claim_held is None
-
-    def test_stage_shares_sum_to_one(self) -> None:
-        assert stage_share([result(0.01), MISSED]) == {"decode": 0.25, "pnp": 0.75}
-        assert stage_share([replace(MISSED, stage_ms={})]) == {}
 
     @given(st.lists(st.floats(0, 1e6), min_size=1, max_size=50), st.sampled_from([0.5, 0.9, 0.95]))
     def test_quantile_is_numpys_on_finite_values(self, values: list[float], share: float) -> None:
@@ -167,9 +118,6 @@ class TestMetrics:
     def test_quantile_is_never_nan(self, missed: int) -> None:
         values = [1.0] * (5 - missed) + [math.inf] * missed
         assert not any(math.isnan(quantile(values, share)) for share in (0.5, 0.9, 0.95))
-
-    def test_trajectory_radius_is_the_root_mean_square(self) -> None:
-        assert trajectory_radius(np.array([[0.0, 0, 0], [2, 0, 0]])) == pytest.approx(1.0)
 
 
 class TestReport:
@@ -213,13 +161,6 @@ class TestReport:
         assert "translation_m" not in content["per_query"][0]
         assert content["relative"]["median_translation_units"] == 0.02
         assert content["relative"]["median_translation_of_reference_radius"] == pytest.approx(0.005)
-
-    def test_table_of_metres(self) -> None:
-        text = printed(evaluation(result(0.01), result(0.02), MISSED))
-        assert "2 of 3" in text
-        assert "2.00 cm" in text
-        assert "infinite" in text
-        assert "2 of [8] matches" in text, "brackets are not markup"
 
     def test_table_of_an_arbitrary_unit(self) -> None:
         text = printed(evaluation(result(0.02), metric=False))
@@ -268,14 +209,3 @@ class TestBench:
         content = json.loads(json.dumps(as_json(measured), allow_nan=False))
         assert content["scenes"][0]["target_met"] is True
         assert content["latency"]["warm_p50_ms"] == 200.0
-
-    def test_a_quick_run_is_not_held_against_the_targets(self) -> None:
-        text = "\n".join(markdown(BenchResult("CPU", [(self.SCENE, evaluation(MISSED))], [], None, [], quick=True)))
-        assert "Quick run" in text
-        assert "| - |" in text
-
-    def test_every_line_of_a_table_has_as_many_cells_as_its_head(self) -> None:
-        lines = markdown(
-            BenchResult("CPU", [(self.SCENE, evaluation(MISSED, references=5))], [], None, [], quick=False)
-        )
-        assert len({line.count("|") for line in lines if line.startswith("|")}) == 1

@@ -18,7 +18,6 @@ from support.images import textured
 from mapless import Internal
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_server.method.views import Features, View
-from mapless_server.observability.provenance import commit_of
 from mapless_server.settings import Settings
 from mapless_tools.charts import inline_svg
 from mapless_tools.dataset import Dataset, Frame, Refusal
@@ -36,7 +35,6 @@ from mapless_tools.evaluate.tables import (
     NO_FIGURE,
     OURS,
     Table,
-    format_median,
     groups_of,
     tables_of,
     text_lines,
@@ -96,19 +94,6 @@ class TestPaper:
             assert average[0] == pytest.approx(translation, rel=0.05, abs=0.6), method.name
             assert average[1] == pytest.approx(rotation, rel=0.1, abs=0.06), method.name
 
-    @pytest.mark.parametrize("name", list(BENCHMARKS))
-    def test_the_papers_own_figures_are_shown(self, name: str) -> None:
-        benchmark = BENCHMARKS[name]
-        (ours,) = (method for method in benchmark.methods if method.variant == "full")
-        dense = {"7scenes": (1.3, 0.41), "12scenes": (0.4, 0.19), "cambridge": (11, 0.27)}
-        sparsest = {"7scenes": (5.9, 1.61), "12scenes": (16.9, 2.56), "cambridge": (25, 0.53)}
-        assert tuple(ours.average) == (DENSE, *benchmark.sparse)
-        assert ours.average[DENSE] == dense[name]
-        assert ours.average[benchmark.sparse[-1]] == sparsest[name]
-
-    def test_benchmarks_have_as_many_scenes_as_their_names_say(self) -> None:
-        assert [len(BENCHMARKS[name].scenes) for name in ("7scenes", "12scenes", "cambridge")] == [7, 12, 4]
-
 
 class TestProtocol:
     def test_settings_are_the_papers_unless_others_are_given(self) -> None:
@@ -127,20 +112,6 @@ class TestProtocol:
             Method("full", "trajectory"),
         )
         assert replace(options, variants=("best",)).methods()[-1] == Method("best", "trajectory")
-
-    @pytest.mark.parametrize(
-        ("fields", "words"),
-        [
-            ({"protocols": ()}, "protocol"),
-            ({"protocols": ("dense", "dense")}, "twice"),
-            ({"scales": ("guess",)}, "guess"),
-            ({"k": 0}, "1 to 64"),
-            ({"k": 65}, "65"),
-        ],
-    )
-    def test_options_outside_their_bounds_are_refused(self, fields: dict[str, Any], words: str) -> None:
-        with pytest.raises(ValueError, match=words):
-            SuiteOptions(**fields)
 
     def test_dense_takes_all_training_frames_and_all_test_frames(self) -> None:
         split = split_scene(dataset(), DENSE, SuiteOptions())
@@ -388,11 +359,6 @@ class TestTables:
         assert row(scenes, "chess, full") == ("chess, full", "1.00/0.500", "2.00/0.500", "2.00/0.500")
         assert row(scales, "trajectory")[0] == "trajectory"
 
-    def test_units_are_centimetres_and_degrees(self) -> None:
-        assert format_median(1.234, 0.5678) == "1.23/0.568"
-        assert format_median(2950.4, 20.634) == "2950/20.63"
-        assert format_median(math.inf, math.inf) == FAILED
-
     @pytest.mark.parametrize("layout", ["7scenes", "12scenes", "cambridge", "cameras"])
     def test_every_line_has_as_many_cells_as_the_head(self, layout: str) -> None:
         (group,) = groups_of(suite({"chess": 0.01}, OPTIONS, layout))
@@ -412,23 +378,6 @@ class TestCharts:
             (axes,) = figure.axes
             labels = axes.get_xlabel() + axes.get_ylabel()
             assert "cm" in labels or "°" in labels
-
-    def test_cumulative_curves_end_at_the_share_localized(self) -> None:
-        (group,) = groups_of(suite({"chess": 0.01, "fire": math.inf}))
-        shares = np.asarray(cumulative(group)[0].axes[0].lines[0].get_ydata(), float)
-        assert (np.diff(shares) > 0).all()
-        assert shares[-1] == pytest.approx(50.0)
-
-    def test_a_long_sequence_keeps_its_worst(self) -> None:
-        (group,) = groups_of(suite({"chess": 0.01}))
-        (key,) = (key for key in group.runs if key[1] == DENSE)
-        run = group.runs[key]
-        many = tuple(replace(run.split.queries[0], name=f"q{i}") for i in range(2000))
-        run.journal.results |= {it.name: result(it.name, 5.0 if it.name == "q777" else 0.01) for it in many}
-        group.runs[key] = replace(run, split=replace(run.split, queries=many))
-        errors_cm = np.asarray(along_sequence(group, "chess")[0].axes[0].lines[0].get_ydata(), float)
-        assert len(errors_cm) <= 400
-        assert errors_cm.max() == 500.0
 
 
 class TestPictures:
@@ -450,9 +399,6 @@ class TestPictures:
         matches = np.stack([np.arange(50), np.arange(50)], axis=1).astype(np.int32)
         assert fit_true_poses(frames[0], frames[1], views[0], views[1], matches).tolist() == [True] * 25 + [False] * 25
 
-    def test_a_picture_is_a_jpeg_in_an_address(self) -> None:
-        assert data_uri(textured(96, 64)).startswith("data:image/jpeg;base64,/9j/")
-
 
 class TestFiles:
     def test_json_and_csv_tell_the_same(self, tmp_path: Path) -> None:
@@ -472,9 +418,6 @@ class TestFiles:
         assert {run["median_translation_cm"] for run in runs if run["scene"] == "fire"} == {""}
         assert content["failures"] == [{"scene": "heads", "message": "no server"}]
         assert content["paper"]["7scenes"]["methods"][-1]["average"]["dense"] == [1.3, 0.41]
-
-    def test_commit_of_what_is_no_checkout_is_empty(self, tmp_path: Path) -> None:
-        assert commit_of(tmp_path) == ""
 
 
 class TestPage:

@@ -10,8 +10,7 @@ from support.layouts import CAMERA, Truth, assert_reads, assert_same_camera, rea
 
 from mapless.geometry import Fisheye, RadialTangential, RigidTransform
 from mapless_tools.ingest.formats import ReadOptions, read_dataset
-from mapless_tools.ingest.formats.colmap.cameras import MODEL_NAMES, ColmapCamera, from_camera
-from mapless_tools.ingest.formats.writing import PosedImage, model_texts
+from mapless_tools.ingest.formats.colmap.cameras import MODEL_NAMES, ColmapCamera
 
 TRUTH = truth()
 PINHOLE = (1, 1, 96, 64, (80.0, 81.0, 47.75, 31.25))
@@ -226,18 +225,3 @@ def test_several_models_are_named_rather_than_one_guessed(tmp_path: Path) -> Non
     with pytest.raises(ValueError, match=r"several COLMAP models: .*sparse/0.*sparse/1"):
         read_dataset(folder)
     assert_reads(read_dataset(folder / "sparse" / "1"), TRUTH)
-
-
-@pytest.mark.parametrize(
-    "lens", [None, RadialTangential(0.1, -0.2, 0.01, 0.02), RadialTangential(0.1, k3=0.3), Fisheye(0.1, 0.2, 0.3, 0.4)]
-)
-def test_what_is_written_reads_back(tmp_path: Path, lens: RadialTangential | Fisheye | None) -> None:
-    planted = Truth(TRUTH.poses, replace(CAMERA, distortion=lens))
-    images = [PosedImage(f"{i}.png", planted.camera, pose) for i, pose in enumerate(planted.poses)]
-    for name, text in model_texts(images).items():
-        (tmp_path / name).write_text(text)
-    for i in range(len(images)):
-        write_image(tmp_path / "images" / f"{i}.png", seed=i)
-    assert_reads(read_dataset(tmp_path), planted)
-    assert len([line for line in (tmp_path / "cameras.txt").read_text().splitlines() if line[0] != "#"]) == 1
-    assert from_camera(1, planted.camera).parameters[2] == CAMERA.principal_x_px + 0.5

@@ -60,11 +60,6 @@ def distance(first: int, second: int, centres_m: Array, factor: float = 1.0) -> 
     )
 
 
-def test_nothing_said_changes_nothing() -> None:
-    dataset = dataset_of(centres())
-    assert in_metres(dataset, MetreOptions()) is dataset
-
-
 def test_a_scale_multiplies_positions_and_keeps_rotations() -> None:
     datum = Datum(47, 8, 400)
     dataset = replace(dataset_of(centres()), datum=datum, down_in_world=(0.0, 0.6, -0.8))

@@ -297,16 +297,3 @@ def test_an_interruption_ends_it_soon_and_keeps_what_is_in(tmp_path: Path) -> No
         upload(server, frames_in(tmp_path), UploadOptions(parallel=1))
     assert began.is_set()
     assert (server.is_closed, len(server.messages)) == (True, 1)
-
-
-def test_files_unlike_the_camera_are_refused_before_sending(tmp_path: Path) -> None:
-    frames = frames_in(tmp_path, 4)
-    write_image(frames[0].image_path, 0, 48, 32)
-    frames[1].image_path.write_bytes(b"GIF89a")
-    frames[2].image_path.unlink()
-    server = Server()
-    why = refusals(upload(server, frames))
-    assert "48x32 pixels, its camera 96x64" in why["r000"]
-    assert "not a JPEG" in why["r001"]
-    assert "No such file" in why["r002"]
-    assert server.messages == [["r003"]]

@@ -2,19 +2,13 @@
 
 import asyncio
 import itertools
-import json
 import math
-import os
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import cv2
 import grpc
 import numpy as np
 import pytest
@@ -23,9 +17,7 @@ from grpc_status import rpc_status
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.images import ImageLimits, decode_image
-from mapless_tools.charts import write_figure
 from mapless_tools.load.calls import (
     REGULAR_JITTER,
     CallRecord,
@@ -40,19 +32,13 @@ from mapless_tools.load.calls import (
     poisson_times,
     regular_times,
 )
-from mapless_tools.load.charts import LATENCIES, RATES, draw_load
-from mapless_tools.load.driving import photo_request, read_answer
 from mapless_tools.load.no_op import CAMERA, padded_photo
-from mapless_tools.load.pipeline import PipelineOptions, PipelineResult, pipeline_checks, pipeline_json
-from mapless_tools.load.report import Check, check_lines, machine_lines, report_part, step_lines
 from mapless_tools.load.sender import Target, connected, send_closed_loop, send_open_loop
-from mapless_tools.load.step import Step, run_step
+from mapless_tools.load.step import Step
 from mapless_tools.load.watch import (
     ProcessSample,
     Scrape,
-    ServerUnderLoad,
     parse_metrics,
-    priority_over,
     reconcile,
 )
 
@@ -119,30 +105,6 @@ def test_clients_together_make_the_rate_and_the_mix() -> None:
         assert call.request == (BAD if call.kind is Kind.BAD_IMAGE else GOOD)
         assert (call.cancel_after_s is not None) == (call.kind is Kind.CANCELLED)
         assert call.cancel_after_s is None or 0 <= call.cancel_after_s <= 0.5
-
-
-def test_equal_seeds_plan_equal_calls_and_others_differ() -> None:
-    def times(seed: int) -> list[float]:
-        return [call.at_s for call in plan_calls(20.0, 10.0, 2, REQUESTS, Mix(), seed)]
-
-    assert times(1) == times(1)
-    assert times(1) != times(2)
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: Mix(cancelled_share=0.6, bad_share=0.6),
-        lambda: Mix(cancelled_share=-0.1),
-        lambda: plan_calls(1.0, 1.0, 0, REQUESTS, Mix(), 0),
-        lambda: plan_calls(0.0, 1.0, 1, REQUESTS, Mix(), 0),
-        lambda: plan_calls(1.0, 1.0, 1, Requests((GOOD,)), Mix(bad_share=0.5), 0),
-        lambda: account_of([], 1.0, 1.0),
-    ],
-)
-def test_senseless_arguments_are_refused(make: Callable[[], object]) -> None:
-    with pytest.raises(ValueError, match=r"\w"):
-        make()
 
 
 # Accounts
@@ -292,20 +254,6 @@ async def test_a_stalled_server_shows_in_every_latency_meanwhile() -> None:
         assert r.latency_s >= released_s - begin_s - r.at_s - 1e-9
 
 
-async def test_a_late_generator_counts_from_the_planned_time() -> None:
-    async def handler(_: bytes, __: Any) -> bytes:
-        return b"localized"
-
-    async with toy_server(handler) as target:
-        late_by_5_s = asyncio.get_running_loop().time() - 5.0
-        plan = [PlannedCall(float(i), i, Kind.QUERY, GOOD) for i in range(3)]
-        records = await send_open_loop(target, plan, late_by_5_s)
-    assert [r.latency_s >= 5.0 - r.at_s for r in records] == [True] * 3
-    lag = account_of(records, 10.0).send_lag
-    assert lag.max_ms is not None
-    assert lag.max_ms >= 5000
-
-
 async def test_a_closed_loop_keeps_so_many_calls_in_progress() -> None:
     running = most = 0
     seen: Counter[bytes] = Counter()
@@ -348,18 +296,6 @@ async def test_a_refused_closed_loop_caller_waits_the_retry_delay() -> None:
 
 
 # The server's process and its own account
-
-
-def test_the_generator_has_priority_while_it_measures_only() -> None:
-    def niceness(process_id: int) -> int:
-        return os.getpriority(os.PRIO_PROCESS, process_id)
-
-    before = niceness(0)
-    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as server:
-        with priority_over(server.pid):
-            assert niceness(server.pid) - niceness(0) == 5
-        assert niceness(0) == before
-        server.communicate(b"\n")
 
 
 PAGE = """
@@ -421,21 +357,6 @@ def test_the_padded_photo_is_an_image_of_the_size_asked_for() -> None:
         assert pixels.shape == (CAMERA.height_px, CAMERA.width_px, 3)
 
 
-def test_a_request_holds_the_photo_and_reference_names() -> None:
-    message = pb.LocalizeRequest.FromString(photo_request(b"photo", CAMERA, ["a", "b"]))
-    assert message.image == b"photo"
-    assert list(message.references) == ["scenes/load/references/a", "scenes/load/references/b"]
-    assert message.intrinsics.width_px == CAMERA.width_px
-
-
-def test_what_an_answer_says() -> None:
-    localized = pb.LocalizeResponse(localization=pb.Localization(pose_stage=pb.POSE_STAGE_REFINED))
-    coarse = pb.LocalizeResponse(localization=pb.Localization(pose_stage=pb.POSE_STAGE_COARSE))
-    rejected = pb.LocalizeResponse(rejection=pb.Rejection(reason=pb.REJECTION_REASON_LOW_OVERLAP))
-    answers = [read_answer(message.SerializeToString()) for message in (localized, coarse, rejected)]
-    assert answers == ["localized", "coarse", "rejected LOW_OVERLAP"]
-
-
 # Reports
 
 
@@ -444,97 +365,3 @@ def step(name: str, asked_per_s: float | None, records: Sequence[CallRecord], sc
     account = account_of(records, 10.0)
     codes = [r.code for r in records]
     return Step(name, asked_per_s, 10.0, account, codes, samples, 0.0, scraped, 0.1, 10.0)
-
-
-def planted_result(slowest_refusal_s: float = 0.004) -> PipelineResult:
-    """A server that answers 8 a second in 0.2 s, and refuses the rest."""
-
-    def calls(answered: int, refused: int) -> list[CallRecord]:
-        answers = [record(at_s=10 * i / max(answered, 1) * 0.9, took_s=0.2 + 0.001 * i) for i in range(answered)]
-        refusals = [record(Fate.REFUSED, at_s=10 * i / max(refused, 1), took_s=0.003) for i in range(refused)]
-        if refusals:
-            refusals[-1] = replace(refusals[-1], ended_s=refusals[-1].at_s + slowest_refusal_s)
-        return answers + refusals
-
-    scraped = Scrape(0, {}, {}, {0.01: 100, math.inf: 100})
-    options = PipelineOptions(shares=(0.7, 1.0, 3.0))
-    steps = [
-        step("70 %", 5.6, calls(56, 0), scraped),
-        step("100 %", 8.0, calls(78, 2), scraped),
-        step("300 %", 24.0, calls(79, 161), scraped),
-    ]
-    ramp = [step("2 at a time", None, calls(80, 0), scraped)]
-    unloaded = step("unloaded", None, calls(80, 0), scraped)
-    regular = step("70 %, regular", 5.6, calls(56, 0), scraped)
-    hammered = step("hammering", None, calls(70, 900), scraped)
-    return PipelineResult("a planted place", options, unloaded, ramp, 8.0, steps, regular, hammered)
-
-
-def test_a_good_server_meets_bars_and_slow_refusals_miss_one() -> None:
-    def by_figure(result: PipelineResult) -> dict[str, bool | None]:
-        return {check.figure: check.met for check in pipeline_checks(result)}
-
-    good, slow = by_figure(planted_result()), by_figure(planted_result(slowest_refusal_s=0.051))
-    ours = {figure: met for figure, met in good.items() if "CPU" not in figure}  # the machine's cores decide that
-    assert set(ours.values()) == {True}
-    different = [figure for figure in good if good[figure] is not slow[figure]]
-    assert different == ["slowest of 161 refusals at 3 times saturation"]
-
-
-def test_the_picture_has_a_curve_for_each_figure(tmp_path: Path) -> None:
-    write_figure(draw_load(planted_result()), tmp_path / "load.png")
-    picture = cv2.imread(str(tmp_path / "load.png"))
-    assert picture is not None
-    assert picture.shape == (1080, 1500, 3)
-    upper, lower = draw_load(planted_result()).axes
-    for axes, names in ((upper, LATENCIES), (lower, RATES)):
-        drawn = [label.partition(":")[0] for label in axes.get_legend_handles_labels()[1]]
-        assert set(names) <= set(drawn)
-    assert "answered in time: 7.9/s" in lower.get_legend_handles_labels()[1]
-
-
-def test_a_step_without_any_answer_can_be_reported() -> None:
-    result = planted_result()
-    refused = [record(Fate.REFUSED, at_s=0.1 * i, took_s=0.003) for i in range(50)]
-    result = replace(result, steps=[*result.steps[:2], step("300 %", 24.0, refused)])
-    assert draw_load(result).axes
-    assert any("300 %" in line for line in step_lines(result.all_steps))
-    goodput = next(check for check in pipeline_checks(result) if check.figure.startswith("goodput"))
-    assert goodput.met is False
-
-
-def test_the_file_of_figures_keeps_earlier_parts(tmp_path: Path) -> None:
-    result = planted_result()
-    file = tmp_path / "load.json"
-    report_part(file, "pipeline", [], pipeline_checks(result), pipeline_json(result))
-    report_part(file, "soak", [], [], {"figure": 1})
-    content = json.loads(file.read_text())
-    assert sorted(content) == ["pipeline", "soak"]
-    assert content["pipeline"]["steps"][2]["share_of_saturation"] == 3.0
-    assert content["pipeline"]["steps"][2]["refusals"]["count"] == 161
-    verdicts = [line for line in check_lines(pipeline_checks(result)) if "| yes |" in line or "**no**" in line]
-    assert len(verdicts) == len(content["pipeline"]["checks"])
-
-
-async def test_a_step_uses_the_servers_account_of_its_time_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    pages = iter([Scrape(10, {"OK": 10}, {}, {}), Scrape(13, {"OK": 13}, {}, {})])
-    monkeypatch.setattr("mapless_tools.load.watch.read_metrics", lambda _: next(pages))
-
-    async def send() -> list[CallRecord]:
-        await asyncio.sleep(0.05)
-        return [record(at_s=0.01 * i, took_s=0.01) for i in range(3)]
-
-    under_load = ServerUnderLoad(os.getpid(), "nowhere")
-    measured = await run_step("toy", under_load, send, 1.0, sample_every_s=0.01)
-    assert measured.scraped is not None
-    assert (measured.scraped.started, measured.scraped.handled) == (3, {"OK": 3})
-    assert measured.answers == 3
-    assert len(measured.samples) >= 2
-    assert [s.at_s for s in measured.samples] == sorted(s.at_s for s in measured.samples)
-
-
-def test_only_an_overcommitted_machine_excuses_a_missed_bar() -> None:
-    met, missed = (Check("overdue", "", "0", it) for it in (True, False))
-    assert "6.3 threads wanted to run on 2 cores" in machine_lines([met, missed], 6.3, 2)[0]
-    assert machine_lines([met, missed], 1.9, 2) == []
-    assert machine_lines([met], 6.3, 2) == []

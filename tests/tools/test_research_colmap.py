@@ -11,7 +11,7 @@ from mapless_tools.ingest.formats.cameras import read_folder
 
 pytest.importorskip("pycolmap")
 
-from research.colmap import Case, SceneDatabase, cases_of, measure, table
+from research.colmap import Case, SceneDatabase, measure, table
 
 ROOM = Path(__file__).parents[2] / "server/mapless_tools/demo/room"
 
@@ -46,17 +46,3 @@ def test_the_table_counts_lost_and_wrong(tmp_path: Path) -> None:
     (tmp_path / "mapless" / case.file_name).write_text(result(a=0.01, b=0.02, c=0.03))
     *_, row = table([case], tmp_path, tmp_path / "mapless")
     assert row == "| room | 5 | 3 | 2 | 1 | infinite / 0.100° | 0.20 | 3 | 0 | infinite / 0.100° | 0.20 |"
-
-
-def test_the_table_rejects_results_of_other_queries(tmp_path: Path) -> None:
-    case = Case("room", None)
-    (tmp_path / "mapless").mkdir()
-    (tmp_path / case.file_name).write_text(result(a=0.01))
-    (tmp_path / "mapless" / case.file_name).write_text(result(b=0.01))
-    with pytest.raises(ValueError, match="other queries"):
-        list(table([case], tmp_path, tmp_path / "mapless"))
-
-
-def test_numbers_of_references_leave_three_queries() -> None:
-    assert [case.references for case in cases_of("room", 26)] == [None, 20, 10, 5]
-    assert [case.references for case in cases_of("room", 8)] == [None]

@@ -1,21 +1,15 @@
 """A soak's verdict: planted leaks are found, and neither noise, waves nor a curve that has settled is taken for one."""
 
-import json
-import os
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from mapless.geometry import Array
-from mapless_tools.load.calls import CallRecord, Fate, Kind, Mix, Requests, plan_calls
-from mapless_tools.load.charts import draw_soak
 from mapless_tools.load.slopes import MIN_SAMPLES, Slope, slope
 from mapless_tools.load.soak import MIN_SETTLED_S, UNITS, SoakOptions, least_minutes, slopes_of
-from mapless_tools.load.watch import Scrape, ServerState, ServerUnderLoad, read_state
+from mapless_tools.load.watch import ServerState
 
 EVERY_S = 10.0
 TIMES_S = np.arange(0.0, 2400.0, EVERY_S)
@@ -69,11 +63,6 @@ def test_a_third_of_wild_samples_moves_it_little() -> None:
     assert found(wild).per_hour == pytest.approx(60, abs=6)
 
 
-def test_a_constant_series_has_slope_zero() -> None:
-    constant = found(np.zeros(len(TIMES_S)))
-    assert (constant.level, constant.per_hour, constant.low, constant.high) == (500, 0, 0, 0)
-
-
 def test_a_day_of_samples_is_thinned_and_its_slope_kept() -> None:
     times = np.arange(0.0, 86_400.0, EVERY_S)
     values = 100 + times / 3600 + np.random.default_rng(5).normal(0, 2, len(times))
@@ -115,60 +104,4 @@ def test_the_minimum_of_minutes_gives_slopes_and_less_none(options: SoakOptions)
     assert looked_at(least - 3) == {}
 
 
-def test_a_process_is_read_with_its_files_sockets_and_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pages = [
-        Scrape(0, {}, {}, {}, {"mapless_event_loop_lag_seconds_sum": s, "mapless_event_loop_lag_seconds_count": n})
-        for s, n in ((1.0, 100.0), (1.5, 200.0))
-    ]
-    monkeypatch.setattr("mapless_tools.load.watch.read_metrics", lambda _: pages.pop(0))
-    (tmp_path / "below").mkdir()
-    (tmp_path / "below" / "file").write_bytes(bytes(2**20))
-    watched = ServerUnderLoad(os.getpid(), "nowhere", tmp_path)
-    first, series = read_state(watched, 0.0, None)
-    second, _ = read_state(watched, 1.0, series)
-    assert first.data_mib == pytest.approx(1.0, abs=0.1)
-    assert 0 < first.unique_mib <= first.resident_mib
-    assert first.threads >= 1
-    assert first.sockets <= first.descriptors
-    assert second.loop_lag_ms == pytest.approx(5.0)
-
-
-def test_the_picture_has_a_panel_and_verdict_for_each_figure() -> None:
-    seen = [state(at, waiting_jobs=at % 3) for at in np.arange(0.0, 900.0, EVERY_S).tolist()]
-    panels = draw_soak(seen, slopes_of(seen, 300)).axes
-    assert len(panels) == len(UNITS)
-    assert all(axes.get_title("left").endswith("an hour, flat") for axes in panels)
-
-
 # What is called
-
-
-def test_calls_with_a_short_deadline_may_fail() -> None:
-    mix = Mix(cancelled_share=0.1, bad_share=0.1, hurried_share=0.3, hurry_s=0.4)
-    plan = plan_calls(50.0, 20.0, 2, Requests((b"good",), (b"bad",)), mix, seed=0)
-    hurried = [call for call in plan if call.kind is Kind.HURRIED]
-    assert len(hurried) / len(plan) == pytest.approx(0.3, abs=0.05)
-    assert all(call.deadline_s is not None and 0 < call.deadline_s <= 0.4 for call in hurried)
-    assert all(call.deadline_s is None for call in plan if call.kind is not Kind.HURRIED)
-    record = CallRecord(Kind.HURRIED, 0, 0.0, 0.0, 0.1, 0.1, "DEADLINE_EXCEEDED", "DEADLINE_EXCEEDED")
-    assert record.fate is Fate.TOO_HURRIED
-    assert replace(record, kind=Kind.QUERY).fate is Fate.OVERDUE
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: SoakOptions(rate_per_s=0.0),
-        lambda: SoakOptions(churn=-1.0),
-        lambda: SoakOptions(settle_share=1.0),
-        lambda: Mix(hurried_share=0.6, bad_share=0.5),
-        lambda: Mix(hurry_s=0.0),
-    ],
-)
-def test_senseless_options_are_refused(make: Callable[[], object]) -> None:
-    with pytest.raises(ValueError, match="must be"):
-        make()
-
-
-def test_the_options_can_be_written_down() -> None:
-    assert json.loads(json.dumps(vars(SoakOptions())))["churn"] == 1.0

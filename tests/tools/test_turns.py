@@ -1,13 +1,10 @@
 """Two servers by turns: what is reported of their times."""
 
-import os
-import time
-
 import numpy as np
 import pytest
 import typer
 
-from mapless_tools.bench.turns import Measured, _processor_s, main, ratio_with_interval, report
+from mapless_tools.bench.turns import Measured, main, ratio_with_interval, report
 
 
 def test_a_planted_ratio_lies_in_its_interval() -> None:
@@ -24,12 +21,6 @@ def test_a_rejected_photograph_counts_for_the_time_alone() -> None:
     lines = report([Measured(times, times, 1e-9), Measured(times, times, None)], ("a", "b"))
     assert "| processor time | 200.0 | 100.0 | 0.500 | 0.500 to 0.500 |" in lines
     assert lines[-1] == "Localized by both: 1, at most 1e-09 (unit of the scene) apart."
-
-
-@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="needs Linux's clocks")
-def test_the_clock_of_a_process_is_its_own() -> None:
-    begin_s = _processor_s(os.getpid())
-    assert begin_s == pytest.approx(time.process_time(), abs=0.05)
 
 
 def test_without_a_commit_nothing_is_measured(capsys: pytest.CaptureFixture[str]) -> None:

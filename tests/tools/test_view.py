@@ -1,7 +1,6 @@
 """What the viewer draws lies where it belongs, what it says is text, and it serves its own pages alone."""
 
 import socket
-import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,9 +16,9 @@ from typer.testing import CliRunner
 
 from mapless import Datum, Quaternion, Reference, Scene
 from mapless.answers import Accuracy, Debug, Diagnostics, Hint, Hypothesis, LocalizationResult, ReferenceUse, Rejected
-from mapless.geometry import Array, Camera, RigidTransform, rotation_from_vector
+from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_tools.cli.app import app
-from mapless_tools.view.drawing import ellipsoid, enlargement, rays
+from mapless_tools.view.drawing import ellipsoid
 from mapless_tools.view.feed import Query, colours_at, read_picture
 from mapless_tools.view.scenery import lay_out, spread_out
 
@@ -64,31 +63,6 @@ class TestShapes:
         assert share == pytest.approx(0.95, abs=0.004)
         assert faces.max() == len(vertices) - 1
 
-    @pytest.mark.parametrize(
-        "axes", [np.diag([1.0, 4.0, 9.0]), np.array([[2.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0, 0, 1]])]
-    )
-    def test_its_faces_look_outwards(self, axes: Array) -> None:
-        vertices, faces = ellipsoid(axes)
-        a, b, c = (vertices[faces[:, i]] for i in range(3))
-        normals, middle = np.cross(b - a, c - a), (a + b + c) / 3
-        outwards = np.einsum("ni,ni->n", normals, middle)
-        assert (outwards > -1e-9).all()
-        assert (outwards > 1e-6).mean() > 0.8  # at the poles they have no area
-
-    def test_a_small_one_is_enlarged_and_one_without_size_is_not(self) -> None:
-        assert enlargement(np.eye(6) * 1e-6, 0.3) == 100
-        assert enlargement(np.eye(6), 0.3) == 1
-        assert enlargement(np.zeros((6, 6)), 0.3) == 1
-
-    def test_rays_lead_to_the_points_and_no_further(self) -> None:
-        centre, points = np.array([1.0, 2.0, 3.0]), np.random.default_rng(0).normal(0, 5, (50, 3))
-        np.testing.assert_allclose(rays(centre, points, 100, 1e3)[:, 1], points)
-        few = rays(centre, points, 10, 2.0)
-        assert few.shape == (10, 2, 3)
-        np.testing.assert_allclose(few[:, 0], np.broadcast_to(centre, (10, 3)))
-        assert np.linalg.norm(few[:, 1] - few[:, 0], axis=1).max() <= 2 + 1e-9
-        assert rays(centre, points[:0], 10, 2.0).shape == (0, 2, 3)
-
 
 class TestScenery:
     def test_a_world_far_from_its_origin_is_drawn_near_zero(self) -> None:
@@ -127,14 +101,6 @@ class TestScenery:
         assert sorted(everything.tolist()) == list(range(20))
         assert len(set(spread_out(np.zeros((9, 6)), 5).tolist())) == 5
 
-    def test_cameras_at_one_place_count_by_where_they_look(self) -> None:
-        around = [reference(i, upright(0, turn=2 * np.pi * i / 12)) for i in range(12)]
-        scenery = lay_out(SCENE, [*around, *(reference(20 + i, upright(0)) for i in range(50))], 12)
-        looks = np.stack([scenery.references[i].world_from_camera.rotation[:, 2] for i in scenery.pictured])
-        apart = np.linalg.norm(looks[:, None] - looks[None], axis=2) + 9 * np.eye(12)
-        assert apart.min() > 0.5
-        assert scenery.size_m == 0.3
-
     def test_neighbours_see_about_the_same(self) -> None:
         scenery = lay_out(SCENE, [reference(i, upright(i, turn=0 if i < 6 else np.pi)) for i in range(12)], 12)
         assert [it.reference_id for it in scenery.neighbours(2, 2)] in (["r1", "r3"], ["r3", "r1"])
@@ -156,13 +122,6 @@ class TestPictures:
         inner = (np.abs(cells % 1 - 0.5) < 0.3).all(axis=1)
         expected = coarse[cells[:, 1].astype(int), cells[:, 0].astype(int)]
         np.testing.assert_allclose(colours_at(reduced, CAMERA, pixels)[inner].astype(int), expected[inner], atol=2)
-
-
-class TestWords:
-    def test_a_query_is_shown_in_a_line(self) -> None:
-        found, lost = query(upright(0)), query(None)
-        assert found.label == "#4 localized to 2.0 cm"
-        assert lost.label == "#4 not localized: low overlap"
 
 
 @pytest.fixture(scope="module")
@@ -222,14 +181,6 @@ class TestCommand:
         assert "not a loopback address" in result.stderr
         assert "ssh -L" in result.stderr
 
-    def test_without_viser_the_error_names_the_extra(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        for name in [it for it in sys.modules if it == "viser" or it.startswith(("viser.", "mapless_tools.view."))]:
-            monkeypatch.delitem(sys.modules, name)
-        monkeypatch.setitem(sys.modules, "viser", None)
-        result = self.run()
-        assert result.exit_code == 2
-        assert "pip install 'mapless[view]'" in result.stderr
-
     def test_senseless_numbers_are_refused(self) -> None:
         pytest.importorskip("viser", reason="needs the extra view")
         result = self.run("--max-pictured", "0")
@@ -243,12 +194,6 @@ class TestCommand:
         assert result.exit_code == 1
         assert "UNAVAILABLE" in result.stderr
         assert threading.active_count() <= before + 1
-
-
-def test_the_extra_is_named_where_it_is_missing() -> None:
-    from mapless_server.extras import install_hint
-
-    assert "mapless[view]" in install_hint(ModuleNotFoundError("no", name="viser"))
 
 
 def test_a_port_that_is_taken_is_not_exchanged_for_another() -> None:
