@@ -1,11 +1,12 @@
-"""How the shipped vocabularies were made, in ten minutes on a CPU core.
+"""Vocabularies for retrieval, learned from rendered rooms in ten minutes on a CPU core.
 
     PYTHONPATH=client:server python -m research.learn_vocabulary --weights-dir FOLDER --output FILE
 
 Rooms are furnished, textured and lit from random numbers, and photographed from anywhere in them with a camera that
 errs in exposure and colour, blurs and has noise. From the features of these photographs the vocabularies are learned.
-Nothing else goes in. Run again it gives the same file up to the last digits of a float16, in which libraries of linear
-algebra may differ; descriptors are named after the very numbers, so another file means that stored ones are made anew.
+Nothing else goes in. The shipped ones were learned so from the rooms of an earlier renderer (`git show
+04d45625:server/research/rendered_room`); those of the present one give others. Descriptors are named after the very
+numbers, so another file means that stored ones are made anew.
 """
 
 import argparse
@@ -20,7 +21,8 @@ from mapless_server.method.features import make_extractor
 from mapless_server.networks.weights import find_weights
 from mapless_server.scenes.retrieval.vlad import LEARNED, REDUCED, SEED, WORDS, Floats, Vocabulary, nearest_words
 
-from .rendered_room.photographs import lit_room, photograph, scatter
+from .rendered_room.furniture import lit_room
+from .rendered_room.photographs import photograph, scatter
 
 View = tuple[NDArray[np.uint8], Camera]
 
@@ -49,9 +51,9 @@ def main() -> None:
 def rendered() -> Iterator[View]:
     """Photographs of the rooms."""
     for seed in ROOMS:
-        room, surfaces = lit_room(seed)
+        room = lit_room(seed)
         for station in scatter(seed, PHOTOGRAPHS, room):
-            yield photograph(surfaces, station, seed), station.camera
+            yield photograph(room, station, seed), station.camera
         print(f"room {seed}: {PHOTOGRAPHS} photographs", flush=True)
 
 

@@ -1,4 +1,4 @@
-"""Writes the demo's photographs, in a minute: `PYTHONPATH=client:server python -m research.rendered_room FOLDER`."""
+"""Writes the demo's photographs: `PYTHONPATH=client:server python -m research.rendered_room FOLDER`, some minutes."""
 
 import json
 import sys
@@ -7,24 +7,24 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from .photographs import lit_room, photograph, scatter, visible_edges, walk
-from .rendering import cast
+from .furniture import lit_room
+from .photographs import cast, photograph, scatter, visible_edges, walk
 
 DEPTH_PX = (240, 180)
 
 
 def main(folder: Path) -> None:
     """Write photographs, depths, cameras and outline of the demo's room."""
-    room, surfaces = lit_room(0)
+    room = lit_room(0)
     references, queries = walk(0, 16), scatter(0, 8, room)
     for name in ("images", "depth"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     frames = []
     for station in references + queries:
         camera, pose = station.camera, station.world_from_camera
-        image = cv2.cvtColor(photograph(surfaces, station, 0), cv2.COLOR_RGB2BGR)
+        image = cv2.cvtColor(photograph(room, station, 0), cv2.COLOR_RGB2BGR)
         cv2.imwrite(str(folder / "images" / f"{station.name}.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, 92])
-        depth_mm = 1000 / cast(room.quads, camera.resized(*DEPTH_PX), pose)[0]
+        depth_mm = 1000 / cast(room, camera.resized(*DEPTH_PX), pose)[0]
         best = [cv2.IMWRITE_PNG_COMPRESSION, 9]
         cv2.imwrite(str(folder / "depth" / f"{station.name}.png"), np.rint(depth_mm).astype(np.uint16), best)
         size = {"width": camera.width_px, "height": camera.height_px, "K": camera.matrix().tolist()}
