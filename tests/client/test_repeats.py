@@ -15,8 +15,8 @@ from support.clients import Played
 
 from mapless import wire
 from mapless.calls import localization, references
+from mapless.connection import Connection
 from mapless.errors import AlreadyExists, Internal, NotFound, Unavailable
-from mapless.exchange import Exchange
 from mapless.geodesy import Datum
 from mapless.geometry import Camera, Quaternion, RigidTransform
 from mapless.options import ConnectOptions
@@ -32,10 +32,6 @@ DOWN = (0.0, 9.81, 0.3)
 CAMERA = Camera(640, 480, 500, 500, 320, 240)
 
 
-def methods(played: Played) -> list[str]:
-    return [call.method.rpartition("/")[2] for call in played.calls]
-
-
 def created(there: Any, generation: int = 1) -> Any:
     """What `create_scene` with DATUM and DOWN makes of it if this scene is there after a lost answer."""
     there = pb.GetSceneResponse(
@@ -43,12 +39,15 @@ def created(there: Any, generation: int = 1) -> Any:
         if isinstance(there, pb.CreateSceneRequest)
         else there
     )
-    exchange = references.create_scene("hall", datum=DATUM, down_in_world=DOWN)
-    return Played(exchange, [GONE, TAKEN, there], ConnectOptions()).result
+    return Played(create, [GONE, TAKEN, there], ConnectOptions()).result
+
+
+def create(connection: Connection) -> Any:
+    return references.create_scene(connection, "hall", datum=DATUM, down_in_world=DOWN)
 
 
 def sent() -> pb.CreateSceneRequest:
-    request = next(references.create_scene("hall", datum=DATUM, down_in_world=DOWN)).request
+    (_, request), *_ = Played(create, [GONE], ConnectOptions(max_attempts=1)).calls
     assert isinstance(request, pb.CreateSceneRequest)
     return request
 
@@ -106,7 +105,7 @@ def stored(request: pb.CreateReferenceRequest) -> pb.Reference:
 
 
 def added(wanted: list[pb.CreateReferenceRequest], answers: list[Any]) -> Played:
-    return Played(references.add_batch("a", wanted, 10.0, {}), answers, ConnectOptions())
+    return Played(lambda it: references.add_batch(it, "a", wanted, 10.0, {}), answers, ConnectOptions())
 
 
 @pytest.mark.parametrize("first", [[], [GONE]], ids=["earlier upload", "lost answer"])
@@ -114,7 +113,7 @@ def test_a_batch_that_is_there_is_found_by_one_call(first: list[Any]) -> None:
     wanted = requests(32)
     played = added(wanted, [*first, TAKEN, pb.ListReferencesResponse(references=map(stored, wanted))])
     assert [it.reference_id for it in played.result] == [it.reference_id for it in wanted]
-    assert methods(played) == ["BatchCreateReferences"] * (len(first) + 1) + ["ListReferences"]
+    assert played.methods == ["BatchCreateReferences"] * (len(first) + 1) + ["ListReferences"]
 
 
 def test_only_what_the_scene_lacks_is_sent_again() -> None:
@@ -126,7 +125,7 @@ def test_only_what_the_scene_lacks_is_sent_again() -> None:
     lacked = [wanted[0], wanted[2]]
     played = added(wanted, [TAKEN, *pages, pb.BatchCreateReferencesResponse(references=map(stored, lacked))])
     assert [it.reference_id for it in played.result] == ["r00", "r01", "r02", "r03"]
-    request = played.calls[-1].request
+    _, request = played.calls[-1]
     assert isinstance(request, pb.BatchCreateReferencesRequest)
     assert list(request.requests) == lacked
 
@@ -191,8 +190,8 @@ def of_a_rig() -> Message:
     return answer
 
 
-def localize() -> Exchange[Any]:
-    return localization.localize(b"photo", CAMERA, "a")
+def localize(connection: Connection) -> Any:
+    return localization.localize(connection, b"photo", CAMERA, "a")
 
 
 @pytest.mark.parametrize(
@@ -202,28 +201,28 @@ def localize() -> Exchange[Any]:
         (localize, of_35_covariances),
         (localize, of_unequal_columns),
         (localize, before_the_calendar),
-        (lambda: localization.localize_rig([], "a"), of_a_rig),
+        (lambda it: localization.localize_rig(it, [], "a"), of_a_rig),
         (
-            lambda: references.retrieve_references(b"photo", CAMERA, "a"),
+            lambda it: references.retrieve_references(it, b"photo", CAMERA, "a"),
             lambda: pb.RetrieveReferencesResponse(references=[pb.RetrievedReference()]),
         ),
-        (lambda: references.get_scene("a"), pb.GetSceneResponse),
-        (lambda: references.get_reference("a", "b"), pb.GetReferenceResponse),
-        (lambda: references.list_scenes().fetch(""), lambda: pb.ListScenesResponse(scenes=[pb.Scene()])),
+        (lambda it: references.get_scene(it, "a"), pb.GetSceneResponse),
+        (lambda it: references.get_reference(it, "a", "b"), pb.GetReferenceResponse),
+        (lambda it: anext(references.list_scenes(it)), lambda: pb.ListScenesResponse(scenes=[pb.Scene()])),
     ],
 )
 def test_an_answer_that_breaks_its_contract_is_a_server_error(
-    ask: Callable[[], Exchange[Any]], answer: Callable[[], Message]
+    ask: Callable[[Connection], Any], answer: Callable[[], Message]
 ) -> None:
-    error = Played(ask(), [answer()], ConnectOptions()).result
+    error = Played(ask, [answer()], ConnectOptions()).result
     assert isinstance(error, Internal)
     assert error.reason == "MALFORMED_ANSWER"
 
 
 def test_the_error_names_field_and_call() -> None:
-    error = Played(localize(), [localized()], ConnectOptions()).result
+    error = Played(localize, [localized()], ConnectOptions()).result
     assert (error.field, error.request_id) == ("localization.world_from_camera.translation_m.x", "id-7")
-    assert "LocalizationService/Localize" in error.message
+    assert "answer of Localize violates" in error.message
 
 
 def test_a_lookup_that_breaks_its_contract_is_a_server_error() -> None:

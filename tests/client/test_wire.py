@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mapless import names, wire
-from mapless.calls.localization import localize
+from mapless import Client, names, wire
 from mapless.geometry import MAX_COORDINATE_M, Camera, RigidTransform
 from mapless.priors import PositionPrior, set_priors
 from mapless.requests import NewReference, create_request
@@ -38,7 +37,7 @@ def changed(**values: Any) -> Camera:
             "reference_id must be a text, is 3",
         ),
         (
-            lambda it: next(localize(b"x", CAMERA, "s", intrinsics_uncertainty=it)),
+            lambda it: Client("localhost").localize(b"x", CAMERA, "s", intrinsics_uncertainty=it),
             40,
             "must be an IntrinsicsUncertainty, .* is 40",
         ),

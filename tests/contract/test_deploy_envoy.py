@@ -6,7 +6,7 @@ from pathlib import Path
 import yaml  # type: ignore[import-untyped]
 from support.manifests import Json, built, check_confined, check_valid, needs_kubectl
 
-from mapless.exchange import SCENE_KEY
+from mapless.connection import SCENE_KEY
 from mapless.v1 import localization_service_pb2
 from mapless_server.services.handlers import SERVICE_NAMES
 from mapless_server.settings import Settings

@@ -17,7 +17,7 @@ from ray.serve.config import AutoscalingConfig
 from ray.serve.schema import ServeDeploySchema
 from support.manifests import CONFINED, VERSIONS, Json, built, check_confined, check_valid, needs_kubectl
 
-from mapless.exchange import SCENE_KEY
+from mapless.connection import SCENE_KEY
 from mapless_ray.app import build
 from mapless_ray.environment import variables
 from mapless_server.services.handlers import SERVICE_NAMES

@@ -22,7 +22,7 @@ from test_imports import LADDER
 from mapless import Camera, Client, NewReference, RigidTransform, pixels
 from mapless import errors as client_errors
 from mapless.cli.arguments import make_parser
-from mapless.exchange import MALFORMED_ANSWER
+from mapless.connection import MALFORMED_ANSWER
 from mapless.report.page import HEADLINES
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server import errors

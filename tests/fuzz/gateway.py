@@ -65,8 +65,7 @@ class _Client:
         )
         return answer
 
-    async def run(self, exchange: Any) -> Any:
-        request = next(exchange).request
+    async def call(self, method: str, request: Any, read: Any) -> Any:
         assert request.image
         return pb.LocalizeResponse()
 

@@ -18,7 +18,8 @@ from google.protobuf.message import Message
 from google.rpc import error_details_pb2, status_pb2
 
 from mapless import Client, ConnectOptions, InvalidArgument, MaplessError, NotFound, aio
-from mapless.exchange import Attempt, Call, Exchange, Pause, _Clock, attempts
+from mapless.client import _finished
+from mapless.connection import Connection
 from support.servers import CAMERA, PHOTO
 
 Connect: TypeAlias = Callable[..., Client]
@@ -215,40 +216,54 @@ def assert_fails_alike(what: str, scene: str, direct: Client, through: Client) -
     return there.value
 
 
-class Played:
-    """An exchange with scripted outcomes; the last is repeated.
+_CHANNEL = grpc.insecure_channel("localhost:1")  # never used
+
+
+class Played(Connection):
+    """A connection with scripted outcomes, of which the last is repeated; makes what it is asked to.
 
     Attributes:
         tries: the time left to each attempt, seconds.
+        calls: method and request of each attempt.
         pauses: seconds.
-        took_s: all of them together with the attempts, which take a second each.
-        result: what it returned, or its error.
+        result: what the calls returned, or their error.
     """
 
     def __init__(
-        self, exchange: Exchange[Any], outcomes: list[Any], options: ConnectOptions, dice: float = 0.5
+        self, ask: Callable[[Connection], Any], outcomes: list[Any], options: ConnectOptions, dice: float = 0.5
     ) -> None:
+        super().__init__("", options, _CHANNEL)
         self.tries: list[float] = []
-        self.calls: list[Call] = []
+        self.calls: list[tuple[str, Any]] = []
         self.pauses: list[float] = []
-        self.took_s = 0.0
-        clock = _Clock(lambda: self.took_s, lambda low, high: low + dice * (high - low))
-        steps = attempts(exchange, options, clock)
-        outcomes = list(outcomes)
+        self._outcomes, self._dice = list(outcomes), dice
         try:
-            step = next(steps)
-            while True:
-                if isinstance(step, Pause):
-                    self.pauses.append(step.duration_s)
-                    self.took_s += step.duration_s
-                    step = next(steps)
-                else:
-                    assert isinstance(step, Attempt)
-                    self.tries.append(step.timeout_s)
-                    self.calls.append(step.call)
-                    self.took_s += 1.0
-                    step = steps.send(outcomes.pop(0) if len(outcomes) > 1 else outcomes[0])
-        except StopIteration as end:
-            self.result: Any = end.value
+            self.result: Any = _finished(ask(self))
         except MaplessError as error:
             self.result = error
+
+    @property
+    def methods(self) -> list[str]:
+        return [method for method, _ in self.calls]
+
+    @property
+    def took_s(self) -> float:
+        """All of it; an attempt takes a second."""
+        return len(self.tries) + sum(self.pauses)
+
+    async def _response(self, method: str, request: Message, timeout_s: float) -> Any:
+        self.tries.append(timeout_s)
+        self.calls.append((method, request))
+        outcome = self._outcomes.pop(0) if len(self._outcomes) > 1 else self._outcomes[0]
+        if isinstance(outcome, MaplessError):
+            raise outcome
+        return outcome
+
+    async def _pause(self, duration_s: float, error: MaplessError) -> None:
+        self.pauses.append(duration_s)
+
+    def _now_s(self) -> float:
+        return self.took_s
+
+    def _uniform(self, low: float, high: float) -> float:
+        return low + self._dice * (high - low)

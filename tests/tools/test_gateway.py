@@ -92,7 +92,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
 
     async def localize(self: aio.Client, *given: Any, **named: Any) -> Any:
         calls.append(named | {"image": given[0], "camera": given[1], "scene": given[2]})
-        return await self.run(localization.localize(*given, **named))
+        return await localization.localize(self, *given, **named)
 
     monkeypatch.setattr(aio.Client, "localize", localize)
     return calls

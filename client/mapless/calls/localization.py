@@ -1,16 +1,17 @@
 """Localization of one photograph, of a rig's photographs, and of a sequence."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+from contextlib import aclosing
 from dataclasses import asdict, replace
 from datetime import datetime
-from functools import wraps
-from typing import Any, ParamSpec, TypeVar
+from inspect import signature
+from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
 from .. import wire
 from ..answer_messages import answer_from_message
 from ..answers import LocalizationResult, Rejected
 from ..axes import Axes
-from ..exchange import Call, Exchange
+from ..connection import Connection
 from ..geometry import Camera, RigidTransform
 from ..groups import (
     GroupRejected,
@@ -26,13 +27,12 @@ from ..priors import Priors, set_priors
 from ..requests import ImageSource, IntrinsicsUncertainty, read_image
 from ..v1 import localization_service_pb2 as pb
 
-SERVICE = "mapless.v1.LocalizationService"
-
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def localize(
+async def _localize_request(
+    connection: Connection,
     image: ImageSource,
     camera: Camera,
     scene: str,
@@ -53,7 +53,7 @@ def localize(
     capture_time: datetime | None = None,
     session_from_camera: RigidTransform | None = None,
     timeout_s: float | None = None,
-) -> Exchange[LocalizationResult | Rejected]:
+) -> pb.LocalizeRequest:
     """Localizes a photograph: estimates the pose of its camera.
 
     Args:
@@ -85,7 +85,7 @@ def localize(
     request = pb.LocalizeRequest(
         scene=scene,
         references=reference_names(scene, references),
-        image=read_image(image),
+        image=await connection.unblocked(read_image, image),
         intrinsics=wire.camera_to_message(camera),
         options=pb.LocalizeOptions(
             variant=wire.enum_value(pb.Variant, variant),
@@ -107,21 +107,35 @@ def localize(
         request.capture_time.FromDatetime(capture_time)
     if session_from_camera is not None:
         request.session_from_camera.CopyFrom(wire.transform_to_message(session_from_camera))
-    response = yield Call(f"{SERVICE}/Localize", request, pb.LocalizeResponse, timeout_s)
-    return answer_from_message(response)
+    return request
 
 
-def _asked_like(model: Callable[P, Any]) -> Callable[[Callable[..., T]], Callable[P, T]]:
-    """Decorator for a call that has the same parameters as `model`, for type checkers."""
+def _asked_like(
+    model: Callable[Concatenate[Connection, P], Coroutine[Any, Any, Any]],
+) -> Callable[[Callable[..., T]], Callable[Concatenate[Any, P], T]]:
+    """Decorator for a call that has the parameters of `model`, and its docstring if it has none of its own."""
 
-    def with_parameters(call: Callable[..., T]) -> Callable[P, T]:
-        return wraps(model, ("__annotations__", "__type_params__"), ())(call)
+    def with_parameters(call: Callable[..., T]) -> Callable[Concatenate[Any, P], T]:
+        own, any_call = signature(call), cast(Any, call)
+        any_call.__signature__ = signature(model).replace(return_annotation=own.return_annotation)
+        any_call.__doc__ = call.__doc__ or model.__doc__
+        return call
 
     return with_parameters
 
 
-@_asked_like(localize)
-def localize_progressively(*asked: Any, **named: Any) -> Exchange[LocalizationResult | Rejected]:
+@_asked_like(_localize_request)
+async def localize(  # noqa: D103, it has the docstring of the request
+    connection: Connection, *asked: Any, **named: Any
+) -> LocalizationResult | Rejected:
+    request = await _localize_request(connection, *asked, **named)
+    return await connection.call("Localize", request, answer_from_message, named.get("timeout_s"))
+
+
+@_asked_like(_localize_request)
+async def localize_progressively(
+    connection: Connection, *asked: Any, **named: Any
+) -> AsyncIterator[LocalizationResult | Rejected]:
     """Localizes a photograph; yields a coarse pose as soon as there is one, then the answer of `localize`.
 
     Yields at most two answers. The first, if there is one, is a `LocalizationResult` with `pose_stage` "COARSE": an
@@ -133,29 +147,23 @@ def localize_progressively(*asked: Any, **named: Any) -> Exchange[LocalizationRe
 
     Args and deadline are those of `localize`; the deadline holds for both answers together.
     """
-    unary = localize(*asked, **named)
-    call = replace(
-        next(unary),
-        method=f"{SERVICE}/LocalizeProgressively",
-        response_type=pb.LocalizeProgressivelyResponse,
-        early=_early_answer,
-    )
-    unary.close()
-    response: pb.LocalizeProgressivelyResponse = yield call
-    return answer_from_message(response.answer)
+    request, timeout_s = await _localize_request(connection, *asked, **named), named.get("timeout_s")
+    async with aclosing(connection.streamed("LocalizeProgressively", request, _streamed, timeout_s)) as answers:
+        async for answer in answers:
+            yield answer
 
 
-def _early_answer(message: pb.LocalizeProgressivelyResponse) -> LocalizationResult | None:
-    """Returns the coarse answer of a message; None if the message has the final answer."""
-    if message.is_final:
-        return None
+def _streamed(message: pb.LocalizeProgressivelyResponse) -> LocalizationResult | Rejected:
     answer = answer_from_message(message.answer)
+    if message.is_final:
+        return answer
     if isinstance(answer, Rejected):
         raise ValueError("a rejection that is not final")
     return replace(answer, is_final=False)
 
 
-def localize_rig(
+async def localize_rig(
+    connection: Connection,
     images: Sequence[RigImage],
     scene: str,
     *,
@@ -165,7 +173,7 @@ def localize_rig(
     capture_time: datetime | None = None,
     session_from_rig: RigidTransform | None = None,
     timeout_s: float | None = None,
-) -> Exchange[RigLocalization | GroupRejected]:
+) -> RigLocalization | GroupRejected:
     """Localizes a rig from photographs that its cameras took at the same moment.
 
     One pose is estimated from all photographs together, which can succeed where each photograph alone fails.
@@ -183,18 +191,18 @@ def localize_rig(
     """
     request = pb.LocalizeRigRequest(
         scene=scene_name(scene),
-        images=[_rig_image_to_message(image, scene) for image in images],
+        images=[await connection.unblocked(_rig_image_to_message, image, scene) for image in images],
         options=pb.LocalizeOptions(reference_count=reference_count, coverage=coverage, confidential=confidential),
     )
     if capture_time is not None:
         request.capture_time.FromDatetime(capture_time)
     if session_from_rig is not None:
         request.session_from_rig.CopyFrom(wire.transform_to_message(session_from_rig))
-    response = yield Call(f"{SERVICE}/LocalizeRig", request, pb.LocalizeRigResponse, timeout_s)
-    return rig_from_message(response)
+    return await connection.call("LocalizeRig", request, rig_from_message, timeout_s)
 
 
-def localize_sequence(
+async def localize_sequence(
+    connection: Connection,
     frames: Sequence[SequenceFrame],
     scene: str,
     *,
@@ -204,7 +212,7 @@ def localize_sequence(
     confidential: bool = False,
     axes: Axes | str = "",
     timeout_s: float | None = None,
-) -> Exchange[SequenceLocalization | GroupRejected]:
+) -> SequenceLocalization | GroupRejected:
     """Localizes a device from a few photographs and the poses that it tracked meanwhile, which may drift or jump.
 
     Where the photographs contradict the tracking, the sequence is cut, and the photographs after the cut are localized
@@ -223,7 +231,7 @@ def localize_sequence(
     """
     request = pb.LocalizeSequenceRequest(
         scene=scene_name(scene),
-        frames=[_frame_to_message(frame, scene) for frame in frames],
+        frames=[await connection.unblocked(_frame_to_message, frame, scene) for frame in frames],
         estimate_session_scale=estimate_session_scale,
         options=pb.LocalizeOptions(
             reference_count=reference_count,
@@ -232,8 +240,7 @@ def localize_sequence(
             axes=wire.enum_value(pb.Axes, axes),
         ),
     )
-    response = yield Call(f"{SERVICE}/LocalizeSequence", request, pb.LocalizeSequenceResponse, timeout_s)
-    return sequence_from_message(response)
+    return await connection.call("LocalizeSequence", request, sequence_from_message, timeout_s)
 
 
 def _uncertainty_to_message(uncertainty: IntrinsicsUncertainty) -> pb.IntrinsicsUncertainty:

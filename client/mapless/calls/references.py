@@ -1,13 +1,15 @@
 """Scenes and references: create, get, update, list, delete; retrieval, audit and coverage."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
+from functools import partial
+from typing import Any
 
 from numpy.typing import ArrayLike
 
 from .. import wire
+from ..connection import Connection
 from ..errors import AlreadyExists, MaplessError
-from ..exchange import Call, Exchange, Pages
 from ..geodesy import Datum
 from ..geometry import Camera, RigidTransform
 from ..names import reference_name, reference_names, scene_name, shown
@@ -29,17 +31,19 @@ from ..results import (
 from ..scenes import UNCHANGED, Calibration, UnchangedType, calibration_to_message, datum_to_message
 from ..v1 import reference_service_pb2 as pb
 from . import repeats
-from .repeats import SERVICE
+
+_PAGE_SIZE = 1000  # the server's maximum
 
 
-def create_scene(
+async def create_scene(
+    connection: Connection,
     scene_id: str,
     *,
     datum: Datum | None = None,
     down_in_world: ArrayLike | None = None,
     arbitrary_unit: bool = False,
     timeout_s: float | None = None,
-) -> Exchange[Scene]:
+) -> Scene:
     """Creates a scene without references.
 
     Args:
@@ -49,28 +53,28 @@ def create_scene(
         arbitrary_unit: whether its references' poses are in an arbitrary unit instead of metres.
         timeout_s: deadline of the call.
     """
-
-    def found(error: MaplessError) -> Exchange[pb.CreateSceneResponse]:
-        return pb.CreateSceneResponse(scene=(yield from repeats.created_scene(request, error)))
-
     request = pb.CreateSceneRequest(
         scene_id=scene_id,
         datum=None if datum is None else datum_to_message(datum),
         down_in_world=None if down_in_world is None else wire.vector_to_message(down_in_world),
         arbitrary_unit=arbitrary_unit,
     )
-    response = yield Call(f"{SERVICE}/CreateScene", request, pb.CreateSceneResponse, timeout_s, on_repeat=found)
-    return scene_from_message(response.scene)
+    on_repeat = partial(repeats.created_scene, request)
+    return await connection.call("CreateScene", request, _scene, timeout_s, on_repeat=on_repeat)
 
 
-def get_scene(scene: str, *, timeout_s: float | None = None) -> Exchange[Scene]:
+def _scene(response: Any) -> Scene:
+    return scene_from_message(response.scene, getattr(response, "warnings", ()))
+
+
+async def get_scene(connection: Connection, scene: str, *, timeout_s: float | None = None) -> Scene:
     """Gets a scene."""
     request = pb.GetSceneRequest(name=scene_name(scene))
-    response = yield Call(f"{SERVICE}/GetScene", request, pb.GetSceneResponse, timeout_s)
-    return scene_from_message(response.scene, response.warnings)
+    return await connection.call("GetScene", request, _scene, timeout_s)
 
 
-def update_scene(
+async def update_scene(
+    connection: Connection,
     scene: str,
     *,
     datum: Datum | UnchangedType | None = UNCHANGED,
@@ -78,7 +82,7 @@ def update_scene(
     calibration: Calibration | UnchangedType | None = UNCHANGED,
     arbitrary_unit: bool | UnchangedType | None = UNCHANGED,
     timeout_s: float | None = None,
-) -> Exchange[Scene]:
+) -> Scene:
     """Changes properties of a scene. A property that is not given keeps its value; None deletes it.
 
     Args:
@@ -104,75 +108,112 @@ def update_scene(
     if calibration is not None and calibration is not UNCHANGED:
         request.scene.calibration.CopyFrom(calibration_to_message(calibration))
     request.scene.arbitrary_unit = arbitrary_unit is True
-    response = yield Call(f"{SERVICE}/UpdateScene", request, pb.UpdateSceneResponse, timeout_s)
-    return scene_from_message(response.scene, response.warnings)
+    return await connection.call("UpdateScene", request, _scene, timeout_s)
 
 
-def list_scenes(*, page_size: int = 0, timeout_s: float | None = None) -> Pages[Scene]:
+async def list_scenes(
+    connection: Connection, *, page_size: int = 0, timeout_s: float | None = None
+) -> AsyncIterator[Scene]:
     """Lists all scenes by id, fetched page by page; the deadline holds for each page."""
-
-    def fetch(token: str) -> Exchange[tuple[list[Scene], str]]:
-        request = pb.ListScenesRequest(page_size=page_size, page_token=token)
-        page = yield Call(f"{SERVICE}/ListScenes", request, pb.ListScenesResponse, timeout_s)
-        return list(map(scene_from_message, page.scenes)), page.next_page_token
-
-    return Pages(fetch)
+    request = pb.ListScenesRequest(page_size=page_size)
+    scenes = connection.listed("ListScenes", request, lambda page: map(scene_from_message, page.scenes), timeout_s)
+    async for scene in scenes:
+        yield scene
 
 
-def delete_scene(scene: str, *, timeout_s: float | None = None) -> Exchange[None]:
+async def delete_scene(connection: Connection, scene: str, *, timeout_s: float | None = None) -> None:
     """Deletes a scene and all its references."""
     request = pb.DeleteSceneRequest(name=scene_name(scene))
-    yield Call(f"{SERVICE}/DeleteScene", request, pb.DeleteSceneResponse, timeout_s, on_repeat=repeats.gone)
+    await connection.call("DeleteScene", request, _nothing, timeout_s, on_repeat=repeats.gone)
 
 
-def add_reference(scene: str, reference: NewReference, *, timeout_s: float | None = None) -> Exchange[Reference]:
+def _nothing(response: Any) -> None:
+    pass
+
+
+async def add_reference(
+    connection: Connection, scene: str, reference: NewReference, *, timeout_s: float | None = None
+) -> Reference:
     """Stores a reference."""
-    request = create_request(scene_name(scene), reference)
-
-    def found(error: MaplessError) -> Exchange[pb.CreateReferenceResponse]:
-        return pb.CreateReferenceResponse(reference=(yield from repeats.stored_reference(request, error)))
-
-    response = yield Call(f"{SERVICE}/CreateReference", request, pb.CreateReferenceResponse, timeout_s, on_repeat=found)
-    return reference_from_message(response.reference, response.warnings)
+    request = await connection.unblocked(create_request, scene_name(scene), reference)
+    on_repeat = partial(repeats.stored_reference, request)
+    return await connection.call("CreateReference", request, _reference, timeout_s, on_repeat=on_repeat)
 
 
-def add_batch(
-    scene: str, requests: Sequence[pb.CreateReferenceRequest], timeout_s: float | None, there: dict[str, pb.Reference]
-) -> Exchange[list[Reference]]:
+def _reference(response: Any) -> Reference:
+    return reference_from_message(response.reference, getattr(response, "warnings", ()))
+
+
+async def add_references(
+    connection: Connection,
+    scene: str,
+    references: Iterable[NewReference],
+    *,
+    on_progress: Callable[[int], None] | None = None,
+    timeout_s: float | None = None,
+) -> list[Reference]:
+    """Stores many references, in as many messages as needed.
+
+    A message is stored whole or not at all. When one fails, the references of earlier messages remain stored:
+    call this again with all of them. Those that the scene has already, with the same photograph, intrinsics and
+    pose, are not stored again, and are returned and counted like the others; AlreadyExists names one that the scene
+    has with another photograph, intrinsics or pose.
+
+    Args:
+        scene: the scene.
+        references: the references; files are read when they are sent. asyncio's client reads them in another thread.
+        on_progress: called with the number stored so far, with those that were there, after each message.
+        timeout_s: deadline of each message; None for `upload_timeout_s`.
+    """
+    stored: list[Reference] = []
+    there: dict[str, Reference] = {}
+    batches = _batches(scene, references, connection.options)
+    while batch := await connection.unblocked(next, batches, None):
+        stored += await add_batch(connection, scene, batch, timeout_s, there)
+        if on_progress is not None:
+            on_progress(len(stored))
+    return stored
+
+
+async def add_batch(
+    connection: Connection,
+    scene: str,
+    requests: Sequence[pb.CreateReferenceRequest],
+    timeout_s: float | None,
+    there: dict[str, Reference],
+) -> list[Reference]:
     """Stores the references of one message that the scene does not have: either all of them or none.
 
     `there` are references that the scene is known to have, by name; they are listed into it if the server rejects a
     message because of one. AlreadyExists for one with the name of another photograph, camera or pose.
     """
     names = [reference_name(scene, it.reference_id) for it in requests]
-    _check_equal(requests, names, there)
-    new = [it for it, name in zip(requests, names, strict=True) if name not in there]
+    for name, wanted in zip(names, requests, strict=True):
+        if what := name in there and repeats.difference(wanted.reference, there[name]):
+            message = f"reference {shown(wanted.reference_id)} exists already, with another {what}"
+            raise AlreadyExists("ALREADY_EXISTS", message, resource=name)
+    new = [it for name, it in zip(names, requests, strict=True) if name not in there]
     request = pb.BatchCreateReferencesRequest(scene=scene_name(scene), requests=new)
-    call = Call(
-        f"{SERVICE}/BatchCreateReferences", request, pb.BatchCreateReferencesResponse, timeout_s, is_upload=True
-    )
     try:
-        response = (yield call) if new else pb.BatchCreateReferencesResponse()
+        if new:
+            there |= await connection.call("BatchCreateReferences", request, _by_name, timeout_s, is_upload=True)
     except AlreadyExists:  # an earlier upload, or an attempt whose answer was lost, has stored some
-        there |= yield from repeats.listed_references(scene_name(scene), timeout_s)
-        if not any(reference_name(scene, it.reference_id) in there for it in new):
+        known = {
+            f"{scene_name(scene)}/references/{it.reference_id}": it
+            async for it in list_references(connection, scene, page_size=_PAGE_SIZE, timeout_s=timeout_s)
+        }
+        if known.keys().isdisjoint(set(names) - there.keys()):
             raise
-        return (yield from add_batch(scene, requests, timeout_s, there))
+        there |= known
+        return await add_batch(connection, scene, requests, timeout_s, there)
     except MaplessError as error:
         _name_reference(error, new)
         raise
-    added = {it.name: reference_from_message(it, response.warnings) for it in response.references}
-    return [added[name] if name in added else reference_from_message(there[name]) for name in names]
+    return [there[name] for name in names]
 
 
-def _check_equal(
-    requests: Sequence[pb.CreateReferenceRequest], names: Sequence[str], there: Mapping[str, pb.Reference]
-) -> None:
-    """Raises AlreadyExists for a reference whose name another one has."""
-    for request, name in zip(requests, names, strict=True):
-        if what := name in there and repeats.difference(request.reference, there[name]):
-            message = f"reference {shown(request.reference_id)} exists already, with another {what}"
-            raise AlreadyExists("ALREADY_EXISTS", message, resource=name)
+def _by_name(response: pb.BatchCreateReferencesResponse) -> dict[str, Reference]:
+    return {it.name: reference_from_message(it, response.warnings) for it in response.references}
 
 
 def _name_reference(error: MaplessError, requests: Sequence[pb.CreateReferenceRequest]) -> None:
@@ -182,7 +223,7 @@ def _name_reference(error: MaplessError, requests: Sequence[pb.CreateReferenceRe
         error.args = (f"{error.reason}: reference {shown(requests[int(place[1])].reference_id)}: {error.message}",)
 
 
-def batches(
+def _batches(
     scene: str, references: Iterable[NewReference], options: ConnectOptions
 ) -> Iterator[list[pb.CreateReferenceRequest]]:
     """Yields requests in the references' order, in batches that fit a message; a larger request is sent alone."""
@@ -201,33 +242,36 @@ def batches(
         yield batch
 
 
-def get_reference(
-    scene: str, reference: str, *, include_image: bool = False, timeout_s: float | None = None
-) -> Exchange[Reference]:
+async def get_reference(
+    connection: Connection, scene: str, reference: str, *, include_image: bool = False, timeout_s: float | None = None
+) -> Reference:
     """Gets a reference, with its photograph if requested."""
     request = pb.GetReferenceRequest(name=reference_name(scene, reference), include_image=include_image)
-    response = yield Call(f"{SERVICE}/GetReference", request, pb.GetReferenceResponse, timeout_s)
-    return reference_from_message(response.reference)
+    return await connection.call("GetReference", request, _reference, timeout_s)
 
 
-def list_references(scene: str, *, page_size: int = 0, timeout_s: float | None = None) -> Pages[Reference]:
+async def list_references(
+    connection: Connection, scene: str, *, page_size: int = 0, timeout_s: float | None = None
+) -> AsyncIterator[Reference]:
     """Lists a scene's references by id, without photographs, page by page; the deadline holds for each page."""
+    request = pb.ListReferencesRequest(scene=scene_name(scene), page_size=page_size)
+    found = connection.listed(
+        "ListReferences", request, lambda page: map(reference_from_message, page.references), timeout_s
+    )
+    async for reference in found:
+        yield reference
 
-    def fetch(token: str) -> Exchange[tuple[list[Reference], str]]:
-        request = pb.ListReferencesRequest(scene=scene_name(scene), page_size=page_size, page_token=token)
-        page = yield Call(f"{SERVICE}/ListReferences", request, pb.ListReferencesResponse, timeout_s)
-        return list(map(reference_from_message, page.references)), page.next_page_token
 
-    return Pages(fetch)
-
-
-def delete_reference(scene: str, reference: str, *, timeout_s: float | None = None) -> Exchange[None]:
+async def delete_reference(
+    connection: Connection, scene: str, reference: str, *, timeout_s: float | None = None
+) -> None:
     """Deletes a reference."""
     request = pb.DeleteReferenceRequest(name=reference_name(scene, reference))
-    yield Call(f"{SERVICE}/DeleteReference", request, pb.DeleteReferenceResponse, timeout_s, on_repeat=repeats.gone)
+    await connection.call("DeleteReference", request, _nothing, timeout_s, on_repeat=repeats.gone)
 
 
-def retrieve_references(
+async def retrieve_references(
+    connection: Connection,
     image: ImageSource,
     camera: Camera,
     scene: str,
@@ -235,7 +279,7 @@ def retrieve_references(
     *,
     priors: Priors | None = None,
     timeout_s: float | None = None,
-) -> Exchange[list[RetrievedReference]]:
+) -> list[RetrievedReference]:
     """Finds the references most similar to a photograph; `localize` chooses among twice as many by feature matches.
 
     Args:
@@ -247,16 +291,25 @@ def retrieve_references(
         timeout_s: deadline of the call.
     """
     request = pb.RetrieveReferencesRequest(
-        scene=scene_name(scene), image=read_image(image), intrinsics=wire.camera_to_message(camera), count=count
+        scene=scene_name(scene),
+        image=await connection.unblocked(read_image, image),
+        intrinsics=wire.camera_to_message(camera),
+        count=count,
     )
     set_priors(request, priors or Priors())
-    response = yield Call(f"{SERVICE}/RetrieveReferences", request, pb.RetrieveReferencesResponse, timeout_s)
-    return list(map(retrieved_from_message, response.references))
+    return await connection.call(
+        "RetrieveReferences", request, lambda it: [*map(retrieved_from_message, it.references)], timeout_s
+    )
 
 
-def audit_scene(
-    scene: str, references: Sequence[str] = (), *, page_size: int = 0, timeout_s: float | None = None
-) -> Pages[ReferenceAudit]:
+async def audit_scene(
+    connection: Connection,
+    scene: str,
+    references: Sequence[str] = (),
+    *,
+    page_size: int = 0,
+    timeout_s: float | None = None,
+) -> AsyncIterator[ReferenceAudit]:
     """Examines references of a scene against their neighbours, by id; results are yielded as they arrive.
 
     Args:
@@ -266,23 +319,24 @@ def audit_scene(
         timeout_s: deadline of each call.
     """
     named = reference_names(scene, references)
-
-    def fetch(token: str) -> Exchange[tuple[list[ReferenceAudit], str]]:
-        request = pb.AuditSceneRequest(scene=scene_name(scene), references=named, page_size=page_size, page_token=token)
-        page = yield Call(f"{SERVICE}/AuditScene", request, pb.AuditSceneResponse, timeout_s)
-        return list(map(audit_from_message, page.audits)), page.next_page_token
-
-    return Pages(fetch)
+    request = pb.AuditSceneRequest(scene=scene_name(scene), references=named, page_size=page_size)
+    audits = connection.listed("AuditScene", request, lambda page: map(audit_from_message, page.audits), timeout_s)
+    async for audit in audits:
+        yield audit
 
 
-def check_coverage(
-    scene: str, world_from_camera: RigidTransform, camera: Camera, *, timeout_s: float | None = None
-) -> Exchange[Coverage]:
+async def check_coverage(
+    connection: Connection,
+    scene: str,
+    world_from_camera: RigidTransform,
+    camera: Camera,
+    *,
+    timeout_s: float | None = None,
+) -> Coverage:
     """Predicts whether a photograph taken at a pose would be localized."""
     request = pb.CheckCoverageRequest(
         scene=scene_name(scene),
         world_from_camera=wire.transform_to_message(world_from_camera),
         intrinsics=wire.camera_to_message(camera),
     )
-    response = yield Call(f"{SERVICE}/CheckCoverage", request, pb.CheckCoverageResponse, timeout_s)
-    return coverage_from_message(response)
+    return await connection.call("CheckCoverage", request, coverage_from_message, timeout_s)

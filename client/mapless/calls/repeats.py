@@ -9,44 +9,45 @@ from typing import Any
 import numpy as np
 
 from .. import wire
+from ..connection import Connection
 from ..errors import MaplessError, NotFound
-from ..exchange import Call, Exchange
 from ..geometry import Array
 from ..names import reference_name, scene_name
+from ..results import Reference, Scene, reference_from_message, scene_from_message
 from ..scenes import datum_from_message, direction_from_message
 from ..v1 import reference_service_pb2 as pb
 
-SERVICE = "mapless.v1.ReferenceService"
 _SAME = 1e-9  # metres, degrees, entries of a rotation or direction: rounding errors of normalization
-_PAGE_SIZE = 1000  # the server's maximum
 
 
-def gone(error: MaplessError) -> Exchange[None]:
+async def gone(connection: Connection, error: MaplessError) -> None:
     """Success if an earlier attempt has deleted the resource (the error is NOT_FOUND); any other error is raised."""
     if error.code != "NOT_FOUND":
         raise error
-    yield from ()
 
 
-def created_scene(wanted: pb.CreateSceneRequest, error: MaplessError) -> Exchange[pb.Scene]:
+async def created_scene(wanted: pb.CreateSceneRequest, connection: Connection, error: MaplessError) -> Scene:
     """Returns the existing scene if it is unchanged since creation and equals the wanted one; else raises the error."""
     if error.code != "ALREADY_EXISTS":
         raise error
-    get = pb.GetSceneRequest(name=scene_name(wanted.scene_id))
-    there: pb.Scene = (yield Call(f"{SERVICE}/GetScene", get, pb.GetSceneResponse)).scene
-    ours, theirs = _of_world(wanted), _of_world(there)
-    if there.generation != 1 or ours.shape != theirs.shape or not np.allclose(ours, theirs, rtol=0, atol=_SAME):
-        raise error
-    return there
+
+    def read(response: pb.GetSceneResponse) -> Scene:
+        there = response.scene
+        ours, theirs = _of_world(wanted), _of_world(there)
+        if there.generation != 1 or ours.shape != theirs.shape or not np.allclose(ours, theirs, rtol=0, atol=_SAME):
+            raise error
+        return scene_from_message(there)
+
+    return await connection.call("GetScene", pb.GetSceneRequest(name=scene_name(wanted.scene_id)), read)
 
 
-def stored_reference(wanted: pb.CreateReferenceRequest, error: MaplessError) -> Exchange[pb.Reference]:
+async def stored_reference(wanted: pb.CreateReferenceRequest, connection: Connection, error: MaplessError) -> Reference:
     """Returns the stored reference if it equals the wanted one; else raises the error."""
     if error.code != "ALREADY_EXISTS":
         raise error
-    get = pb.GetReferenceRequest(name=reference_name(wanted.scene, wanted.reference_id))
+    request = pb.GetReferenceRequest(name=reference_name(wanted.scene, wanted.reference_id))
     try:
-        there: pb.Reference = (yield Call(f"{SERVICE}/GetReference", get, pb.GetReferenceResponse)).reference
+        there = await connection.call("GetReference", request, lambda it: reference_from_message(it.reference))
     except NotFound:  # another client has deleted it
         raise error from None
     if difference(wanted.reference, there):
@@ -54,27 +55,14 @@ def stored_reference(wanted: pb.CreateReferenceRequest, error: MaplessError) -> 
     return there
 
 
-def listed_references(scene: str, timeout_s: float | None) -> Exchange[dict[str, pb.Reference]]:
-    """Lists all references of a scene, by name."""
-    listed: dict[str, pb.Reference] = {}
-    token = ""
-    while True:
-        request = pb.ListReferencesRequest(scene=scene, page_size=_PAGE_SIZE, page_token=token)
-        page = yield Call(f"{SERVICE}/ListReferences", request, pb.ListReferencesResponse, timeout_s)
-        listed |= {it.name: it for it in page.references}
-        token = page.next_page_token
-        if not token:
-            return listed
-
-
-def difference(wanted: pb.Reference, stored: pb.Reference) -> str:
+def difference(wanted: pb.Reference, stored: Reference) -> str:
     """What distinguishes two references of one name: "photograph", "intrinsics", "pose"; empty if they are equal."""
     if stored.image_sha256 != hashlib.sha256(wanted.image).hexdigest():
         return "photograph"
-    if stored.intrinsics != wanted.intrinsics:
+    if wire.camera_to_message(stored.camera) != wanted.intrinsics:
         return "intrinsics"
-    ours, theirs = (wire.transform_from_message(it.world_from_camera, "").matrix() for it in (wanted, stored))
-    return "" if np.allclose(ours, theirs, rtol=0, atol=_SAME) else "pose"
+    ours = wire.transform_from_message(wanted.world_from_camera, "").matrix()
+    return "" if np.allclose(ours, stored.world_from_camera.matrix(), rtol=0, atol=_SAME) else "pose"
 
 
 def _of_world(message: Any) -> Array:

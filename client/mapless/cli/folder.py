@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from ..answers import LocalizationResult, Rejected
 from ..client import Client
 from ..errors import MaplessError, ResourceExhausted
-from ..exchange import Pause
 from ..options import ConnectOptions
 
 EXIT_FAILED, EXIT_USAGE, EXIT_REJECTED = 1, 2, 3
@@ -65,9 +64,9 @@ class LimitedClient(Client):
         super().__init__(address, options)
         self._concurrency = concurrency
 
-    def _pause(self, pause: Pause) -> None:
-        self._concurrency.failed(pause.error)
-        super()._pause(pause)
+    async def _pause(self, duration_s: float, error: MaplessError) -> None:
+        self._concurrency.failed(error)
+        await super()._pause(duration_s, error)
 
 
 class Tally:

@@ -18,14 +18,11 @@ from starlette.types import ASGIApp
 
 from mapless import MaplessError, Rejected, Unavailable
 from mapless.aio import Client
-from mapless.exchange import Call, Exchange
 from mapless.names import parse_scene_name, scene_name
-from mapless.v1 import localization_service_pb2 as pb
 
 from . import geopose, openapi, plain
 from .guard import Failure, Guard, GuardOptions, of_server
 
-LOCALIZE = "mapless.v1.LocalizationService/Localize"
 _SENT_HEADERS = (
     "authorization",
     "connect-protocol-version",
@@ -178,7 +175,7 @@ class _Handlers:
     async def localize(self, request: Request) -> Response:
         client = self._client_for(request)
         asked = await plain.read_form(request.headers, request.stream(), self.options.scene)
-        response = await _while_connected(request, client.run(_localized(asked)))
+        response = await _while_connected(request, client.call("Localize", asked, lambda it: it))
         return JSONResponse(await asyncio.to_thread(plain.to_json, response))
 
     async def description(self, request: Request) -> Response:
@@ -207,11 +204,6 @@ async def _while_connected(request: Request, work: Coroutine[Any, Any, T]) -> T:
         raise
     finally:
         watching.cancel()
-
-
-def _localized(request: pb.LocalizeRequest) -> Exchange[pb.LocalizeResponse]:
-    response: pb.LocalizeResponse = yield Call(LOCALIZE, request, pb.LocalizeResponse)
-    return response
 
 
 async def _not_found(request: Request, error: Exception) -> Response:

@@ -1,5 +1,6 @@
 """When a call is tried again, and when not: decided without a server, by a planted clock."""
 
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 import pytest
@@ -8,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.clients import Played
 
+from mapless.connection import Connection
 from mapless.errors import (
     AlreadyExists,
     DeadlineExceeded,
@@ -18,7 +20,6 @@ from mapless.errors import (
     ResourceExhausted,
     Unavailable,
 )
-from mapless.exchange import Call, Exchange
 from mapless.options import ConnectOptions
 from mapless.wire import FieldError
 
@@ -30,9 +31,9 @@ def full(retry_after_s: float | None) -> MaplessError:
     return ResourceExhausted("RESOURCE_EXHAUSTED", "full", retry_after_s=retry_after_s)
 
 
-def asking(**given: Any) -> Exchange[Any]:
-    """An exchange of one call, which returns what it is answered."""
-    return (yield Call("s/M", Empty(), Empty, **given))
+def asking(**given: Any) -> Callable[[Connection], Coroutine[Any, Any, Any]]:
+    """Makes one call, and returns what it is answered."""
+    return lambda connection: connection.call("M", Empty(), lambda it: it, **given)
 
 
 def test_pauses_double_up_to_the_longest_and_are_counted() -> None:
@@ -117,8 +118,8 @@ def test_every_upload_has_the_time_of_uploads() -> None:
     assert Played(asking(is_upload=True, timeout_s=2.0), [Empty()], options).tries == [2.0]
 
 
-def found(error: MaplessError) -> Exchange[str]:
-    yield Call("s/Get", Empty(), Empty)
+async def found(connection: Connection, error: MaplessError) -> str:
+    await connection.call("Get", Empty(), lambda it: it)
     return f"found after {error.code}"
 
 
@@ -128,7 +129,7 @@ TAKEN, ABSENT = AlreadyExists("ALREADY_EXISTS", "taken"), NotFound("NOT_FOUND", 
 def test_a_change_whose_answer_was_lost_is_looked_up() -> None:
     played = Played(asking(on_repeat=found), [UNAVAILABLE, TAKEN, Empty()], ConnectOptions())
     assert played.result == "found after ALREADY_EXISTS"
-    assert [call.method for call in played.calls] == ["s/M", "s/M", "s/Get"]
+    assert played.methods == ["M", "M", "Get"]
 
 
 @pytest.mark.parametrize("outcomes", [[TAKEN], [full(0.1), TAKEN]])
@@ -138,8 +139,8 @@ def test_a_conflict_without_a_lost_try_is_an_error(outcomes: list[Any]) -> None:
 
 
 def test_the_error_is_raised_if_the_found_resource_differs() -> None:
-    def foreign(error: MaplessError) -> Exchange[str]:
-        yield Call("s/Get", Empty(), Empty)
+    async def foreign(connection: Connection, error: MaplessError) -> str:
+        await connection.call("Get", Empty(), lambda it: it)
         raise error
 
     assert Played(asking(on_repeat=foreign), [UNAVAILABLE, ABSENT, Empty()], ConnectOptions()).result is ABSENT
@@ -148,9 +149,9 @@ def test_the_error_is_raised_if_the_found_resource_differs() -> None:
 def test_the_lookup_after_a_lost_answer_has_the_remaining_time() -> None:
     """Each attempt takes a second, and there are 32 things to look up."""
 
-    def each(error: MaplessError) -> Exchange[None]:
+    async def each(connection: Connection, error: MaplessError) -> None:
         for _ in range(32):
-            yield Call("s/Get", Empty(), Empty)
+            await connection.call("Get", Empty(), lambda it: it)
 
     played = Played(asking(timeout_s=10.0, on_repeat=each), [UNAVAILABLE, TAKEN, Empty()], ConnectOptions())
     assert isinstance(played.result, DeadlineExceeded)
@@ -171,23 +172,11 @@ def test_no_time_is_not_the_usual_time(timeout_s: float) -> None:
 
 
 def test_an_answer_that_cannot_be_read_is_the_servers_fault() -> None:
-    def reading() -> Exchange[None]:
-        yield Call("s/M", Empty(), Empty)
+    def read(response: Any) -> None:
         raise FieldError("pose.translation_m.x", "must be finite, is nan")
 
-    error = Played(reading(), [Empty()], ConnectOptions()).result
+    error = Played(lambda it: it.call("M", Empty(), read), [Empty()], ConnectOptions()).result
     assert isinstance(error, Internal)
     assert (error.code, error.reason, error.field) == ("INTERNAL", "MALFORMED_ANSWER", "pose.translation_m.x")
-    assert "s/M" in error.message
+    assert "answer of M violates" in error.message
     assert isinstance(error.__cause__, FieldError)
-
-
-def test_a_request_that_cannot_be_made_is_the_callers() -> None:
-    def without_focal_length() -> Empty:
-        raise FieldError("camera", "is none")
-
-    def making() -> Exchange[None]:
-        yield Call("s/M", without_focal_length(), Empty)
-
-    with pytest.raises(FieldError, match="is none"):
-        Played(making(), [Empty()], ConnectOptions())
