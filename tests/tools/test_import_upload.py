@@ -14,7 +14,6 @@ from support.layouts import CAMERA, truth, write_image
 
 from mapless import (
     AlreadyExists,
-    DeadlineExceeded,
     Internal,
     InvalidArgument,
     MaplessError,
@@ -27,14 +26,15 @@ from mapless import (
 )
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_tools.dataset import Dataset, Frame
+from mapless_tools.ingest import upload as uploading
 from mapless_tools.ingest.existing import KnownReferences
 from mapless_tools.ingest.report import ImportReport
-from mapless_tools.ingest.upload import BATCH_BYTES, BATCH_COUNT, Uploader, UploadOptions
+from mapless_tools.ingest.upload import BATCH_COUNT, Uploader
 
 Fault = Callable[[Sequence[NewReference], int], MaplessError | None]
 """What the server answers to a message and to which call, None to store it."""
 
-QUICK = UploadOptions(parallel=2, busy_patience_s=1.0, away_patience_s=1.2)
+PARALLEL = 2
 
 
 class Server:
@@ -94,9 +94,9 @@ def frames_in(folder: Path, count: int = 20) -> list[Frame]:
     return frames
 
 
-def upload(server: Any, frames: Sequence[Frame], options: UploadOptions = QUICK) -> ImportReport:
+def upload(server: Any, frames: Sequence[Frame], parallel: int = PARALLEL) -> ImportReport:
     report = ImportReport("s", Dataset("d", tuple(frames), True, ""), frames)
-    Uploader(server, KnownReferences(server.stored.values()), report, options, lambda *_: None).run()
+    Uploader(server, KnownReferences(server.stored.values()), report, parallel, lambda *_: None).run()
     return report
 
 
@@ -115,18 +115,8 @@ def test_messages_are_bounded_and_few_are_in_flight(tmp_path: Path) -> None:
     assert report.went_well
     assert sorted(report.added) == sorted(server.stored) == names(frames)
     assert max(map(len, server.messages)) <= BATCH_COUNT
-    assert server.most_in_flight <= QUICK.parallel
+    assert server.most_in_flight <= PARALLEL
     assert server.stored["r007"].image_sha256 == hashlib.sha256(frames[7].image_path.read_bytes()).hexdigest()
-
-
-def test_large_photographs_go_in_smaller_messages(tmp_path: Path) -> None:
-    frames = frames_in(tmp_path, 4)
-    for frame in frames:
-        with frame.image_path.open("ab") as file:
-            file.write(bytes(BATCH_BYTES // 2))  # behind a PNG's end anything may stand
-    server = Server()
-    assert upload(server, frames, UploadOptions(parallel=1)).went_well
-    assert server.messages == [["r000"], ["r001"], ["r002"], ["r003"]]
 
 
 def test_a_difference_to_what_is_stored_is_refused_with_detail(tmp_path: Path) -> None:
@@ -168,7 +158,7 @@ def test_what_is_refused_is_not_counted_as_stored(tmp_path: Path) -> None:
     frames[1].image_path.write_bytes(b"")
     progress: list[tuple[int, int]] = []
     report = ImportReport("s", Dataset("d", tuple(frames), True, ""), frames)
-    uploader = Uploader(Server(), KnownReferences([]), report, QUICK, lambda step, *counts: progress.append(counts))  # type: ignore[arg-type]
+    uploader = Uploader(Server(), KnownReferences([]), report, PARALLEL, lambda step, *counts: progress.append(counts))  # type: ignore[arg-type]
     uploader.run()
     assert progress == [(0, 4), (3, 3)]
 
@@ -177,7 +167,7 @@ def test_the_same_image_under_another_id_is_the_same_reference(tmp_path: Path) -
     frames = frames_in(tmp_path, 3)
     twin = Frame("twin", frames[0].image_path, CAMERA, frames[0].world_from_camera)
     elsewhere = Frame("elsewhere", frames[1].image_path, CAMERA, RigidTransform.identity())
-    report = upload(Server(), [*frames, twin, elsewhere], UploadOptions(parallel=1))
+    report = upload(Server(), [*frames, twin, elsewhere], 1)
     assert [(item.frame, item.reason) for item in report.skipped] == [("twin", "the same image as r000")]
     assert "as r001" in refusals(report)["elsewhere"]
 
@@ -216,44 +206,25 @@ def test_an_unnamed_refusal_is_located_by_sending_parts(tmp_path: Path, error: M
     assert (len(report.added), report.stopped) == (9, "")
 
 
-BUSY = ResourceExhausted("RESOURCE_EXHAUSTED", "busy", reason="OVERLOADED", retry_after_s=0.05)
-
-
-@pytest.mark.parametrize(("error", "times"), [(BUSY, 3), (Unavailable("UNAVAILABLE", "starting"), 1)])
-def test_a_busy_or_absent_server_is_waited_for(tmp_path: Path, error: MaplessError, times: int) -> None:
-    server = Server(lambda references, call: error if call <= times else None)
+def test_a_server_that_restarts_is_waited_for(tmp_path: Path) -> None:
+    server = Server(lambda references, call: Unavailable("UNAVAILABLE", "starting") if call == 1 else None)
     assert upload(server, frames_in(tmp_path, 4)).went_well
-    assert len(server.messages) == times + 1
+    assert len(server.messages) == 2
 
 
-@pytest.mark.parametrize("kind", [Unavailable, DeadlineExceeded])
-def test_a_message_stored_despite_a_lost_answer_is_added(tmp_path: Path, kind: type[MaplessError]) -> None:
-    server = Server()
-
-    def fault(message: Sequence[NewReference], call: int) -> MaplessError | None:
-        if call > 1:
-            return None
-        server.store(message)
-        return kind("UNAVAILABLE", "connection reset")
-
-    server._fault = fault
-    report = upload(server, frames_in(tmp_path, 4), UploadOptions(parallel=1))
-    assert (sorted(report.added), report.skipped) == (["r000", "r001", "r002", "r003"], [])
-
-
-def test_references_added_by_another_caller_are_skipped(tmp_path: Path) -> None:
+def test_what_another_caller_stores_meanwhile_is_refused_alone(tmp_path: Path) -> None:
     frames = frames_in(tmp_path, 4)
     server = Server()
 
     def fault(message: Sequence[NewReference], call: int) -> MaplessError | None:
         if call == 1:
-            server.store(message[:2])
+            server.store([replace(message[1], image=b"another")])
         return None
 
     server._fault = fault
-    report = upload(server, frames, UploadOptions(parallel=1))
-    assert [item.frame for item in report.skipped] == ["r000", "r001"]
-    assert report.added == ["r002", "r003"]
+    report = upload(server, frames, 1)
+    assert refusals(report) == {"r001": "is there already, but its image differs"}
+    assert report.added == ["r000", "r002", "r003"]
 
 
 @pytest.mark.parametrize(
@@ -266,11 +237,12 @@ def test_references_added_by_another_caller_are_skipped(tmp_path: Path) -> None:
     ],
 )
 def test_what_hits_all_ends_the_import_and_the_next_run_goes_on(
-    tmp_path: Path, error: MaplessError, message: str
+    tmp_path: Path, error: MaplessError, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(uploading, "AWAY_S", 0.0)
     server = Server(lambda references, call: error if call > 1 else None)
     frames = frames_in(tmp_path)
-    report = upload(server, frames, UploadOptions(parallel=1, busy_patience_s=0.5, away_patience_s=0.6))
+    report = upload(server, frames, 1)
     assert message in report.stopped
     assert not report.went_well
     assert report.untried_count == 20 - BATCH_COUNT
@@ -294,6 +266,6 @@ def test_an_interruption_ends_it_soon_and_keeps_what_is_in(tmp_path: Path) -> No
 
     server = Interrupted()
     with pytest.raises(KeyboardInterrupt):
-        upload(server, frames_in(tmp_path), UploadOptions(parallel=1))
+        upload(server, frames_in(tmp_path), 1)
     assert began.is_set()
     assert (server.is_closed, len(server.messages)) == (True, 1)

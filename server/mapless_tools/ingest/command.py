@@ -99,7 +99,6 @@ def import_command(
     from .formats import KeyframeOptions, ReadOptions
     from .importing import ImportOptions, run_import
     from .metres import MetreOptions
-    from .upload import UploadOptions
 
     try:
         read = ReadOptions(
@@ -118,7 +117,7 @@ def import_command(
             max_count=max_count,
             id_prefix=id_prefix,
             check=not skip_check,
-            upload=UploadOptions(parallel=parallel),
+            parallel=parallel,
         )
         settings = _settings(data_dir, connection)
         went_well = run_import(folder, scene, options, settings, None if dry_run else connection, report)

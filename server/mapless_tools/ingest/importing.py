@@ -27,7 +27,7 @@ from .existing import NO_METRES, KnownReferences, WrongUnit, open_scene
 from .formats import ReadOptions, read_dataset
 from .metres import MetreOptions, in_metres
 from .report import WRONG_POSES, ImportReport, print_report, to_json, verdict_lines
-from .upload import Uploader, UploadOptions
+from .upload import Uploader
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,7 @@ class ImportOptions:
         max_count: largest number of frames, evenly spread; None for all.
         id_prefix: prefix of every reference's id, for several folders in one scene.
         check: whether to compare photographs with the poses first.
+        parallel: number of messages in flight, 1 to 64; the server describes their photographs concurrently.
     """
 
     format: str = "auto"
@@ -52,13 +53,15 @@ class ImportOptions:
     max_count: int | None = None
     id_prefix: str = ""
     check: bool = True
-    upload: UploadOptions = field(default_factory=UploadOptions)
+    parallel: int = 3
 
     def __post_init__(self) -> None:
         if self.split not in ("", "train", "test"):
             raise ValueError(f"split must be train or test, not {self.split!r}")
         if self.stride < 1 or (self.max_count is not None and self.max_count < 1):
             raise ValueError(f"stride and max must be at least 1, not {self.stride} and {self.max_count}")
+        if not 1 <= self.parallel <= 64:
+            raise ValueError(f"--parallel is the number of messages in flight, 1 to 64, not {self.parallel}")
         if self.id_prefix:
             check_id(f"{self.id_prefix}0")
 
@@ -100,7 +103,7 @@ def run_import(
         elif report.verdict is not None and report.verdict.is_wrong:
             report.stopped = WRONG_POSES
         else:
-            _store(report, options.upload, settings, connection)
+            _store(report, options.parallel, settings, connection)
     return report.went_well
 
 
@@ -135,7 +138,7 @@ def refuse_wrong_images(report: ImportReport) -> None:
             report.refused.append(Refusal(frame.name, f"{frame.image_path.name} {reason}"))
 
 
-def _store(report: ImportReport, options: UploadOptions, settings: Settings, connection: Connection) -> None:
+def _store(report: ImportReport, parallel: int, settings: Settings, connection: Connection) -> None:
     """Stores the chosen frames in the scene, which is created with the dataset's datum and down if missing."""
     try:
         with connected(connection, settings) as client, progress_bars() as progress:
@@ -145,7 +148,7 @@ def _store(report: ImportReport, options: UploadOptions, settings: Settings, con
             attributes = SceneAttributes(scene.datum, scene.down_in_world, arbitrary_unit=scene.arbitrary_unit)
             _warn(report, contradictions(poses, attributes))
             _warn(report, [another_unit([it.world_from_camera for it in existing], poses)])
-            Uploader(client, KnownReferences(existing), report, options, progress).run()
+            Uploader(client, KnownReferences(existing), report, parallel, progress).run()
     except WrongUnit as error:
         report.stopped = str(error)
     except (MaplessError, ServerFailed) as error:
