@@ -21,7 +21,7 @@ from mapless_server.engine.interface import EngineOptions
 from mapless_server.engine.query import Caller, Description, Photo, Query, Result, Tier
 from mapless_server.engine.stages import MAX_LISTINGS, QueryStages
 from mapless_server.engine.tiers import EscalationOptions
-from mapless_server.errors import DeadlineExceeded, InvalidArgument, Unavailable
+from mapless_server.errors import InvalidArgument, Unavailable
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.options import LocalizeOptions
@@ -31,7 +31,7 @@ from mapless_server.method.results import PoseStage
 from mapless_server.method.trust.judge import LEVELS, JudgeOptions
 from mapless_server.method.views import Features, Matches, PosedView, View
 from mapless_server.scenes import Narrowing, Sphere
-from mapless_server.scheduling import Abandoned, CostModel, Ending, Flow, Job, Next
+from mapless_server.scheduling import CostModel, Flow, Job, Next
 from mapless_server.security import SceneKey
 from mapless_server.serve.assembly import engine_over
 from mapless_server.store import NewReference, SelfCalibration, Store, calibrations
@@ -293,16 +293,6 @@ class TestTiers:
         seen = setting.extractors["strong"].seen
         assert sum(np.array_equal(image, textured(seed=7)) for image in seen) == 1
 
-    def test_a_deadline_that_passes_in_the_first_tier_is_no_answer(self, setting: Setting) -> None:
-        def slow(_: View, __: Sequence[PosedView], check: Callable[[], None]) -> Answer:
-            time.sleep(0.3)
-            check()
-            return localized(SURE_INLIERS)
-
-        setting.replies = {"cheap": slow}
-        with pytest.raises(DeadlineExceeded):
-            setting.localize(deadline_s=0.2)
-
     def test_tiers_share_neither_names_nor_what_remembers_matches(self, setting: Setting) -> None:
         cheap, strong = setting.engine.tiers
         same_name = Tier(StandInExtractor("cheap"), strong.pipeline)
@@ -389,42 +379,6 @@ class TestRematching:
         result = setting.localize(deadline_s)
         assert result.tier.extractor.name == "strong"
         assert planted.calls == calls
-
-    def test_a_pair_that_waited_too_long_is_not_begun(self, setting: Setting) -> None:
-        planted = self.pair_matching(setting)
-        stages = QueryStages(setting.engine.tiers, ESCALATION, whole(lambda *_: rejected()))
-        job = setting.engine.query_job(query_of(("r0", "r1")), caller())
-        job.step.payload.__dict__["tier"] = 1
-        for stage in ("prepare", "coarse"):
-            (done,) = stages.prepare([job])
-            assert isinstance(done, Next)
-            job.step = done.step
-            assert job.step.stage == stage
-            job.step.payload.__dict__["deadline_s"] = time.monotonic()
-        assert planted.calls == 0
-
-    def test_a_sure_photograph_is_not_matched_again(self, setting: Setting) -> None:
-        planted = self.pair_matching(setting)
-        setting.replies["cheap"] = localized(SURE_INLIERS)
-        setting.localize()
-        assert planted.calls == 0
-
-
-class TestMemory:
-    def test_a_group_photo_is_counted_with_its_group_only(
-        self, setting: Setting, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        setting.replies["cheap"] = localized(SURE_INLIERS)
-        run, sizes = setting.engine.queue.run, list[int]()
-
-        def noted(job: Job) -> Any:
-            sizes.append(job.size_bytes)
-            return run(job)
-
-        monkeypatch.setattr(setting.engine.queue, "run", noted)
-        setting.localize()
-        setting.localize(is_part=True)
-        assert sizes == [len(PHOTO), 0]
 
 
 class TestPhotograph:
@@ -521,21 +475,6 @@ class TestDescribingReferences:
         assert took_s - seconds >= 2 * self.STEP_S
         assert seconds >= self.STEP_S, "the photograph's own description is part of it"
 
-    def test_nor_does_one_that_is_given_up(self, setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
-        add_undescribed(setting, 2)
-        stages = QueryStages(setting.engine.tiers, ESCALATION)
-        job = setting.engine.query_job(query_of(("new0", "new1")), caller())
-
-        def extract(*_: Any) -> View:
-            time.sleep(self.STEP_S)
-            job.end(Ending.CANCELLED, None)
-            return View(CAMERA, FEATURES)
-
-        monkeypatch.setattr(setting.extractors["cheap"], "extract", extract)
-        (verdict,) = stages.prepare([job])
-        assert isinstance(verdict, Abandoned)
-        assert job.unusual_s >= self.STEP_S
-
 
 def query_of(reference_ids: tuple[str, ...]) -> Query:
     photo = Photo(PHOTO, CAMERA, "image")
@@ -551,13 +490,6 @@ def add_undescribed(setting: Setting, count: int) -> None:
 
 
 class TestDescribe:
-    def test_every_tier_once_and_without_pixels(self, setting: Setting) -> None:
-        photos = [Photo(encode(".png", textured(seed=i)), CAMERA, "image") for i in range(5)]
-        described = setting.describe(photos)
-        assert [list(found.views) for found in described] == [["cheap", "strong"]] * 5
-        assert all(view.photograph is None for found in described for view in found.views.values())
-        assert [len(it.seen) for it in setting.extractors.values()] == [5, 5]
-
     def test_a_bad_image_names_its_field(self, setting: Setting) -> None:
         photos = [Photo(PHOTO, CAMERA, "requests[0].image"), Photo(PHOTO[:-50], CAMERA, "requests[1].image")]
         with pytest.raises(InvalidArgument) as caught:

@@ -7,7 +7,7 @@ import pytest
 
 from mapless_server import errors
 from mapless_server.engine.failures import failure_of
-from mapless_server.scheduling import Abandoned, Failure
+from mapless_server.scheduling import Failure
 
 LOST = [
     "CUDA error: an illegal memory access was encountered\nCUDA kernel errors might be asynchronously reported",
@@ -74,14 +74,6 @@ def test_memory_of_the_host() -> None:
     assert failure_of(caught(lambda: np.zeros(2**56, np.uint8))) is Failure.OUT_OF_MEMORY  # a kind of its own
 
 
-@pytest.mark.parametrize(
-    "error",
-    [Abandoned(), ValueError("x"), KeyError("x"), ArithmeticError("NaN"), OSError(28, "no space"), StopIteration()],
-)
-def test_everything_else_is_of_the_item(error: Exception) -> None:
-    assert failure_of(error) is Failure.JOB_FAILED
-
-
 def test_an_earlier_handled_failure_does_not_affect_this_one() -> None:
     def handle() -> None:
         try:
@@ -107,10 +99,6 @@ class TestTorch:
         assert failure_of(torch.AcceleratorError(LOST[0])) is Failure.DEVICE_LOST
         assert failure_of(torch.AcceleratorError("a text of a later version")) is Failure.DEVICE_LOST
         assert failure_of(torch.AcceleratorError("CUDA error: out of memory")) is Failure.OUT_OF_MEMORY
-
-    def test_shapes_that_do_not_fit(self) -> None:
-        torch = pytest.importorskip("torch", reason="the networks' extra is not installed")
-        assert failure_of(caught(lambda: torch.ones(2, 3) @ torch.ones(2, 3))) is Failure.JOB_FAILED
 
     def test_memory_of_the_host(self) -> None:
         """Torch says it with a RuntimeError of its own words."""

@@ -17,14 +17,11 @@ from support.images import encode, textured
 from fuzz import benchmarks, captures, colmap
 from fuzz.images import chunk
 from fuzz.importing import Layout
-from mapless.geometry import Camera, RigidTransform
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, decode_image, png_chunks
 from mapless_server.images.png_chunks import essential_png
 from mapless_server.security import SecurityError, read_tokens
 from mapless_server.settings import ConfigError, load_settings
-from mapless_server.store import codec
-from mapless_tools.dataset import Refusal, printable
 from mapless_tools.ingest.formats import read_dataset
 
 RGB = textured(32, 32)
@@ -238,24 +235,6 @@ def test_messages_about_a_refused_frame_can_be_printed(tmp_path: Path, name: str
         text.encode()
 
 
-def test_messages_about_a_refused_folder_can_be_printed(tmp_path: Path) -> None:
-    of = layout(captures.LAYOUTS, "nerfstudio")
-    folder = written(tmp_path, of, b'"test_filenames"', b'"train_filenames": ["\\ud800\\u001b"], "test_filenames"')
-    (folder / "transforms.json").write_bytes(
-        (folder / "transforms.json").read_bytes().replace(b'"./images/0.png"]', b'"\\ud800\\u001b"]')
-    )
-    with pytest.raises(ValueError, match="in both splits") as caught:
-        read_dataset(folder)
-    assert str(caught.value).isprintable()
-
-
-def test_printable_keeps_printable_and_shows_other_characters() -> None:
-    assert printable("Küche/照片 1.jpg") == "Küche/照片 1.jpg"
-    assert printable("a\x1b\n\ud800\u2028") == "a\\x1b\\n\\ud800\\u2028"
-    assert len(printable("x" * 10_000)) < 1010
-    assert Refusal("\x07", "\x1b") == Refusal("\\x07", "\\x1b")
-
-
 def test_names_in_a_file_of_tokens_are_printed_as_text(tmp_path: Path) -> None:
     file = tmp_path / "tokens.json"
     file.write_text('{"\\u001b[2J\\u2028": 1}')
@@ -305,17 +284,3 @@ def test_the_password_of_a_url_in_another_setting_is_not_shown(tmp_path: Path, n
 
 def test_a_password_with_a_line_break_is_not_shown_either() -> None:
     assert "ter2" not in str(load_settings({"capture_dir": "postgresql://u:hun\nter2@db:5432/mapless"}))
-
-
-@pytest.mark.parametrize(
-    "data", [b"", b"{}", b"[]", b"null", b"\xff", b"1" * 5000, b"[" * 100_000, b'{"camera": 1, "world_from_camera": 2}']
-)
-def test_stored_bytes_of_another_form_are_damaged(data: bytes) -> None:
-    """They were a KeyError, a TypeError or a UnicodeDecodeError, and so an internal error of the whole scene."""
-    sha256 = codec.sha256_for("owner", data)
-    for read in (codec.decode_geometry, codec.decode_view, codec.decode_attributes):
-        with pytest.raises(codec.Damaged):
-            read("owner", data, sha256)
-    camera, pose = Camera(32, 33, 30.0, 31.0, 15.5, 16.0), RigidTransform.identity()
-    stored = codec.encode_geometry(camera, pose)
-    assert codec.decode_geometry("owner", stored, codec.sha256_for("owner", stored))[0] == camera

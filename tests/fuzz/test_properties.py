@@ -9,7 +9,6 @@ import math
 import struct
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,22 +17,18 @@ from hypothesis import strategies as st
 from rich.console import Console
 from support.images import encode, textured
 
-from fuzz import localization
 from fuzz.images import chunk
 from fuzz.importing import CAMERA, image_of
 from fuzz.laws import check_pose, check_received_camera
 from mapless import names, wire
 from mapless.geometry import Camera, Distortion, Fisheye, RadialTangential, RigidTransform, rotation_from_vector
-from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless.wire import MAX_SIDE_PX, MIN_SIDE_PX, FieldError
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, decode_image, image_size
 from mapless_server.images.png_chunks import essential_png
-from mapless_server.services.messages.answers import answer_frames_of
-from mapless_server.services.messages.queries import query_from_message
 from mapless_server.services.messages.references import Page
-from mapless_server.store import SceneAttributes, codec
+from mapless_server.store import codec
 from mapless_tools.dataset import Dataset, Refusal, legal_id, printable
 from mapless_tools.ingest.formats import read_dataset
 from mapless_tools.ingest.formats.writing import LAYOUTS, PosedImage
@@ -105,61 +100,10 @@ def test_no_extra_chunk_or_cut_of_a_png_changes_a_pixel(further: list[tuple[byte
     assert essential_png(essential_png(data)) == essential_png(data)
 
 
-@given(st.binary(max_size=300))
-def test_bytes_of_no_format_are_refused(data: bytes) -> None:
-    with pytest.raises(InvalidArgument) as caught:
-        decode_image(data, LIMITS, "photo")
-    assert caught.value.field == "photo"
-    assert caught.value.reason.startswith("IMAGE_")
-
-
 @given(cameras(), poses())
 def test_what_the_interface_allows_is_accepted_and_comes_back(camera: Camera, pose: RigidTransform) -> None:
     check_received_camera(camera)
     check_pose(pose)
-
-
-def read(request: pb.LocalizeRequest) -> None:
-    """As the service does, up to the values that the engine gets."""
-    answer_frames_of(request)
-    query_from_message(request, "acme", localization.ENGINE, SceneAttributes())
-
-
-_NUMBERS = [
-    "intrinsics.focal_x_px",
-    "intrinsics.principal_y_px",
-    "intrinsics.radial_tangential.k1",
-    "position_prior.position_m.x",
-    "position_prior.radius_m",
-    "heading_prior.direction.y",
-    "heading_prior.sigma_deg",
-    "pose_prior.world_from_camera.rotation.x",
-    "pose_prior.world_from_camera.translation_m.z",
-    "session_from_camera.translation_m.y",
-    "options.coverage",
-]
-
-
-@pytest.mark.parametrize("path", _NUMBERS)
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_a_number_that_is_none_is_refused_by_its_field(path: str, value: float) -> None:
-    """The guilty field, or the message that it belongs to."""
-    request = pb.LocalizeRequest.FromString(localization.seeds()[3][1:])
-    full = pb.LocalizeRequest.FromString(localization.seeds()[2][1:])
-    for field in ("heading_prior", "pose_prior"):
-        getattr(request, field).CopyFrom(getattr(full, field))
-    request.session_from_camera.CopyFrom(full.pose_prior.world_from_camera)
-    request.intrinsics.radial_tangential.k1 = 0.1
-    read(request)
-    message: Any = request
-    *parents, name = path.split(".")
-    for parent in parents:
-        message = getattr(message, parent)
-    setattr(message, name, value)
-    with pytest.raises(FieldError) as caught:
-        read(request)
-    assert path.startswith(caught.value.field)
-    assert caught.value.field.count(".") >= 1
 
 
 @settings(max_examples=25)

@@ -1,7 +1,6 @@
 """The final adjustment: its derivatives, its elimination of the points, and its accuracy."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,9 +9,9 @@ from support.compare import assert_jacobian, assert_pose_close, pose_error
 from support.planted import NOISE, disturbed, drifted, stages, true_correspondences, true_structure
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
-from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless.geometry import Array, RigidTransform
 from mapless_server.method.adjust import adjust_pose
-from mapless_server.method.bundle import Bundle, BundleProblem, Poses
+from mapless_server.method.bundle import Bundle, BundleProblem
 from mapless_server.method.optimize import MinimizeOptions, minimize
 from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.pose_problem import AdjustOptions, optimum, pose_problem
@@ -62,17 +61,6 @@ def test_gradient_equals_finite_differences_of_the_cost(moved: float, tolerance:
     )
 
 
-def test_a_lower_curvature_changes_neither_gradient_nor_minimum() -> None:
-    problem, state = problem_of("curvature", 1e-3)
-    curved = problem.replaced(least_curvature=0.5)
-    plain, longer = problem.linearize(state), curved.linearize(state)
-    for name in ("pose_gradient", "point_gradient"):
-        np.testing.assert_allclose(getattr(longer, name), getattr(plain, name), rtol=1e-9, atol=1e-9)
-    assert np.linalg.eigvalsh(plain.pose_block - longer.pose_block).min() > -1e-6 * plain.pose_block.max()
-    ends = [minimize(it, state, MinimizeOptions(100, 1e-14)).world_from_query for it in (problem, curved)]
-    assert_pose_close(ends[1], ends[0], metres=1e-6, degrees=1e-5)
-
-
 def test_the_optimum_is_near_that_of_many_steps() -> None:
     """By less than a standard deviation of the residuals."""
     for case in range(3):
@@ -80,28 +68,6 @@ def test_the_optimum_is_near_that_of_many_steps() -> None:
         far = minimize(problem, state, MinimizeOptions(60, 1e-14))
         near = optimum(problem, state, AdjustOptions())
         assert problem.query_motion_sigma(far, near, problem.linearize(far)) < 1
-
-
-def test_cameras_turn_together_as_each_alone_to_the_last_bit() -> None:
-    random = random_for("turns")
-    motion = random.normal(size=(500, 6)) * 10.0 ** random.uniform(-12, 0.5, (500, 1))
-    motion[0] = 0
-    turned = Poses(np.tile(np.eye(3), (500, 1, 1)), np.zeros((500, 3))).moved(motion).rotation
-    np.testing.assert_array_equal(turned, [rotation_from_vector(it[3:]) @ np.eye(3) for it in motion])
-
-
-def test_replaced_problems_share_sorted_observations_and_cost_the_same() -> None:
-    problem, state = problem_of("replaced")
-    motion = random_for("replaced").normal(size=(int((problem.view == 3).sum()), 2, 4))
-    changes: dict[str, Any] = {
-        "keypoint_motion": motion,
-        "intrinsics_information": np.ones(4),
-        "intrinsics_offset": np.ones(4),
-    }
-    state = replace(state, intrinsics=np.array([1e-3, 0.5, -0.5, 2e-3]))
-    wider, sorted_again = problem.replaced(**changes), replace(problem, **changes)
-    assert wider.by_view.sums is problem.by_view.sums
-    assert wider.cost(state) == sorted_again.cost(state)
 
 
 def residuals(problem: BundleProblem, state: Bundle) -> Array:
@@ -139,53 +105,6 @@ def test_reduced_step_equals_the_step_of_the_full_system(damping: float) -> None
     np.testing.assert_allclose(actual, expected, atol=2e-3 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("moved", [0.0, 1e-3])
-def test_normal_equations_equal_sums_over_plain_rows(moved: float) -> None:
-    problem, state = problem_of("plain", moved)
-    residual, by_point, by_pose = problem.by_view.linearized(state)
-    weight = 1 / (1 + (residual**2).sum(axis=0) / problem.loss_scale_sigma**2)
-    size, count = 6 * len(state.poses.rotation), len(state.points)
-    matrix, gradient = np.zeros((size + 3 * count,) * 2), np.zeros(size + 3 * count)
-    for o, (point, view) in enumerate(zip(problem.by_view.point, problem.by_view.view, strict=True)):
-        jacobian = np.zeros((2, len(gradient)))
-        jacobian[:, 6 * view : 6 * view + 6] = by_pose[:, :, o]
-        jacobian[:, size + 3 * point : size + 3 * point + 3] = by_point[:, :, o]
-        matrix += weight[o] * jacobian.T @ jacobian
-        gradient += weight[o] * jacobian.T @ residual[:, o]
-    inverse = np.linalg.inv(matrix[size:, size:])
-    reduced, right, eliminated = problem.by_view.equations(state, problem.loss_scale_sigma).reduced(0.0)
-    crossed = matrix[:size, size:] @ inverse
-    expected = matrix[:size, :size] - crossed @ matrix[size:, :size]
-    np.testing.assert_allclose(reduced, expected, atol=1e-9 * np.abs(matrix[:size, :size]).max())
-    slopes = gradient[:size] - crossed @ gradient[size:]
-    np.testing.assert_allclose(right, slopes, atol=1e-9 * np.abs(gradient[:size]).max())
-    motion = random_for("plain motion").normal(0, 1e-3, size)
-    steps = -inverse @ (gradient[size:] + matrix[size:, :size] @ motion)
-    np.testing.assert_allclose(eliminated.steps(motion).ravel(), steps, atol=1e-9 * np.abs(steps).max())
-
-
-def test_a_point_that_is_not_determined_gives_no_step() -> None:
-    problem, state = problem_of("singular")
-    equations = problem.linearize(state)
-    equations.point_block[:, 3] = 0.0
-    assert problem.step(state, equations, 1e-4) is None
-
-
-def test_reference_motion_is_the_motion_from_the_given_pose() -> None:
-    problem, state = problem_of("prior")
-    np.testing.assert_allclose(problem.reference_motion(state), 0, atol=1e-12)
-    motion = random_for("prior motion").normal(0, 1e-4, (len(state.poses.rotation), 6))
-    error = problem.reference_motion(state.moved(motion, np.zeros_like(state.points)))
-    np.testing.assert_allclose(error, motion[:-1], atol=1e-7)
-
-
-def test_cost_is_nan_for_a_point_behind_a_camera() -> None:
-    problem, state = problem_of("behind")
-    points = state.points.copy()
-    points[0] = [0.0, 0.0, -100.0]
-    assert np.isnan(problem.cost(replace(state, points=points)))
-
-
 # The adjustment
 
 
@@ -221,13 +140,13 @@ def test_exact_references_do_not_make_the_pose_worse() -> None:
 
 def test_references_with_errors_of_their_own_improve_the_pose() -> None:
     """The position; the angle loses at most a twentieth, for allowing for a drift that is not there."""
-    before, after = mean_errors(1.0, MANY_POINTS, seeds=40)
+    before, after = mean_errors(1.0, MANY_POINTS, seeds=24)
     assert after[0] < 0.95 * before[0]
     assert after[1] < 1.05 * before[1]
 
 
 def test_references_that_drift_hold_the_pose_by_the_nearest() -> None:
-    before, after = mean_errors(0.0, MANY_POINTS, seeds=40, drift=1.0)
+    before, after = mean_errors(0.0, MANY_POINTS, seeds=16, drift=1.0)
     assert (after < 0.9 * before).all()
 
 
@@ -308,29 +227,6 @@ def test_matches_with_large_errors_are_not_used() -> None:
     assert isinstance(estimate, PoseEstimate)
     adjusted = adjust_pose(scene.query, scene.references, structure, wrong, estimate, AdjustOptions())
     assert_pose_close(adjusted.world_from_camera, scene.world_from_query, metres=1e-3, degrees=0.01)
-
-
-def test_the_covariance_is_symmetric_and_positive() -> None:
-    """Its size is tested in test_uncertainty."""
-    scene = make_scene(random_for("covariance"), FEW_POINTS)
-    structure, matches, estimate = stages(scene, scene.references)
-    adjusted = adjust_pose(scene.query, scene.references, structure, matches, estimate, AdjustOptions())
-    assert adjusted.is_adjusted
-    assert adjusted.intrinsics
-    assert np.linalg.eigvalsh(adjusted.covariance - adjusted.intrinsics.pose_covariance).min() > 0
-    np.testing.assert_allclose(adjusted.covariance, adjusted.covariance.T)
-    assert np.linalg.eigvalsh(adjusted.covariance).min() > 0
-
-
-def test_the_input_is_not_modified() -> None:
-    scene = make_scene(random_for("untouched"), FEW_POINTS)
-    structure, matches, estimate = stages(scene, scene.references)
-    points = structure.x_in_world.copy()
-    poses = [r.world_from_camera.matrix() for r in scene.references]
-    adjust_pose(scene.query, scene.references, structure, matches, estimate, AdjustOptions())
-    np.testing.assert_array_equal(structure.x_in_world, points)
-    for reference, pose in zip(scene.references, poses, strict=True):
-        np.testing.assert_array_equal(reference.world_from_camera.matrix(), pose)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3])

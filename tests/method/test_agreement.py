@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.planted import moved_references, true_correspondences, true_structure
+from support.planted import true_correspondences, true_structure
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
-from mapless.geometry import RigidTransform
 from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.results import PoseEstimate, Support
 from mapless_server.method.trust import evidence
@@ -109,18 +108,3 @@ def test_guided_matches_take_no_part_beside_others() -> None:
     assert disagreement_of_matches(mixed, DISTANCE_M, OPTIONS) < 0.01
     only = replace(support, matches=replace(support.matches, guided=np.ones(len(wrong), bool)))
     assert disagreement_of_matches(only, DISTANCE_M, OPTIONS) < 0.01
-
-
-def test_the_unit_and_the_world_frame_do_not_matter() -> None:
-    scene = planted("frame")
-    support = solved(scene)
-    world = RigidTransform(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([3.0, -2.0, 1.0]))
-    structure = replace(support.structure, x_in_world=world.apply(support.structure.x_in_world))
-    turned = replace(support, structure=structure, references=moved_references(support.references, world))
-    assert disagreement_of_matches(turned, DISTANCE_M, OPTIONS) == pytest.approx(
-        disagreement_of_matches(support, DISTANCE_M, OPTIONS), rel=1e-3
-    )
-    larger = replace(support, structure=replace(structure, x_in_world=1000 * structure.x_in_world))
-    assert disagreement_of_matches(larger, 1000 * DISTANCE_M, OPTIONS) == pytest.approx(
-        disagreement_of_matches(support, DISTANCE_M, OPTIONS), rel=1e-3
-    )

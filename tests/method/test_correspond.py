@@ -205,15 +205,6 @@ def test_wide_matches_contain_the_strict_ones() -> None:
         assert {tuple(m) for m in matcher.match_references(first, second).tolist()} == strict
 
 
-def test_matches_with_the_query_are_query_first() -> None:
-    scene = make_scene(random_for("query first"), SceneOptions(reference_count=2))
-    for matches, shown in zip(
-        Matcher().correspond(scene.query, scene.references).query_matches, scene.reference_points, strict=True
-    ):
-        true = {tuple(m) for m in same_points(scene.query_points, shown).tolist()}
-        assert len(true & {tuple(m) for m in matches.tolist()}) > 0.98 * len(true)
-
-
 def test_without_features_there_are_no_matches() -> None:
     scene = make_scene(random_for("blank"), SceneOptions(reference_count=2))
     blank = View(CAMERA, features(np.empty((0, 128)), np.empty((0, 2))))
@@ -247,16 +238,6 @@ def test_pairs_of_references_are_matched_once(matched_pairs: list[tuple[Features
     assert len(matched_pairs) == 10 + 4  # the query's alone
     for pair, matches in once.reference_pairs.items():
         np.testing.assert_array_equal(again.reference_pairs[pair], matches)
-
-
-def test_a_cached_pair_keeps_the_order_of_its_columns() -> None:
-    scene = make_scene(random_for("order"), SceneOptions(reference_count=2))
-    matcher = Matcher()
-    first, second = scene.references
-    forth, back = matcher.match_references(first, second), matcher.match_references(second, first)
-    fresh = Matcher().match_references(second, first)
-    np.testing.assert_array_equal(back, fresh)
-    assert {tuple(m) for m in forth.tolist()} != {tuple(m) for m in back.tolist()}
 
 
 def test_matches_depend_neither_on_the_order_nor_on_the_other_references() -> None:
@@ -360,16 +341,6 @@ class TestPairMatching:
             np.testing.assert_array_equal(found[pair], expected)
         assert sum(map(len, found.values())) > sum(map(len, usual.values()))
 
-    def test_wide_strong_pairs_are_made_from_the_strict_ones(self) -> None:
-        first, second = self.SCENE.references[:2]
-        pairs = AnyRatio()
-        matcher = Matcher(pair_matching=pairs)
-        anew = matcher.match_pair(first, second, True, True)
-        strict = matcher.match_pair(first, second, strong=True)
-        pairs.seen.clear()
-        np.testing.assert_array_equal(matcher.match_pair(first, second, True, True, strict), anew)
-        assert not pairs.seen
-
     def test_strong_pairs_have_names_of_their_own(self) -> None:
         one, other = AnyRatio(), AnyRatio()
         other.name = "other weights"
@@ -389,20 +360,6 @@ def test_what_determines_matches_is_in_their_name() -> None:
     names = {Matcher(options).matching(wide) for options in (usual, *changed) for wide in (False, True)}
     assert len(names) == 5 + 3  # strict matches do not depend on the options of wide ones
     assert Matcher(replace(usual, query_ratio=0.5)).matching() == Matcher(usual).matching()
-
-
-def test_the_cache_is_bounded_and_drops_the_least_recently_used(matched_pairs: list[tuple[Features, Features]]) -> None:
-    scene = make_scene(random_for("bounded"), SceneOptions(reference_count=4, point_count=50))
-    a, b, c, d = scene.references
-    matcher = Matcher(CorrespondOptions(remembered_pairs=2))
-    for first, second in ((a, b), (a, c), (a, b), (a, d)):  # forgets (a, c), since (a, b) was used after it
-        matcher.match_references(first, second)
-    assert len(matched_pairs) == 3
-    matcher.match_references(a, b)
-    matcher.match_references(a, d)
-    assert len(matched_pairs) == 3
-    matcher.match_references(a, c)
-    assert len(matched_pairs) == 4
 
 
 def test_pairs_of_a_deleted_reference_leave_the_cache(matched_pairs: list[tuple[Features, Features]]) -> None:
@@ -448,13 +405,6 @@ def test_references_are_chosen_by_a_sample_unless_it_has_few_matches(
         np.testing.assert_array_equal(matches, expected)
 
 
-def test_where_there_is_nothing_to_choose_each_is_matched_once(matched_pairs: list[tuple[Features, Features]]) -> None:
-    scene = make_scene(random_for("no choice"), SceneOptions(reference_count=3, point_count=100))
-    assert sorted(Matcher().match_best(scene.query, scene.references, 3, best_by_count(3))) == [0, 1, 2]
-    assert len(matched_pairs) == 3
-    assert Matcher().match_best(scene.query, [], 3, best_by_count(3)) == {}
-
-
 # Query matching
 
 
@@ -478,16 +428,6 @@ def test_a_query_matcher_leaves_references_to_the_matcher() -> None:
     assert ours.reference_pairs.keys() == usual.reference_pairs.keys()
     for pair, matches in usual.reference_pairs.items():
         np.testing.assert_array_equal(ours.reference_pairs[pair], matches)
-
-
-def test_given_query_matches_are_used_as_they_are() -> None:
-    scene = make_scene(random_for("known"), SceneOptions(reference_count=3))
-    fixed = Fixed()
-    matcher = Matcher(query_matching=fixed)
-    first = matcher.correspond(scene.query, scene.references)
-    second = matcher.correspond(scene.query, scene.references, wide=True, query_matches=first.query_matches)
-    assert fixed.calls == 1
-    assert second.query_matches == first.query_matches
 
 
 def test_the_check_cancels_the_matching_of_the_query() -> None:

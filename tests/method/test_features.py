@@ -73,14 +73,6 @@ def test_planted_blobs_are_found_at_their_positions() -> None:
     assert_is_well_formed(view.features)
 
 
-def test_opencvs_default_upscaling_shifts_by_a_quarter_pixel() -> None:
-    """The reason for the extractor's option; when this fails, OpenCV's default has changed."""
-    image, centres = blobs(random_for("blobs"), CAMERA)
-    found = cv2.SIFT.create(contrastThreshold=0.02).detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
-    bias = misses(np.array([k.pt for k in found]), centres).mean(axis=0)
-    np.testing.assert_allclose(np.abs(bias), 0.25, atol=0.05)
-
-
 def test_keypoint_sizes_grow_with_the_blobs() -> None:
     near, _ = blobs(random_for("sizes"), CAMERA)
     far = cv2.resize(near, (200, 150), interpolation=cv2.INTER_AREA)
@@ -218,11 +210,6 @@ def test_the_name_changes_with_every_option_of_the_features() -> None:
     }
     assert len(names) == 4
     assert SiftExtractor().name == SiftExtractor(SiftOptions()).name == make_extractor("sift").name
-
-
-def test_unknown_extractors_are_refused() -> None:
-    with pytest.raises(ValueError, match="unknown features 'surf'"):
-        make_extractor("surf")
 
 
 def test_features_of_inconsistent_shapes_are_refused() -> None:

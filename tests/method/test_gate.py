@@ -191,12 +191,6 @@ def test_poses_within_the_bounds_are_one_place() -> None:
     assert not (isinstance(outcome, Rejection) and outcome.reason is RejectionReason.AMBIGUOUS)
 
 
-def test_no_second_pose_is_searched_if_nearly_all_matches_agree(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Most queries are saved the search."""
-    monkeypatch.setattr(ambiguity, "ransac", None)
-    assert isinstance(answer_of(SCENE.references).outcome, Localization)
-
-
 def test_outliers_without_a_common_pose_are_no_second_place(monkeypatch: pytest.MonkeyPatch) -> None:
     """Half of the keypoints lie anywhere."""
     search = Mock(wraps=ransac)

@@ -42,13 +42,6 @@ def test_rig_ransac_finds_the_planted_pose(wrong_share: float) -> None:
     assert inlier_count(cameras, found, OPTIONS.inlier_px) >= round(180 * (1 - wrong_share))
 
 
-def test_three_matches_of_three_cameras_determine_a_pose() -> None:
-    cameras = planted(random_for("three"), (1, 1, 1))
-    found = rig_ransac(cameras, OPTIONS)
-    assert found is not None
-    assert inlier_count(cameras, found, OPTIONS.inlier_px) == 3
-
-
 @pytest.mark.parametrize("unit", [0.37, 1.0, 25.0])
 def test_scaled_ransac_finds_the_planted_pose_and_scale(unit: float) -> None:
     """Metres per unit, not units per metre."""

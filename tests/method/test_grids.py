@@ -1,8 +1,5 @@
 """Pictures for networks: planted blobs are where the picture's camera projects them, for any lens, shape and size."""
 
-import math
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -17,7 +14,6 @@ from mapless.geometry import Array, Camera, Fisheye, RadialTangential
 from mapless_server.method.coarse.grids import (
     Grid,
     GridOptions,
-    Layout,
     common_grid,
     fitted_grid,
     lay_out,
@@ -114,16 +110,6 @@ def test_large_photographs_nearly_equal_the_official_loaders() -> None:
     assert np.sqrt((difference**2).mean()) < 0.7
 
 
-def test_distortion_below_half_a_pixel_is_ignored() -> None:
-    photograph, camera = textured(640, 480), camera_of(640, 480)
-    slight = replace(camera, distortion=RadialTangential(k1=1e-3))
-    grid = natural_grid(camera, OPTIONS)
-    np.testing.assert_array_equal(
-        lay_out(slight, grid, OPTIONS).picture(photograph), lay_out(camera, grid, OPTIONS).picture(photograph)
-    )
-    assert lay_out(replace(camera, distortion=RadialTangential(k1=1e-2)), grid, OPTIONS).undistorts
-
-
 @pytest.mark.parametrize("grid", [Grid(37, 28), Grid(28, 37), Grid(46, 22)], ids=str)
 @pytest.mark.parametrize("name", CAMERAS)
 def test_planted_blobs_are_where_the_camera_projects_them(name: str, grid: Grid) -> None:
@@ -167,24 +153,6 @@ def test_shown_is_the_mask_of_the_photographs_pixels(camera: Camera) -> None:
     photograph = textured(camera.width_px, camera.height_px)
     filling = layout.picture(photograph)[:, ~shown]
     assert (filling == filling[:, :1]).all()
-
-
-def test_pictures_show_the_expected_share_of_a_photograph() -> None:
-    """A landscape grid shows all of a portrait or a panorama; most of a lens, but nothing beyond the field's bound."""
-
-    def share(layout: Layout) -> float:
-        return 1.0 if layout.shown is None else float(layout.shown.mean())
-
-    panorama = lay_out(CAMERAS["panorama"], natural_grid(CAMERAS["panorama"], OPTIONS), OPTIONS)
-    assert panorama.grid == Grid(46, 22)
-    assert share(panorama) == pytest.approx(panorama.grid.aspect / (1242 / 375), abs=0.01)
-    portrait = lay_out(camera_of(480, 640), Grid(37, 28), OPTIONS)
-    assert share(portrait) == pytest.approx(0.75 / portrait.grid.aspect, abs=0.01)
-    for name in ("barrel", "fisheye", "fisheye beyond a half-space"):
-        layout = lay_out(CAMERAS[name], natural_grid(CAMERAS[name], OPTIONS), OPTIONS)
-        assert share(layout) > 0.99
-        corner = layout.camera.rays(np.array([-0.5, -0.5]))
-        assert np.abs(corner[:2]).max() <= math.tan(math.radians(OPTIONS.max_half_field_deg)) + 1e-2
 
 
 def test_photographs_of_extreme_shapes_have_a_picture() -> None:

@@ -1,7 +1,6 @@
 """Errors of a photograph's intrinsics: their derivatives, the evidence of them, and what they add to a covariance."""
 
 import re
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -14,15 +13,12 @@ from mapless.geometry import Array, Camera, Distortion, Fisheye, RadialTangentia
 from mapless_server.method.adjust import adjust_pose
 from mapless_server.method.intrinsics import (
     ContradictionOptions,
-    IntrinsicsEquations,
     IntrinsicsEvidence,
     corrected,
     keypoint_motion,
 )
 from mapless_server.method.options import IntrinsicsSigma
 from mapless_server.method.pose_problem import AdjustOptions, pose_problem, with_intrinsics
-from mapless_server.method.priors.known import NO_PRIORS
-from mapless_server.method.recalibrate import _with_errors
 from mapless_server.method.rejection import Advice, IntrinsicsParameter, Rejection, RejectionReason
 from mapless_server.method.results import PoseEstimate, Support
 from mapless_server.method.trust.intrinsics import WrongCameraOptions, intrinsics_checks, wrong_camera, wrong_intrinsics
@@ -80,12 +76,6 @@ def test_planted_errors_are_found_within_their_sigma(parameter: str) -> None:
     assert (np.abs(evidence.value)[wrong] > 4 * evidence.sigma[wrong]).any()
 
 
-def test_right_intrinsics_have_no_significant_errors() -> None:
-    found = [adjusted(make_scene(random_for("right", i))).intrinsics for i in range(5)]
-    normalized = np.array([it.value / it.sigma for it in found if it])
-    assert np.abs(normalized).max() < 1.5
-
-
 def test_what_the_matches_of_a_reference_share_is_in_the_sigma() -> None:
     """A wrong focal length of two references of five, by which the photograph's is off and more uncertain."""
     scene = make_scene(random_for("shared error"), SceneOptions(reference_count=5))
@@ -98,17 +88,6 @@ def test_what_the_matches_of_a_reference_share_is_in_the_sigma() -> None:
     assert off
     assert off.sigma[0] > 2 * right.sigma[0]
     assert abs(off.value[0]) < 3 * off.sigma[0]
-
-
-def test_matches_that_no_reference_sees_are_as_certain_as_their_regions() -> None:
-    random = np.random.default_rng(0)
-    regions = np.stack([np.eye(4)] * 3), random.normal(size=(3, 4))
-    one, two = (
-        IntrinsicsEquations(np.stack([np.eye(4)] * count), np.ones((count, 4)), *regions, np.zeros((6, 4)))
-        for count in (1, 2)
-    )
-    for ours, theirs in zip(*(it.estimate(np.zeros(4), np.ones(4), 1.0, 1.0) for it in (one, two)), strict=True):
-        np.testing.assert_allclose(ours, theirs)
 
 
 def test_a_flat_wall_does_not_determine_the_focal_length() -> None:
@@ -184,20 +163,6 @@ def test_a_prior_as_wide_as_that_of_estimates_ends() -> None:
     found = adjusted(scene, IntrinsicsSigma(focal_share=0.24))
     assert found.intrinsics
     assert found.intrinsics.removed[0] == pytest.approx(-0.26, abs=0.005)
-
-
-def test_too_few_matches_determine_no_intrinsics() -> None:
-    """Nothing is computed from them: no warnings, which are errors here."""
-    scene = make_scene(random_for("too few"))
-    structure, matches, estimate = stages(scene, scene.references)
-    terms = scene.query, scene.references, structure, matches
-    found = adjust_pose(*terms, estimate, AdjustOptions())
-    assert found.intrinsics
-    usual = IntrinsicsSigma().of(scene.query.camera)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        nowhere = replace(found, world_from_camera=found.world_from_camera.shifted(np.array([0.0, 50.0, 0.0])))
-        assert _with_errors(*terms, nowhere, AdjustOptions(), NO_PRIORS, usual, usual) is None
 
 
 def test_right_intrinsics_are_never_rejected() -> None:

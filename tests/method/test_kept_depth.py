@@ -14,7 +14,7 @@ from mapless_server.method.kept_depth import KeptDepthOptions, with_kept_depths
 from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions, Variant
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.results import DepthPlanes, Structure
+from mapless_server.method.results import Structure
 from mapless_server.method.structure import StructureOptions, triangulated_structure
 from mapless_server.method.structure import observe as observations_of
 from mapless_server.method.tracks import Tracks
@@ -56,11 +56,6 @@ def point_numbers(structure: Structure, references: tuple[PosedView, ...]) -> Ar
 
 def replace_depths(reference: PosedView) -> PosedView:
     return next(it for it in SCENE.references if it.key == reference.key)
-
-
-def test_without_depths_the_structure_is_the_same_object() -> None:
-    structure, correspondences = matched(SCENE.references)
-    assert with_kept_depths(structure, SCENE.references, correspondences) is structure
 
 
 def test_a_keypoint_that_only_the_query_matches_gets_a_point() -> None:
@@ -200,10 +195,3 @@ def test_a_map_of_another_size_than_its_camera_is_an_error() -> None:
         KeptDepth(SCENE.query.camera, np.ones((2, 2), np.float32), 0.02)
     with pytest.raises(ValueError, match="relative_sigma"):
         KeptDepth(SCENE.query.camera.resized(2, 2), np.ones((2, 2), np.float32), 0.0)
-
-
-def test_distances_from_planes_are_signed_and_weighted() -> None:
-    planes = DepthPlanes(np.array([[0.0, 0.0, 1.0]] * 2), np.array([2.0, 1.0]), np.array([4.0, 0.0]))
-    points = np.array([[5.0, 5.0, 2.5], [0.0, 0.0, 9.0]])
-    assert planes.distance(points) == pytest.approx([0.5, 8.0])
-    assert planes.cost(points) == pytest.approx(4 * 0.25)

@@ -27,7 +27,6 @@ from mapless_server.method.features.edgepoint2 import SIZE_OF_WIDTH, EdgePoint2E
 from mapless_server.method.features.network import (  # noqa: E402
     LearnedOptions,
     image_tensor,
-    peak_offsets,
     strict_maxima,
 )
 from mapless_server.method.features.xfeat import SHIFT_PX, XfeatExtractor  # noqa: E402
@@ -151,16 +150,6 @@ def test_aliked_scores_and_descriptors_are_those_of_kornia(aliked: AlikedExtract
         torch.testing.assert_close(ours, (scores, network.desc_head(features, [keypoints])[0][0]), rtol=0, atol=2e-5)
 
 
-def test_a_wide_peak_has_a_large_keypoint_size(aliked: AlikedExtractor, monkeypatch: pytest.MonkeyPatch) -> None:
-    centres = np.rint(peaks(random_for("wide"), 320, 256))
-    sizes = []
-    for sigma_px in (0.5, 1.0, 3.0):
-        score_map = bumps(centres, 320, 256, sigma_px)
-        monkeypatch.setattr(FIND_MAPS, lambda *_, s=score_map: planted(s))
-        sizes.append(np.median(aliked.extract(np.zeros((256, 320, 3), np.uint8), CAMERA).features.sizes_px))
-    assert 0 < sizes[0] < sizes[1] < sizes[2] <= 4 * np.sqrt(8)  # all weight in the corners of five by five pixels
-
-
 def test_xfeat_keypoints_are_the_peaks_of_the_keypoint_map(
     xfeat: XfeatExtractor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -243,12 +232,6 @@ def test_strict_maxima_equal_brute_force() -> None:
                 expected.append([x, y])
     assert strict_maxima(scores, 5, 10.0).tolist() == expected
     assert 3 < len(expected) < 40
-
-
-def test_offsets_find_the_maximum_of_a_parabola() -> None:
-    x, y = torch.meshgrid(torch.arange(9.0), torch.arange(7.0), indexing="xy")
-    heights = 5 - 0.3 * (x - 4.3) ** 2 - 0.7 * (y - 2.6) ** 2
-    torch.testing.assert_close(peak_offsets(heights, torch.tensor([[4, 3]])), torch.tensor([[0.3, -0.4]]))
 
 
 @pytest.mark.parametrize("name", ["aliked", "xfeat", "edgepoint2"])

@@ -73,17 +73,6 @@ def tensors(query: View, references: Sequence[View]) -> list[Tensor]:
     return [torch.from_numpy(a) for a in arrays]
 
 
-def test_values_in_the_padding_have_no_effect(views: tuple[View, list[View]]) -> None:
-    made = network()
-    position, descriptor, positions, descriptors, mask = tensors(*views)
-    loud = ~mask[..., None]
-    with torch.inference_mode():
-        index, score = made(position, descriptor, positions, descriptors, mask)
-        index_loud, score_loud = made(position, descriptor, positions + 9 * loud, descriptors + 1e3 * loud, mask)
-    torch.testing.assert_close(score, score_loud, atol=1e-6, rtol=0)
-    torch.testing.assert_close(index[score > 0.01], index_loud[score > 0.01])
-
-
 def test_it_pauses_between_layers(views: tuple[View, list[View]]) -> None:
     query, references = views
     made, inputs, pauses = network(), tensors(query, references[:1]), list[None]()

@@ -138,28 +138,6 @@ def test_refinement_makes_a_rough_pose_accurate() -> None:
     assert max(errors[Variant.FULL][1], errors[Variant.BEST][1]) < 0.5 * errors[Variant.COARSE][1]
 
 
-@pytest.mark.nightly
-def test_best_beats_full_under_noisy_reference_poses() -> None:
-    errors: dict[Variant, list[float]] = {Variant.FULL: [], Variant.BEST: []}
-    for seed in range(24):
-        scene = make_scene(random_for("average", seed), SceneOptions(point_count=300))
-        random = random_for("reference noise", seed)
-        references = [
-            replace(reference, world_from_camera=disturbed(reference.world_from_camera, random, 0.003, 0.06))
-            for reference in scene.references
-        ]
-        for variant, mine in errors.items():
-            found = pose_of(localize(scene.query, references, Pipeline(), LocalizeOptions(variant)))
-            mine.append(pose_error(found.world_from_camera, scene.world_from_query)[0])
-    assert np.mean(errors[Variant.BEST]) < 0.7 * np.mean(errors[Variant.FULL])
-
-
-def disturbed(pose: RigidTransform, random: np.random.Generator, metres: float, degrees: float) -> RigidTransform:
-    """The pose with normal noise on its centre and rotation."""
-    turn = rotation_from_vector(random.normal(0.0, np.radians(degrees), 3))
-    return RigidTransform(pose.rotation @ turn, pose.translation + random.normal(0.0, metres, 3))
-
-
 def test_wrong_keypoints_and_few_points_do_not_prevent_a_pose() -> None:
     for seed in range(4):
         scene = make_scene(

@@ -1,12 +1,9 @@
 """Matching: planted pairs, votes, and the guided search against loops."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from support.planted import true_correspondences, true_structure
 from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for
 
@@ -16,7 +13,6 @@ from mapless_server.method.match import PAPER_MATCH, MatchOptions, match_points,
 from mapless_server.method.observations import ONE_PIXEL
 from mapless_server.method.results import PointMatches, Structure
 from mapless_server.method.tracks import Tracks
-from mapless_server.method.views import Features, View
 
 NOTHING = PointMatches(np.empty(0, np.intp), np.empty(0, np.intp), np.empty(0, bool), 0.0)
 
@@ -169,17 +165,6 @@ def test_the_guided_search_equals_brute_force(options: MatchOptions, off_m: floa
         assert not set(found.keypoint) & set(known.keypoint)
 
 
-def test_the_papers_search_finds_planted_pairs_in_its_radius() -> None:
-    scene = make_scene(random_for("paper"), SceneOptions(noise_px=0.3))
-    structure, true = true_structure(scene)
-    near = about(scene.world_from_query, 0.03, 0.3)  # about 10 px
-    found = match_points(scene.query, scene.references, structure, query_matches(), near, PAPER_MATCH)
-    assert len(pairs_of(found) & pairs_of(true)) > 0.95 * len(true)
-    far = about(scene.world_from_query, 0.0, 5.0)  # 70 px
-    found = match_points(scene.query, scene.references, structure, query_matches(), far, PAPER_MATCH)
-    assert len(pairs_of(found) & pairs_of(true)) == 0
-
-
 def test_the_guided_search_keeps_the_votes() -> None:
     scene = make_scene(random_for("adds"), SceneOptions(noise_px=0.3))
     structure, true = true_structure(scene)
@@ -192,37 +177,3 @@ def test_the_guided_search_keeps_the_votes() -> None:
     np.testing.assert_array_equal(found.guided, np.arange(len(found)) >= len(voted))
     assert len(pairs_of(found) & pairs_of(true)) > 0.95 * len(true)
     assert len(pairs_of(found) - pairs_of(true)) < 0.01 * len(true)
-
-
-def test_similarity_is_the_best_observations() -> None:
-    """A point seen by two references, one of which shows it changed: the other is enough."""
-    scene = make_scene(random_for("best"), SceneOptions(reference_count=2, descriptor_noise=0.0, seen_share=1.0))
-    structure, true = true_structure(scene)
-    last = scene.references[1]
-    random = random_for("best descriptors")
-    others = random.permutation(last.view.features.descriptors)
-    changed = replace(last, view=replace(last.view, features=replace(last.view.features, descriptors=others)))
-    references = (scene.references[0], changed)
-    found = search(scene.query, references, structure, scene.world_from_query, NOTHING, MatchOptions(radius_px=5.0))
-    assert len(pairs_of(found) & pairs_of(true)) > 0.95 * len(true)
-
-
-@pytest.mark.parametrize("options", [PAPER_MATCH, MatchOptions()])
-def test_without_points_or_keypoints_nothing_is_found(options: MatchOptions) -> None:
-    scene = make_scene(random_for("nothing"), SceneOptions(point_count=60))
-    structure, _ = true_structure(scene)
-    none = query_matches(*[[] for _ in scene.references])
-    nothing: NDArray[np.intp] = np.empty(0, np.intp)
-    empty = Structure(np.empty((0, 3)), Tracks(nothing, nothing, nothing), ONE_PIXEL)
-    away = RigidTransform(
-        np.diag([-1.0, 1.0, -1.0]) @ scene.world_from_query.rotation, scene.world_from_query.translation
-    )
-    blank = View(
-        CAMERA, Features(np.empty((0, 2), np.float32), np.empty((0, 128), np.float32), np.empty(0, np.float32))
-    )
-    for query, points, pose in (
-        (scene.query, empty, scene.world_from_query),
-        (scene.query, structure, away),
-        (blank, structure, scene.world_from_query),
-    ):
-        assert len(match_points(query, scene.references, points, none, pose, options)) == 0

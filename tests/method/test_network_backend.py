@@ -14,7 +14,7 @@ pytest.importorskip("torch", reason="the networks' extra is not installed")
 pytest.importorskip("PIL", reason="the networks' extra is not installed")
 
 from safetensors.torch import save_file
-from support.grey_network import OPTIONS, GreyRunner, arrays_of, assert_same_bits, grey_backend, grey_request, greys_of
+from support.grey_network import OPTIONS, arrays_of, assert_same_bits
 from support.images import textured
 from support.programs import printed
 from support.small_networks import (
@@ -40,24 +40,9 @@ from mapless_server.networks import mapanything, pi3
 from mapless_server.networks.mapanything import MapAnything
 from mapless_server.networks.pi3 import Pi3
 from mapless_server.networks.runner import NetworkRunner
-from mapless_server.networks.weights import CATALOGUE, CheckpointError, WeightsMissing, named
+from mapless_server.networks.weights import CheckpointError, WeightsMissing, named
 
 # What is asked of the network
-
-
-def test_the_catalogue_has_the_weights_of_every_backend() -> None:
-    assert {it.name for it in CATALOGUE if it.purpose == "backend"} == set(NETWORKS)
-
-
-def test_views_keep_their_order_in_the_reconstruction() -> None:
-    runner = GreyRunner()
-    outcome = reconstruct_one(grey_backend(runner), *grey_request(7, 50, 100, 150))
-    assert greys_of(outcome) == [7, 50, 100, 150]
-    assert isinstance(outcome, Reconstruction)
-    assert outcome.query.camera.width_px == 70
-    assert [view.confidence.shape for view in outcome.references] == [(56, 70)] * 3
-    np.testing.assert_array_equal(outcome.references[0].confidence, np.float32(0.5))
-    assert runner.encoded == [1, 1, 1, 1]
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -98,20 +83,6 @@ def test_confidence_is_zero_where_a_picture_is_filled() -> None:
     assert (filled.confidence[:, 30:40] > 0).all()
     corners = filled.camera.project(portrait.view.camera.rays(np.array([[-0.5, -0.5], [71.5, 95.5]])))
     np.testing.assert_allclose(corners, [[13.5, -0.5], [55.5, 55.5]], atol=0.51)
-
-
-def test_without_references_a_query_is_rejected() -> None:
-    query, _ = small_request(0)
-    outcome = reconstruct_one(grey_backend(GreyRunner()), query, [])
-    assert isinstance(outcome, Rejection)
-    assert outcome.reason is RejectionReason.NO_USABLE_REFERENCES
-
-
-def test_a_view_without_a_photograph_is_refused() -> None:
-    query, references = small_request(2)
-    bare = replace(references[1], view=replace(references[1].view, photograph=None))
-    with pytest.raises(ValueError, match="r1 has no photograph"):
-        reconstruct_one(grey_backend(GreyRunner()), query, [references[0], bare])
 
 
 # Not a number
@@ -160,11 +131,6 @@ def test_odd_shapes_and_intrinsics_are_reconstructed(name: str) -> None:
 
 
 # From a name to a backend
-
-
-def test_an_unknown_name_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="known: auto, geometric, pi3, pi3x, mapanything"):
-        make_reconstructor("vggt", tmp_path)
 
 
 def test_a_network_needs_its_weights(tmp_path: Path) -> None:

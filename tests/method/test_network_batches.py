@@ -24,7 +24,7 @@ from support.grey_network import (
 from support.small_networks import small_request, small_runner
 
 from mapless_server.method.choices import NETWORKS
-from mapless_server.method.coarse import Bucket, Request, reconstruct_one
+from mapless_server.method.coarse import Request, reconstruct_one
 from mapless_server.method.coarse.network import NetworkReconstructor
 from mapless_server.method.coarse.token_cache import TokenCacheOptions
 
@@ -106,16 +106,6 @@ def test_each_view_of_a_batch_is_encoded_once(cache: TokenCacheOptions) -> None:
     assert [greys_of(outcome) for outcome in outcomes] == [[i, 50, 100, 150] for i in (1, 2, 3, 4)]
     assert sum(runner.encoded) == 3 + 4
     assert runner.batches == [4]
-
-
-def test_queries_of_one_bucket_are_one_batch_of_the_network() -> None:
-    backend = grey_backend(GreyRunner())
-    assert backend.bucket(*grey_request(1, 50, 60)) == Bucket("grey", 2, (4, 5))
-    assert str(backend.bucket(*grey_request(1, 50, 60))) == "grey-4x5-2"
-    assert str(backend.bucket(*grey_request(1, 50, size=(72, 96)))) == "grey-5x4-1"
-    query, _ = grey_request(1, 50)
-    with pytest.raises(ValueError, match="the query has no photograph"):
-        backend.bucket(replace(query, photograph=None), grey_request(1, 50)[1])
 
 
 def test_one_requests_error_does_not_fail_the_others() -> None:

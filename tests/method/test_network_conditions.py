@@ -65,13 +65,6 @@ def test_a_single_posed_view_has_no_effect() -> None:
     assert_same_bits(reconstruct_one(backend, query, [reference]), reconstruct_one(backend, query, [moved]))
 
 
-def test_pi3_gets_no_poses() -> None:
-    query, references = small_request(3)
-    backend = NetworkReconstructor(small_runner("pi3"), OPTIONS)
-    moved = [replace(it, world_from_camera=pose) for it, pose in zip(references, random_poses(3), strict=True)]
-    assert_same_bits(reconstruct_one(backend, query, references), reconstruct_one(backend, query, moved))
-
-
 # Known poses (MapAnything)
 
 

@@ -3,35 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import is_dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.fake_network import FakeNetwork
 from support.scenes import SceneOptions, random_for
 
-from mapless.geometry import RigidTransform
 from mapless_server.method.correspond import Correspondences
 from mapless_server.method.match import one_to_one as one_to_one_on_host
 from mapless_server.method.options import ScaleStrategy
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.results import ScaleStage
 from mapless_server.method.scale_equations import ScaleOptions
-from mapless_server.method.structure import StructureOptions, tracks_of
-from mapless_server.method.views import Reconstruction
 
 pytest.importorskip("torch", reason="the networks' extra is not installed")
 
 import torch
-from support.device import CASES, VARIANTS, Case, Watch, assert_same, case_of, on_device
+from support.device import CASES, VARIANTS, Case, Watch, assert_same, case_of
 from torch import Tensor
 
 from mapless_server.method.coarse.device import DeviceReconstruction
-from mapless_server.method.on_device import Refined, launch_on_device, prepare
 from mapless_server.method.on_device import match as device_match
+from mapless_server.method.on_device import prepare
 from mapless_server.method.on_device.compute import Inputs, Options, compute
-from mapless_server.method.on_device.transfer import fetch, upload
+from mapless_server.method.on_device.transfer import upload
 
 # The host's results
 
@@ -52,28 +46,6 @@ def test_every_variant_equals_the_hosts_result(case: str, variant: str) -> None:
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_every_scale_strategy_equals_the_hosts_result(case: Case, strategy: ScaleStrategy) -> None:
     assert_same(case.on_device(ScaleOptions(strategy)), case.on_host(ScaleOptions(strategy)))
-
-
-def test_the_cases_use_different_stages_and_anchors() -> None:
-    """Each stage of the scale decides, another anchor than the first; votes and searches find, tracks are cut short."""
-    found = {name: case.on_host(ScaleOptions(), *VARIANTS["best"]) for name, case in CASES.items()}
-    refined = {name: it for name, it in found.items() if isinstance(it, Refined)}
-    assert refined["noise"].scale.stage is ScaleStage.TRIANGULATION
-    assert refined["the trajectory wins"].scale.stage is ScaleStage.TRAJECTORY
-    assert refined["another anchor"].scale.anchor == 1
-    case, structure, matches = CASES["noise"], refined["noise"].structure, refined["noise"].matches
-    assert structure is not None
-    assert matches is not None
-    assert 0 < matches.guided.mean() < 1
-    given = tracks_of(case.scene.references, case.correspondences, StructureOptions())
-    index = {(v, k): p for p, v, k in zip(given.point, given.view, given.keypoint, strict=True)}
-    kept = np.bincount(structure.tracks.point)
-    before = np.bincount(given.point)
-    first = zip(
-        structure.tracks.view[structure.tracks.starts], structure.tracks.keypoint[structure.tracks.starts], strict=True
-    )
-    assert (kept < [before[index[it]] for it in first]).any()
-    assert len(kept) < len(before)
 
 
 def test_options_of_the_scale_equal_the_hosts_result() -> None:
@@ -161,45 +133,6 @@ def test_compute_stays_on_the_device_and_reads_no_value(variant: str) -> None:
         outputs = compute(there, uploaded, CASES["noise"].scene.query.camera, options)
     assert outputs.candidates.metres_per_unit.device == meta
     assert watch.launched.total() < 3500  # at a few microseconds each
-
-
-@pytest.mark.parametrize(
-    "wait",
-    [
-        lambda x: x.sum().item(),
-        lambda x: x[x > 0],
-        lambda x: x.nonzero(),
-        lambda x: x if x.sum() > 0 else -x,
-        lambda x: x[x.argmax()],
-        lambda x: x.cpu(),
-        lambda x: x * torch.ones(3),
-        lambda x: torch.unique(x),
-    ],
-)
-def test_the_watch_fails_where_a_value_is_read(wait: Callable[[Tensor], object]) -> None:
-    x = torch.ones(3, device="meta")
-    with Watch("meta"), pytest.raises((RuntimeError, NotImplementedError, AssertionError)):
-        wait(x)
-
-
-def byte_count(record: Any) -> int:
-    """Size of all arrays in a dataclass, at any depth."""
-    values = vars(record).values()
-    inside = sum(byte_count(value) for value in values if is_dataclass(value))
-    return inside + sum(value.nbytes for value in values if isinstance(value, np.ndarray))
-
-
-def test_transfers_are_small_and_keep_the_values() -> None:
-    reconstruction, inputs, options = arguments_of(CASES["noise"], "best")
-    uploaded = upload(inputs, torch.device("cpu"))
-    outputs = compute(reconstruction, uploaded, CASES["noise"].scene.query.camera, options)
-    descriptors = sum(r.view.features.descriptors.nbytes for r in CASES["noise"].scene.references)
-    assert descriptors < byte_count(inputs) < 3 * descriptors
-    fetched = fetch(outputs)
-    assert outputs.points is not None
-    assert fetched.points is not None
-    np.testing.assert_array_equal(fetched.points.seen, outputs.points.seen.numpy())
-    np.testing.assert_array_equal(fetched.candidates.query_rotation, outputs.candidates.query_rotation.numpy())
 
 
 # Rejections
@@ -315,39 +248,3 @@ def test_pixels_of_zero_confidence_are_not_broken() -> None:
 
 
 # The reconstruction
-
-
-def test_a_fetched_reconstruction_equals_the_original() -> None:
-    scene = CASES["noise"].scene
-    before: Reconstruction = FakeNetwork(scene).reconstruct(scene.query, scene.references)
-    after = on_device(before).fetch()
-    assert after.query.camera == before.query.camera
-    assert np.isnan(after.query.point_map).all()
-    assert not after.query.confidence.any()
-    np.testing.assert_array_equal(after.query.confidence.shape, before.query.confidence.shape)
-    for mine, theirs in zip(after.references, before.references, strict=True):
-        assert mine.camera == theirs.camera
-        np.testing.assert_array_equal(mine.point_map, theirs.point_map)
-        np.testing.assert_array_equal(mine.confidence, theirs.confidence)
-    for view, given in zip((*after.references, after.query), (*before.references, before.query), strict=True):
-        pose: RigidTransform = view.local_from_camera
-        np.testing.assert_array_equal(pose.matrix(), given.local_from_camera.matrix().astype(np.float32))
-
-
-def test_misuse_is_refused() -> None:
-    case = CASES["noise"]
-    good = case.reconstruction
-    for changes in (
-        {"point_maps": good.point_maps[:-1]},
-        {"confidence": good.confidence[:, :-1]},
-        {"local_from_camera": good.local_from_camera[:-1]},
-        {"reference_cameras": good.reference_cameras[:-1]},
-        {"query_camera": case.scene.query.camera},
-    ):
-        with pytest.raises(ValueError, match=r"fit|size"):
-            replace(good, **changes)
-    scene, correspondences = case.scene, case.correspondences
-    with pytest.raises(ValueError, match="4 reconstructed references of 3"):
-        launch_on_device(good, scene.query, scene.references[:3], correspondences, Options())
-    with pytest.raises(ValueError, match=r"Options\.structure and Options\.match must both be given"):
-        Options(structure=StructureOptions())

@@ -1,26 +1,20 @@
 """The optimizer and its losses: minima against SciPy's, damping, stopping, wrong options."""
 
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy import optimize
-from support.compare import assert_jacobian
 from support.scenes import random_for
 
 from mapless.geometry import Array
-from mapless_server.method.arrays import SYMMETRIC
 from mapless_server.method.optimize import (
     MinimizeOptions,
     cauchy_cost,
     cauchy_weight,
     damped_step,
     minimize,
-    minimize_each,
-    soft_l1,
-    soft_l1_weight,
     solve_step,
 )
 
@@ -86,41 +80,6 @@ def test_minimum_equals_scipys_with_cauchy_loss(outlier_share: float, off: float
         assert problem.cost(found) < problem.cost(start)
 
 
-def test_minimum_equals_scipys_with_soft_l1_loss() -> None:
-    """Points of a plane by their distances to anchors; what is wrong is wrong for some of them."""
-    random, count = random_for("each"), 20
-    anchors, truth = random.normal(0, 5, (9, 3)), random.normal(0, 2, (count, 3))
-    measured = np.linalg.norm(truth[:, None] - anchors, axis=2) + random.normal(0, 0.02, (count, 9))
-    measured[::3, 0] += 1.0
-
-    def residuals(points: Array) -> Array:
-        return np.asarray(np.linalg.norm(points[:, None] - anchors, axis=2) - measured)
-
-    def cost(points: Array) -> Array:
-        return np.asarray(soft_l1(residuals(points) ** 2, 0.1).sum(axis=1))
-
-    def linearize(points: Array) -> tuple[Array, Array]:
-        jacobian = points[:, None] - anchors
-        jacobian /= np.linalg.norm(jacobian, axis=2, keepdims=True)
-        weight = soft_l1_weight(residuals(points) ** 2, 0.1)
-        weighted = np.swapaxes(jacobian * weight[:, :, None], 1, 2)
-        hessian = np.stack([(weighted @ jacobian)[:, i, j] for i, j in SYMMETRIC])
-        return hessian, (weighted @ residuals(points)[:, :, None])[..., 0].T
-
-    start = truth + random.normal(0, 0.3, truth.shape)
-    start[5] = np.nan
-    found = minimize_each(lambda it: cost(it.T), lambda it: linearize(it.T), start.T, 60).T
-    assert np.isnan(found[5]).all()
-    for p in np.delete(np.arange(count), 5):
-
-        def row(x: Array, p: int = int(p)) -> Array:
-            return np.asarray(np.linalg.norm(x - anchors, axis=1) - measured[p])
-
-        theirs = least_squares(row, start[p], loss="soft_l1", f_scale=0.1, xtol=1e-14, ftol=1e-14, gtol=1e-14)
-        np.testing.assert_allclose(found[p], theirs.x, atol=1e-6)
-    np.testing.assert_array_less(np.delete(cost(found), 5), np.delete(cost(start), 5))
-
-
 def test_steps_that_raise_the_cost_are_damped() -> None:
     """Beside a gross first guess Gauss-Newton's step overshoots; no taken step raises the cost."""
     problem = decay("damped", 0.0)
@@ -182,25 +141,3 @@ def test_singular_systems_have_only_a_least_norm_step() -> None:
     for broken in (np.full((2, 2), np.nan), np.diag([1.0, np.inf])):
         assert solve_step(broken, np.array([np.nan, 1.0]), least_norm=True) is None
         assert damped_step(broken, np.array([np.nan, 1.0]), 1.0) is None
-
-
-@pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])
-@pytest.mark.parametrize("squared", [1e-6, 0.3, 10.0, 1e6])
-def test_losses_equal_scipys_and_weights_their_derivatives(scale: float, squared: float) -> None:
-    s = np.array([squared])
-    assert cauchy_cost(s, scale) == pytest.approx(scale**2 * math.log1p(squared / scale**2))
-    theirs = least_squares(lambda x: [math.sqrt(squared) + 0 * x[0]], [0.0], loss="cauchy", f_scale=scale)
-    assert cauchy_cost(s, scale) == pytest.approx(2 * theirs.cost)
-    assert_jacobian(cauchy_weight(s, scale), lambda x: cauchy_cost(x, scale), s, tolerance=1e-5)
-    theirs = least_squares(lambda x: [math.sqrt(squared) + 0 * x[0]], [0.0], loss="soft_l1", f_scale=scale)
-    assert soft_l1(s, scale)[0] == pytest.approx(2 * theirs.cost)
-    assert_jacobian(soft_l1_weight(s, scale), lambda x: float(soft_l1(x, scale)[0]), s, tolerance=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("iterations", -1), ("min_decrease", 0.0), ("damping", -1.0), ("raised_by", 1.0)]
-)
-def test_a_wrong_option_is_named(name: str, value: float) -> None:
-    known: dict[str, Any] = {"iterations": 1, "min_decrease": 0.1, name: value}
-    with pytest.raises(ValueError, match=rf"{name} must be .* is {value}"):
-        MinimizeOptions(**known)

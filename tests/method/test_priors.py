@@ -191,12 +191,6 @@ def test_priors_shift_with_the_world() -> None:
     assert [prior.kind for prior in there] == [PriorKind.POSITION, PriorKind.HEADING, PriorKind.GRAVITY, PriorKind.POSE]
 
 
-def test_empty_priors_are_false() -> None:
-    assert not NO_PRIORS
-    assert Priors(gravity=gravity_at(POSE))
-    assert NO_PRIORS.check(POSE, np.eye(6)) == ()
-
-
 UNSYMMETRIC = np.eye(3)
 UNSYMMETRIC = UNSYMMETRIC + np.array([[0, 0.5, 0], [0, 0, 0], [0, 0, 0]])
 

@@ -21,7 +21,6 @@ from mapless_server.method.scale import estimate_scale
 from mapless_server.method.scale_equations import (
     ScaleOptions,
     pairs_of,
-    trajectory_radius,
     trajectory_scale,
     triangulate_depths,
 )
@@ -111,14 +110,6 @@ def test_noise_and_bad_depths_cost_half_a_percent(seed: int) -> None:
     assert result.metres_per_unit == pytest.approx(network.world_from_local.scale, rel=5e-3)
 
 
-def test_a_share_of_the_matches_gives_the_same_scale() -> None:
-    scene = make_scene(random_for("share"))
-    network = FakeNetwork(scene, 2, FakeNetworkOptions(depth_noise_m=0.01))
-    result = scale_of(scene, network, replace(TRIANGULATION, max_matches=500))
-    assert result.metres_per_unit != scale_of(scene, network, TRIANGULATION).metres_per_unit
-    assert result.metres_per_unit == pytest.approx(network.world_from_local.scale, rel=5e-3)
-
-
 def test_wrong_matches_do_not_move_the_median() -> None:
     scene = make_scene(random_for("wrong matches"))
     matches = true_matches(scene)
@@ -164,24 +155,6 @@ def test_the_local_frame_does_not_change_the_result(
     assert (after.stage, after.anchor) == (before.stage, before.anchor)
     assert after.metres_per_unit * scale == pytest.approx(before.metres_per_unit, rel=1e-6)
     assert_same_pose(after.world_from_query, before.world_from_query, metres=1e-5, degrees=1e-5)
-
-
-def test_the_order_of_references_does_not_change_the_result() -> None:
-    scene = make_scene(random_for("order"))
-    confidences = (0.3, 0.4, 0.9, 0.5, 0.6, 0.7)
-    network = FakeNetwork(scene, 5, FakeNetworkOptions(0.01, pose_noise_m=0.02, reference_confidences=confidences))
-    order = [3, 1, 5, 0, 2, 4]
-    shuffled = replace(
-        scene,
-        references=tuple(scene.references[i] for i in order),
-        reference_points=tuple(scene.reference_points[i] for i in order),
-    )
-    for strategy in ScaleStrategy:
-        options = ScaleOptions(strategy=strategy)
-        before, after = scale_of(scene, network, options), scale_of(shuffled, network, options)
-        assert before.anchor == order[after.anchor] == 2
-        assert after.metres_per_unit == pytest.approx(before.metres_per_unit, rel=1e-12)
-        assert_same_pose(after.world_from_query, before.world_from_query, metres=1e-9, degrees=1e-5)
 
 
 # Which stage decides.
@@ -344,18 +317,7 @@ def test_a_confidence_that_is_not_finite_is_not_the_anchor() -> None:
     assert result.anchor != 0
 
 
-def test_other_references_than_the_networks_are_refused() -> None:
-    with pytest.raises(ValueError, match="zip"):
-        estimate_scale(RECONSTRUCTION, SCENE.references[:-1], MATCHES)
-
-
 # The equations.
-
-
-def test_trajectory_radius_of_a_square_is_its_half_diagonal() -> None:
-    square = np.array([[1.0, 1, 7], [1, -1, 7], [-1, 1, 7], [-1, -1, 7]])
-    assert trajectory_radius(square) == pytest.approx(np.sqrt(2))
-    assert trajectory_radius(3 * square + 5) == pytest.approx(3 * np.sqrt(2))
 
 
 def test_trajectory_scale_equals_a_plain_implementation() -> None:

@@ -79,16 +79,6 @@ def test_the_least_recently_used_moves_to_the_host_then_out() -> None:
         assert_holds(cache, key(i), tokens(i))
 
 
-def test_nothing_is_copied_to_the_host_twice() -> None:
-    cache = cache_of(1, 2)
-    cache.put(key(0), tokens(0))
-    for _ in range(3):
-        cache.put(key(1), tokens(1))
-        assert cache.get(key(0)) is not None
-    assert cache.counters.host_bytes == 2 * SIZE
-    assert cache.counters.device_bytes == SIZE
-
-
 @pytest.mark.parametrize(
     ("device_count", "host_count", "kept"), [(0, 0, 0), (3, 0, 3), (0, 3, 3), (2, 3, 5), (9, 9, 8)]
 )
@@ -125,14 +115,6 @@ def test_tokens_released_from_the_device_stay_on_the_host() -> None:
     assert cache.counters == TokenCacheCounters(host_bytes=2 * SIZE, evictions=2)
     assert held(cache, 4) == [2, 3]
     assert cache.counters.host_hits == 2
-
-
-def test_storing_a_key_again_replaces_its_tokens() -> None:
-    cache = cache_of(2, 0)
-    cache.put(key(0), tokens(0))
-    cache.put(key(0), tokens(5))
-    assert_holds(cache, key(0), tokens(5))
-    assert cache.counters.device_bytes == SIZE
 
 
 def test_threads_get_the_tokens_of_their_keys() -> None:

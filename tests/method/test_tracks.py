@@ -76,23 +76,6 @@ def random_pairs(draw: st.DrawFn) -> tuple[Pairs, list[int]]:
     return pairs_of(pairs), counts
 
 
-def test_a_track_left_with_one_keypoint_is_dropped() -> None:
-    # One keypoint of view 1 cannot be matched twice with view 0, but let a caller try.
-    tracks = build_tracks(pairs_of({(0, 1): [(0, 0), (1, 0)]}), [2, 1])
-    assert_is_well_formed(tracks)
-    assert tracks.point_count == 1
-
-
-def test_without_matches_there_are_no_tracks() -> None:
-    matched_views: list[list[tuple[int, int]]] = [[], [(0, 1)], [(0, 1), (1, 2)]]
-    for views in matched_views:
-        tracks = build_tracks(pairs_of({pair: [] for pair in views}), [3, 0, 2])
-        assert tracks.point_count == 0
-        assert len(tracks.starts) == 0
-        assert tracks.select(np.empty(0, bool)).point_count == 0
-    assert build_tracks(pairs_of({(1, 2): [(0, 0)]}), [1, 1, 1], anchor=0).point_count == 0
-
-
 @given(random_pairs(), st.sampled_from([None, 0, 1]))
 def test_tracks_equal_those_of_a_union_find(drawn: tuple[Pairs, list[int]], anchor: int | None) -> None:
     pairs, counts = drawn

@@ -35,7 +35,6 @@ from mapless_server.method.trust.two_view import (
     two_view_trust,
 )
 from mapless_server.method.two_view.matches import TwoViewMatches
-from mapless_server.method.two_view.pose import band_chance, disc_chance
 from mapless_server.method.two_view.solve import TwoViewOptions, solve_two_view
 from mapless_server.method.uncertainty.covariance import UncertaintyOptions
 from mapless_server.method.views import Features, Matches, PosedView, View
@@ -156,29 +155,12 @@ def test_wrong_matches_among_right_ones_are_no_inliers(wrong_share: float) -> No
         assert two_view_failure(problem.evidence(support), GATE) is None
 
 
-def test_the_same_matches_give_the_same_pose() -> None:
-    first, second = (pose_of(planted((50, 30), 0.5, 0.4).solved()) for _ in range(2))
-    np.testing.assert_array_equal(first.rotation, second.rotation)
-    np.testing.assert_array_equal(first.translation, second.translation)
-
-
-def test_poses_do_not_depend_on_the_unit_of_length() -> None:
-    problem = planted((50, 40), 0.5)
-    feet = [
-        replace(r, world_from_camera=replace(r.world_from_camera, translation=r.world_from_camera.translation * 3.28))
-        for r in problem.references
-    ]
-    scaled = replace(problem, references=tuple(feet))
-    expected = pose_of(problem.solved()).translation
-    np.testing.assert_allclose(pose_of(scaled.solved()).translation / 3.28, expected, atol=1e-3)
-
-
 @pytest.mark.parametrize("pose_noise_px", [0.0, 1.0])
 def test_covariance_is_right_against_planted_noise(pose_noise_px: float) -> None:
-    """The mean squared errors of 30 poses, over the mean of what is stated."""
+    """The mean squared errors of 16 poses, over the mean of what is stated."""
     errors, stated = [], []
     plain = AdjustOptions(uncertainty=UncertaintyOptions(position_factor=1.0, rotation_factor=1.0, gap_growth=0.0))
-    for seed in range(30):
+    for seed in range(16):
         problem = planted((60, 60, 60), 0.5, 0.0, seed, pose_noise_px)
         support = solve_two_view(
             problem.query, problem.references, problem.correspondences, (), ORIGIN,
@@ -300,7 +282,7 @@ def test_references_are_always_matched_at_their_given_poses() -> None:
 
 
 def test_random_matches_have_no_accepted_pose() -> None:
-    for seed in range(4):
+    for seed in range(2):
         problem = planted((150, 120, 100), 0.0, 1.0, seed)
         support = problem.solved()
         assert support is None or two_view_failure(problem.evidence(support), GATE) is not None
@@ -347,12 +329,6 @@ def test_triangulated_points_are_the_planted_ones() -> None:
     projected = CAMERA.project(TRUE.inverse().apply(points))
     np.testing.assert_allclose(projected, problem.query.features.keypoints, atol=1e-3)
     assert (parallax_deg > 1).all()
-
-
-def test_chances_are_shares_of_the_image() -> None:
-    assert disc_chance(CAMERA, 4.0) == pytest.approx(np.pi * 16 / (960 * 720))
-    assert band_chance(CAMERA, 2.0) == pytest.approx(4 * np.sqrt(2) * 1200 / (960 * 720))
-    assert disc_chance(CAMERA, 1e4) == band_chance(CAMERA, 1e4) == 1.0
 
 
 def test_trust_rises_with_the_second_references_share() -> None:

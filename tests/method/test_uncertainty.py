@@ -18,8 +18,7 @@ from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.pose_errors import PoseErrorOptions, PoseErrors, most_probable, pose_errors
 from mapless_server.method.pose_problem import AdjustOptions
 from mapless_server.method.results import PoseEstimate, PoseStage, Structure, Support
-from mapless_server.method.uncertainty.covariance import UncertaintyOptions, dispersed_covariance, scale_covariance
-from mapless_server.method.uncertainty.dispersion import Dispersion
+from mapless_server.method.uncertainty.covariance import UncertaintyOptions, scale_covariance
 
 POSITION, ROTATION = slice(0, 3), slice(3, 6)
 PLAIN = UncertaintyOptions(gap_growth=0.0)
@@ -103,14 +102,6 @@ def test_covariance_of_scale_noise_equals_sampling() -> None:
     assert position == pytest.approx(1, abs=0.4)
 
 
-def test_scale_moves_the_camera_along_the_arm_only() -> None:
-    pose = RigidTransform(np.eye(3), np.array([3.0, 4.0, 0.0]))
-    covariance = scale_covariance(pose, np.zeros(3), 0.01)
-    np.testing.assert_allclose(covariance[:3, :3], 1e-4 * np.outer([3, 4, 0], [3, 4, 0]))
-    np.testing.assert_array_equal(covariance[3:], 0)
-    np.testing.assert_array_equal(covariance[:, 3:], 0)
-
-
 def test_an_initial_poses_covariance_covers_its_errors() -> None:
     """5 cm off its optimum: the stated standard deviation in this direction is 5 cm."""
     scene = make_scene(random_for("initial"), FEW)
@@ -127,49 +118,12 @@ def test_an_initial_poses_covariance_covers_its_errors() -> None:
     assert np.sqrt(along @ refined[:3, :3] @ along) < 0.02
 
 
-def test_covariance_grows_with_the_gap() -> None:
-    """As the gap to twice its exponent."""
-    one = np.diag([1.0, 2.0, 3.0, 1.0, 2.0, 3.0])
-    options = replace(PLAIN, gap_growth=0.1)
-
-    def trace(gap: float) -> float:
-        found = Dispersion(one, np.zeros((9, 6)), np.zeros(6), gap)
-        return float(np.trace(dispersed_covariance(found, RigidTransform(np.eye(3), np.zeros(3)), options)))
-
-    assert trace(0.2) / trace(0.1) == pytest.approx(2**0.2)
-    assert trace(5.0) == trace(0.5)
-
-
-def test_factors_multiply_standard_deviations() -> None:
-    scene = make_scene(random_for("factors"), FEW)
-    structure, _, estimate = stages(scene, scene.references)
-    support = support_of(scene, structure, estimate)
-    options = [
-        AdjustOptions(uncertainty=replace(PLAIN, position_factor=position, rotation_factor=rotation))
-        for position, rotation in ((1.0, 1.0), (2.0, 3.0))
-    ]
-    plain, factored = (with_covariance(support, UNSCALED, it) for it in options)
-    assert plain.intrinsics
-    factor = np.repeat([2.0, 3.0], 3)
-    of_intrinsics = plain.intrinsics.pose_covariance  # without factors
-    expected = factor[:, None] * (plain.covariance - of_intrinsics) * factor + of_intrinsics
-    np.testing.assert_allclose(factored.covariance, expected, atol=1e-15)
-
-
 def test_matches_with_one_point_keep_the_former_covariance() -> None:
     scene = make_scene(random_for("spot"), FEW)
     structure, _, estimate = stages(scene, scene.references)
     nowhere = replace(structure, x_in_world=np.zeros_like(structure.x_in_world))
     covariance = with_covariance(support_of(scene, nowhere, estimate), UNSCALED, PLAIN_ADJUST).covariance
     np.testing.assert_array_equal(covariance, estimate.covariance)
-
-
-def test_a_support_without_a_pose_is_refused() -> None:
-    scene = make_scene(random_for("nothing"), FEW)
-    structure, matches = true_structure(scene)
-    support = Support(scene.query, scene.references, structure, matches, None, np.zeros(3))
-    with pytest.raises(ValueError, match="estimate must not be None"):
-        with_covariance(support, UNSCALED, PLAIN_ADJUST)
 
 
 FOCAL_PX, DEPTH_M, LEVEL_PX = 500.0, 4.0, 0.5
@@ -196,12 +150,6 @@ def test_the_drift_has_the_covariance_of_a_random_walk() -> None:
     found = np.cov(motions.reshape(len(walks), -1).T)
     scale = np.sqrt(np.outer(np.diag(errors.drift), np.diag(errors.drift)))
     np.testing.assert_allclose(found / scale, errors.drift / scale, atol=0.1)
-
-
-def test_own_errors_are_independent_and_move_the_image_alike() -> None:
-    _, _, _, errors = planted("own")
-    angle = LEVEL_PX / FOCAL_PX
-    np.testing.assert_allclose(errors.own, np.diag(np.tile(np.repeat([angle * DEPTH_M, angle], 3) ** 2, 8)), atol=1e-18)
 
 
 def test_a_reference_at_the_place_of_the_query_does_not_drift() -> None:

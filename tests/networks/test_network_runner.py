@@ -134,21 +134,3 @@ def test_a_device_without_flash_attention_is_refused(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(Attention, "attend", staticmethod(flash_attention))
     with pytest.raises(UnsuitableDevice, match="pi3 cannot run on cpu: no flash attention"):
         NetworkRunner(ruled_network("pi3"), "pi3", "sha")
-
-
-def test_a_single_posed_view_is_ignored() -> None:
-    runner = NetworkRunner(ruled_network("pi3x"), "pi3x", "sha")
-    tokens = runner.encode(some_images(2), intrinsics(2))[None]
-    without = runner.reconstruct(tokens, GRID, 1)
-    single = runner.reconstruct(tokens, GRID, 1, line(2), torch.tensor([[True, False]]))
-    assert torch.equal(single.camera_poses, without.camera_poses)
-    runner.close()
-
-
-def test_scenes_with_unequal_posed_view_counts_are_refused() -> None:
-    runner = NetworkRunner(ruled_network("pi3x"), "pi3x", "sha")
-    tokens = runner.encode(some_images(3), intrinsics(3)).expand(2, -1, -1, -1)
-    posed = torch.tensor([[True, True, False], [True, True, True]])
-    with pytest.raises(ValueError, match=r"\[2, 3\]"):
-        runner.reconstruct(tokens, GRID, 2, line(3).repeat(2, 1, 1, 1), posed)
-    runner.close()

@@ -33,21 +33,6 @@ def assert_close(found: Tensor, expected: Tensor, tolerance: float = 1e-5) -> No
     assert (found - expected).abs().max() <= tolerance * expected.abs().max()
 
 
-def test_output_is_equivariant_to_the_order_of_views(network: Network) -> None:
-    given, order = some_images(4), torch.tensor([2, 0, 3, 1])
-    plain, permuted = reconstruct(network, given, 4), reconstruct(network, given[order], 4)
-    assert_close(permuted.local_points, plain.local_points[:, order], 5e-5)
-    assert_close(permuted.confidence_logits, plain.confidence_logits[:, order], 5e-5)
-    assert_close(permuted.camera_poses, plain.camera_poses[:, order], 5e-5)
-
-
-def test_tokens_of_a_view_depend_on_it_alone(network: Network) -> None:
-    given = some_images(3)
-    layout = network.layout(GRID)
-    one_by_one = torch.cat([network.encode(image[None], layout) for image in given])
-    assert_close(one_by_one, network.encode(given, layout), 1e-6)
-
-
 def test_omitted_maps_do_not_change_the_rest(network: Network) -> None:
     given = some_images(4)
     everything, some = reconstruct(network, given, 4), reconstruct(network, given, 2)
@@ -56,30 +41,6 @@ def test_omitted_maps_do_not_change_the_rest(network: Network) -> None:
     assert_close(some.confidence_logits, everything.confidence_logits[:, :2])
     torch.testing.assert_close(some.camera_poses, everything.camera_poses, rtol=0, atol=0)
     assert reconstruct(network, given, 0).local_points.shape[1] == 0
-
-
-def test_scenes_of_a_batch_are_independent(network: Network) -> None:
-    given = some_images(6)
-    layout = network.layout(GRID)
-    tokens = network.encode(given, layout).unflatten(0, (2, 3))
-    together = network.reconstruct(tokens, layout, 3)
-    for scene in range(2):
-        alone = network.reconstruct(tokens[scene : scene + 1], layout, 3)
-        assert_close(together.local_points[scene : scene + 1], alone.local_points)
-        assert_close(together.camera_poses[scene : scene + 1], alone.camera_poses)
-
-
-def test_nan_in_one_view_makes_the_output_nan(network: Network) -> None:
-    given = some_images(3)
-    given[1, 0, 0, 0] = torch.nan
-    output = reconstruct(network, given, 3)
-    assert output.camera_poses[..., :3, :].isnan().all()
-    assert output.local_points.isnan().all()
-
-
-def test_sides_that_are_not_multiples_of_a_patch_are_refused() -> None:
-    with pytest.raises(ValueError, match="multiples of 14, not 70x57"):
-        patch_grid(torch.zeros(1, 3, 57, 70))
 
 
 def test_in_low_precision_only_the_main_residual_stays_float32() -> None:
@@ -142,11 +103,6 @@ def test_placeholders_of_unknown_poses_count_for_the_scale() -> None:
     torch.testing.assert_close(with_placeholder(2.0), alone)  # the mean of 1 and 3
     far = with_placeholder(200.0)
     torch.testing.assert_close(far[..., :3, 3] * 34, alone[..., :3, 3])  # (1 + 3 + 200) / 3 instead of 2
-
-
-def test_views_at_one_place_keep_their_scale() -> None:
-    poses = poses_at((0, 0, 0), (0.01, 0, 0))
-    torch.testing.assert_close(normalize_poses(poses)[0, 1, :3, 3].norm(), torch.tensor(0.01))
 
 
 def test_the_pose_of_an_unposed_view_only_affects_the_scale() -> None:

@@ -13,7 +13,6 @@ from mapless_server.method.trust.judge import JudgeOptions
 from mapless_server.method.views import Features, PosedView
 from mapless_server.scenes import AuditVerdict, ReferenceAudit
 from mapless_server.scenes.audit import auditor, comparison
-from mapless_server.scenes.audit.auditor import Auditor
 from mapless_server.scenes.audit.finder import ReferenceGone
 from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.audit.resection import with_focal
@@ -92,14 +91,6 @@ def test_a_wrong_focal_length_is_named_with_what_puts_it_right(
     assert found.verdict is AuditVerdict.WRONG_INTRINSICS
     assert found.focal_ratio == pytest.approx(1 / ratio, abs=0.005)
     assert f"{100 * (ratio - 1):+.1f} %" in found.message
-
-
-def test_a_focal_length_off_by_less_than_two_per_cent_is_not_named(
-    references: list[PosedView], pairs: PairMatches
-) -> None:
-    view = references[VICTIM].view
-    victim = replace(references[VICTIM], view=replace(view, camera=with_focal(view.camera, 1.015)))
-    assert not any(a.verdict.is_alarm for a in audit(altered(references, VICTIM, victim), pairs))
 
 
 def test_a_pose_that_looks_away_has_no_error_in_pixels(references: list[PosedView], pairs: PairMatches) -> None:
@@ -184,25 +175,12 @@ def test_a_reference_without_neighbours_is_unverifiable(references: list[PosedVi
     assert audits[-1].position_offset_m is None
 
 
-def test_one_reference_alone_is_unverifiable(references: list[PosedView], pairs: PairMatches) -> None:
-    assert [a.verdict for a in audit(references[:1], pairs)] == [AuditVerdict.UNVERIFIABLE]
-
-
 def test_the_verdict_does_not_depend_on_other_references(references: list[PosedView], pairs: PairMatches) -> None:
     scene = altered(references, VICTIM, moved(references[VICTIM], (0.05, 0.0, 0.0)))
     together = audit(scene, pairs)
     neighbour = VICTIM + 1
     alone = audit_references([scene[neighbour].name], finder_of(scene), pairs=pairs)
     assert alone == [together[neighbour]]
-
-
-def test_the_verdict_does_not_depend_on_where_the_world_begins(references: list[PosedView], pairs: PairMatches) -> None:
-    """UTM coordinates are millions of metres."""
-    scene = altered(references, VICTIM, moved(references[VICTIM], (0.05, 0.0, 0.0)))
-    far = [replace(r, world_from_camera=r.world_from_camera.shifted([4.5e5, 5.4e6, 300.0])) for r in scene]
-    for near, there in zip(audit(scene, pairs), audit(far, pairs), strict=True):
-        assert near.verdict is there.verdict
-        assert near.position_offset_m == pytest.approx(there.position_offset_m, abs=1e-4)
 
 
 def test_references_are_loaded_as_they_are_needed(
@@ -243,14 +221,6 @@ def test_a_neighbour_that_cannot_be_loaded_is_no_witness(references: list[PosedV
     assert asked.count(lost) == 1
     with pytest.raises(ReferenceGone):
         audit_references([lost], finder, pairs=pairs)
-
-
-def test_what_is_remembered_of_neighbours_changes_no_verdict(references: list[PosedView], pairs: PairMatches) -> None:
-    scene = altered(references, VICTIM, moved(references[VICTIM], (0.05, 0.0, 0.0)))
-    names = [r.name for r in scene]
-    forgetful = Auditor(finder_of(scene), pairs, cached_findings=1)
-    assert [forgetful.audit(name) for name in names] == audit(scene, pairs)
-    assert forgetful._findings.used == 1
 
 
 def test_one_among_many_faulty_ones_is_never_consistent(references: list[PosedView], pairs: PairMatches) -> None:

@@ -8,16 +8,15 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
-from itertools import combinations
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 from support.planted import AnyRatio
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 from support.servers import StandInDescriptor, StandInExtractor
-from support.stores import DATABASES, Folder, Place, damage, place_on
+from support.stores import DATABASES, Folder, Place, damage, let_pass, place_on
 from support.waiting import wait_until
 
 from mapless_server.errors import Unavailable
@@ -32,7 +31,7 @@ from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.scenes.stored_pairs import Matching, PairFinder
 from mapless_server.security import SceneKey
-from mapless_server.store import NewReference, Store, pairs, rows
+from mapless_server.store import NewReference, Store, pairs
 from mapless_server.store.pairs import PairStore
 
 SCENE = SceneKey("s")
@@ -138,11 +137,6 @@ def compared(monkeypatch: pytest.MonkeyPatch) -> Counter[int]:
     return counts
 
 
-def let_pass(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
-    now_us = rows.now_us
-    monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(seconds * 1e6))
-
-
 class TestResults:
     @pytest.mark.parametrize("wide", [False, True])
     def test_a_query_finds_all_pairs_and_gets_the_same(self, store: Store, wide: bool, compared: Counter[int]) -> None:
@@ -158,17 +152,6 @@ class TestResults:
             assert found.reference_pairs[pair].dtype == matches.dtype
         assert (server.counts.made, server.counts.waits, server.counts.failures) == (20, 0, 0)
 
-    def test_wide_pairs_begin_with_the_stored_strict_ones(self, store: Store, compared: Counter[int]) -> None:
-        server = Server(store)
-        server.background.match_waiting()
-        assert (compared.total(), server.counts.made) == (10, 20)
-        assert not server.counts.found  # what queries find
-
-    def test_nothing_is_made_twice(self, store: Store, compared: Counter[int]) -> None:
-        for _ in range(2):
-            Server(store, widths=[False]).background.match_waiting()
-        assert len(compared) == compared.total() == 10
-
     def test_each_reference_is_matched_with_the_nearest_before_it(self, place: Folder) -> None:
         with place.open() as store:
             store.create_scene(SCENE)
@@ -177,26 +160,6 @@ class TestResults:
             server = Server(store, BackgroundOptions(pairs=1), widths=[False])
             server.background.match_waiting()
             assert set(server.stored()) == {("r0", "r1"), ("r3", "r4")}
-
-    def test_what_a_calibration_missed_is_matched_before_the_next(self, store: Store) -> None:
-        server, waiting = Server(store, widths=[False]), list[int]()
-
-        class Calibrations:
-            kind = "planted"
-
-            def calibrate_next(self, _: Callable[[], None]) -> bool:
-                waiting.append(server.pairs.count_waiting(server.name()))
-                if len(waiting) == 1:
-                    store.delete_reference(SCENE, "r1")
-                    store.add_references(SCENE, [new(1)])
-                return len(waiting) < 2
-
-            def maintain(self) -> None:
-                """Nothing is damaged."""
-
-        server.background._calibrations = cast(Any, Calibrations())
-        server.background._match_and_calibrate()
-        assert waiting == [0, 0]
 
     def test_one_that_is_added_later_is_matched_with_those_before(self, store: Store, compared: Counter[int]) -> None:
         server = Server(store, widths=[False])
@@ -251,13 +214,6 @@ class TestStrongPairs:
         server.background.match_waiting()
         assert (server.counts.made, server.counts.waits, server.counts.failures) == (20, 0, 0)
         assert min(len(it) for it in server.stored().values() if it is not None) >= 1
-
-    def test_they_are_fewer_and_under_names_of_their_own(self, store: Store) -> None:
-        server = Server(store, BackgroundOptions(strong_pairs=1), widths=[False], strong=True)
-        server.background.match_waiting()
-        assert 10 < server.counts.made < 10 + 5  # one each at most, and the first has none before it
-        Server(store, widths=[False]).background.match_waiting()
-        assert len(server.stored()) == 10
 
 
 class TestDamage:
@@ -331,10 +287,6 @@ class TestUnused:
     def hours(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(background, "_USE_IS_RECORDED_S", 0.0)
 
-    def pass_days(self, monkeypatch: pytest.MonkeyPatch, share: float) -> None:
-        now_us = rows.now_us
-        monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(1e6 * share * pairs.KEPT_S))
-
     def test_servers_with_other_settings_keep_one_anothers_pairs(
         self, store: Store, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -342,20 +294,12 @@ class TestUnused:
         for _ in range(4):
             for server in servers:
                 server.background.match_waiting()
-            self.pass_days(monkeypatch, 0.6)
+            let_pass(monkeypatch, 0.6 * pairs.KEPT_S)
         assert [len(servers[0].stored(wide)) for wide in (False, True)] == [10, 10]
         for _ in range(2):
             servers[0].background.match_waiting()
-            self.pass_days(monkeypatch, 0.6)
+            let_pass(monkeypatch, 0.6 * pairs.KEPT_S)
         assert [len(servers[0].stored(wide)) for wide in (False, True)] == [10, 0]
-
-    def test_a_server_that_makes_none_keeps_what_it_uses(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-        Server(store, widths=[False]).background.match_waiting()
-        self.pass_days(monkeypatch, 1.1)
-        reader, other = Server(store, widths=[False]), Server(store, widths=[True])
-        reader.background.maintain()
-        other.background.match_waiting()
-        assert [len(reader.stored(wide)) for wide in (False, True)] == [10, 10]
 
 
 class TestFailures:
@@ -476,20 +420,6 @@ class TestPriority:
             server.background.close()  # at once, though it waits
         assert server.counts.failures == 0
 
-    def test_references_are_not_chosen_while_callers_are_served(
-        self, store: Store, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        """What is not described yet would be described first, which takes long."""
-        server = Server(store, BackgroundOptions(poll_s=0.01, busy_share=1e-9, quiet_s=0.01), lambda: False)
-        monkeypatch.setattr(server.background, "_nearest", lambda *_: pytest.fail("references were chosen"))
-        server.background.start()
-        try:
-            wait_until(lambda: server.counts.waits is not None)  # counted after the first claim
-            assert not threading.Event().wait(0.1)
-        finally:
-            server.background.close()
-        assert server.counts.failures == 0
-
     def test_a_gap_between_calls_is_not_idleness(self, store: Store) -> None:
         """The server is idle whenever a step could begin, except for once."""
         looks = iter([False])
@@ -502,11 +432,6 @@ class TestPriority:
         finally:
             server.background.close()
         assert (server.counts.made, len(server.stored())) == (0, 0)
-
-    def test_a_busy_server_gets_its_share(self, store: Store) -> None:
-        server = Server(store, BackgroundOptions(busy_share=1.0, quiet_s=0.01), lambda: False)
-        server.background.match_waiting()
-        assert server.counts.made == 20
 
     def test_a_busy_server_with_slow_pairs_ends_too(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
         """The wait for its share would be longer than a claim holds."""
@@ -524,44 +449,9 @@ class TestPriority:
             server.background._match_claimed(library, *found)
         assert server.counts.failures == 0
 
-    def test_what_another_server_matched_waits_no_longer(self, store: Store) -> None:
-        first, second = Server(store), Server(store)
-        claimed = second.background._claim()
-        assert claimed is not None
-        first.background._count_waiting()
-        assert first.counts.waits == 5
-        with closing(ReferenceLibrary(store)) as library:
-            second.background._match_claimed(library, *claimed)
-        second.background.match_waiting()
-        first.background.match_waiting()
-        assert first.counts.waits == 0
-
-    def test_what_is_made_before_the_claim_ends_is_stored(
-        self, store: Store, monkeypatch: pytest.MonkeyPatch, compared: Counter[int]
-    ) -> None:
-        monkeypatch.setattr("mapless_server.scenes.background.CLAIM_S", 0.0)
-        server = Server(store, widths=[False])
-        usual = server.background._let_callers_first
-        steps = iter(range(1000))
-
-        def sometimes(_: float = 0.25) -> None:
-            usual()
-            in_time = next(steps) % 3
-            monkeypatch.setattr("mapless_server.scenes.background.CLAIM_S", 60.0 if in_time else 0.0)
-
-        monkeypatch.setattr(server.background, "_let_callers_first", sometimes)
-        server.background.match_waiting()
-        assert len(compared) == compared.total() == 10
-
     def test_a_store_that_can_only_be_read_is_left_alone(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
         server = Server(store, BackgroundOptions(poll_s=0.01))
         monkeypatch.setattr(store.database, "only_reads", True)
         server.background.start()
         server.background.close()
         assert not server.stored()
-
-
-def test_order_of_names_is_that_of_the_rows(store: Store) -> None:
-    server = Server(store, widths=[False])
-    server.background.match_waiting()
-    assert set(server.stored()) == set(combinations(["r0", "r1", "r2", "r3", "r4"], 2))

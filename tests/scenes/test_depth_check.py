@@ -155,10 +155,6 @@ def test_nothing_is_kept_if_the_known_pose_is_not_found(found: RigidTransform) -
     assert checked(found=found) == [None] * 4
 
 
-def test_what_cannot_be_checked_is_not_kept() -> None:
-    assert checked(options=DepthCheckOptions(min_points=10_000)) == [None] * 4
-
-
 def test_without_confidence_nothing_is_kept() -> None:
     views = [predicted(i, wall_depth(i)) for i in range(4)]
     doubted = tuple(replace(it, confidence=0.05 * it.confidence) for it in views)
@@ -167,11 +163,3 @@ def test_without_confidence_nothing_is_kept() -> None:
     )
     given = SCENE.references, SCENE.world_from_query, correspondences(), DepthCheckOptions()
     assert checked_depths(Reconstruction(views[0], doubted), scale, *given) == [None] * 4
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("max_off", 0.0), ("min_points", 2), ("max_scale", 1.0), ("max_sigma", 0.001)]
-)
-def test_options_out_of_bounds_are_named(name: str, value: float) -> None:
-    with pytest.raises(ValueError, match=name):
-        DepthCheckOptions(**{name: value})  # type: ignore[arg-type]

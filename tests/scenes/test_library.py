@@ -17,10 +17,8 @@ from support.stores import damage
 
 from mapless.geometry import Camera
 from mapless_server.errors import DataLoss, NotFound, RequestError
-from mapless_server.images import ImageLimits
 from mapless_server.method.options import StageContext
 from mapless_server.method.views import View
-from mapless_server.scenes import library as library_module
 from mapless_server.scenes.library import FeaturesMissing, Loaded, ReferenceLibrary, load_usable
 from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, Store
@@ -93,14 +91,6 @@ class TestPhotographs:
             np.testing.assert_array_equal(photograph.read(), PIXELS[reference_id])
             assert store.images_read == count
 
-    def test_nothing_holds_pixels_after_they_were_looked_at(self, store: CountingStore) -> None:
-        library = ReferenceLibrary(store)
-        for count in (1, 2):
-            (reference,) = library.load(SCENE, ["r0"], OLD, context())[1]
-            assert reference.view.photograph is not None
-            reference.view.photograph.read()
-            assert store.images_read == count
-
     def test_stay_those_of_the_reference_while_the_scene_changes(self, store: CountingStore) -> None:
         _, (kept, gone) = ReferenceLibrary(store).load(SCENE, ["r0", "r1"], OLD, context())
         assert kept.view.photograph is not None
@@ -119,11 +109,6 @@ class TestPhotographs:
         assert reference.view.photograph is not None
         with pytest.raises(DataLoss, match="'odd'"):
             reference.view.photograph.read()
-
-    def test_todays_limits_do_not_shut_out_what_was_let_in_before(self) -> None:
-        assert library_module.STORED_IMAGES.max_bytes >= 1024 * 2**20, "the largest message that can be set"
-        assert library_module.STORED_IMAGES.max_pixels >= 268_000_000, "the largest image that can be set"
-        assert library_module.STORED_IMAGES.max_side_px >= ImageLimits().max_side_px
 
 
 class TestDescribing:
@@ -250,10 +235,6 @@ class TestUsable:
             self.load(store, IDS, (DataLoss,))
         with pytest.raises(DataLoss):
             self.load(store, IDS, (NotFound,))
-
-    def test_nothing_may_be_left(self, store: CountingStore) -> None:
-        damage(store, SCENE, "r1", "pose")
-        assert self.load(store, ["r1"], (DataLoss,)) == ([], ["r1"])
 
     def test_a_scene_that_is_not_there_is_an_error(self, store: CountingStore) -> None:
         with pytest.raises(NotFound) as caught:

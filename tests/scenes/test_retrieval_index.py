@@ -114,21 +114,6 @@ def test_any_changes_leave_what_they_leave_in_a_dictionary(
         assert_same(index, slow)
 
 
-def test_many_adds_and_removals_in_blocks() -> None:
-    """Enough for the arrays to grow several times and to be compacted."""
-    index, slow = SceneIndex(DIMENSION), SlowIndex()
-    for generation in range(10):
-        added = tuple(reference(100 * generation + i) for i in range(100))
-        removed = frozenset(list(slow.by_key)[:90])
-        for target in (index, slow):
-            target.apply(change(generation, added, removed))
-        assert_same(index, slow)
-    assert len(index.entries()) == 1000 - 9 * 90
-    for target in (index, slow):
-        target.apply(change(10, removed=frozenset(list(slow.by_key)[:-5])))
-    assert_same(index, slow)
-
-
 def test_entries_stay_as_they_were() -> None:
     index = SceneIndex(DIMENSION)
     index.apply(whole(*(reference(i, described=i > 0) for i in range(300))))
@@ -178,16 +163,6 @@ def test_readers_see_one_generation_whole_during_changes() -> None:
     for reader in readers:
         reader.join()
     assert not torn
-
-
-def test_similarities_are_the_same_gathered_or_in_one_go() -> None:
-    index = SceneIndex(DIMENSION)
-    index.apply(whole(*(reference(i) for i in range(64))))
-    entries = index.entries()
-    rows = entries.rows()
-    every = entries.similarities(QUERY, rows)
-    for few in (rows[::7], rows[:1], rows[5:20], rows[:0]):
-        np.testing.assert_allclose(entries.similarities(QUERY, few), every[few], rtol=1e-6, atol=1e-7)
 
 
 def test_a_blank_photograph_resembles_nothing_and_is_described() -> None:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from support.scenes import SceneOptions, make_scene
 from support.stores import damage
 
-from mapless.geometry import RigidTransform
 from mapless_server.errors import NotFound, Unavailable
 from mapless_server.method.views import PosedView, View
 from mapless_server.scenes import AuditVerdict, CoverageVerdict, Viewpoint
@@ -147,41 +146,3 @@ def test_a_scene_that_never_holds_still_is_unavailable(store: Store, monkeypatch
         auditor.audit("r0", go_on)
     assert caught.value.reason == "SCENE_CHANGED"
     assert len(readings) == 3
-
-
-def test_a_page_of_a_large_scene_makes_no_pose_per_reference(store: Store) -> None:
-    """Poses are made for the few that are looked at, not for the scene."""
-    tools = tools_of(store)
-    view = REFERENCES[0].view
-    far = [RigidTransform(np.eye(3), np.array([1000.0 + i, 0.0, 0.0])) for i in range(100)]
-    distant = [NewReference(f"far{i}", b"far %d" % i, view.camera, far[i], {"planted": view}, FLAT) for i in range(100)]
-    store.add_references(KEY, distant)
-    auditor = SceneAuditor(tools, KEY)
-    entries, made = auditor._read(), []
-    original = type(entries).reference
-
-    def counting(self: Any, row: int) -> Any:
-        made.append(row)
-        return original(self, row)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(type(entries), "reference", counting)
-        auditor._finder(entries.rows())
-        assert made == []
-        found = auditor._finder(entries.rows()).near("scenes/s/references/r0", 3)
-    assert {name.rpartition("/")[2] for name in found} <= {f"r{i}" for i in range(1, 6)}
-    assert len(set(made)) <= 4 * 3 + 1
-
-
-def test_neighbours_among_rows_with_holes_are_the_nearest(store: Store) -> None:
-    store.delete_reference(KEY, "r1")
-    auditor = SceneAuditor(tools_of(store), KEY)
-    finder = auditor._finder(auditor._read().rows())
-    left = {f"scenes/s/references/r{i}": REFERENCES[i].world_from_camera for i in range(len(REFERENCES)) if i != 1}
-    np.testing.assert_array_equal(finder.origin, REFERENCES[0].world_from_camera.translation)
-    for name, pose in left.items():
-        np.testing.assert_allclose(finder.pose(name).matrix(), pose.shifted(-finder.origin).matrix(), atol=1e-12)
-        assert set(finder.near(name, 4)) == left.keys() - {name}
-        (nearest,) = finder.near(name, 1)
-        away_m = {it: np.linalg.norm(left[it].translation - pose.translation) for it in left if it != name}
-        assert away_m[nearest] <= 1.5 * min(away_m.values())

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from sqlalchemy import select
-from support.stores import EXTRACTOR, make_reference
+from support.stores import EXTRACTOR, let_pass, make_reference
 
 from mapless.geometry import Camera
 from mapless_server.errors import DataLoss, NotFound, Unavailable
@@ -17,9 +17,9 @@ from mapless_server.scenes.depth.scene_depths import SceneDepths
 from mapless_server.scenes.library import Closed, ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import SceneKey
-from mapless_server.store import Store, pairs, rows
+from mapless_server.store import Store, rows
 from mapless_server.store.depths import depth_kind, load_depths
-from mapless_server.store.pairs import FIRST_RETRY_S, PairStore
+from mapless_server.store.pairs import FIRST_RETRY_S
 from mapless_server.store.tables import reference_matching
 
 SCENE = SceneKey("office")
@@ -139,8 +139,7 @@ def test_a_failure_is_tried_again_later(store: Store, error: Exception, monkeypa
     assert it.maker.asked.count("b") == 1
     assert it.events.count(("depth_failures", 1, "")) == 1
     it.maker._answers.clear()
-    now_us = rows.now_us
-    monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(1e6 * (FIRST_RETRY_S + 1)))
+    let_pass(monkeypatch, FIRST_RETRY_S + 1)
     it.run()
     assert it.kept() == {"a", "b", "c"}
 
@@ -190,12 +189,6 @@ class TestFinder:
             assert len(first.depths.depth) == len(first.view.features)
         assert it.events == [("looked up", 2, 1, 0), ("looked up", 0, 1, 0)]
 
-    def test_a_later_depth_is_found(self, store: Store) -> None:
-        it = work(store)
-        assert all(view.depths is None for view in it.finder.with_depths(views(store), EXTRACTOR))
-        it.run()
-        assert all(view.depths is not None for view in it.finder.with_depths(views(store), EXTRACTOR))
-
     def test_damaged_ones_are_not_used_and_made_again(self, store: Store) -> None:
         it = work(store)
         it.run()
@@ -221,10 +214,3 @@ class TestFinder:
         assert [view.key for view in found] == [view.key for view in references]
         assert all(view.depths is None for view in found)
         assert it.events[-1] == ("depth_failures", 1, "")
-
-
-def test_claims_end_by_themselves_long_after_those_of_pairs(store: Store) -> None:
-    claims = PairStore(store.database, claim_s=1800.0)
-    assert claims.claim("depth-1/x", pairs.Progress()) is not None
-    (due_us,) = due_times_us(store)
-    assert 1700e6 < due_us - rows.now_us() < 1900e6

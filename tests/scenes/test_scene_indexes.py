@@ -92,16 +92,6 @@ class TestMemory:
         assert set(indexes._cached) == {keys[0], keys[2], keys[3]}
         assert indexes.size_bytes == sum(held.index.size_bytes for held in indexes._cached.values())
 
-    def test_one_that_was_deleted_takes_none(self, store: Store) -> None:
-        store.add_references(SCENE, [new(0, is_described=True)])
-        indexes = indexes_of(store)
-        indexes.entries(SCENE, StageContext())
-        assert indexes.size_bytes > 0
-        for _ in range(2):  # a second time there is nothing to forget
-            indexes.forget(SCENE)
-            assert indexes.size_bytes == 0
-        assert "r0" in indexes.entries(SCENE, StageContext())  # as if it were asked for the first time
-
     @pytest.mark.parametrize("is_described", [True, False])
     def test_one_that_is_deleted_while_it_is_asked_takes_none(
         self, store: Store, is_described: bool, monkeypatch: pytest.MonkeyPatch

@@ -18,18 +18,6 @@ def served(queue: FairQueue[str], count: int) -> list[str]:
     return [queue.pop() for _ in range(count)]
 
 
-def test_one_caller_is_served_in_order() -> None:
-    queue: FairQueue[str] = FairQueue(QUANTUM_S)
-    for name in "abc":
-        queue.push(name, Flow("t", "c"), 0.7)
-    assert len(queue) == 3
-    assert queue.cost_s == pytest.approx(2.1)
-    assert served(queue, 3) == ["a", "b", "c"]
-    assert (len(queue), queue.cost_s) == (0, 0.0)
-    with pytest.raises(IndexError):
-        queue.pop()
-
-
 def test_a_hundred_requests_of_one_do_not_delay_another() -> None:
     queue: FairQueue[str] = FairQueue(QUANTUM_S)
     for i in range(100):

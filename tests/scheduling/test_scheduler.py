@@ -151,15 +151,6 @@ class TestAdmission:
             toy.scheduler.check_room(toy.jobs[0].flow, toy.jobs[0].step, toy.now_s)
         toy.admit(client="another")
 
-    def test_a_job_is_booked_for_no_more_than_it_was_admitted_for(self) -> None:
-        toy = Toy()
-        job = toy.admit()
-        toy.finish(toy.take("host"), onward(job))
-        for _ in range(100):
-            toy.learn("refine", "toy", 9.0)
-        toy.finish(toy.take("device"), onward(job))
-        assert job.booked_s["host"] == pytest.approx(COST_S["refine"])
-
     def test_memory_is_bounded(self) -> None:
         toy = Toy()
         toy.admit(size_bytes=700)
@@ -184,13 +175,6 @@ class TestAdmission:
         """Else a prediction that is wrong once would be wrong for ever."""
         Toy().admit(deadline_s=0.01)
 
-    def test_a_light_caller_is_not_refused_for_a_heavy_ones_queue(self) -> None:
-        toy = Toy()
-        for _ in range(5):
-            toy.admit(client="heavy")
-        assert toy.refusal(client="heavy", deadline_s=1.7).reason is Refusal.QUEUE_FULL
-        toy.admit(client="light", deadline_s=1.7)
-
     def test_an_expensive_caller_prices_no_other_out(self) -> None:
         toy = Toy()
         for _ in range(20):
@@ -213,17 +197,6 @@ class TestAdmission:
         assert toy.refusal(deadline_s=3.0).reason is Refusal.DEADLINE_INFEASIBLE
         toy.now_s = 31.0
         toy.admit(deadline_s=34.0)
-
-    def test_stages_that_jobs_do_not_reach_cost_them_nothing(self) -> None:
-        toy = Toy()
-        for _ in range(30):
-            toy.admit(client="tracked")
-            toy.finish(toy.take("host"), Done("result"))
-        job = toy.admit(client="tracked")
-        assert job.booked_s["host"] == pytest.approx(COST_S["prepare"], rel=0.1)
-        assert job.booked_s["device"] == pytest.approx(0.0, abs=0.02)
-        certain = toy.admit(stage="refine", client="tracked")
-        assert certain.booked_s["host"] == pytest.approx(COST_S["refine"], rel=0.1)
 
     def test_no_job_is_admitted_while_draining(self) -> None:
         toy = Toy()
@@ -277,16 +250,6 @@ class TestOrder:
         assert toy.take("host").jobs == (second,)
         assert not first.is_over
 
-    def test_steps_of_a_quantum_leave_no_thread_idle(self) -> None:
-        toy = Toy()
-        toy.scheduler.costs.forget()
-        toy.learn("describe", "toy", 0.001, "short")
-        for client in ("long", "long too"):
-            toy.learn("prepare", "toy", OPTIONS.quantum_s, client)
-            toy.admit(client=client)
-        toy.admit(client="short", stage="describe")
-        assert [toy.take("host").stage.name for _ in range(2)] == ["prepare", "prepare"]
-
     def test_a_batch_is_of_one_bucket_and_as_large_as_what_waits(self) -> None:
         toy = Toy(WorkQueueOptions(max_queued_s=1000))
         for i in range(8):
@@ -315,27 +278,6 @@ class TestOrder:
         between = [later - earlier - 1 for earlier, later in itertools.pairwise([-1, *large])]
         assert between == [64, 128, 256, 512]
         assert set(sizes) == {1, 2}
-
-    def test_a_trial_that_fails_leaves_the_size_that_fits(self) -> None:
-        toy, sizes = Toy(WorkQueueOptions(max_queued_s=1e9)), []
-        for _ in range(400):
-            for _ in range(3):
-                toy.admit(stage="coarse", bucket="b", deadline_s=1e9)
-            batch = toy.take("device")
-            sizes.append(len(batch.jobs))
-            if len(batch.jobs) == 3:
-                toy.scheduler.limit_batch("coarse", "b", 3)
-            toy.finish(batch, *[Done("result")] * len(batch.jobs))
-        assert sizes == [3, *[1] * 64, *[2] * 128, 3, *[2] * 206]
-
-    def test_a_lane_computes_as_much_at_a_time_as_it_has_threads(self) -> None:
-        toy = Toy(WorkQueueOptions(max_queued_s=1000))
-        for _ in range(3):
-            toy.admit()
-        first, _ = toy.take("host"), toy.take("host")
-        assert toy.scheduler.take("host", toy.now_s) is None
-        toy.finish(first, Done(None))
-        toy.take("host")
 
 
 class TestTime:
@@ -405,13 +347,6 @@ class TestTime:
         toy.scheduler.expire(4.5)
         assert toy.ends[0] == [(Ending.DEGRADED, "coarse")]
 
-    def test_and_at_once_if_that_is_foreseen(self) -> None:
-        toy = Toy()
-        job = toy.admit(stage="coarse", deadline_s=0.45)
-        fallback = Fallback(lambda: Done("coarse", Ending.DEGRADED), 0.4)
-        toy.finish(toy.take("device"), onward(job, fallback))  # it is 0.3, and refining takes 0.2
-        assert toy.ends[0] == [(Ending.DEGRADED, "coarse")]
-
     def test_a_prediction_that_is_wrong_does_not_stay_so(self) -> None:
         """What is not computed teaches nothing: so, now and then, what seems useless is computed all the same."""
         toy = Toy()
@@ -428,15 +363,6 @@ class TestTime:
             toy.now_s += 1.0
         assert refined > 50
         assert toy.ending_of(job) is Ending.OK
-
-    def test_a_job_cancelled_while_computed_is_charged(self) -> None:
-        quota = PlantedQuota()
-        toy = Toy(quota=quota)
-        toy.admit(deadline_s=5.0)
-        toy.take("host")
-        toy.scheduler.expire(5.0)
-        ((predicted_s, actual_s),) = quota.settled
-        assert actual_s == predicted_s > 0
 
     @pytest.mark.parametrize(
         ("kind", "others", "expected"),

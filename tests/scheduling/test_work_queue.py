@@ -14,7 +14,7 @@ import weakref
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any, ParamSpec
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -46,8 +46,6 @@ ROOMY = WorkQueueOptions(max_queued_s=1e6, heartbeat_s=0.05)
 LIMIT_S = 20.0
 FAR_S = 600.0
 MAX_BATCH = 8
-
-P = ParamSpec("P")
 
 
 class PlantedError(Exception):
@@ -177,14 +175,6 @@ def _nothing_unhandled(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
 
 
 class TestResults:
-    async def test_a_job_that_has_ended_is_not_run_again(self) -> None:
-        async with Toy(lambda jobs: [Done(job.step.payload) for job in jobs]) as toy:
-            job = Job(Flow("t", "c"), Step("then", "toy", "b", "z"), time.monotonic() + FAR_S, 1)
-            toy.gate.set()
-            assert await toy.queue.run(job) == "z"
-            with pytest.raises(ValueError, match="has ended"):
-                await toy.queue.run(job)
-
     async def test_a_job_passes_its_stages_and_records_their_times(self) -> None:
         marks: dict[str, tuple[float, float]] = {}
 
@@ -225,16 +215,6 @@ class TestResults:
         async with Toy(compute) as toy:
             assert await toy.together(range(2)) == [0, 1]
 
-    async def test_a_step_held_back_for_shorter_ones_starts_when_none_come(self) -> None:
-        async with Toy() as toy:
-            for client, cost_s in (("short", 0.0), ("plug", 1.0), ("long", 1.0)):
-                for stage in ("first", "then"):
-                    costs, flow = toy.queue._scheduler.costs, Flow("t", client)
-                    costs.observe(stage, "toy", flow, cost_s, time.monotonic())
-            await toy.plug("first")
-            assert await outcomes([toy.submit("short", "first", client="short")]) == ["short"]
-            assert await outcomes([toy.submit("long", "first", client="long")]) == ["long"]
-
 
 class TestFailure:
     @settings(max_examples=25, deadline=None)
@@ -252,15 +232,6 @@ class TestFailure:
             assert await toy.submit("later") == "later"
         assert toy.observer.endings[Ending.FAILED] == sum(fails)
         assert not toy.fatals
-
-    async def test_a_job_given_an_exception_fails_alone_and_once(self) -> None:
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
-            return [PlantedError() if job.step.payload == 1 else Done(job.step.payload) for job in jobs]
-
-        async with Toy(compute) as toy:
-            zero, one, two = await toy.together(range(3))
-        assert (zero, type(one), two) == (0, PlantedError, 2)
-        assert toy.seen == [[0, 1, 2]]
 
     @pytest.mark.parametrize("error", [StopIteration(), StopAsyncIteration(), asyncio.TimeoutError(), KeyError("x")])
     async def test_any_exception_is_the_jobs_alone(self, error: Exception) -> None:
@@ -335,15 +306,6 @@ class TestFailure:
             toy.seen.clear()
             await toy.together(range(1, 9))
         assert [len(it) for it in toy.seen] == [1] * 8
-
-    async def test_a_job_that_is_too_large_alone_ends_out_of_memory(self) -> None:
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
-            raise MemoryError
-
-        async with Toy(compute) as toy:
-            (outcome,) = await outcomes([toy.submit(0)])
-        assert isinstance(outcome, MemoryError)
-        assert toy.observer.endings == {Ending.OUT_OF_MEMORY: 1}
 
 
 class TestEndOfAll:
@@ -465,22 +427,6 @@ class TestEndOfAll:
         (said,) = [it.getMessage() for it in caplog.records if it.levelname == "ERROR"]
         assert "toy-device" in said
         assert "left behind" in said
-
-    async def test_a_queue_that_never_began_can_be_closed(self) -> None:
-        async with Toy() as toy:
-            await toy.queue.close()
-            (refused,) = await outcomes([toy.submit(0)])
-            assert isinstance(refused, Refused)
-            assert not toy.queue.is_alive_within(FAR_S)
-
-    async def test_draining_finishes_what_waits(self) -> None:
-        async with Toy() as toy:
-            calls = await toy.waiting(range(3))
-            toy.queue.drain()
-            (refused,) = await outcomes([toy.submit("late")])
-            assert isinstance(refused, Refused)
-            toy.gate.set()
-            assert await outcomes(calls) == [0, 1, 2]
 
 
 class TestCallersWhoLeave:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sqlalchemy import Connection, Row
 from support.stores import EXTRACTOR, Place, Shared, make_reference
 
 from mapless.geodesy import Datum, enu_from_y_up
@@ -17,7 +16,7 @@ from mapless.geometry import Quaternion, rotation_from_vector
 from mapless.scenes import Calibration, unit_vector
 from mapless_server import errors
 from mapless_server.security import DEFAULT_TENANT, SceneKey
-from mapless_server.store import ContradictingDown, SceneAttributes, Store, codec, deletion, queries
+from mapless_server.store import ContradictingDown, SceneAttributes, Store, codec, deletion
 
 OFFICE, HALL, NOWHERE = map(SceneKey, ("office", "hall", "nowhere"))
 DATUM = Datum(47.1 / 3, -8.1 / 3, 400.1 / 3, Quaternion(0.0, 0.0, 0.6, 0.8))
@@ -69,23 +68,6 @@ def test_each_change_is_alone_and_raises_the_generation(store: Store) -> None:
         assert updated == store.get_scene(OFFICE)
         assert updated.generation == generation
     assert expected == SceneAttributes()
-
-
-def test_references_in_memory_are_not_read_again(store: Store) -> None:
-    store.create_scene(OFFICE)
-    store.add_references(OFFICE, [make_reference("a")])
-    store.update_scene(OFFICE, datum=DATUM)
-    changes = store.list_changes(OFFICE, 2, "vlad")
-    assert (changes.generation, changes.added, changes.is_whole) == (3, (), False)
-
-
-def test_other_changes_leave_it_alone(store: Store) -> None:
-    store.create_scene(OFFICE, SceneAttributes(DATUM))
-    store.create_scene(HALL)
-    store.add_references(OFFICE, [make_reference("a")])
-    store.delete_reference(OFFICE, "a")
-    store.update_scene(HALL, down_in_world=DOWN)
-    assert known_of(store, OFFICE) == SceneAttributes(DATUM)
 
 
 @pytest.mark.parametrize("count", [0, 3])
@@ -190,22 +172,6 @@ def test_changes_at_once_lose_none_of_each_other(store: Store) -> None:
             found = known_of(store, OFFICE)
             assert (found.datum, found.down_in_world, found.calibration is None) == (DATUM, DOWN, False)
     assert store.get_scene(OFFICE).generation == 1 + 6 * rounds
-
-
-def test_an_unshared_store_is_read_once(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[SceneKey] = []
-    find = queries.find_attributes
-
-    def count(connection: Connection, key: SceneKey) -> Row[Any]:
-        asked.append(key)
-        return find(connection, key)
-
-    monkeypatch.setattr(queries, "find_attributes", count)
-    with place.open() as store:
-        store.create_scene(OFFICE, SceneAttributes(DATUM))
-        for _ in range(5):
-            assert store.get_attributes(OFFICE).datum == DATUM
-        assert len(asked) == (5 if isinstance(place, Shared) else 1)
 
 
 def test_a_store_without_a_cache_sees_every_change(place: Place) -> None:

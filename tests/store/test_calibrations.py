@@ -1,13 +1,12 @@
 """Self-calibrations in the store: each scene is claimed by one server, and what is stored holds for its kind alone."""
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from support.stores import Place, make_reference
+from support.stores import Place, let_pass, make_reference
 
 from mapless_server.security import SceneKey
-from mapless_server.store import SceneAttributes, SelfCalibration, Store, calibration_kind, rows
+from mapless_server.store import SceneAttributes, SelfCalibration, Store, calibration_kind
 from mapless_server.store.calibrations import (
     CLAIM_S,
     CalibrationClaim,
@@ -16,8 +15,6 @@ from mapless_server.store.calibrations import (
     count_waiting,
     discard_damaged,
     list_newest,
-    postpone,
-    release,
     renew,
 )
 from mapless_server.store.pairs import delete_unused, record_use
@@ -32,11 +29,6 @@ def store(place: Place) -> Iterator[Store]:
         store.create_scene(OFFICE)
         store.add_references(OFFICE, [make_reference("a", 1), make_reference("b", 2)])
         yield store
-
-
-def let_pass(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
-    now_us = rows.now_us
-    monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(seconds * 1e6))
 
 
 def of(store: Store, factor: float = 2.0, kind: str = KIND) -> SelfCalibration:
@@ -80,12 +72,6 @@ def test_frequent_changes_do_not_keep_servers_busy(store: Store, monkeypatch: py
     assert claim_scene(store.database, KIND) is not None
 
 
-def test_of_two_servers_one_calibrates(store: Store) -> None:
-    with ThreadPoolExecutor(4) as pool:
-        claims = list(pool.map(lambda _: claim_scene(store.database, KIND), range(8)))
-    assert sum(it is not None for it in claims) == 1
-
-
 def test_the_claim_of_a_killed_server_ends(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     killed = claimed(store)
     let_pass(monkeypatch, CLAIM_S - 1)
@@ -106,20 +92,6 @@ def test_a_renewed_claim_lasts(store: Store, monkeypatch: pytest.MonkeyPatch) ->
     let_pass(monkeypatch, CLAIM_S - 1)
     assert claim_scene(store.database, KIND) is None
     assert add(store, renewed, of(store), 0.0)
-
-
-def test_failures_are_tried_again_later_and_later(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    waits = []
-    for _ in range(3):
-        waits.append(postpone(store.database, claimed(store)))
-        assert claim_scene(store.database, KIND) is None
-        let_pass(monkeypatch, waits[-1] + 1)
-    assert waits == [30, 60, 120]
-
-
-def test_a_closed_server_leaves_the_scene_to_others(store: Store) -> None:
-    release(store.database, claimed(store))
-    assert claim_scene(store.database, KIND) is not None
 
 
 def test_a_deleted_scene_takes_its_calibration_along(store: Store, place: Place) -> None:

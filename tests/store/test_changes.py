@@ -99,47 +99,6 @@ def test_what_is_no_descriptor_is_refused(store: Store, wrong: np.ndarray) -> No
     assert store.get_scene(OFFICE).generation == 2
 
 
-def test_each_change_is_reported_once(store: Store) -> None:
-    store.create_scene(OFFICE)
-    store.create_scene(HALL)
-    a, b = store.add_references(OFFICE, [described("a"), described("b")])
-    start = store.list_changes(OFFICE, None, NAME).generation
-    (c,) = store.add_references(OFFICE, [described("c")])
-    store.delete_reference(OFFICE, "a")
-    store.add_references(HALL, [described("elsewhere")])
-    changes = store.list_changes(OFFICE, start, NAME)
-    assert [it.key for it in changes.added] == [c.key]
-    assert (changes.removed, changes.is_whole) == (frozenset({a.key}), False)
-    after = store.list_changes(OFFICE, changes.generation, NAME)
-    assert (after.generation, after.added, after.removed) == (changes.generation, (), frozenset())
-    # One that came and went in between is never listed as added.
-    store.add_references(OFFICE, [described("d")])
-    store.delete_reference(OFFICE, "d")
-    assert store.list_changes(OFFICE, after.generation, NAME).added == ()
-    assert b.key in {it.key for it in store.list_changes(OFFICE, None, NAME).added}
-
-
-def test_a_descriptor_found_later_is_a_change_once(store: Store) -> None:
-    store.create_scene(OFFICE)
-    a, _ = store.add_references(OFFICE, [make_reference("a"), make_reference("b")])
-    first, second = (make_descriptor(np.random.default_rng(seed), 16) for seed in (1, 2))
-    store.add_descriptor(a.key, NAME, first)
-    changes = store.list_changes(OFFICE, 2, NAME)
-    assert changes.generation == store.get_scene(OFFICE).generation == 3
-    assert [(it.key, it.descriptor is not None) for it in changes.added] == [(a.key, True)]
-    store.add_descriptor(a.key, NAME, second)
-    assert store.list_changes(OFFICE, 2, NAME).generation == 3
-    (found,) = (it for it in store.list_changes(OFFICE, None, NAME).added if it.key == a.key)
-    assert found.descriptor is not None
-    assert_same_bits(found.descriptor, first.astype(np.float16).astype(np.float32))
-    store.delete_reference(OFFICE, "a")
-    with pytest.raises(errors.NotFound, match="deleted"):
-        store.add_descriptor(a.key, "other", first)
-    store.delete_scene(OFFICE)
-    with pytest.raises(errors.NotFound):
-        store.add_descriptor(a.key, "other", first)
-
-
 def test_one_of_many_descriptors_wins_and_counts_once(store: Store) -> None:
     store.create_scene(OFFICE)
     (a,) = store.add_references(OFFICE, [make_reference("a")])
@@ -163,14 +122,6 @@ def test_a_new_life_and_a_generation_yet_to_come_are_read_whole(store: Store) ->
         changes = store.list_changes(OFFICE, since, NAME)
         assert (changes.is_whole, [it.reference_id for it in changes.added]) == (True, ["b"])
     assert not store.list_changes(OFFICE, generation, NAME).is_whole
-
-
-def test_a_descriptor_goes_with_its_reference(place: Place) -> None:
-    with place.open() as store:
-        store.create_scene(OFFICE)
-        store.add_references(OFFICE, [described("a"), described("b")])
-        store.delete_reference(OFFICE, "a")
-        assert place.fetch("SELECT count(*) FROM global_descriptor") == [(1,)]
 
 
 @pytest.mark.parametrize(

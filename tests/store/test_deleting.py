@@ -301,21 +301,6 @@ class TestMemory:
     def used_bytes(self, store: Store) -> tuple[int, ...]:
         return tuple(it.used for it in (store.reference_cache, store._resolved, store._attributes))
 
-    def ask(self, store: Store, key: SceneKey) -> None:
-        store.load_references(key, ["r1", "r0"], EXTRACTOR)
-        store.get_attributes(key)
-
-    def test_what_was_remembered_is_forgotten(self, place: Place) -> None:
-        with place.open() as store:
-            for key in (OFFICE, HALL):
-                fill(store, key)
-            self.ask(store, OFFICE)
-            before = self.used_bytes(store)
-            self.ask(store, HALL)
-            assert all(now > then for now, then in zip(self.used_bytes(store)[:2], before[:2], strict=True))
-            store.delete_scene(HALL)
-            assert self.used_bytes(store) == before
-
     @pytest.mark.parametrize("what", ["scene", "reference"])
     def test_what_is_being_read_meanwhile_is_not_remembered(
         self, place: Place, what: str, monkeypatch: pytest.MonkeyPatch

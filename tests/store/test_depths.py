@@ -9,7 +9,7 @@ from support.stores import Place, faults_of, make_reference
 from mapless.geometry import Camera
 from mapless_server.method.views import KeptDepth
 from mapless_server.security import SceneKey
-from mapless_server.store import Store, codec, depths, pairs, rows
+from mapless_server.store import Store, codec, depths
 from mapless_server.store.depths import (
     depth_kind,
     discard_depths,
@@ -18,7 +18,7 @@ from mapless_server.store.depths import (
     list_without,
     load_depths,
 )
-from mapless_server.store.pairs import PairStore, Progress, delete_unused, record_use
+from mapless_server.store.pairs import PairStore, Progress
 
 SCENE = SceneKey("office")
 KIND = depth_kind("mapanything", "a" * 64)
@@ -59,13 +59,6 @@ def test_depths_are_read_to_half_a_per_cent(store: Store, near_m: float, far_m: 
     assert np.array_equal(np.isnan(read.depth), np.isnan(depth.depth))
     assert np.nanmax(np.abs(np.log(read.depth / depth.depth))) <= 0.0051
     assert not read.depth.flags.writeable
-
-
-def test_a_map_without_any_depth_is_read_as_such(store: Store) -> None:
-    key = key_of(store, "a")
-    nothing = KeptDepth(CAMERA, np.full((48, 64), np.nan, np.float32), 0.02)
-    keep_depths(store.database, KIND, {key: nothing})
-    assert np.isnan(load_depths(store.database, [key], KIND).depths[key].depth).all()
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0])
@@ -125,13 +118,6 @@ def test_bytes_of_another_reference_or_kind_do_not_pass(store: Store, place: Pla
     assert load_depths(store.database, [first, second], KIND).damaged == {(KIND, second)}
 
 
-@pytest.mark.parametrize("version", [0, 2])
-def test_another_version_of_the_format_is_damage(version: int) -> None:
-    data = bytes([version]) + codec.encode_depth(kept())[1:]
-    with pytest.raises(codec.Damaged, match="depth"):
-        codec.decode_depth("", data, codec.sha256_for("", data))
-
-
 def test_depths_of_another_version_are_not_found(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     key = key_of(store, "a")
     keep_depths(store.database, KIND, {key: kept()})
@@ -163,19 +149,3 @@ def test_they_are_deleted_with_the_reference_and_the_scene(store: Store, place: 
     assert place.fetch("SELECT count(*) FROM reference_depth") == [(2,)]
     store.delete_scene(SCENE)
     assert place.fetch("SELECT count(*) FROM reference_depth") == [(0,)]
-
-
-def test_those_without_use_are_deleted(store: Store, place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also of a reference that no server has claimed."""
-    keep_depths(store.database, OTHER, {key_of(store, name): kept() for name in "ab"})
-    claims = PairStore(store.database)
-    claim = claims.claim(OTHER, Progress())
-    assert claim is not None
-    claims.add(OTHER, claim, {}, is_complete=True)
-    record_use(store.database, [OTHER])
-    now_us = rows.now_us
-    monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(1e6 * (pairs.KEPT_S + 1)))
-    keep_depths(store.database, KIND, {key_of(store, "c"): kept()})
-    record_use(store.database, [KIND])
-    delete_unused(store.database, lambda: None)
-    assert place.fetch("SELECT kind FROM reference_depth") == [(KIND,)]

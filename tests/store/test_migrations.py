@@ -162,12 +162,6 @@ def test_a_step_that_fails_changes_nothing(place: Place, monkeypatch: pytest.Mon
         assert store.get_scene(OFFICE).reference_count == 3
 
 
-def test_looking_changes_nothing(place: Place) -> None:
-    make_version_1(place)
-    place.open_as_is().close()
-    assert place.fetch("SELECT schema_version FROM store_version") == [(1,)]
-
-
 @pytest.mark.parametrize("is_empty", [True, False])
 def test_of_servers_that_start_at_once_one_migrates(shared: Shared, is_empty: bool) -> None:
     if not is_empty:

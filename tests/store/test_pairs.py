@@ -1,17 +1,17 @@
 """Stored matches of pairs: what is read is what was stored, each reference is claimed by one server at a time."""
 
+from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support.stores import Place, assert_same_bits, faults_of, make_reference
+from support.stores import Place, assert_same_bits, faults_of, let_pass, make_reference
 
 from mapless_server.security import SceneKey
-from mapless_server.store import Store, pairs, rows
+from mapless_server.store import Store, pairs
 from mapless_server.store.backup import back_up, restore
-from mapless_server.store.pairs import Claim, PairStore, Progress
+from mapless_server.store.pairs import KEPT_S, Claim, PairStore, Progress, delete_unused, record_use
 
 SCENE, OTHER = SceneKey("office"), SceneKey("acme/office")
 MATCHING = "sift/strict"
@@ -42,11 +42,6 @@ def claim_all(stored: PairStore, progress: Progress | None = None) -> list[Claim
     return found
 
 
-def let_pass(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
-    now_us = rows.now_us
-    monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(seconds * 1e6))
-
-
 def complete(store: Store, stored: PairStore) -> dict[tuple[str, str], np.ndarray]:
     """Every pair of the scene; what was stored."""
     everything: dict[tuple[str, str], np.ndarray] = {}
@@ -68,11 +63,6 @@ class TestMatches:
         found = stored.load(MATCHING, [pair, pair[::-1], (key_of(store, "c"), key_of(store, "a"))])
         assert list(found) == [pair]
         assert_same_bits(np.asarray(found[pair]), matches(count))
-
-    def test_of_another_matching_are_not_found(self, two: tuple[Store, PairStore]) -> None:
-        store, stored = two
-        (pair, *_) = complete(store, stored)
-        assert stored.load("another", [pair]) == {}
 
     @pytest.mark.parametrize("which", ["first_key", "second_key"])
     def test_are_deleted_with_either_reference(self, two: tuple[Store, PairStore], place: Place, which: str) -> None:
@@ -140,17 +130,6 @@ class TestMatches:
 
 
 class TestClaims:
-    def test_each_reference_is_claimed_once(self, two: tuple[Store, PairStore]) -> None:
-        store, stored = two
-        with ThreadPoolExecutor(4) as threads:
-            claims = [
-                it for found in threads.map(lambda _: claim_all(PairStore(store.database)), range(4)) for it in found
-            ]
-        assert sorted(it.reference_id for it in claims) == ["a", "b", "c"]
-        assert claim_all(stored) == []
-        assert stored.count_waiting(MATCHING) == 3
-        assert stored.claim("another", Progress()) is not None
-
     def test_each_pair_belongs_to_the_later_reference(self, two: tuple[Store, PairStore]) -> None:
         store, stored = two
         keys = {name: key_of(store, name) for name in "abc"}
@@ -179,18 +158,6 @@ class TestClaims:
         assert claim_all(stored) == [claim]
         assert stored.list_missing(MATCHING, claim, keys, 20) == [keys[1]]
         assert stored.list_missing(MATCHING, claim, keys, 1) == []
-
-    def test_completed_ones_are_not_claimed_again(
-        self, two: tuple[Store, PairStore], monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        store, stored = two
-        progress = Progress()
-        complete(store, stored)
-        let_pass(monkeypatch, 1e6)
-        assert claim_all(stored, progress) == []
-        assert stored.count_waiting(MATCHING) == 0
-        store.add_references(SCENE, [make_reference("d", 9)])
-        assert [it.reference_id for it in claim_all(stored, progress)] == ["d"]
 
     def test_the_wait_after_failures_grows(self, two: tuple[Store, PairStore], monkeypatch: pytest.MonkeyPatch) -> None:
         _, stored = two
@@ -226,3 +193,93 @@ class TestClaims:
         store, stored = two
         key = store.delete_reference(SCENE, "a")  # between listing and claiming
         assert not stored._claim(MATCHING, key)
+
+
+OURS, THEIRS = "aliked/strict", "sift/strict"
+
+
+@pytest.fixture
+def used(two: tuple[Store, PairStore], monkeypatch: pytest.MonkeyPatch) -> Store:
+    """Every pair of the three references, matched in two ways, both used now."""
+    monkeypatch.setattr(pairs, "_REFERENCES_AT_A_TIME", 2)
+    store, _ = two
+    for name in (OURS, THEIRS):
+        match_all(store, name)
+    record_use(store.database, [OURS, THEIRS])
+    return store
+
+
+def match_all(store: Store, name: str) -> int:
+    """Number of pairs that are stored."""
+    pairs, progress, count = PairStore(store.database), Progress(), 0
+    keys = list(store.find_keys(SCENE, ["a", "b", "c"]).values())
+    while claim := pairs.claim(name, progress):
+        made = {(other, claim.key): np.zeros((1, 2), np.int32) for other in pairs.list_missing(name, claim, keys, 9)}
+        pairs.add(name, claim, made, is_complete=True)
+        count += len(made)
+    return count
+
+
+def count_pairs(place: Place) -> Counter[str]:
+    return Counter(name for (name,) in place.fetch("SELECT matching FROM reference_pair"))
+
+
+def nothing() -> None:
+    pass
+
+
+def test_what_is_used_by_any_server_is_kept(used: Store, place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    let_pass(monkeypatch, KEPT_S - 1)
+    delete_unused(used.database, nothing)
+    assert count_pairs(place) == {OURS: 3, THEIRS: 3}
+    record_use(used.database, [OURS])
+    let_pass(monkeypatch, 2)
+    delete_unused(used.database, nothing)
+    assert count_pairs(place) == {OURS: 3}
+    assert place.fetch("SELECT matching FROM matching_use") == [(OURS,)]
+
+
+@pytest.fixture
+def unused(used: Store, monkeypatch: pytest.MonkeyPatch) -> Store:
+    """The store when only one of the two ways has been used of late."""
+    let_pass(monkeypatch, KEPT_S + 1)
+    record_use(used.database, [OURS])
+    return used
+
+
+def test_deleted_pairs_are_made_again(unused: Store, place: Place) -> None:
+    delete_unused(unused.database, nothing)
+    record_use(unused.database, [THEIRS])
+    assert match_all(unused, OURS) == 0
+    assert match_all(unused, THEIRS) == 3
+    assert count_pairs(place) == {OURS: 3, THEIRS: 3}
+
+
+def test_a_server_that_comes_back_meanwhile_stops_it(unused: Store, place: Place) -> None:
+    calls = list[None]()
+
+    def second_portion() -> None:
+        calls.append(None)
+        if len(calls) == 2:
+            record_use(unused.database, [THEIRS])
+
+    delete_unused(unused.database, second_portion)
+    assert len(calls) == 2
+    assert place.fetch("SELECT count(*) FROM reference_matching WHERE matching = ?", THEIRS) == [(1,)]
+    assert match_all(unused, THEIRS) > 0
+
+
+def test_a_deletion_that_was_interrupted_is_completed(unused: Store, place: Place) -> None:
+    calls = list[None]()
+
+    def end() -> None:
+        calls.append(None)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        delete_unused(unused.database, end)
+    assert place.fetch("SELECT count(*) FROM reference_matching WHERE matching = ?", THEIRS) == [(1,)]
+    delete_unused(unused.database, nothing)
+    assert place.fetch("SELECT count(*) FROM reference_matching WHERE matching = ?", THEIRS) == [(0,)]
+    assert count_pairs(place) == {OURS: 3}

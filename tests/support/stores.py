@@ -8,11 +8,12 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import psycopg
+import pytest
 
 from mapless.geometry import Camera, Distortion, RigidTransform, rotation_from_vector
 from mapless_server.method.views import Features, View
 from mapless_server.security import SceneKey
-from mapless_server.store import NewReference, Store, sqlite
+from mapless_server.store import NewReference, Store, rows, sqlite
 from mapless_server.store.postgresql import PostgresqlDatabase
 from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
 from mapless_server.store.store import DEFAULT_CACHE_BYTES
@@ -136,6 +137,12 @@ def make_descriptor(random: np.random.Generator, dimension: int) -> np.ndarray:
 def view_of(new: NewReference) -> View:
     """What the one extractor found."""
     return new.views[EXTRACTOR]
+
+
+def let_pass(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
+    """Puts the store's clock forward."""
+    now_us = rows.now_us
+    monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(seconds * 1e6))
 
 
 def assert_same_bits(actual: np.ndarray, expected: np.ndarray) -> None:

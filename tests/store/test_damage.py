@@ -1,16 +1,28 @@
-"""Pages of an SQLite file that a disk has lost: the reference that lies there is named, and nothing else is.
+"""Damage: the reference that it is in is named, and nothing else is; pages that a disk has lost, and changed bytes.
 
 Features and descriptors here are large enough to lie on pages of their own. A page is found by what was stored in it.
 """
 
+import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from support.stores import EXTRACTOR, Folder, faults_of, lose_page_with, make_reference, view_of
+from support.stores import (
+    EXTRACTOR,
+    Folder,
+    Place,
+    assert_same_view,
+    faults_of,
+    lose_page_with,
+    make_reference,
+    view_of,
+)
 
+from mapless_server import errors
 from mapless_server.errors import AlreadyExists, DataLoss, NotFound
 from mapless_server.security import SceneKey
-from mapless_server.store import deletion
+from mapless_server.store import Store, codec, deletion
 from mapless_server.store.sqlite import DATABASE_FILE
 
 SCENE = SceneKey("office")
@@ -112,3 +124,77 @@ def test_a_lost_table_of_references_names_no_reference(folder: Folder) -> None:
     with folder.open() as store, pytest.raises(DataLoss, match="the store is damaged"):
         store.load_references(SCENE, IDS, EXTRACTOR)
     assert any(fault.startswith("database: ") for fault in faults_of(folder))
+
+
+# Changed bytes
+
+
+OFFICE = SceneKey("office")
+
+
+OF_FEATURES, OF_REFERENCE = "WHERE reference_key = ?", "WHERE key = ?"
+DAMAGES: dict[str, tuple[str, Callable[[str, str, bytes], tuple[object, ...]]]] = {
+    "zeros": (f"features SET data = ? {OF_FEATURES}", lambda key, *_: (bytes(100), key)),
+    "nothing": (f"features SET data = ? {OF_FEATURES}", lambda key, *_: (b"", key)),
+    "features of another": (
+        f"features SET data = (SELECT data FROM features {OF_FEATURES}) {OF_FEATURES}",
+        lambda key, other, _: (other, key),
+    ),
+    "features and checksum of another": (
+        f"features SET (data, sha256) = (SELECT data, sha256 FROM features {OF_FEATURES}) {OF_FEATURES}",
+        lambda key, other, _: (other, key),
+    ),
+    "another width": (
+        f"reference SET geometry = ? {OF_REFERENCE}",
+        lambda key, _, geometry: (geometry.replace(b"640", b"641"), key),
+    ),
+    "no geometry": (f"reference SET geometry = ? {OF_REFERENCE}", lambda key, *_: (b"\xff", key)),
+    "text for bytes": (f"reference SET geometry = CAST(geometry AS TEXT) {OF_REFERENCE}", lambda key, *_: (key,)),
+}
+"""Statements after UPDATE, and their parameters by a reference's key, another's, and its geometry."""
+
+
+class TestDamage:
+    @pytest.mark.parametrize("damage", DAMAGES)
+    def test_one_damaged_reference_is_named_and_the_other_served(self, store: Store, place: Place, damage: str) -> None:
+        store.create_scene(OFFICE)
+        bad, good_record = store.add_references(OFFICE, [make_reference("bad", 1), make_reference("good", 2)])
+        if damage == "text for bytes" and not isinstance(place, Folder):
+            pytest.skip("to PostgreSQL, text is not bytes")
+        statement, parameters = DAMAGES[damage]
+        ((geometry,),) = place.fetch("SELECT geometry FROM reference WHERE key = ?", bad.key)
+        place.execute(f"UPDATE {statement}", *parameters(bad.key, good_record.key, geometry))
+        for ids in (["bad"], ["good", "bad"], None):
+            with pytest.raises(errors.DataLoss, match="'bad'"):
+                store.load_references(OFFICE, ids, EXTRACTOR)
+        (good,) = store.load_references(OFFICE, ["good"], EXTRACTOR).references
+        assert_same_view(good.view, view_of(make_reference("good", 2)))
+        assert store.read_image(OFFICE, "bad") == make_reference("bad", 1).image
+        store.delete_reference(OFFICE, "bad")
+        assert len(store.load_references(OFFICE, None, EXTRACTOR).references) == 1
+
+    def test_damaged_image_is_not_handed_out(self, store: Store, place: Place) -> None:
+        store.create_scene(OFFICE)
+        bad, _ = store.add_references(OFFICE, [make_reference("bad"), make_reference("good")])
+        place.execute("UPDATE image SET data = ? WHERE reference_key = ?", bytes(5000), bad.key)
+        with pytest.raises(errors.DataLoss, match="'bad'"):
+            store.read_image(OFFICE, "bad")
+        with pytest.raises(errors.DataLoss, match="'bad'"):
+            store.read_image_of(bad.key)
+        assert store.read_image(OFFICE, "good") == make_reference("good").image
+
+    def test_every_single_bit_flip_is_noticed(self) -> None:
+        blob = codec.encode_view(view_of(make_reference("a", count=1)))
+        sha256 = codec.sha256_for("owner", blob)
+        codec.decode_view("owner", blob, sha256)
+        for position in range(0, len(blob), 7):
+            flipped = bytearray(blob)
+            flipped[position] ^= 1 << position % 8
+            with pytest.raises(codec.Damaged):
+                codec.decode_view("owner", bytes(flipped), sha256)
+
+    def test_a_later_format_is_not_misread(self) -> None:
+        blob = bytearray(codec.encode_view(view_of(make_reference("a", count=1))))
+        struct.pack_into("<B", blob, 0, codec.SMALL_VIEW_FORMAT_VERSION + 1)
+        with pytest.raises(codec.Damaged, match="format 3"):
+            codec.decode_view("owner", bytes(blob), codec.sha256_for("owner", bytes(blob)))
