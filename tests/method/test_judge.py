@@ -4,17 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.planted import true_structure
+from support.planted import true_correspondences, true_structure
 from support.pnp_problems import POSE, problem_of
-from support.scenes import CAMERA, SceneOptions, make_scene, random_for
+from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import PoseEstimate, Support
 from mapless_server.method.trust.evidence import (
+    NO_AGREEMENT,
     AgreementOptions,
     Evidence,
+    disagreement_of_matches,
+    disagreement_of_references,
     epipolar_share,
     evidence_of,
     expected_share,
@@ -44,11 +47,7 @@ POOR = Evidence(22, 102, 0.1, 0.6, 0.04, 0.1, 0.3, 0.2)
 def support_of(outlier_share: float = 0.0, seen_share: float = 0.9) -> Support:
     """A planted photograph, solved."""
     options = SceneOptions(point_count=300, outlier_share=outlier_share, seen_share=seen_share)
-    scene = make_scene(random_for("judge", outlier_share, seen_share), options)
-    structure, matches = true_structure(scene)
-    estimate = solve_pose(scene.query, structure, matches, scene.world_from_query, PnpOptions())
-    assert isinstance(estimate, PoseEstimate)
-    return Support(scene.query, scene.references, structure, matches, estimate, np.zeros(3))
+    return solved(make_scene(random_for("judge", outlier_share, seen_share), options))
 
 
 def verdict(support: Support, coverage: float, options: JudgeOptions = OPTIONS) -> tuple[float, Rejection | None]:
@@ -207,3 +206,97 @@ def test_findable_points_are_in_front_and_inside_the_image() -> None:
     assert findable_count(query, structure.x_in_world, POSE) == 2
     bare = problem_of(inside[:1], np.zeros((1, 2)))[0]
     assert findable_count(bare, structure.x_in_world, POSE) == 1
+
+
+# Halves of the data
+
+
+AGREEMENT, DISTANCE_M = AgreementOptions(), 4.0
+
+
+def scene_of(case: object, **options: object) -> SyntheticScene:
+    return make_scene(random_for("agreement", case), replace(SceneOptions(point_count=300), **options))  # type: ignore[arg-type]
+
+
+def solved(scene: SyntheticScene) -> Support:
+    structure, matches = true_structure(scene)
+    estimate = solve_pose(scene.query, structure, matches, scene.world_from_query, PnpOptions())
+    assert isinstance(estimate, PoseEstimate)
+    return Support(scene.query, scene.references, structure, matches, estimate, np.zeros(3))
+
+
+def both(scene: SyntheticScene, support: Support) -> tuple[float, float]:
+    votes = votes_of(support, true_correspondences(scene).query_matches)
+    return (
+        disagreement_of_matches(support, DISTANCE_M, AGREEMENT),
+        disagreement_of_references(support, votes, DISTANCE_M, AGREEMENT),
+    )
+
+
+@pytest.mark.parametrize("outlier_share", [0.0, 0.3])
+def test_halves_of_a_right_pose_agree(outlier_share: float) -> None:
+    for case in range(5):
+        scene = scene_of(case, outlier_share=outlier_share)
+        assert max(both(scene, solved(scene))) < 0.01
+
+
+def test_small_motions_of_halves_are_those_of_ransac(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenes = [scene_of(case, outlier_share=0.3, noise_px=1.0) for case in range(5)]
+    supports = [solved(scene) for scene in scenes]
+    moved = [both(*it) for it in zip(scenes, supports, strict=True)]
+    monkeypatch.setattr("mapless_server.method.trust.evidence.MAJORITY", 1.0)
+    found = [both(*it) for it in zip(scenes, supports, strict=True)]
+    assert moved != found
+    np.testing.assert_allclose(moved, found, rtol=0.1, atol=2e-4)  # a thousandth counts as nothing
+
+
+def test_a_line_of_points_does_not_say_that_halves_agree() -> None:
+    scene = scene_of("line")
+    support = solved(scene)
+    along = np.linspace(0, 1, len(support.structure.x_in_world))[:, None]
+    x_in_world = scene.world_from_query.apply(np.array([-1.0, 0, 4]) + along * np.array([2.0, 0, 1]))
+    pixels = scene.query.camera.project(scene.world_from_query.inverse().apply(x_in_world)).astype(np.float32)
+    keypoints = scene.query.features.keypoints.copy()
+    keypoints[support.matches.keypoint] = pixels[support.matches.point]
+    query = replace(scene.query, features=replace(scene.query.features, keypoints=keypoints))
+    line = replace(support, query=query, structure=replace(support.structure, x_in_world=x_in_world))
+    assert disagreement_of_matches(line, DISTANCE_M, AGREEMENT) > 0.1
+
+
+def test_halves_of_random_matches_disagree() -> None:
+    scene = scene_of("random")
+    support = solved(scene)
+    shuffled = random_for("shuffled").permutation(support.matches.point)
+    wrong = replace(support, matches=replace(support.matches, point=shuffled))
+    assert disagreement_of_matches(wrong, DISTANCE_M, AGREEMENT) > 0.1
+
+
+def test_halves_of_references_with_wrong_poses_disagree() -> None:
+    """Points seen by references of one half are where those references were moved to."""
+    scene = scene_of("moved")
+    support = solved(scene)
+    votes = votes_of(support, true_correspondences(scene).query_matches)
+    shift = np.array([1.0, 0.0, 0.0])
+    moved = replace(votes, x_in_world=votes.x_in_world + np.where((votes.reference % 2 == 0)[:, None], shift, 0.0))
+    assert disagreement_of_references(support, votes, DISTANCE_M, AGREEMENT) < 0.01
+    assert disagreement_of_references(support, moved, DISTANCE_M, AGREEMENT) > 0.05
+
+
+def test_fewer_matches_than_two_poses_need_give_none() -> None:
+    scene = scene_of("few", point_count=60)
+    support, few = solved(scene), slice(0, 6)
+    matches = support.matches
+    kept = replace(matches, point=matches.point[few], keypoint=matches.keypoint[few], guided=matches.guided[few])
+    assert disagreement_of_matches(replace(support, matches=kept), DISTANCE_M, AGREEMENT) == NO_AGREEMENT
+
+
+def test_guided_matches_take_no_part_beside_others() -> None:
+    scene = scene_of("guided")
+    support = solved(scene)
+    wrong = random_for("guided").permutation(support.matches.point)
+    guided = np.arange(len(wrong)) % 3 > 0
+    point = np.where(guided, wrong, support.matches.point)
+    mixed = replace(support, matches=replace(support.matches, point=point, guided=guided))
+    assert disagreement_of_matches(mixed, DISTANCE_M, AGREEMENT) < 0.01
+    only = replace(support, matches=replace(support.matches, guided=np.ones(len(wrong), bool)))
+    assert disagreement_of_matches(only, DISTANCE_M, AGREEMENT) < 0.01

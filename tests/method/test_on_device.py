@@ -7,25 +7,33 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.scenes import SceneOptions, random_for
-
-from mapless_server.method.correspond import Correspondences
-from mapless_server.method.match import one_to_one as one_to_one_on_host
-from mapless_server.method.options import ScaleStrategy
-from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.scale_equations import ScaleOptions
+from numpy.typing import NDArray
 
 pytest.importorskip("torch", reason="the networks' extra is not installed")
 
 import torch
 from support.device import CASES, VARIANTS, Case, Watch, assert_same, case_of
+from support.scenes import SceneOptions, random_for
 from torch import Tensor
 
+from mapless import geometry
+from mapless.geometry import Array
+from mapless_server.method.arrays import (
+    AnyArray,
+    median,
+    normalize,
+    normalize_jacobian,
+)
 from mapless_server.method.coarse.device import DeviceReconstruction
+from mapless_server.method.correspond import Correspondences
+from mapless_server.method.match import one_to_one as one_to_one_on_host
 from mapless_server.method.on_device import match as device_match
 from mapless_server.method.on_device import prepare
 from mapless_server.method.on_device.compute import Inputs, Options, compute
 from mapless_server.method.on_device.transfer import upload
+from mapless_server.method.options import ScaleStrategy
+from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.scale_equations import ScaleOptions
 
 # The host's results
 
@@ -248,3 +256,32 @@ def test_pixels_of_zero_confidence_are_not_broken() -> None:
 
 
 # The reconstruction
+
+
+# Functions of both kinds of arrays
+
+
+KINDS: dict[str, Callable[[NDArray[np.generic]], AnyArray]] = {"numpy": lambda array: array, "torch": torch.from_numpy}
+POINTS = np.concatenate([random_for("points").normal(size=(20, 3)), [[1.0, 2.0, 0.0], [1.0, 2.0, np.nan]]])
+
+every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
+Kind = Callable[[NDArray[np.generic]], AnyArray]
+
+
+@every_kind
+@pytest.mark.parametrize("size", [0, 1, 2, 7, 8])
+def test_masked_median_is_that_of_the_chosen_values(kind: Kind, size: int) -> None:
+    random = random_for("median", size)
+    for chosen_count in range(size + 1):
+        values, where = random.normal(size=size), random.permutation(size) < chosen_count
+        expected = np.median(values[where]) if chosen_count else np.nan
+        np.testing.assert_array_equal(np.asarray(median(kind(values), kind(where))), expected)
+
+
+@every_kind
+def test_projection_equals_the_clients(kind: Kind) -> None:
+    """Also behind the camera, beside it and for NaN."""
+    points = kind(POINTS)
+    np.testing.assert_array_equal(np.asarray(normalize(points)), geometry.normalize(POINTS))
+    expected: Array = geometry.normalize_jacobian(POINTS)
+    np.testing.assert_allclose(np.asarray(normalize_jacobian(points)), expected, rtol=1e-15)

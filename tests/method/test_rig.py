@@ -1,5 +1,6 @@
 """Rigs: a planted pose is found from the matches of several cameras, also where none of them has enough."""
 
+import ctypes
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -8,17 +9,19 @@ import numpy as np
 import pytest
 from support.compare import assert_jacobian, assert_pose_close
 from support.groups import NOTHING, caller_pose, images_of, looking
-from support.scenes import SceneOptions, make_scene, random_for
+from support.scenes import CAMERA, SceneOptions, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.groups.checks import check_mounting, check_tracking, check_unit, hinted_group
+from mapless_server.method.groups.generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
 from mapless_server.method.groups.images import rejection_without_matches
 from mapless_server.method.groups.jumps import Jump
 from mapless_server.method.groups.rig import RigEstimate, RigOptions, RigState, solve_rig
 from mapless_server.method.groups.sequence import SequenceEstimate
 from mapless_server.method.groups.start import CHECK_TRACKING
 from mapless_server.method.perturbation import rotation_vector
+from mapless_server.method.pnp import PnpOptions
 from mapless_server.method.priors.known import PositionPrior, Priors
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.method.results import MetricScale, PoseStage, ScaleStage
@@ -291,3 +294,74 @@ def test_without_matches_the_hint_is_the_furthest_photographs() -> None:
     images = [NOTHING, replace(NOTHING, answer=Answer(furthest))]
     outcome = hinted_group(rejection_without_matches(images), [])
     assert (outcome.reason, outcome.hint) == (RejectionReason.LOW_OVERLAP, own)
+
+
+# The adapter of PoseLib's generalized solvers
+
+
+PNP = PnpOptions()
+TURNED_RIG = RigidTransform(rotation_from_vector([0.3, -0.2, 0.5]), np.array([1.0, -2.0, 3.0]))
+
+
+def planted(
+    random: np.random.Generator, counts: tuple[int, ...], wrong_share: float = 0.0, unit: float = 1.0
+) -> list[CameraMatches]:
+    """Cameras that look all ways, with so many matches each; `unit` of the rig's frame in metres."""
+    cameras = []
+    for count in counts:
+        rig_from_camera = RigidTransform(rotation_from_vector(random.normal(0, 1, 3)), random.normal(0, 0.3, 3))
+        pixels = random.uniform([0, 0], [CAMERA.width_px, CAMERA.height_px], (count, 2))
+        x_in_camera = CAMERA.rays(pixels) * random.uniform(3, 8, (count, 1))
+        x_in_world = TURNED_RIG.compose(rig_from_camera).apply(x_in_camera)
+        pixels = pixels + random.normal(0, 0.3, pixels.shape)
+        wrong = random.permutation(count)[: round(wrong_share * count)]
+        pixels[wrong] = random.uniform([0, 0], [CAMERA.width_px, CAMERA.height_px], (len(wrong), 2))
+        fixed = RigidTransform(rig_from_camera.rotation, rig_from_camera.translation / unit)
+        cameras.append(CameraMatches(CAMERA, fixed, pixels, x_in_world))
+    return cameras
+
+
+@pytest.mark.parametrize("wrong_share", [0.0, 0.5])
+def test_rig_ransac_finds_the_planted_pose(wrong_share: float) -> None:
+    cameras = planted(random_for("rig", wrong_share), (60, 40, 80), wrong_share)
+    found = rig_ransac(cameras, PNP)
+    assert found is not None
+    assert_pose_close(found, TURNED_RIG, metres=0.005, degrees=0.05)
+    assert inlier_count(cameras, found, PNP.inlier_px) >= round(180 * (1 - wrong_share))
+
+
+@pytest.mark.parametrize("unit", [0.37, 1.0, 25.0])
+def test_scaled_ransac_finds_the_planted_pose_and_scale(unit: float) -> None:
+    """Metres per unit, not units per metre."""
+    cameras = planted(random_for("scaled", unit), (60, 60, 60), 0.5, unit)
+    found = scaled_ransac(cameras, PNP, 2000, 600)
+    assert found is not None
+    assert found.scale == pytest.approx(unit, rel=0.03)
+    assert_pose_close(RigidTransform(found.rotation, found.translation), TURNED_RIG, metres=0.05, degrees=0.5)
+
+
+@pytest.mark.parametrize("counts", [(), (2,), (1, 1)])
+def test_too_few_matches_have_no_pose(counts: tuple[int, ...]) -> None:
+    cameras = planted(random_for("few"), counts)
+    assert rig_ransac(cameras, PNP) is None
+    assert not cameras or scaled_ransac(cameras, PNP, 100, 600) is None
+
+
+def test_one_camera_alone_has_no_scale() -> None:
+    assert scaled_ransac(planted(random_for("one"), (50,)), PNP, 100, 600) is None
+
+
+def test_the_same_matches_give_the_same_bits_for_any_rng_state() -> None:
+    """PoseLib draws from the C library, as any other library may."""
+    libc = ctypes.CDLL(None)
+    cameras = planted(random_for("bits"), (60, 40, 80), 0.3)
+
+    def poses(drawn: int) -> list[bytes]:
+        for _ in range(drawn):
+            libc.rand()
+        rigid, scaled = rig_ransac(cameras, PNP), scaled_ransac(cameras, PNP, 50, 600)
+        assert rigid is not None
+        assert scaled is not None
+        return [it.tobytes() for it in (rigid.matrix(), scaled.rotation, scaled.translation, np.float64(scaled.scale))]
+
+    assert poses(0) == poses(1) == poses(7)

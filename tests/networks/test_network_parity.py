@@ -15,8 +15,10 @@ import torch
 from numpy.typing import NDArray
 from support.parity_rule import deviation, existing, images, network_without_weights, ruled_network, weights
 from support.parity_rule import full_network as make_full_network
+from torch import Tensor
 
 from mapless_server.networks.conditions import normalize_poses
+from mapless_server.networks.heads import nearest_rotation
 from mapless_server.networks.network import Network, NetworkOutput, patch_grid
 from mapless_server.networks.pi3 import UNUSED, Pi3X
 
@@ -125,3 +127,113 @@ def metric(network: Network, given: torch.Tensor, case: dict[str, NDArray[Any]])
     finally:
         handle.remove()
     return torch.cat(seen).exp()[:, 0]
+
+
+# Laws for any weights
+
+
+GRID = (4, 5)
+
+
+@pytest.fixture(scope="module", params=["pi3", "pi3x"])
+def network(request: pytest.FixtureRequest) -> Network:
+    return ruled_network(request.param)
+
+
+def some_images(views: int, grid: tuple[int, int] = GRID) -> Tensor:
+    return torch.from_numpy(images("laws", (views, 3, grid[0] * 14, grid[1] * 14)))
+
+
+def reconstruct(network: Network, given: Tensor, mapped: int, poses: Tensor | None = None) -> NetworkOutput:
+    layout = network.layout(patch_grid(given))
+    posed = None if poses is None else torch.arange(len(given))[None]
+    return network.reconstruct(network.encode(given, layout)[None], layout, mapped, poses, posed)
+
+
+def assert_close(found: Tensor, expected: Tensor, tolerance: float = 1e-5) -> None:
+    assert (found - expected).abs().max() <= tolerance * expected.abs().max()
+
+
+def test_omitted_maps_do_not_change_the_rest(network: Network) -> None:
+    given = some_images(4)
+    everything, some = reconstruct(network, given, 4), reconstruct(network, given, 2)
+    assert some.local_points.shape[1] == some.confidence_logits.shape[1] == 2
+    assert_close(some.local_points, everything.local_points[:, :2])
+    assert_close(some.confidence_logits, everything.confidence_logits[:, :2])
+    torch.testing.assert_close(some.camera_poses, everything.camera_poses, rtol=0, atol=0)
+    assert reconstruct(network, given, 0).local_points.shape[1] == 0
+
+
+def test_in_low_precision_only_the_main_residual_stays_float32() -> None:
+    network = ruled_network("pi3")
+    network.set_compute_type(torch.bfloat16)
+    parts = ("encoder.blocks.1", "decoder.2", "decoder.3", "point_decoder.blocks.1", "point_head", "camera_head")
+    seen: dict[str, torch.dtype] = {}
+    for name, module in network.named_modules():
+        if name in parts:
+            module.register_forward_hook(lambda _m, _i, out, name=name: seen.update({name: out.dtype}))
+    given = some_images(3)
+    low = reconstruct(network, given, 3)
+    assert seen.pop("point_decoder.blocks.1") is torch.bfloat16
+    assert set(seen.values()) == {torch.float32}
+    assert len(seen) == 5
+    high = reconstruct(ruled_network("pi3"), given, 3)
+    assert 1e-5 < (low.local_points - high.local_points).norm() / high.local_points.norm() < 0.05
+
+
+def random_matrices(count: int) -> Tensor:
+    return torch.from_numpy(np.random.default_rng(0).normal(size=(count, 3, 3)))
+
+
+def test_the_nearest_rotation_equals_that_of_the_svd() -> None:
+    matrices = random_matrices(2000)
+    u, s, vt = torch.linalg.svd(matrices)
+    sign = torch.det(u @ vt)
+    expected = u @ torch.diag_embed(torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], -1)) @ vt
+    assert (sign < 0).sum() > 500, "mirrored ones among them"
+    unique = s[:, 1] + sign * s[:, 2] > 1e-3 * s[:, 0]
+    torch.testing.assert_close(nearest_rotation(matrices)[unique], expected[unique], rtol=0, atol=1e-9)
+
+
+def poses_at(*positions: tuple[float, float, float]) -> Tensor:
+    poses = torch.eye(4).repeat(1, len(positions), 1, 1)
+    poses[0, :, :3, :3] = nearest_rotation(random_matrices(len(positions))).float()
+    poses[0, :, :3, 3] = torch.tensor(positions)
+    return poses
+
+
+def test_normalized_poses_do_not_depend_on_frame_or_unit() -> None:
+    poses = poses_at((1, 2, 3), (2, 2, 3), (1, 5, 3))
+    moved = poses_at((9, -4, 0))[:, :1] @ poses
+    moved[..., :3, 3] *= 30
+    expected = normalize_poses(poses)
+    torch.testing.assert_close(normalize_poses(moved), expected, rtol=0, atol=1e-5)
+    torch.testing.assert_close(expected[0, 0], torch.eye(4), rtol=0, atol=1e-6)
+    torch.testing.assert_close(expected[0, 1:, :3, 3].norm(dim=-1).mean(), torch.tensor(1.0))
+
+
+def test_placeholders_of_unknown_poses_count_for_the_scale() -> None:
+    known = poses_at((0, 0, 0), (1, 0, 0), (0, 3, 0))
+    alone = normalize_poses(known)
+
+    def with_placeholder(distance: float) -> Tensor:
+        placeholder = torch.eye(4)[None, None].clone()
+        placeholder[..., 0, 3] = distance
+        return normalize_poses(torch.cat([known, placeholder], dim=1))[:, :3]
+
+    torch.testing.assert_close(with_placeholder(2.0), alone)  # the mean of 1 and 3
+    far = with_placeholder(200.0)
+    torch.testing.assert_close(far[..., :3, 3] * 34, alone[..., :3, 3])  # (1 + 3 + 200) / 3 instead of 2
+
+
+def test_the_pose_of_an_unposed_view_only_affects_the_scale() -> None:
+    network = ruled_network("pi3x")
+    assert isinstance(network, Pi3X)
+    layout = network.layout(GRID)
+    tokens = network.encode(some_images(3), layout)[None]
+    posed = torch.tensor([[0, 1]])
+    poses = normalize_poses(poses_at((0, 0, 0), (1, 0, 0), (0, 3, 0)))
+    other = poses.clone()
+    other[0, 2] = poses_at((7, 7, 7))[0, 0]
+    first, second = (network.reconstruct(tokens, layout, 2, p, posed) for p in (poses, other))
+    torch.testing.assert_close(first.camera_poses, second.camera_poses, rtol=0, atol=0)

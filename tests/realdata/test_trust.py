@@ -1,17 +1,22 @@
 """Acceptance at a stated coverage on real photographs: right answers, and almost nothing else."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain, combinations
 
 import numpy as np
 import pytest
+from scipy.special import bdtrik
 
+from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.answer import Localization
 from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.priors.known import NO_PRIORS, GravityPrior, Priors
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
+from mapless_server.method.uncertainty.radii import accuracy_from_covariance
 from mapless_tools.dataset import Dataset
-from research.places import METRIC, OTHERS, Measured, Place, answered, cross_pairs, right_pairs
+from research.places import METRIC, OTHERS, Measured, Pair, Place, answered, cross_pairs, right_pairs
 
 from .conftest import read_place_once
 
@@ -110,3 +115,103 @@ def trust_of(measured: Measured) -> float:
     """Of what is answered; 0 of what is not."""
     outcome = measured.answer.outcome
     return outcome.trust or 0.0 if isinstance(outcome, Localization) else 0.0
+
+
+def fewest(probability: float, count: int, share: float) -> float:
+    """The number that is not exceeded with a probability, of so many each of which holds with a share."""
+    return float(np.ceil(bdtrik(probability, count, share)))
+
+
+def held(scene: str, k: int) -> tuple[int, dict[str, int]]:
+    """Answers of a scene's photographs, each left out once and given K references, and how many radii held."""
+    found = list(answered(right_pairs(read_place_once(scene), None, (k,)), LocalizeOptions(coverage=1.0)))
+    rows: list[Sequence[bool]] = []
+    for it in found:
+        assert isinstance(it.answer.outcome, Localization)
+        assert it.answer.outcome.covariance is not None
+        assert it.off is not None
+        radii, (off_m, off_deg) = accuracy_from_covariance(it.answer.outcome.covariance), it.off
+        rows.append(
+            (
+                off_m <= radii.position_68_m,
+                off_m <= radii.position_95_m,
+                off_deg <= radii.rotation_68_deg,
+                off_deg <= radii.rotation_95_deg,
+            )
+        )
+    names = ("position 68", "position 95", "rotation 68", "rotation 95")
+    return len(rows), dict(zip(names, np.sum(rows, axis=0).tolist(), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("scene", "k"), [("fountain-P11", 5), pytest.param("tum-fr3-office", 10, marks=pytest.mark.nightly)]
+)
+def test_radii_contain_the_truth_as_often_as_stated(photographs: Callable[[str], Dataset], scene: str, k: int) -> None:
+    """Within what chance allows one time in a thousand; photographs of one walk are not independent, besides."""
+    photographs(scene)
+    count, shares = held(scene, k)
+    assert count >= 11
+    low, high = fewest(0.0005, count, 0.68), fewest(0.9995, count, 0.68)
+    for name in ("position 68", "rotation 68"):
+        assert low <= shares[name] <= high, (name, shares, count)
+    for name in ("position 95", "rotation 95"):
+        assert shares[name] >= fewest(0.0005, count, 0.95), (name, shares, count)
+
+
+FOUNTAIN, OFFICE = "fountain-P11", "tum-fr3-office"
+SENSORS = {"none": 0.0, "1°": 1.0, "upside down": -1.0}
+"""Signs of what an accelerometer with a noise of 1 degree measures; without one, 0."""
+
+
+def sensed(query: int, world_from_camera: RigidTransform, down_in_world: Array, sign: float) -> Priors:
+    if not sign:
+        return NO_PRIORS
+    right = world_from_camera.rotation.T @ down_in_world
+    noise = np.random.default_rng(query).normal(0, math.radians(1.0), 3)
+    down = sign * rotation_from_vector(noise - right * (right @ noise)) @ right
+    return Priors(gravity=GravityPrior(down / np.linalg.norm(down), down_in_world, 1.0))
+
+
+def measured(pairs: Sequence[Pair], place: Place, names: Sequence[str]) -> dict[str, list[Measured]]:
+    """Down is what most photographs of the place call down."""
+    down = np.mean([pose.rotation[:, 1] for pose in place.poses.values()], axis=0)
+    down /= np.linalg.norm(down)
+
+    def with_priors(sign: float) -> Iterator[Pair]:
+        for i, pair in enumerate(pairs):
+            assert pair.true_pose is not None
+            yield replace(pair, priors=sensed(i, pair.true_pose, down, sign))
+
+    return {name: list(answered(with_priors(SENSORS[name]))) for name in names}
+
+
+def is_right(it: Measured) -> bool:
+    return it.right and isinstance(it.answer.outcome, Localization)
+
+
+def checks(it: Measured) -> tuple[bool, bool]:
+    """Whether a prior contradicts the answer, and whether one was used."""
+    assert isinstance(it.answer.outcome, Localization)
+    found = it.answer.outcome.prior_checks
+    return any(check.conflict for check in found), any(check.used for check in found)
+
+
+def test_gravity_neither_moves_nor_loses_a_good_answer(photographs: Callable[[str], Dataset]) -> None:
+    photographs(FOUNTAIN)
+    place = read_place_once(FOUNTAIN)
+    found = measured(list(right_pairs(place, None, (3,)))[::4], place, ("none", "1°", "upside down"))
+    for none, right, upside_down in zip(*found.values(), strict=True):
+        assert is_right(none)
+        assert (checks(right)[0], checks(upside_down)) == (False, (True, False))
+        assert none.off
+        assert right.off
+        assert right.off[0] == pytest.approx(none.off[0], abs=1e-3)
+        assert upside_down.off == none.off
+
+
+def test_a_weak_answer_gains(photographs: Callable[[str], Dataset]) -> None:
+    """No reference within three frames: with gravity more of these photographs are localized."""
+    photographs(OFFICE)
+    place = read_place_once(OFFICE)
+    found = measured(list(right_pairs(place, None, (5,), frames_apart=3))[2:6], place, ("none", "1°"))
+    assert sum(map(is_right, found["1°"])) > sum(map(is_right, found["none"]))

@@ -77,21 +77,6 @@ class TestDamage:
 
 
 class TestMemory:
-    def test_what_is_held_is_what_the_scenes_take(self, store: Store) -> None:
-        """The running total is the sum, after scenes grew, were forgotten and were deleted."""
-        keys = [SceneKey(f"many-{i}") for i in range(4)]
-        indexes = indexes_of(store)
-        for key in keys:
-            store.create_scene(key)
-            indexes.entries(key, StageContext())
-        store.add_references(keys[0], [new(i, is_described=True) for i in range(3)])
-        indexes.entries(keys[0], StageContext())
-        store.delete_scene(keys[1])
-        with pytest.raises(NotFound):
-            indexes.entries(keys[1], StageContext())
-        assert set(indexes._cached) == {keys[0], keys[2], keys[3]}
-        assert indexes.size_bytes == sum(held.index.size_bytes for held in indexes._cached.values())
-
     @pytest.mark.parametrize("is_described", [True, False])
     def test_one_that_is_deleted_while_it_is_asked_takes_none(
         self, store: Store, is_described: bool, monkeypatch: pytest.MonkeyPatch
