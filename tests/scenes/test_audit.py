@@ -234,18 +234,20 @@ def test_one_among_many_faulty_ones_is_never_consistent(references: list[PosedVi
 
 # Coverage
 
+PAIRS_OF_SCENE = PairMatches()
+
 
 @pytest.fixture(scope="module")
 def scene() -> SyntheticScene:
     return make_scene(np.random.default_rng(3), SceneOptions(reference_count=6, noise_px=0.3))
 
 
-def check(scene: SyntheticScene, pairs: PairMatches, world_from_camera: RigidTransform) -> Coverage:
-    return check_coverage(scene.query.camera, world_from_camera, finder_of(scene.references), pairs)
+def check(scene: SyntheticScene, world_from_camera: RigidTransform) -> Coverage:
+    return check_coverage(scene.query.camera, world_from_camera, finder_of(scene.references), PAIRS_OF_SCENE)
 
 
-def test_among_the_references_one_is_localized(scene: SyntheticScene, pairs: PairMatches) -> None:
-    coverage = check(scene, pairs, scene.world_from_query)
+def test_among_the_references_one_is_localized(scene: SyntheticScene) -> None:
+    coverage = check(scene, scene.world_from_query)
     assert coverage.verdict is CoverageVerdict.LOCALIZABLE
     assert 150 < coverage.expected_match_count <= REPEATABILITY * len(scene.x_in_world)
     assert coverage.image_share > 0.3
@@ -265,24 +267,24 @@ def test_among_the_references_one_is_localized(scene: SyntheticScene, pairs: Pai
     ],
 )
 def test_where_no_reference_looks_one_is_not_localized(
-    scene: SyntheticScene, pairs: PairMatches, centre: tuple[float, float, float], target: tuple[float, float, float]
+    scene: SyntheticScene, centre: tuple[float, float, float], target: tuple[float, float, float]
 ) -> None:
-    coverage = check(scene, pairs, look_at(centre, target))
+    coverage = check(scene, look_at(centre, target))
     assert coverage.verdict is CoverageVerdict.NOT_LOCALIZABLE
     assert coverage.expected_match_count < 20
     assert coverage.position_68_m is None
 
 
-def test_the_further_off_the_fewer_matches(scene: SyntheticScene, pairs: PairMatches) -> None:
+def test_the_further_off_the_fewer_matches(scene: SyntheticScene) -> None:
     poses = [look_at((0.0, 0.0, -distance), (0.0, 0.0, 0.0)) for distance in (4.0, 6.0, 9.0, 14.0)]
-    counts = [check(scene, pairs, pose).expected_match_count for pose in poses]
+    counts = [check(scene, pose).expected_match_count for pose in poses]
     assert counts == sorted(counts, reverse=True)
     assert counts[0] > 4 * counts[-1]
 
 
-def test_without_two_references_nothing_is_known(scene: SyntheticScene, pairs: PairMatches) -> None:
+def test_without_two_references_nothing_is_known(scene: SyntheticScene) -> None:
     for references in ((), scene.references[:1]):
         finder = finder_of(references)
-        coverage = check_coverage(scene.query.camera, scene.world_from_query, finder, pairs)
+        coverage = check_coverage(scene.query.camera, scene.world_from_query, finder, PAIRS_OF_SCENE)
         assert coverage.verdict is CoverageVerdict.NOT_LOCALIZABLE
         assert "at least 2" in coverage.message
