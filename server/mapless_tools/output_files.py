@@ -3,7 +3,7 @@
 import json
 import math
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -32,12 +32,23 @@ def markdown_table(head: str, rows: Iterable[Iterable[object]]) -> list[str]:
     return [f"| {head} |", "|---" * (head.count("|") + 1) + "|", *lines]
 
 
+def text_table(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table in columns, of which the first is on the left, independent of a terminal's width."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(f"{cell:{'>' if i else '<'}{widths[i]}}" for i, cell in enumerate(row)) for row in rows]
+
+
 @contextmanager
 def whole_file(file: Path) -> Iterator[Path]:
-    """A file to write in place of another, which it replaces when the block ends without an error."""
-    partial = file.with_name(file.name + ".partial")
-    yield partial
-    os.replace(partial, file)
+    """A file to write, which gets its name when the block ends without an error: completely or not at all."""
+    partial = file.with_name(f".{file.name}.partial")
+    try:
+        yield partial
+        with partial.open("rb") as stream:
+            os.fsync(stream.fileno())
+        os.replace(partial, file)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def render(template: str, **values: object) -> str:

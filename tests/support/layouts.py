@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_tools.dataset import Dataset, Frame
-from mapless_tools.ingest.formats.writing import LAYOUTS, PosedImage, write_file
+from mapless_tools.ingest.formats.writing import LAYOUTS, PosedImage
 from support.images import encode, textured
 
 CAMERA = Camera(96, 64, 80.0, 81.0, 47.25, 30.75)
@@ -65,7 +65,7 @@ def write_layout(folder: Path, layout: str, planted: Truth) -> Path:
         images.append(PosedImage(f"{i}.png", planted.camera, pose))
     for path, text in LAYOUTS[layout].files(images, "a test").items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        write_file(folder / path, text.encode())
+        (folder / path).write_text(text)
     return folder
 
 

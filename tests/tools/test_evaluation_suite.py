@@ -37,7 +37,6 @@ from mapless_tools.evaluate.tables import (
     Table,
     groups_of,
     tables_of,
-    text_lines,
 )
 from mapless_tools.usage import UsageError
 
@@ -365,7 +364,6 @@ class TestTables:
         for table in tables_of(group):
             assert {len(line.cells) for line in table.rows} == {len(table.head)}
             assert any(line.source == OURS for line in table.rows)
-            assert len({len(line) for line in text_lines(table)}) == 1
 
 
 class TestCharts:

@@ -1,6 +1,7 @@
 """Recognizing layouts, reading cameras.json frame by frame, and writing folders that read back."""
 
 import json
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,8 @@ from mapless.geometry import Camera, Fisheye, RadialTangential, RigidTransform
 from mapless_tools.ingest import FORMATS
 from mapless_tools.ingest.formats import read_dataset, recognize
 from mapless_tools.ingest.formats.cameras import read_folder
-from mapless_tools.ingest.formats.writing import LAYOUTS, PosedImage, image_name, write_file
+from mapless_tools.ingest.formats.writing import LAYOUTS, PosedImage, image_name
+from mapless_tools.output_files import whole_file
 
 TRUTH = truth()
 
@@ -110,9 +112,11 @@ def test_long_ids_come_back_from_their_file_names(tmp_path: Path) -> None:
 
 
 def test_files_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
-    write_file(tmp_path / "a", b"first")
-    with pytest.raises(TypeError):
-        write_file(tmp_path / "a", "no bytes")  # type: ignore[arg-type]
+    for text in ("first", "second, interrupted"):
+        with suppress(KeyboardInterrupt), whole_file(tmp_path / "a") as file:
+            file.write_text(text)
+            if text != "first":
+                raise KeyboardInterrupt
     assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir()] == [("a", b"first")]
 
 

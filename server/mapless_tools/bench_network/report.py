@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from mapless_tools.output_files import markdown_table
+from mapless_tools.output_files import markdown_table, text_table
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,7 @@ def markdown(title: str, figures: Sequence[Figure]) -> list[str]:
 
 def table(figures: Sequence[Figure]) -> list[str]:
     """The same in columns of equal width, with a heading for each part; only notes on why something is not measured."""
-    rows = [HEADINGS, *(_cells(figure) for figure in figures)]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(HEADINGS))]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    lines = text_table([HEADINGS, *map(_cells, figures)])
     result = [f"  {lines[0]}"]
     part = None
     for figure, line in zip(figures, lines[1:], strict=True):

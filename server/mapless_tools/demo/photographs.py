@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless import Camera, RigidTransform
+from mapless import Camera, NewReference, RigidTransform
 from mapless.geometry import Array
 from mapless_tools.dataset import Frame
 from mapless_tools.ingest.formats.cameras import read_folder
@@ -28,6 +28,10 @@ class Photograph:
     data: bytes
     camera: Camera
     world_from_camera: RigidTransform
+
+    def reference(self, reference_id: str = "") -> NewReference:
+        """The photograph as a reference to store, by its name or another id."""
+        return NewReference(reference_id or self.name, self.data, self.camera, self.world_from_camera)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,9 +11,9 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from mapless import Client, LocalizationResult, NewReference, Rejected
-from mapless.geometry import rotation_angle_deg
+from mapless import Client, LocalizationResult, Rejected
 from mapless_tools.child import child_server
+from mapless_tools.evaluate.metrics import pose_error
 
 from . import picture
 from .photographs import Photograph, Place, place_of
@@ -56,9 +56,7 @@ def run_demo(data: Path | None, output: Path, console: Console | None = None) ->
         console.print(f"server: own process at {server.address}")
         client.create_scene(SCENE)
         with console.status("adding references"):
-            client.add_references(
-                SCENE, [NewReference(p.name, p.data, p.camera, p.world_from_camera) for p in place.references]
-            )
+            client.add_references(SCENE, [it.reference() for it in place.references])
         outcomes = []
         for query in place.queries:
             with console.status(f"localizing {query.name}"):
@@ -78,8 +76,7 @@ def judge(query: Photograph, answer: LocalizationResult | Rejected) -> Outcome:
     """Compares an answer with the truth."""
     if isinstance(answer, Rejected):
         return Outcome(query, answer, math.inf, math.inf)
-    error = query.world_from_camera.inverse().compose(answer.world_from_camera)
-    return Outcome(query, answer, float(np.linalg.norm(error.translation)), rotation_angle_deg(error.rotation))
+    return Outcome(query, answer, *pose_error(query.world_from_camera, answer.world_from_camera))
 
 
 def table_of(outcomes: Sequence[Outcome], metric: bool) -> Table:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from mapless_tools.charts import figure_of, inline_svg, new_axes, plot, use_logarithms
-from mapless_tools.output_files import render
+from mapless_tools.output_files import render, text_table
 
 from .benchmarks import DENSE
 from .figures import RULES
@@ -18,7 +18,7 @@ from .metrics import QueryResult
 from .pictures import EPIPOLAR_PX, WorstQuery
 from .plan import Method, setting_name
 from .suite import SceneWork, Suite
-from .tables import Average, Group, groups_of, tables_of, text_lines
+from .tables import Average, Group, groups_of, tables_of
 
 
 def page(suite: Suite, worst: Sequence[WorstQuery]) -> str:
@@ -50,7 +50,8 @@ def print_suite(suite: Suite) -> None:
     for group in groups_of(suite):
         for table in (table for table in tables_of(group) if not table.wide):
             print(f"\n{group.title}. {table.title}")
-            print("\n".join((*text_lines(table), *table.notes)))
+            lines = text_table([table.head, *(row.cells for row in table.rows)])
+            print("\n".join((*lines, *table.notes)))
     print()
     for name, value in facts(suite).items():
         print(f"{name}: {value}")

@@ -138,19 +138,6 @@ def tables_of(group: Group) -> tuple[Table, ...]:
     return tuple(table for table in (*tables, _timing(group)) if table.rows)
 
 
-def text_lines(table: Table) -> list[str]:
-    """The table as lines of plain text, independent of the terminal's width."""
-    lines = (table.head, *(row.cells for row in table.rows))
-    widths = [max(len(line[i]) for line in lines) for i in range(len(table.head))]
-    return [
-        "  ".join(
-            cell.rjust(width) if i else cell.ljust(width)
-            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
-        )
-        for line in lines
-    ]
-
-
 def format_median(translation_cm: float, rotation_deg: float) -> str:
     """A median in the paper's form with one more digit: "0.62/0.214"."""
     if math.isinf(translation_cm) or math.isinf(rotation_deg):

@@ -6,10 +6,11 @@ It can also rescue a damaged store: undamaged references are written.
 from pathlib import Path
 
 from mapless import Client, Reference
+from mapless_tools.output_files import whole_file
 from mapless_tools.progress import Progress
 
 from .fetching import Export, fetch_all
-from .formats.writing import LAYOUTS, PosedImage, image_name, write_file
+from .formats.writing import LAYOUTS, PosedImage, image_name
 
 FORMATS = (*LAYOUTS, "gltf")
 
@@ -45,7 +46,8 @@ def export_scene(client: Client, scene: str, folder: Path, layout: str, progress
         image = reference.image or b""
         name = image_name(reference.reference_id, image)
         place.mkdir(parents=True, exist_ok=True)
-        write_file(place / name, image)
+        with whole_file(place / name) as file:
+            file.write_bytes(image)
         return PosedImage(name, reference.camera, reference.world_from_camera)
 
     known = client.get_scene(scene)
@@ -53,5 +55,6 @@ def export_scene(client: Client, scene: str, folder: Path, layout: str, progress
     if images:
         for path, text in written.files(images, f"mapless scene {scene}", known).items():
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
-            write_file(folder / path, text.encode())
+            with whole_file(folder / path) as file:
+                file.write_text(text, encoding="utf-8")
     return Export(len(images), damaged)

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from mapless import Client, LocalizationResult, MaplessError, Reference
 from mapless import Scene as KnownScene
 from mapless.geometry import Array, Quaternion, RigidTransform
+from mapless_tools.output_files import whole_file
 from mapless_tools.progress import Progress
 from mapless_tools.view.scenery import Scenery, lay_out
 
 from .fetching import Export, fetch_all
 from .formats.collecting import OPENCV_FROM_OPENGL
-from .formats.writing import write_file
 
 PICTURES, THUMBNAIL_PX = 200, 128
 """Photographs in the file, and the longer side of each: some kilobytes, so that a page can load the file."""
@@ -63,7 +63,8 @@ def export_gltf(client: Client, scene: str, folder: Path, progress: Progress) ->
     views, damaged = fetch_all(client, scene, take, progress, PICTURES)
     if views:
         folder.mkdir(parents=True, exist_ok=True)
-        write_file(folder / f"{scene}.glb", to_gltf(known, views))
+        with whole_file(folder / f"{scene}.glb") as file:
+            file.write_bytes(to_gltf(known, views))
     return Export(len(views), damaged)
 
 

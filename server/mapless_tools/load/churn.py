@@ -16,7 +16,7 @@ from typing import Any
 import grpc
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from mapless import ConnectOptions, MaplessError, NewReference, aio
+from mapless import ConnectOptions, MaplessError, aio
 from mapless.names import scene_name
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import localization_service_pb2_grpc as rpcs
@@ -90,8 +90,7 @@ class Workers:
         stored: list[str] = []
         async with aio.Client(self.address, ONCE) as client:
             for number in self._rounds():
-                photo = chance.choice(self.place.references)
-                new = NewReference(f"extra-{number}", photo.data, photo.camera, photo.world_from_camera)
+                new = chance.choice(self.place.references).reference(f"extra-{number}")
                 if await self.outcomes.count("references", client.add_reference(SCENE, new)):
                     stored.append(new.reference_id)
                 # One whose answer came too late was perhaps stored all the same, and stays: a few at most.
@@ -108,8 +107,7 @@ class Workers:
                 scene = f"scene-{number % SCENES}"
                 await self.outcomes.count("scenes", client.create_scene(scene), *UNCERTAIN)
                 for photo in (first, second):
-                    new = NewReference(photo.name, photo.data, photo.camera, photo.world_from_camera)
-                    await self.outcomes.count("scenes", client.add_reference(scene, new), *UNCERTAIN)
+                    await self.outcomes.count("scenes", client.add_reference(scene, photo.reference()), *UNCERTAIN)
                 asked = asyncio.create_task(self._localize(client, scene, self.place.queries[0]))
                 await asyncio.sleep(chance.choice([0.0, 0.05, 0.2, 3.0]))
                 await self.outcomes.count("scenes", client.delete_scene(scene), *UNCERTAIN)

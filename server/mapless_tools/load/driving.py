@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mapless import Client, NewReference, wire
+from mapless import Client, wire
 from mapless.geometry import Camera
 from mapless.names import reference_name, scene_name
 from mapless.v1 import localization_service_pb2 as pb
@@ -31,7 +31,7 @@ METHOD = "/mapless.v1.LocalizationService/Localize"
 def store_references(client: Client, references: Sequence[Photograph]) -> None:
     """Creates the scene and stores the references in it."""
     client.create_scene(SCENE)
-    client.add_references(SCENE, [NewReference(p.name, p.data, p.camera, p.world_from_camera) for p in references])
+    client.add_references(SCENE, [it.reference() for it in references])
 
 
 def requests_for(client: Client, queries: Sequence[Photograph]) -> Requests:

@@ -1,9 +1,9 @@
 """Queries, and receiving them as they are answered, by WatchQueries; connects again when needed."""
 
+import hashlib
 import logging
 import threading
-import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mapless import ConnectOptions, MaplessError, wire
 from mapless.answer_messages import answer_from_message
 from mapless.answers import LocalizationResult, Rejected
-from mapless.errors import Internal, from_rpc_error
+from mapless.errors import from_rpc_error
 from mapless.geometry import Array, Camera, RigidTransform, resized_pixel
 from mapless.names import scene_name
 from mapless.v1 import localization_service_pb2 as pb
@@ -99,34 +99,15 @@ class Feed:
         """Watches a scene: `show` is called with queries, `report` with the state and whether queries will come."""
         self._channel = options.channel(address)
         self._metadata = options.metadata()
-        self._timeout_s = options.timeout_s
         self._request = pb.WatchQueriesRequest(scene=scene_name(scene))
         self._stub = LocalizationServiceStub(self._channel)
         self._show, self._report = show, report
-        # So that the viewer's own calls are recognized among those that are watched.
-        self._own = f"view-{uuid.uuid4().hex[:12]}"
+        self.own: set[bytes] = set()
+        """SHA-256 of photographs that the viewer localizes itself, which are not shown."""
         self._count = 0
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
         self._thread.start()
-
-    def localize(self, image: bytes, camera: Camera, references: Sequence[str]) -> LocalizationResult | Rejected:
-        """Localizes a photograph against some references, with the matches; it is not shown."""
-        scene = self._request.scene
-        request = pb.LocalizeRequest(
-            scene=scene,
-            references=[f"{scene}/references/{it}" for it in references],
-            image=image,
-            intrinsics=wire.camera_to_message(camera),
-            options=pb.LocalizeOptions(include_debug=True),
-        )
-        metadata = (*self._metadata, ("x-request-id", f"{self._own}-{uuid.uuid4().hex[:8]}"))
-        try:
-            return answer_from_message(self._stub.Localize(request, timeout=self._timeout_s, metadata=metadata))
-        except grpc.RpcError as error:
-            raise from_rpc_error(error) from error
-        except FieldError as error:
-            raise Internal("INTERNAL", str(error), reason="MALFORMED_ANSWER", field=error.field) from error
 
     def close(self) -> None:
         """Ends the watching."""
@@ -157,14 +138,13 @@ class Feed:
         if call.is_active():
             self._report("live", True)
         for message in call:
-            answer = answer_from_message(message.answer)
-            if answer.diagnostics.request_id.startswith(self._own):
+            if hashlib.sha256(message.image).digest() in self.own:
                 continue
             self._count += 1 + message.missed_count
             if not message.image:  # too large to be shown
                 continue
             camera = wire.camera_from_message(message.intrinsics, "intrinsics")
-            self._show(Query(self._count, message.image, camera, answer))
+            self._show(Query(self._count, message.image, camera, answer_from_message(message.answer)))
 
 
 def _words(failure: MaplessError) -> str:

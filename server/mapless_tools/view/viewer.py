@@ -1,5 +1,6 @@
 """The viewer: a client of the server, the stage, and the work in the background that fills it."""
 
+import hashlib
 import logging
 import threading
 from collections.abc import Callable, Iterator
@@ -10,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from mapless import Client, ConnectOptions, MaplessError, Reference, ResourceExhausted
+from mapless import Client, ConnectOptions, MaplessError, Reference
 from mapless_server.errors import InvalidArgument
 from mapless_server.method.options import check_bounds
 
@@ -21,8 +22,6 @@ from .stage import Stage
 
 log = logging.getLogger(__name__)
 
-_TRIES, _BUSY_S = 20, 1.0
-"""Tries of a call to a busy server, and the wait between them where it does not state one."""
 _FIRST = 40
 """Photographs that are loaded before the first points."""
 SEED_NEIGHBOURS = 8
@@ -98,19 +97,13 @@ class _Background:
             log.warning("query %d cannot be shown: %s", query.number, error)
 
     def _do(self, work: Callable[[], None]) -> None:
-        """Runs `work`, again if the server is busy, unless the viewer closes; a failure is logged only."""
-        for _ in range(_TRIES):
-            if self._closing.is_set():
-                return
-            try:
+        """Runs `work`, unless the viewer closes; a failure is logged only."""
+        try:
+            if not self._closing.is_set():
                 work()
-                return
-            except ResourceExhausted as error:
-                self._closing.wait(error.retry_after_s or _BUSY_S)
-            except (MaplessError, InvalidArgument) as error:
-                if not self._closing.is_set():
-                    log.warning("%s", error)
-                return
+        except (MaplessError, InvalidArgument) as error:
+            if not self._closing.is_set():
+                log.warning("%s", error)
 
     def _load(self, reference: Reference) -> None:
         image = self._client.get_reference(self._scene, reference.reference_id, include_image=True).image or b""
@@ -123,7 +116,8 @@ class _Background:
         if len(near) < 2:
             return
         image = self._client.get_reference(self._scene, reference.reference_id, include_image=True).image or b""
-        answer = feed.localize(image, reference.camera, near)
+        feed.own.add(hashlib.sha256(image).digest())
+        answer = self._client.localize(image, reference.camera, self._scene, near, include_debug=True)
         self._show_points(Query(0, image, reference.camera, answer))
 
     def _show_points(self, query: Query) -> None:

@@ -1,10 +1,8 @@
 """A scene's references as a folder of files: images, and a description of their cameras and poses."""
 
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from mapless import Scene
@@ -111,20 +109,6 @@ def image_name(reference_id: str, image: bytes) -> str:
     if image.startswith(b"\x89PNG"):
         return f"{reference_id}.png"
     return f"{reference_id}.webp" if image.startswith(b"RIFF") else f"{reference_id}.jpg"
-
-
-def write_file(file: Path, content: bytes) -> None:
-    """Writes a file either completely or not at all."""
-    unfinished = file.with_name(f".{file.name}.unfinished")
-    try:
-        with unfinished.open("wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        unfinished.replace(file)
-    except BaseException:
-        unfinished.unlink(missing_ok=True)
-        raise
 
 
 def _entry(image: PosedImage) -> dict[str, Any]:
