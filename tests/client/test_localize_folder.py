@@ -13,10 +13,10 @@ import grpc
 import pytest
 from google.rpc import error_details_pb2, status_pb2
 from support.clients import hosted
+from support.commands import run_client
 from support.planted_answers import diagnostics, localized, rejected
 
 from mapless import wire
-from mapless.__main__ import main
 from mapless.cli import localize
 from mapless.cli.folder import Concurrency, Tally
 from mapless.errors import InvalidArgument, ResourceExhausted
@@ -105,10 +105,8 @@ def run(
     server: FewAtATime, folder: Path, capsys: pytest.CaptureFixture[str], *arguments: str
 ) -> tuple[Any, list[Any], str]:
     """Exit code, answers, and what was said of them."""
-    with pytest.raises(SystemExit) as caught:
-        main(["localize", "s", str(folder), "--address", server.address, *arguments])
-    printed = capsys.readouterr()
-    return caught.value.code, [json.loads(line) for line in printed.out.splitlines()], printed.err
+    code, printed, error = run_client(capsys, "localize", "s", folder, "--address", server.address, *arguments)
+    return code, [json.loads(line) for line in printed.splitlines()], error
 
 
 def test_refused_photographs_do_not_wait_behind_new_ones(

@@ -23,7 +23,6 @@ from mapless_tools.demo import room
 
 REFERENCES, QUERIES = 7, 2
 PAIRS = REFERENCES * (REFERENCES - 1) // 2
-OFF = {"background_matching": False}
 
 
 def answers(server: RunningServer) -> list[bytes]:
@@ -45,7 +44,7 @@ def _answer(stub: LocalizationServiceStub, index: int) -> bytes:
 def unmatched(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[bytes]]:
     """A folder with a scene without stored pairs, and the answers of a server without stored pairs."""
     data_dir = tmp_path_factory.mktemp("unmatched") / "data"
-    with serving_really(data_dir, **OFF) as served:
+    with serving_really(data_dir, background_matching=False) as served:
         with Client(served.address) as client:
             client.create_scene("room")
             added = [NewReference(it.name, it.data, it.camera, it.world_from_camera) for it in room().references]
@@ -87,7 +86,7 @@ def count_pairs(data_dir: Path) -> int:
 
 
 def test_answers_are_the_same_with_stored_pairs(matched: Path, expected: list[bytes]) -> None:
-    with serving_really(matched, **OFF) as served:
+    with serving_really(matched, background_matching=False) as served:
         assert answers(served) == expected
         assert served.value("mapless_stored_pairs_total", result="stored") > 0
         assert served.value("mapless_stored_pairs_total", result="absent") == 0
@@ -95,7 +94,7 @@ def test_answers_are_the_same_with_stored_pairs(matched: Path, expected: list[by
 
 def test_switched_off_nothing_is_made(data_dir: Path, expected: list[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(BackgroundMatching, "_claim", lambda _: pytest.fail("a reference was claimed"))
-    with serving_really(data_dir, **OFF) as served:
+    with serving_really(data_dir, background_matching=False) as served:
         assert answers(served) == expected
         assert served.value("mapless_stored_pairs_total", result="stored") == 0
         assert served.value("mapless_stored_pairs_total", result="absent") > 0
@@ -104,7 +103,7 @@ def test_switched_off_nothing_is_made(data_dir: Path, expected: list[bytes], mon
 
 def test_switched_off_damaged_pairs_are_deleted(matched: Path, expected: list[bytes]) -> None:
     Folder(matched).execute("UPDATE reference_pair SET data = zeroblob(16)")
-    with serving_really(matched, **OFF) as served:
+    with serving_really(matched, background_matching=False) as served:
         assert answers(served) == expected
         damaged = served.value("mapless_stored_pairs_total", result="damaged")
         wait_until(lambda: count_pairs(matched) == 2 * PAIRS - damaged)
@@ -125,7 +124,7 @@ def test_what_a_killed_server_began_is_finished(
     with serving_really(data_dir) as served:
         wait_until(lambda: served.value("mapless_background_pairs_total") == 2 * PAIRS - begun)
     assert count_pairs(data_dir) == 2 * PAIRS
-    with serving_really(data_dir, **OFF) as served:
+    with serving_really(data_dir, background_matching=False) as served:
         assert answers(served) == expected
 
 

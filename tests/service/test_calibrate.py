@@ -94,7 +94,7 @@ def answer_to(client: Client, scene: str) -> LocalizationResult:
     return answer
 
 
-def test_planted_factors_are_stored_and_multiply_answers(
+def test_planted_factors_multiply_answers_until_they_are_cleared(
     server: RunningServer, client: Client, planted: str, folder: Path, tmp_path: Path
 ) -> None:
     before = answer_to(client, planted)
@@ -126,25 +126,13 @@ def test_planted_factors_are_stored_and_multiply_answers(
     assert figures["held"][0]["before"]["part"] == sum(before.accuracy.position_68_m >= OFF_M)
     assert "<svg" in (tmp_path / "report.html").read_text()
 
-
-def test_calibrating_again_finds_the_same_factors(
-    server: RunningServer, client: Client, planted: str, folder: Path, tmp_path: Path
-) -> None:
-    """It measures answers as they are without a calibration."""
-    stored = []
-    for _ in range(2):
-        assert calibrate(server, tmp_path, folder, "--scene", planted).exit_code == 0
-        stored.append(client.get_scene(planted).calibration)
-    assert stored[0] is not None
-    assert stored[1] is not None
-    assert stored[1].position_factor_68 == pytest.approx(stored[0].position_factor_68)
-    assert stored[1].rotation_factor_95 == pytest.approx(stored[0].rotation_factor_95)
-
-
-def test_cleared_answers_are_uncalibrated(
-    server: RunningServer, client: Client, planted: str, folder: Path, tmp_path: Path
-) -> None:
+    # Calibrated again, it measures answers as they are without a calibration.
     assert calibrate(server, tmp_path, folder, "--scene", planted).exit_code == 0
+    again = client.get_scene(planted).calibration
+    assert again is not None
+    assert again.position_factor_68 == pytest.approx(stored.position_factor_68)
+    assert again.rotation_factor_95 == pytest.approx(stored.rotation_factor_95)
+
     assert calibrate(server, tmp_path, "--scene", planted, "--clear").exit_code == 0
     assert client.get_scene(planted).calibration is None
     accuracy = answer_to(client, planted).accuracy
@@ -166,21 +154,14 @@ def test_other_features_are_not_calibrated(folder: Path, tmp_path: Path) -> None
         assert answer.accuracy.position_68_m == pytest.approx(accuracy_from_covariance(COVARIANCE).position_68_m)
 
 
-def test_a_dry_run_stores_nothing(
-    server: RunningServer, client: Client, planted: str, folder: Path, tmp_path: Path
-) -> None:
-    done = calibrate(server, tmp_path, folder, "--scene", planted, "--dry-run")
-    assert done.exit_code == 0
-    assert "dry run" in done.stdout
-    assert client.get_scene(planted).calibration is None
-
-
-def test_a_photograph_is_not_compared_with_itself(
+def test_a_dry_run_compares_no_photo_with_itself_nor_stores(
     server: RunningServer, client: Client, planted: str, tmp_path: Path
 ) -> None:
     """The folder holds the references' very files; the method answers a reference, so what sees itself is exact."""
     same = write_folder(tmp_path / "same", [pose(i) for i in range(COUNT)], ".png")
-    calibrate(server, tmp_path, same, "--scene", planted, "--dry-run")
+    done = calibrate(server, tmp_path, same, "--scene", planted, "--dry-run")
+    assert "dry run" in done.stdout
+    assert client.get_scene(planted).calibration is None
     figures = json.loads((tmp_path / "report.json").read_text())
     assert len(figures["per_query"]) == COUNT
     assert min(it["error_m"] for it in figures["per_query"]) > 0.9

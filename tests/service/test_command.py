@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 from google.protobuf import json_format
+from support.commands import run_client
 from support.servers import BLACK, CAMERA, PHOTO, RunningServer, pose
 
 import mapless
 from mapless import AlreadyExists, Camera, Client, NewReference, wire
-from mapless.__main__ import main
 from mapless.cli.arguments import make_parser
 from mapless.cli.output import plain
 
@@ -34,14 +34,10 @@ def run(server: RunningServer, capsys: pytest.CaptureFixture[str]) -> Run:
     """Runs the command: exit code, output (parsed if it is JSON), and error output."""
 
     def run(*arguments: object) -> tuple[int, Any, str]:
-        with pytest.raises(SystemExit) as caught:
-            main(["--address", server.address, *map(str, arguments)])
-        printed = capsys.readouterr()
-        try:
-            output = json.loads(printed.out)
-        except json.JSONDecodeError:
-            output = printed.out
-        return int(caught.value.code or 0), output, printed.err
+        code, printed, error = run_client(capsys, "--address", server.address, *arguments)
+        with suppress(json.JSONDecodeError):
+            return code, json.loads(printed), error
+        return code, printed, error
 
     return run
 
@@ -319,12 +315,6 @@ def test_a_photograph_beside_a_cameras_json_needs_no_camera(run: Run, scene: str
     assert (code, "give --camera" in error_text) == (2, True)
 
 
-def test_an_error_that_concerns_all_photographs_ends_the_run(run: Run, folder: Path) -> None:
-    code, printed, error_text = run("localize", "nowhere", folder)
-    assert (code, printed) == (1, "")
-    assert error_text.startswith("mapless: NOT_FOUND: ")
-
-
 class TestOnATerminal:
     @pytest.fixture
     def terminal(self, monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
@@ -360,14 +350,6 @@ class TestOnATerminal:
         assert "[############............] 1/2, 0 s to go" in report
         assert "[########################] 2/2" in report
         assert report.endswith("\r\x1b[K2 of 2 localized\n")
-
-    def test_a_rejection_is_printed_with_its_reason(self, run: Run, folder: Path, terminal: Callable[[], None]) -> None:
-        terminal()
-        run("scene", "create", "nothing")
-        photo = str(folder / "images" / "0.png")
-        code, printed, _ = run("localize", "nothing", photo, "--camera", FOUR_NUMBERS)
-        assert code == 3
-        assert printed.startswith("not localized: NO_USABLE_REFERENCES\n  ")
 
 
 def test_drawings_are_one_page_each_and_debug_goes_by_name(run: Run, scene: str, folder: Path, tmp_path: Path) -> None:
@@ -410,6 +392,7 @@ def test_a_scene_has_its_place_on_the_earth(run: Run) -> None:
         (["--camera", "nan,1,2,3"], "nan,1,2,3"),
         (["--camera", "cameras.json"], "cameras.json"),
         (["--axes", "sideways", "--camera", '{"width_px": 96}'], "camera: height_px"),
+        (["--camera", FOUR_NUMBERS, "--count", "0"], "--count: must be at least 1, is 0"),
     ],
 )
 def test_wrong_arguments_are_reported_before_any_call(
@@ -419,13 +402,6 @@ def test_wrong_arguments_are_reported_before_any_call(
     assert (code, printed) == (2, "")
     assert expected in error_text
     assert "Traceback" not in error_text
-
-
-@pytest.mark.parametrize("command", ["localize", "retrieve"])
-def test_no_references_at_all_is_no_number_to_choose(capsys: pytest.CaptureFixture[str], command: str) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main([command, "s", "photo.jpg", "--camera", "c.json", "--count", "0"])
-    assert (caught.value.code, "--count: must be at least 1, is 0" in capsys.readouterr().err) == (2, True)
 
 
 def test_an_interruption_while_the_command_is_loaded_is_quiet(tmp_path: Path) -> None:
@@ -449,22 +425,15 @@ def test_an_interruption_while_the_command_is_loaded_is_quiet(tmp_path: Path) ->
     assert (done.returncode, done.stdout, done.stderr) == (128 + signal.SIGINT, "", "")
 
 
-@pytest.mark.parametrize("command", [["health"], ["scene", "list"]])
-def test_connection_flags_may_stand_before_or_after_the_command(
-    server: RunningServer, capsys: pytest.CaptureFixture[str], command: list[str]
-) -> None:
-    for arguments in (
-        [*command, "--address", server.address],
-        ["--address", "127.0.0.1:1", *command, "--address", server.address],
-        ["--address", server.address, *command, "--timeout", "20"],
-        [command[0], "--address", server.address, *command[1:]],
-    ):
-        with pytest.raises(SystemExit) as caught:
-            main(arguments)
-        assert caught.value.code == 0, capsys.readouterr().err
-
-
-def test_connection_flags_after_the_command_keep_those_before() -> None:
+def test_connection_flags_may_stand_before_or_after_the_command() -> None:
+    for command in (["health"], ["scene", "list"]):
+        for arguments in (
+            [*command, "--address", "here"],
+            ["--address", "127.0.0.1:1", *command, "--address", "here"],
+            ["--address", "here", *command, "--timeout", "20"],
+            [command[0], "--address", "here", *command[1:]],
+        ):
+            assert make_parser().parse_args(arguments).address == "here"
     first = make_parser().parse_args(["--timeout", "3", "--tls", "--client-id", "a", "health", "--client-id", "b"])
     assert (first.timeout, first.tls, first.client_id, first.ca) == (3.0, True, "b", None)
     last = make_parser().parse_args(["localize", "s", "p.jpg", "--ca", "x.crt", "--camera", "c.json"])
@@ -475,6 +444,5 @@ def test_the_address_is_that_of_the_environment(
     server: RunningServer, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MAPLESS_ADDRESS", server.address)
-    with pytest.raises(SystemExit) as caught:
-        main(["health"])
-    assert (caught.value.code, json.loads(capsys.readouterr().out)) == (0, HEALTHY)
+    code, printed, _ = run_client(capsys, "health")
+    assert (code, json.loads(printed)) == (0, HEALTHY)

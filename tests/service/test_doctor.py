@@ -15,10 +15,10 @@ from typing import Any
 import grpc
 import pytest
 from support.certificates import DAY, authority, signed
+from support.commands import run_client
 from support.servers import CAMERA, PHOTO, RunningServer, make_scene, serving
 
 from mapless import Client
-from mapless.__main__ import main
 from mapless.cli import doctor
 from mapless_server.security import create_token
 
@@ -56,11 +56,9 @@ def guarded(tmp_path_factory: pytest.TempPathFactory, files: Path) -> Iterator[R
 
 def findings(capsys: pytest.CaptureFixture[str], address: str, *flags: object, code: int = 1) -> dict[str, Any]:
     """What is found, by check; the command ends with a code and prints no error."""
-    with pytest.raises(SystemExit) as caught:
-        main(["doctor", "--address", address, "--json", *map(str, flags)])
-    printed = capsys.readouterr()
-    assert (caught.value.code, printed.err) == (code, "")
-    found = {it["check"]: it for it in json.loads(printed.out)}
+    ended, printed, error = run_client(capsys, "doctor", "--address", address, "--json", *flags)
+    assert (ended, error) == (code, "")
+    found = {it["check"]: it for it in json.loads(printed)}
     assert list(found) == CHECKS
     return found
 

@@ -39,7 +39,7 @@ DISTANCE_M = 3.0
 by_one = pytest.mark.parametrize(
     "name", [it if it == "pi3x" else pytest.param(it, marks=pytest.mark.nightly) for it in NETWORKS]
 )
-"""What no network decides; nightly with the others."""
+"""What no network decides, each of which has tests of its own; nightly with the others."""
 WALL = textured(800, 240, seed=8)
 """Wallpaper: it moves by 100 px when the camera moves by a metre along it."""
 NAMES = ["r0", "r1", "r2", "r3"]
@@ -77,7 +77,7 @@ def on_network(
         yield client, backend, server
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@by_one
 def test_a_random_network_is_answered_for(tmp_path: Path, name: str) -> None:
     """Nothing but the answer's form is known: the network is random, but matches and poses of references are true."""
     with on_network(tmp_path, small_network(name), name) as (client, backend, _):
@@ -94,7 +94,7 @@ def test_a_random_network_is_answered_for(tmp_path: Path, name: str) -> None:
         assert backend.cache.counters.device_hits >= 4
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@by_one
 def test_a_network_of_nans_gives_no_coarse_pose(tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture) -> None:
     network = small_network(name)
     for parameter in network.parameters():

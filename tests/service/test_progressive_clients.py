@@ -15,6 +15,7 @@ import grpc
 import numpy as np
 import pytest
 from support.clients import Awaiting, hosted, status
+from support.commands import run_client
 from support.servers import CAMERA, PHOTO, pose
 
 from mapless import (
@@ -29,7 +30,6 @@ from mapless import (
     aio,
     wire,
 )
-from mapless.__main__ import main
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import (
     LocalizationServiceServicer,
@@ -242,10 +242,9 @@ CAMERA_NUMBERS = "80,81,47.5,31.5"
 
 def command(capsys: pytest.CaptureFixture[str], address: str, *arguments: str) -> tuple[int, list[str], str]:
     """Exit code, lines printed, and the error output."""
-    with pytest.raises(SystemExit) as ended:
-        main(["--address", address, "localize", "s", *arguments, "--camera", CAMERA_NUMBERS, "--progressive"])
-    printed = capsys.readouterr()
-    return int(ended.value.code or 0), printed.out.splitlines(), printed.err
+    flags = ("--camera", CAMERA_NUMBERS, "--progressive")
+    code, printed, error = run_client(capsys, "--address", address, "localize", "s", *arguments, *flags)
+    return code, printed.splitlines(), error
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Priors of requests are converted with frames and units, and each wrong field is rejected by its name."""
+"""Priors and scenes as messages: converted with frames and units, and each wrong field is rejected by its name."""
 
 import math
 from typing import Any
@@ -6,13 +6,17 @@ from typing import Any
 import numpy as np
 import pytest
 from google.protobuf.json_format import ParseDict
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from mapless.geodesy import Datum, GeoPosition, geodetic_from_world, world_from_geodetic
 from mapless.geometry import Quaternion
+from mapless.scenes import Calibration, unit_vector
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless.wire import FieldError
 from mapless_server.services.messages.queries import UNKNOWN_HEIGHT_SIGMA_M, needs_attributes, priors_from_message
+from mapless_server.services.messages.references import changes_from_message
 from mapless_server.store import SceneAttributes
 
 NOTHING = SceneAttributes()
@@ -212,11 +216,37 @@ def test_a_certain_geo_position_without_a_height_is_a_prior() -> None:
     np.testing.assert_allclose(sigmas_m, [0.01, 0.01, 1000.0], rtol=1e-4)
 
 
-def test_a_geo_position_needs_a_datum_and_gravity_a_down() -> None:
-    for fields, field in (
-        ({"geoPositionPrior": GEO}, "geo_position_prior"),
-        ({"gravityPrior": {"downInCamera": vector(0, 1, 0), "sigmaDeg": 1}}, "gravity_prior.down_in_world"),
-    ):
-        with pytest.raises(FieldError) as error:
-            priors_from_message(request(**fields), NOTHING)
-        assert error.value.field == field
+@pytest.mark.parametrize("seconds", [0, 1, 10**15, -(10**15)])
+def test_the_caller_does_not_set_when_a_calibration_was_stored(seconds: int) -> None:
+    calibration = reference_pb.SceneCalibration(
+        position_factor_68=1.0,
+        position_factor_95=1.5,
+        rotation_factor_68=1.0,
+        rotation_factor_95=2.0,
+        query_count=7,
+        variant=pb.VARIANT_BEST,
+    )
+    calibration.create_time.seconds = seconds
+    sent = reference_pb.UpdateSceneRequest(scene=reference_pb.Scene(name="scenes/hall", calibration=calibration))
+    sent.update_mask.paths.append("calibration")
+    changes = changes_from_message(sent)
+    stored = changes["calibration"]
+    assert isinstance(stored, Calibration)
+    assert (stored.create_time, stored.query_count, stored.rotation_factor_95) == (None, 7, 2.0)
+    assert sent.scene.calibration.create_time.seconds == seconds  # the request itself is left alone
+
+
+@settings(deadline=None)
+@given(st.tuples(*[st.floats(allow_nan=False, allow_infinity=False)] * 3))
+def test_directions_are_of_unit_length_whatever_they_were(vector: tuple[float, float, float]) -> None:
+    """Also of vectors whose squares are no numbers."""
+    if not any(vector):
+        with pytest.raises(ValueError, match="not zero"):
+            unit_vector(*vector)
+        return
+    found = np.array(unit_vector(*vector))
+    assert np.linalg.norm(found) == pytest.approx(1)
+    largest = np.abs(vector).max()
+    np.testing.assert_allclose(
+        found * np.linalg.norm(np.array(vector) / largest), np.array(vector) / largest, atol=1e-12
+    )

@@ -1,7 +1,9 @@
-"""`mapless-server` in this process, as a user runs it."""
+"""`mapless-server` and `mapless` in this process, as a user runs them."""
 
+import pytest
 from typer.testing import CliRunner, Result
 
+from mapless.__main__ import main
 from mapless_tools.cli.app import app
 
 
@@ -17,3 +19,11 @@ def refusal(*arguments: object) -> str:
     assert done.stdout == ""
     (line,) = (line for line in done.stderr.strip().splitlines() if not line.startswith("reading scenes"))
     return line
+
+
+def run_client(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    """Exit code, output and error output of `mapless`."""
+    with pytest.raises(SystemExit) as caught:
+        main([*map(str, arguments)])
+    printed = capsys.readouterr()
+    return int(caught.value.code or 0), printed.out, printed.err

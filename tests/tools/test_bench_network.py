@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812
+import typer
 from support.small_networks import MAPANYTHING, PI3, PI3X, references_of, small_runner
 from support.small_networks import photograph as photograph_of
 
@@ -17,6 +18,7 @@ from mapless_server.method.coarse import reconstruct_one
 from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.method.views import Features, Reconstruction, View
+from mapless_tools.bench.turns import Measured, main, ratio_with_interval, report
 from mapless_tools.bench_network import command
 from mapless_tools.bench_network.command import bench_network
 from mapless_tools.bench_network.forward import Forward, max_difference
@@ -161,3 +163,25 @@ def test_a_part_that_fails_is_reported_and_the_rest_runs(
     assert "There is no CUDA device" in printed
     assert "forward-pi3: 0 figures, 1 not measured, " in printed
     assert printed.count("operations: 1 figures") == 1
+
+
+def test_a_planted_ratio_lies_in_its_interval() -> None:
+    random = np.random.default_rng(1)
+    before = random.uniform(0.1, 0.3, 40)
+    ratio, low, high = ratio_with_interval(np.stack([before, 0.8 * before * random.normal(1, 0.05, 40)], axis=1))
+    assert low < 0.8 < high
+    assert low < ratio < high
+    assert high - low < 0.05
+
+
+def test_a_rejected_photograph_counts_for_the_time_alone() -> None:
+    times = np.array([[0.2, 0.2], [0.1, 0.1]])
+    lines = report([Measured(times, times, 1e-9), Measured(times, times, None)], ("a", "b"))
+    assert "| processor time | 200.0 | 100.0 | 0.500 | 0.500 to 0.500 |" in lines
+    assert lines[-1] == "Localized by both: 1, at most 1e-09 (unit of the scene) apart."
+
+
+def test_without_a_commit_nothing_is_measured(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(typer.Exit):
+        main("")
+    assert "BEFORE=commit" in capsys.readouterr().err

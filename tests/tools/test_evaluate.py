@@ -4,6 +4,7 @@ import io
 import json
 import math
 from dataclasses import replace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from support.evaluations import query_result
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_tools.bench.report import BenchResult, BenchScene, Figures, Latency, as_json, markdown, met
+from mapless_tools.charts import INK, figure_of, inline_svg, new_axes, plot, use_logarithms
 from mapless_tools.child import Memory
 from mapless_tools.dataset import Dataset
 from mapless_tools.evaluate.metrics import QueryResult, pose_error, quantile, summarize
@@ -209,3 +211,28 @@ class TestBench:
         content = json.loads(json.dumps(as_json(measured), allow_nan=False))
         assert content["scenes"][0]["target_met"] is True
         assert content["latency"]["warm_p50_ms"] == 200.0
+
+
+def test_a_failure_is_a_cross_and_breaks_the_curve() -> None:
+    axes = new_axes("a < b", "query", "translation error, cm")
+    plot(axes, "best & all", range(5), [1.0, 2.0, math.inf, 1.0, 1.0])
+    curve, crosses = axes.lines
+    assert np.isnan(np.asarray(curve.get_ydata(), float)).tolist() == [False, False, True, False, False]
+    assert (np.asarray(crosses.get_xdata()).tolist(), crosses.get_marker()) == ([2.0], "x")
+    svg = ElementTree.fromstring(inline_svg(figure_of(axes)))
+    assert {"a < b", "query", "translation error, cm", "best & all"} <= set(svg.itertext())
+
+
+def test_a_chart_has_the_colour_of_the_page_around_it() -> None:
+    svg = inline_svg(figure_of(new_axes("title", "x", "y")))
+    assert INK not in svg
+    assert "currentColor" in svg
+    assert svg == inline_svg(figure_of(new_axes("title", "x", "y"))), "the same chart is the same text"
+
+
+def test_logarithmic_scales_have_plain_numbers() -> None:
+    axes = new_axes("title", "x", "y")
+    use_logarithms(axes.yaxis)
+    plot(axes, "curve", [0, 1], [0.03, 40.0])
+    texts = set(ElementTree.fromstring(inline_svg(figure_of(axes))).itertext())
+    assert {"0.1", "1", "10", "0.05", "0.5", "20"} <= texts

@@ -213,7 +213,7 @@ async def test_calls_to_a_refusing_and_silent_server_are_counted_once() -> None:
 
     plan = plan_calls(400.0, 0.5, 2, REQUESTS, Mix(0.2, 0.2, 0.05), seed=5)
 
-    async with toy_server(handler, deadline_s=0.4) as target:
+    async with toy_server(handler, deadline_s=2.0) as target:
         records = await send_open_loop(target, plan)
     assert [(r.at_s, r.kind, r.client) for r in records] == [(c.at_s, c.kind, c.client) for c in plan]
     account = account_of(records, 0.5)
