@@ -11,8 +11,8 @@ localizes a photograph with the server of MAPLESS_ADDRESS (default localhost:500
 has all calls of the interface; `mapless.aio.Client` is the same for asyncio.
 
 Begin with `Client` (client.py) and its calls (calls/), which return the values of answers.py, groups.py and results.py.
-geometry.py states the conventions of frames and units. connection.py has retries and deadlines, wire.py the conversion
-between values and messages, report/ the HTML report of an answer, cli/ the command `mapless`.
+geometry.py states the conventions of frames and units. connection.py has retries and deadlines, wire.py and messages.py
+the conversion between values and messages, report/ the HTML report of an answer, cli/ the command `mapless`.
 """
 
 from . import aio

@@ -2,27 +2,13 @@
 
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Any
 
-import numpy as np
-
-from . import wire
-from .answer_messages import (
-    accuracy_from_message,
-    covariance_from_message,
-    diagnostics_from_message,
-    geo_pose_from_message,
-    prior_checks_from_messages,
-    rejection_fields,
-)
 from .answers import Accuracy, Diagnostics, Hint, Hypothesis, PriorCheck, pose_lines, rejection_text
 from .axes import Axes, pose_to
 from .geodesy import GeoPose
 from .geometry import Array, Camera, RigidTransform, Similarity
 from .priors import Priors
 from .requests import ImageSource
-from .v1 import localization_service_pb2 as pb
-from .wire import optional
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,75 +199,3 @@ def _support(answer: RigLocalization | SequenceLocalization) -> str:
     trust = "" if answer.trust is None else f", trust {answer.trust:.3f}"
     photographs = f"{len(answer.images)} photographs"
     return f"localized{trust}: {answer.inlier_count} of {answer.match_count} matches, {photographs}"
-
-
-def rig_from_message(message: pb.LocalizeRigResponse) -> RigLocalization | GroupRejected:
-    """Answer of a message."""
-    capture_time = optional(message, "capture_time", wire.time_from_message)
-    if message.WhichOneof("outcome") == "rejection":
-        return _rejected(message, capture_time)
-    found = message.localization
-    path = "localization.world_from_"
-    return wire.filled(
-        RigLocalization,
-        found,
-        world_from_rig=wire.transform_from_message(found.world_from_rig, path + "rig"),
-        world_from_session=optional(found, "world_from_session", wire.transform_from_message, path + "session"),
-        geo_pose=optional(found, "geo_pose", geo_pose_from_message),
-        capture_time=capture_time,
-        trust=found.trust if found.HasField("trust") else None,
-        **_common(message),
-    )
-
-
-def sequence_from_message(message: pb.LocalizeSequenceResponse) -> SequenceLocalization | GroupRejected:
-    """Answer of a message."""
-    if message.WhichOneof("outcome") == "rejection":
-        return _rejected(message, None)
-    found = message.localization
-    rigid = wire.transform_from_message(found.world_from_session, "localization.world_from_session")
-    return wire.filled(
-        SequenceLocalization,
-        found,
-        world_from_session=Similarity(found.session_scale, rigid.rotation, rigid.translation),
-        scale_sigma=found.session_scale_sigma,
-        world_from_camera=tuple(
-            wire.transform_from_message(pose.world_from_camera, "localization.poses") for pose in found.poses
-        ),
-        axes=wire.value_name(pb.Axes, found.axes),
-        trust=found.trust if found.HasField("trust") else None,
-        jumps=tuple(wire.filled(TrackingJump, jump) for jump in found.jumps),
-        **_common(message),
-    )
-
-
-def _common(message: pb.LocalizeRigResponse | pb.LocalizeSequenceResponse) -> dict[str, Any]:
-    covariance = covariance_from_message(message.localization)
-    return {
-        "covariance": np.full((6, 6), np.nan) if covariance is None else covariance,
-        "accuracy": accuracy_from_message(message.localization.accuracy),
-        "images": _reports(message),
-    }
-
-
-def _rejected(
-    message: pb.LocalizeRigResponse | pb.LocalizeSequenceResponse, capture_time: datetime | None
-) -> GroupRejected:
-    rejection = message.rejection
-    images = _reports(message)
-    return wire.filled(
-        GroupRejected, rejection, images=images, capture_time=capture_time, **rejection_fields(rejection)
-    )
-
-
-def _reports(message: pb.LocalizeRigResponse | pb.LocalizeSequenceResponse) -> tuple[ImageReport, ...]:
-    return tuple(
-        wire.filled(
-            ImageReport,
-            image,
-            rejected_alone=wire.value_name(pb.RejectionReason, image.alone.reason) if image.HasField("alone") else None,
-            diagnostics=diagnostics_from_message(image.diagnostics),
-            prior_checks=prior_checks_from_messages(image.prior_checks),
-        )
-        for image in message.images
-    )

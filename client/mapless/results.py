@@ -1,14 +1,11 @@
 """Scenes, references, and results of retrieval, audit and coverage."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import datetime
 
-from . import names, wire
 from .geodesy import Datum
 from .geometry import Camera, RigidTransform
-from .scenes import Calibration, Vector, calibration_from_message, datum_from_message, direction_from_message
-from .v1 import reference_service_pb2 as pb
+from .scenes import Calibration, Vector
 
 
 @dataclass(frozen=True)
@@ -120,55 +117,3 @@ class Coverage:
     position_68_m: float | None
     references: tuple[str, ...]
     arbitrary_unit: bool = False
-
-
-def scene_from_message(message: pb.Scene, warnings: Iterable[str] = ()) -> Scene:
-    """Scene of a message, and what `update_scene` found."""
-    return wire.filled(
-        Scene,
-        message,
-        scene_id=names.parse_scene_name(message.name),
-        create_time=wire.time_from_message(message.create_time),
-        datum=wire.optional(message, "datum", datum_from_message, "datum"),
-        down_in_world=wire.optional(message, "down_in_world", direction_from_message, "down_in_world"),
-        calibration=wire.optional(message, "calibration", calibration_from_message, "calibration"),
-        warnings=tuple(warnings),
-    )
-
-
-def reference_from_message(message: pb.Reference, warnings: Iterable[str] = ()) -> Reference:
-    """Reference of a message, and what was found when it was added."""
-    scene_id, reference_id = names.parse_reference_name(message.name)
-    return wire.filled(
-        Reference,
-        message,
-        scene_id=scene_id,
-        reference_id=reference_id,
-        camera=wire.camera_from_message(message.intrinsics, "intrinsics"),
-        world_from_camera=wire.transform_from_message(message.world_from_camera, "world_from_camera"),
-        create_time=wire.time_from_message(message.create_time),
-        image=message.image or None,
-        warnings=tuple(warnings),
-    )
-
-
-def retrieved_from_message(message: pb.RetrievedReference) -> RetrievedReference:
-    """Retrieved reference of a message."""
-    pose = wire.transform_from_message(message.world_from_camera, "world_from_camera")
-    return wire.filled(RetrievedReference, message, world_from_camera=pose)
-
-
-def audit_from_message(message: pb.ReferenceAudit) -> ReferenceAudit:
-    """Audit of a message."""
-    return wire.filled(ReferenceAudit, message, verdict=wire.value_name(pb.AuditVerdict, message.verdict))
-
-
-def coverage_from_message(message: pb.CheckCoverageResponse) -> Coverage:
-    """Coverage of a message."""
-    return wire.filled(
-        Coverage,
-        message,
-        verdict=wire.value_name(pb.CoverageVerdict, message.verdict),
-        position_68_m=message.position_68_m or None,
-        references=tuple(message.references),
-    )

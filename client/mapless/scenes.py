@@ -1,13 +1,13 @@
 """Properties of a scene: calibration, directions, datum, and their messages, which client and server share."""
 
 import math
-from dataclasses import dataclass
-from datetime import datetime
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
 from enum import Enum
 from typing import Final, Literal
 
 from . import wire
-from .geodesy import MAX_HEIGHT_M, MIN_HEIGHT_M, Datum
+from .geodesy import Datum
 from .geometry import Quaternion
 from .v1 import geometry_pb2
 from .v1 import localization_service_pb2 as localization_pb
@@ -106,25 +106,13 @@ def datum_to_message(datum: Datum) -> pb.Datum:
 
 def datum_from_message(message: pb.Datum, field: str) -> Datum:
     """Datum of a message, its quaternion normalized; FieldError if a number is out of range, or its norm is not one."""
-    ranges = (("latitude_deg", -90.0, 90.0), ("longitude_deg", -180.0, 180.0), ("height_m", MIN_HEIGHT_M, MAX_HEIGHT_M))
-    for name, least, most in ranges:
-        value = getattr(message, name)
-        if not least <= value <= most:
-            raise FieldError(joined(field, name), f"must be {least:g} to {most:g}, is {value:g}")
-    if not message.HasField("enu_from_world"):
-        return Datum(message.latitude_deg, message.longitude_deg, message.height_m)
     q = message.enu_from_world
     try:
-        rotation = Quaternion(q.x, q.y, q.z, q.w).normalized()
+        turned = Quaternion(q.x, q.y, q.z, q.w) if message.HasField("enu_from_world") else Quaternion(0, 0, 0, 1)
+        datum = Datum(message.latitude_deg, message.longitude_deg, message.height_m, turned)
+        return replace(datum, enu_from_world=turned.normalized())
     except ValueError as error:
-        raise FieldError(joined(field, "enu_from_world"), str(error)) from None
-    return Datum(message.latitude_deg, message.longitude_deg, message.height_m, rotation)
-
-
-def direction_to_message(direction: Vector) -> geometry_pb2.Vector3:
-    """Message of a direction."""
-    x, y, z = direction
-    return geometry_pb2.Vector3(x=x, y=y, z=z)
+        raise _of_field(error, field) from None
 
 
 def direction_from_message(message: geometry_pb2.Vector3, field: str) -> Vector:
@@ -156,9 +144,14 @@ def calibration_from_message(message: pb.SceneCalibration, field: str) -> Calibr
     try:
         return Calibration(
             **{name: getattr(message, name) for name in (*FACTORS, *TEXTS, "query_count")},
-            variant=wire.value_name(_VARIANT, message.variant),
-            create_time=wire.optional(message, "create_time", wire.time_from_message),
+            variant=wire.value_name(_VARIANT.DESCRIPTOR, message.variant),
+            create_time=message.create_time.ToDatetime(timezone.utc) if message.HasField("create_time") else None,
         )
     except ValueError as error:
-        name, _, fault = str(error).partition(" ")
-        raise FieldError(joined(field, name), fault) from None
+        raise _of_field(error, field) from None
+
+
+def _of_field(error: ValueError, field: str) -> FieldError:
+    """The error of a message at a path, of that of a dataclass with the same fields, "height_m must be ..."."""
+    name, _, fault = str(error).partition(" ")
+    return FieldError(joined(field, name.removesuffix(":")), fault)

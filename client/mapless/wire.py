@@ -7,7 +7,6 @@ field by its path in the request, "requests[3].reference.intrinsics.focal_x_px".
 import dataclasses
 import math
 from collections.abc import Callable
-from datetime import datetime, timezone
 from enum import Enum
 from typing import Any, TypeVar
 
@@ -63,25 +62,6 @@ def _parsed(parse: Callable[[str], T], text: str, field: str) -> T:
         raise FieldError(field, str(error)) from None
 
 
-def filled(kind: type[T], message: Any, /, **values: Any) -> T:
-    """A dataclass with the given values; other fields have the message's values of the same names, or defaults."""
-    given: Any = kind
-    names_of = {it.name for it in dataclasses.fields(given)} - set(values)
-    same = names_of.intersection(message.DESCRIPTOR.fields_by_name)
-    return kind(**{name: getattr(message, name) for name in same}, **values)
-
-
-def optional(message: Any, field: str, read: Callable[..., T], *arguments: Any) -> T | None:
-    """Reads `read(part, *arguments)` of a message's part; None if the message has no such part."""
-    return read(getattr(message, field), *arguments) if message.HasField(field) else None
-
-
-def time_from_message(message: Any) -> datetime:
-    """A time in UTC of a google.protobuf.Timestamp."""
-    time: datetime = message.ToDatetime(timezone.utc)
-    return time
-
-
 def camera_to_message(camera: Camera) -> pb.CameraIntrinsics:
     """Message of a camera; TypeError, naming the field, if one is not a number, or for another type than a camera."""
     if not isinstance(camera, Camera):
@@ -124,7 +104,8 @@ def camera_from_message(message: pb.CameraIntrinsics, field: str) -> Camera:
         value = getattr(message, principal)
         if not -side_px <= value <= 2 * side_px:
             raise FieldError(joined(field, principal), f"must be {-side_px} to {2 * side_px}, is {value:g}")
-    return filled(Camera, message, distortion=_distortion_from_message(message, field))
+    pinhole = {it.name: getattr(message, it.name) for it in dataclasses.fields(Camera) if it.name != "distortion"}
+    return Camera(**pinhole, distortion=_distortion_from_message(message, field))
 
 
 def _distortion_from_message(message: pb.CameraIntrinsics, field: str) -> Distortion | None:
@@ -199,11 +180,14 @@ def enum_prefix(enum: ProtoEnum) -> str:
     return str(enum.Name(0)).removesuffix("UNSPECIFIED")
 
 
-def value_name(enum: ProtoEnum, number: int) -> str:
-    """REJECTION_REASON_LOW_OVERLAP becomes "LOW_OVERLAP"; an unknown value, from a newer server, its number as text."""
-    if number not in enum.values():
-        return str(number)
-    return str(enum.Name(number)).removeprefix(enum_prefix(enum))
+def value_name(enum: Any, number: int) -> str:
+    """REJECTION_REASON_LOW_OVERLAP becomes "LOW_OVERLAP"; an unknown value, from a newer server, its number as text.
+
+    `enum` is a descriptor.
+    """
+    names = enum.values_by_number
+    prefix = names[0].name.removesuffix("UNSPECIFIED")
+    return names[number].name.removeprefix(prefix) if number in names else str(number)
 
 
 def enum_value(enum: ProtoEnum, value: str | Enum) -> Any:

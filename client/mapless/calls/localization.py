@@ -8,7 +8,6 @@ from inspect import signature
 from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
 from .. import wire
-from ..answer_messages import answer_from_message
 from ..answers import LocalizationResult, Rejected
 from ..axes import Axes
 from ..connection import Connection
@@ -19,9 +18,8 @@ from ..groups import (
     RigLocalization,
     SequenceFrame,
     SequenceLocalization,
-    rig_from_message,
-    sequence_from_message,
 )
+from ..messages import answer_from_message, rig_from_message, sequence_from_message
 from ..names import reference_names, scene_name
 from ..priors import Priors, set_priors
 from ..requests import ImageSource, IntrinsicsUncertainty, read_image

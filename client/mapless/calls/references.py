@@ -12,6 +12,7 @@ from ..connection import Connection
 from ..errors import AlreadyExists, MaplessError
 from ..geodesy import Datum
 from ..geometry import Camera, RigidTransform
+from ..messages import read, reference_from_message, scene_from_message
 from ..names import reference_name, reference_names, scene_name, shown
 from ..options import ConnectOptions
 from ..priors import Priors, set_priors
@@ -22,11 +23,6 @@ from ..results import (
     ReferenceAudit,
     RetrievedReference,
     Scene,
-    audit_from_message,
-    coverage_from_message,
-    reference_from_message,
-    retrieved_from_message,
-    scene_from_message,
 )
 from ..scenes import UNCHANGED, Calibration, UnchangedType, calibration_to_message, datum_to_message
 from ..v1 import reference_service_pb2 as pb
@@ -298,7 +294,7 @@ async def retrieve_references(
     )
     set_priors(request, priors or Priors())
     return await connection.call(
-        "RetrieveReferences", request, lambda it: [*map(retrieved_from_message, it.references)], timeout_s
+        "RetrieveReferences", request, lambda it: [read(RetrievedReference, each) for each in it.references], timeout_s
     )
 
 
@@ -320,7 +316,9 @@ async def audit_scene(
     """
     named = reference_names(scene, references)
     request = pb.AuditSceneRequest(scene=scene_name(scene), references=named, page_size=page_size)
-    audits = connection.listed("AuditScene", request, lambda page: map(audit_from_message, page.audits), timeout_s)
+    audits = connection.listed(
+        "AuditScene", request, lambda page: [read(ReferenceAudit, it) for it in page.audits], timeout_s
+    )
     async for audit in audits:
         yield audit
 
@@ -339,4 +337,4 @@ async def check_coverage(
         world_from_camera=wire.transform_to_message(world_from_camera),
         intrinsics=wire.camera_to_message(camera),
     )
-    return await connection.call("CheckCoverage", request, coverage_from_message, timeout_s)
+    return await connection.call("CheckCoverage", request, partial(read, Coverage), timeout_s)

@@ -12,8 +12,9 @@ from .. import wire
 from ..connection import Connection
 from ..errors import MaplessError, NotFound
 from ..geometry import Array
+from ..messages import reference_from_message, scene_from_message
 from ..names import reference_name, scene_name
-from ..results import Reference, Scene, reference_from_message, scene_from_message
+from ..results import Reference, Scene
 from ..scenes import datum_from_message, direction_from_message
 from ..v1 import reference_service_pb2 as pb
 

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless import ConnectOptions, MaplessError, wire
-from mapless.answer_messages import answer_from_message
 from mapless.answers import LocalizationResult, Rejected
 from mapless.errors import from_rpc_error
 from mapless.geometry import Array, Camera, RigidTransform, resized_pixel
+from mapless.messages import answer_from_message
 from mapless.names import scene_name
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub

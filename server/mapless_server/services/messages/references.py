@@ -13,7 +13,6 @@ from mapless.scenes import (
     datum_from_message,
     datum_to_message,
     direction_from_message,
-    direction_to_message,
 )
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
@@ -133,7 +132,7 @@ def scene_to_message(scene: SceneRecord) -> pb.Scene:
         generation=scene.generation,
         reference_count=scene.reference_count,
         datum=datum_to_message(known.datum) if known.datum else None,
-        down_in_world=direction_to_message(known.down_in_world) if known.down_in_world else None,
+        down_in_world=wire.vector_to_message(known.down_in_world) if known.down_in_world else None,
         calibration=calibration_to_message(known.calibration) if known.calibration else None,
         arbitrary_unit=known.arbitrary_unit,
     )
