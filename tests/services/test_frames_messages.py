@@ -10,11 +10,11 @@ from google.protobuf import json_format
 from support.servers import CAMERA, PHOTO
 
 from mapless import Fisheye, RadialTangential, wire
-from mapless.answer_messages import answer_from_message
 from mapless.answers import Rejected
 from mapless.axes import Axes
 from mapless.geodesy import Datum, GeoPose
 from mapless.geometry import Quaternion, RigidTransform
+from mapless.messages import answer_from_message
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server.engine.interface import EngineOptions
