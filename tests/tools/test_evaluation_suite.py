@@ -3,7 +3,6 @@
 import csv
 import json
 import math
-import xml.etree.ElementTree as ElementTree
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -19,13 +18,12 @@ from mapless import Internal
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_server.method.views import Features, View
 from mapless_server.settings import Settings
-from mapless_tools.charts import inline_svg
 from mapless_tools.dataset import Dataset, Frame, Refusal
 from mapless_tools.evaluate import suite as suite_module
 from mapless_tools.evaluate.benchmarks import BENCHMARKS, DENSE, ScenePlace, find_scenes
 from mapless_tools.evaluate.figures import write_figures
 from mapless_tools.evaluate.metrics import QueryResult
-from mapless_tools.evaluate.page import ablation, along_sequence, cumulative, page, sparsity
+from mapless_tools.evaluate.page import page
 from mapless_tools.evaluate.pictures import WorstQuery, data_uri, fit_true_poses
 from mapless_tools.evaluate.plan import EvaluationOptions, Method, SuiteOptions, split_scene
 from mapless_tools.evaluate.references import Matcher, PlannedQuery, paired, pairs_file, read_pairs
@@ -364,18 +362,6 @@ class TestTables:
         for table in tables_of(group):
             assert {len(line.cells) for line in table.rows} == {len(table.head)}
             assert any(line.source == OURS for line in table.rows)
-
-
-class TestCharts:
-    def test_every_chart_of_the_report_is_well_formed(self) -> None:
-        (group,) = groups_of(suite({"chess": 0.01, "fire": math.inf}, OPTIONS))
-        figures = [*sparsity(group), *cumulative(group), *ablation(group), *along_sequence(group, "fire")]
-        assert len(figures) == 2 + 4 + 2 + 2
-        for figure in figures:
-            ElementTree.fromstring(inline_svg(figure))
-            (axes,) = figure.axes
-            labels = axes.get_xlabel() + axes.get_ylabel()
-            assert "cm" in labels or "°" in labels
 
 
 class TestPictures:
