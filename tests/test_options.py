@@ -46,7 +46,7 @@ OUTSIDE: dict[str, list[tuple[str, Any]]] = {
     + [("max_matches", 0), ("position_factor", 0.0)],
     "scenes.retrieval.ranking.RankOptions": [("apart_m", -1.0), ("apart_deg", 181.0), ("nearby_weight", 1.5)]
     + [("nearby_weight", NAN), ("same_place_m", -1.0), ("per_place", 0), ("pool", 0), ("smallest_pool", 0)],
-    "scheduling.options.WorkQueueOptions": [("max_queued_s", 0.0), ("max_bytes", -1), ("flow_share", 1.1)]
+    "scheduling.admission.WorkQueueOptions": [("max_queued_s", 0.0), ("max_bytes", -1), ("flow_share", 1.1)]
     + [("time_margin", 0.9), ("first_stage_interval", 1)],
 }
 

@@ -10,7 +10,7 @@ admission   A job is admitted if its predicted computing time and its memory fit
             earlier jobs of the same kind, or else typical of all callers'.
 lane        A group of threads, such as "host" or "device". Each stage is computed by one lane.
 fairness    Of the jobs that wait for a stage, the next one is chosen by deficit round robin over tenants and their
-            clients (`fair_queue`). While short jobs keep coming, long steps leave one thread of a lane to them.
+            clients (`FairQueue`). While short jobs keep coming, long steps leave one thread of a lane to them.
 batch       Waiting jobs of the same stage and bucket are computed together, up to the stage's `max_batch`.
 deadline    A job ends at its deadline wherever it is, and with its fallback, if it has one, shortly before. The thread
             that computes it notices at its next `Job.check`.
@@ -19,7 +19,7 @@ deadline    A job ends at its deadline wherever it is, and with its fallback, if
 threads that compute what the scheduler selects, and callers that wait on an event loop.
 """
 
-from .admission import CostModel
+from .admission import CostModel, WorkQueueOptions
 from .jobs import (
     Abandoned,
     Done,
@@ -38,7 +38,6 @@ from .jobs import (
     StageResult,
     Step,
 )
-from .options import WorkQueueOptions
 from .scheduler import Quota
 from .work_queue import ComputeItem, Failure, Fatal, ItemList, WorkQueue, compute_items
 

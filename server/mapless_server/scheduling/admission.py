@@ -1,15 +1,62 @@
-"""Admission: a job is refused if it cannot be computed in time, and no caller can take the room of the others.
+"""Which jobs are admitted, and in which order they are computed, so that no caller can take the room of the others.
 
-The cost of a job is predicted from jobs of its kind (`CostModel`), and booked while it is admitted (`Ledger`).
+The cost of a job is predicted from jobs of its kind (`CostModel`), and booked while it is admitted (`Ledger`). A job is
+refused if it cannot be computed in time (`Admission`). Those that wait take turns by caller and tenant (`FairQueue`).
 """
 
 import math
 from collections import Counter, OrderedDict, deque
-from collections.abc import Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import zip_longest
 from statistics import median_low
+from typing import Generic, TypeVar
 
 from .jobs import Flow, Job, Refusal, Refused
-from .options import WorkQueueOptions
+
+J = TypeVar("J", bound=Hashable)
+
+
+@dataclass(frozen=True)
+class WorkQueueOptions:
+    """Bounds of admission, order of computing, and supervision of the threads.
+
+    Attributes:
+        max_queued_s: largest predicted computing time of the admitted jobs, seconds per thread of a lane, besides a
+            caller's only job (see `Admission.check_queue`). The result of a job admitted beyond it would be late, and a
+            longer queue has no higher throughput.
+        max_bytes: largest memory of admitted jobs, and of calls that consist of several jobs, together.
+        flow_share: share, 0 to 1, that one caller may use of what other callers leave of either bound, so that there is
+            always room for the next caller.
+        time_margin: a job is admitted if at least this many times its predicted time remains until its deadline; 1 or
+            more. Predictions are averages, and a result that comes too late is wasted for everyone.
+        first_stage_interval: one of this many batches of a lane is of the first stage, if several stages wait; 2 or
+            more.
+        quantum_s: computing time credited to a caller in each round of the fair queue; about what one job of a stage
+            takes.
+        stall_limit_s: a batch without any progress (its end, or a job's `check`) for longer is considered hung: its
+            thread is lost, and the queue ends.
+        heartbeat_s: interval of supervision.
+    """
+
+    max_queued_s: float = 2.0
+    max_bytes: int = 256 * 2**20
+    flow_share: float = 0.75
+    time_margin: float = 1.2
+    first_stage_interval: int = 4
+    quantum_s: float = 0.2
+    stall_limit_s: float = 120.0
+    heartbeat_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        least = {"time_margin": 1, "first_stage_interval": 2}
+        for name, value in vars(self).items():
+            if not (value > 0 and value >= least.get(name, 0)):
+                bound = f"at least {least[name]}" if name in least else "above 0"
+                raise ValueError(f"WorkQueueOptions.{name} must be {bound}, is {value}")
+        if self.flow_share > 1:
+            raise ValueError(f"WorkQueueOptions.flow_share must be at most 1, is {self.flow_share}")
+
 
 FIRST_GUESS_S = 0.25
 """Predicted before anything is observed."""
@@ -266,3 +313,119 @@ class Admission:
     def _share(self, bound: float, held: float, held_by_flow: float) -> float:
         """The part of a bound that one caller may have, given what it and all callers have."""
         return self._options.flow_share * (bound - (held - held_by_flow))
+
+
+MAX_DEBTORS = 100
+"""Callers without waiting jobs whose debts are kept."""
+
+
+@dataclass
+class _Account(Generic[J]):
+    """A caller's waiting jobs with their costs, first in first out, and the computing time it has left."""
+
+    jobs: OrderedDict[J, float] = field(default_factory=OrderedDict)
+    credit_s: float = 0.0
+
+
+class FairQueue(Generic[J]):
+    """Waiting jobs in the order in which they are to be computed.
+
+    Deficit round robin (Shreedhar and Varghese, 1996) with overdrawing: each caller in turn is credited a quantum of
+    time and served while it has credit. If its last job costs more, it pays the rest back in later rounds, also if its
+    next job comes later, as the next step of a long one does. So while two callers both wait, their shares differ by at
+    most a quantum and two jobs, whatever they send.
+    """
+
+    def __init__(self, quantum_s: float) -> None:
+        """A tenant's only caller gets `quantum_s` per round, which should be at least the cost of a typical job."""
+        self._quantum_s = quantum_s
+        # Callers with waiting jobs or debts, in the order of their turns.
+        self._accounts: OrderedDict[Flow, _Account[J]] = OrderedDict()
+        self._callers_of_tenant: Counter[str] = Counter()
+        self._flow_of: dict[J, Flow] = {}
+        self._cost_s = 0.0
+
+    def __len__(self) -> int:
+        return len(self._flow_of)
+
+    def __contains__(self, job: object) -> bool:
+        return job in self._flow_of
+
+    def __iter__(self) -> Iterator[J]:
+        return iter(self._flow_of)
+
+    @property
+    def cost_s(self) -> float:
+        """Sum of the costs of all waiting jobs."""
+        return self._cost_s if self._flow_of else 0.0  # without rounding errors
+
+    def push(self, job: J, flow: Flow, cost_s: float) -> None:
+        """Adds a job behind those of its caller."""
+        account = self._accounts.get(flow)
+        if account is None:
+            account = self._accounts[flow] = _Account()
+            self._callers_of_tenant[flow.tenant] += 1
+        account.jobs[job] = cost_s
+        self._flow_of[job] = flow
+        self._cost_s += cost_s
+
+    def remove(self, job: J) -> float:
+        """Removes a job without charging its caller; returns its cost."""
+        flow = self._flow_of.pop(job)
+        cost_s = self._accounts[flow].jobs.pop(job)
+        self._cost_s -= cost_s
+        self._forget_if_settled(flow)
+        if len(self._accounts) > len(self._flow_of) + MAX_DEBTORS:  # callers come and go without end
+            debtor = next(it for it, account in self._accounts.items() if not account.jobs)
+            self._accounts[debtor].credit_s = 0.0
+            self._forget_if_settled(debtor)
+        return cost_s
+
+    def pop(self, is_allowed: Callable[[J], bool] = lambda _: True) -> J:
+        """Removes the next of the allowed jobs and charges its caller; raises IndexError if none waits."""
+        while True:
+            for flow in list(self._accounts):
+                account = self._accounts[flow]
+                if account.credit_s > 0 and (job := next(filter(is_allowed, account.jobs), None)) is not None:
+                    return self._charge(job)
+                self._begin_turn(flow, 1)
+            # All are in debt: skip the rounds in which no caller would be served.
+            waiting = [flow for flow, account in self._accounts.items() if any(map(is_allowed, account.jobs))]
+            if not waiting:
+                raise IndexError("nothing waits")
+            idle_rounds = min(int(-self._accounts[it].credit_s / self._share_s(it)) for it in waiting)
+            for flow in list(self._accounts):
+                self._begin_turn(flow, max(0, idle_rounds))
+
+    def pop_alike(self, is_alike: Callable[[J], bool], at_most: int) -> list[J]:
+        """Removes further jobs to compute with the last one, from each caller in turn, and charges for them."""
+        if at_most < 1:
+            return []
+        alike = [list(filter(is_alike, account.jobs)) for account in self._accounts.values()]
+        in_turn = [job for of_round in zip_longest(*alike) for job in of_round if job is not None]
+        return [self._charge(job) for job in in_turn[:at_most]]
+
+    def _begin_turn(self, flow: Flow, rounds: int) -> None:
+        account, share_s = self._accounts[flow], self._share_s(flow)
+        account.credit_s = min(account.credit_s + rounds * share_s, max(share_s, account.credit_s))
+        self._accounts.move_to_end(flow)
+        self._forget_if_settled(flow)
+
+    def _forget_if_settled(self, flow: Flow) -> None:
+        """Forgets a caller that neither waits nor is in debt."""
+        if self._accounts[flow].jobs or self._accounts[flow].credit_s < 0:
+            return
+        del self._accounts[flow]
+        self._callers_of_tenant[flow.tenant] -= 1
+        if not self._callers_of_tenant[flow.tenant]:
+            del self._callers_of_tenant[flow.tenant]
+
+    def _share_s(self, flow: Flow) -> float:
+        """The credit of a caller per round, seconds."""
+        return self._quantum_s / self._callers_of_tenant[flow.tenant]
+
+    def _charge(self, job: J) -> J:
+        account = self._accounts[self._flow_of[job]]
+        account.credit_s -= account.jobs[job]
+        self.remove(job)
+        return job

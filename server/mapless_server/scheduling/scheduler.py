@@ -12,8 +12,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, Protocol
 
-from .admission import MAX_OF_CALLERS, Admission, CostModel, Ledger
-from .fair_queue import FairQueue
+from .admission import MAX_OF_CALLERS, Admission, CostModel, FairQueue, Ledger, WorkQueueOptions
 from .jobs import (
     Abandoned,
     Batch,
@@ -35,7 +34,6 @@ from .jobs import (
     StageResult,
     Step,
 )
-from .options import WorkQueueOptions
 
 _TRY_ONE_IN = 8
 

@@ -11,8 +11,8 @@ from contextlib import contextmanager
 from enum import Enum
 from typing import Any, Generic, TypeVar
 
+from .admission import WorkQueueOptions
 from .jobs import Batch, Done, Ending, Flow, Job, Next, Observer, Stage, StageLoad, StageResult, Step
-from .options import WorkQueueOptions
 from .scheduler import Quota, Scheduler
 
 log = logging.getLogger(__name__)
