@@ -7,7 +7,7 @@ import pytest
 
 NAN = float("nan")
 OUTSIDE: dict[str, list[tuple[str, Any]]] = {
-    "engine.tiers.EscalationOptions": [("doubtful_trust", -1.0), ("doubtful_radius_m", -1.0), ("clearly_more", 0.5)]
+    "engine.options.EscalationOptions": [("doubtful_trust", -1.0), ("doubtful_radius_m", -1.0), ("clearly_more", 0.5)]
     + [("time_share", 0.0), ("time_share", 1.5), ("same_position_m", NAN), ("same_rotation_deg", -1.0)],
     "method.pose_problem.AdjustOptions": [("max_error_px", 0.0), ("iterations", 0), ("loss_scale_sigma", -1.0)],
     "method.coarse.geometric.GeometricOptions": [("min_baseline_m", 0.0)],

@@ -35,7 +35,7 @@ from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling import Refusal
 from mapless_server.settings import CLIENT_ADDRESS_VARIABLE, CLIENT_TOKEN_VARIABLE, Settings, load_settings
 from mapless_server.store.codec import encode_view
-from mapless_server.store.faults import RETRY_AFTER_S
+from mapless_server.store.database import RETRY_AFTER_S
 from mapless_server.store.postgresql import CONNECTION_WAIT_S, CONNECTIONS_AT_MOST, CONNECTIONS_KEPT
 from mapless_tools.cli.app import app
 

@@ -17,10 +17,9 @@ from support.images import encode, textured
 from support.servers import CAMERA, PHOTO, StandInDescriptor, StandInExtractor, StandInReconstructor, pose, whole
 
 from mapless.geometry import RigidTransform
-from mapless_server.engine.interface import EngineOptions
+from mapless_server.engine.options import EngineOptions, EscalationOptions
 from mapless_server.engine.query import Caller, Description, Photo, Query, Result, Tier
 from mapless_server.engine.stages import MAX_LISTINGS, QueryStages
-from mapless_server.engine.tiers import EscalationOptions
 from mapless_server.errors import InvalidArgument, Unavailable
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.answer import Answer, Localization

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_server import errors
 from mapless_server.engine.failures import failure_of
+from mapless_server.engine.options import EscalationOptions
 from mapless_server.engine.query import Result, Tier
 from mapless_server.engine.tiers import (
     UNRECOVERABLE,
-    EscalationOptions,
     better_of,
     is_doubtful,
     of_two_places,

@@ -13,10 +13,9 @@ from support.corner import CAMERA, photograph, pose
 from support.images import encode, textured
 
 from mapless.geometry import RigidTransform, rotation_from_vector
-from mapless_server.engine.interface import EngineOptions
+from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.query import TRACK, Caller, Photo, Query, Result, Tier
 from mapless_server.engine.stages import QueryStages
-from mapless_server.engine.tracking import can_track
 from mapless_server.errors import DataLoss
 from mapless_server.method.answer import Localization
 from mapless_server.method.features import SiftExtractor
@@ -197,9 +196,9 @@ def test_a_search_elsewhere_that_fails_costs_no_answer(localize: Localize, monke
 
 
 def test_what_leaves_the_references_open_is_not_tracked() -> None:
-    assert can_track(query(prior()))
-    assert not can_track(query())
-    assert not can_track(query(prior(sigma_deg=21.0)))
-    assert not can_track(query(prior(), reference_ids=("r0",)))
-    assert not can_track(query(prior(), is_part=True))
-    assert not can_track(query(prior(), options=LocalizeOptions(variant=Variant.FULL)))
+    assert query(prior()).can_be_tracked
+    assert not query().can_be_tracked
+    assert not query(prior(sigma_deg=21.0)).can_be_tracked
+    assert not query(prior(), reference_ids=("r0",)).can_be_tracked
+    assert not query(prior(), is_part=True).can_be_tracked
+    assert not query(prior(), options=LocalizeOptions(variant=Variant.FULL)).can_be_tracked

@@ -19,7 +19,7 @@ from mapless.names import check_id
 from mapless.v1 import geometry_pb2
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.engine.groups import MAX_FRAMES, MAX_RIG_IMAGES, MIN_FRAMES
-from mapless_server.engine.interface import EngineOptions
+from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.query import Query
 from mapless_server.images import image_size
 from mapless_server.method.priors.known import DirectionPrior, PosePrior, PositionPrior, Prior

@@ -18,7 +18,8 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.observability.logs import JsonFormatter, TextFormatter
 from mapless_server.rpc import CLIENT_ID_KEY, REQUEST_ID_KEY, Call, CallGuard
 from mapless_server.security import METHOD_ROLES, Authenticator, SecurityError
-from mapless_server.security.tokens import Token, Tokens, read_tokens, sha256_of
+from mapless_server.security.access import Token, Tokens, sha256_of
+from mapless_server.security.tokens import read_tokens
 
 from . import folders
 from .target import Target

@@ -22,7 +22,7 @@ from mapless.scenes import UNCHANGED
 from mapless.v1 import geometry_pb2
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
-from mapless_server.engine.interface import EngineOptions
+from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.query import Caller, Description, Photo
 from mapless_server.method.views import Features, View
 from mapless_server.rpc import Call

@@ -21,9 +21,8 @@ from mapless_server.method.coarse.token_cache import TokenCacheCounters
 from mapless_server.method.rejection import RejectionReason
 from mapless_server.observability import exporter
 from mapless_server.observability.exporter import MAX_CONNECTIONS, MetricsServer
-from mapless_server.observability.metrics import COUNTED, LOCALIZED, STAGES, Metrics
+from mapless_server.observability.metrics import COUNTED, LOCALIZED, STAGES, Metrics, watch_event_loop
 from mapless_server.scheduling import Ending, Refusal, StageLoad
-from mapless_server.serve.running import watch_event_loop
 
 LOCALIZE = "/mapless.v1.LocalizationService/Localize"
 OUTCOMES = (LOCALIZED, *(reason.value for reason in RejectionReason))
@@ -398,7 +397,7 @@ class Heard(Metrics):
 async def test_a_blocked_loop_is_measured_and_logged(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mapless_server.serve.running.WARN_S", 0.1)
+    monkeypatch.setattr("mapless_server.observability.metrics.WARN_S", 0.1)
     heard = Heard()
     caplog.set_level(logging.WARNING)
     watching = asyncio.create_task(watch_event_loop(heard))

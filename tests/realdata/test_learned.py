@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mapless_server.engine.options import EscalationOptions
 from mapless_server.engine.query import Tier
-from mapless_server.engine.tiers import EscalationOptions, is_doubtful
+from mapless_server.engine.tiers import is_doubtful
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.localize import localize

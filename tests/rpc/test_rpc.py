@@ -9,7 +9,7 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import grpc
 import pytest
@@ -21,9 +21,8 @@ from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server.errors import NotFound, Overloaded, PermissionDenied, RequestError, Unauthenticated, Unavailable
-from mapless_server.observability.tracing import CallSpan, Tracer
-from mapless_server.rpc import CallGuard, pace, receiving
-from mapless_server.rpc.call import ANSWER_MARGIN_SHARE, Call
+from mapless_server.rpc import Call, CallGuard, receiving, sending
+from mapless_server.rpc.guard import ANSWER_MARGIN_SHARE
 from mapless_server.rpc.receiving import OpenMethods, Receiver
 from mapless_server.scheduling import Flow, StageRecord
 from mapless_server.security import Principal, Role
@@ -38,7 +37,7 @@ Answer = Callable[[Any, Call], Awaitable[Any]]
 
 
 @dataclass
-class Counted(Tracer, CallSpan):
+class Counted:
     """Counts and traces of calls."""
 
     trace_id: str = ""
@@ -79,7 +78,7 @@ async def serving(answer: Answer, counted: Counted, **options: Any) -> AsyncIter
 @asynccontextmanager
 async def listening(answer: Answer, counted: Counted, **options: Any) -> AsyncIterator[int]:
     """The port of such a server."""
-    guard = CallGuard(observer=counted, tracer=counted, **options)
+    guard = CallGuard(observer=cast(Any, counted), tracer=cast(Any, counted), **options)
     server = grpc.aio.server(options=[("grpc.max_receive_message_length", 2**20)])
     method = grpc.unary_unary_rpc_method_handler(
         answer, pb.LocalizeRequest.FromString, pb.LocalizeResponse.SerializeToString
@@ -320,8 +319,8 @@ class TestCallsWithHeadersOnly:
     async def test_refusals_beyond_a_rate_wait_for_their_turn(
         self, counted: Counted, monkeypatch: pytest.MonkeyPatch, error: RequestError, is_paced: bool
     ) -> None:
-        monkeypatch.setattr(pace, "PER_S", 20)
-        monkeypatch.setattr(pace, "BURST", 2)
+        monkeypatch.setattr(sending, "PER_S", 20)
+        monkeypatch.setattr(sending, "BURST", 2)
 
         def refuse(method: str, flow: Flow) -> None:
             raise error

@@ -10,7 +10,7 @@ import weakref
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import grpc
 import pytest
@@ -83,7 +83,7 @@ async def serving(
         assert request.scene == "scenes/hall"
         return numbers
 
-    guard = CallGuard(observer=counted, **options)
+    guard = CallGuard(observer=cast(Any, counted), **options)
     server = grpc.aio.server()
     method = grpc.unary_stream_rpc_method_handler(watch, understand, pb.WatchQueriesResponse.SerializeToString)
     service = {name.rpartition("/")[2]: guard.guarded(name, method) for name in (METHOD, FINITE)}

@@ -29,7 +29,7 @@ from mapless_server.scenes.background import BackgroundMatching, BackgroundOptio
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
-from mapless_server.scenes.stored_pairs import Matching, PairFinder
+from mapless_server.scenes.stored import Matching, PairFinder
 from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, Store, pairs
 from mapless_server.store.pairs import PairStore

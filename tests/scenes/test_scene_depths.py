@@ -18,10 +18,10 @@ from mapless_server.method.correspond import Correspondences, Matcher
 from mapless_server.method.results import MetricScale, ScaleStage
 from mapless_server.method.views import KeptDepth, PosedView, ReconstructedView, Reconstruction
 from mapless_server.scenes.depth.check import DepthCheckOptions, checked_depths
-from mapless_server.scenes.depth.finder import DepthFinder
 from mapless_server.scenes.depth.scene_depths import SceneDepths
 from mapless_server.scenes.library import Closed, ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
+from mapless_server.scenes.stored import DepthFinder
 from mapless_server.security import SceneKey
 from mapless_server.store import Store, rows
 from mapless_server.store.depths import depth_kind, load_depths

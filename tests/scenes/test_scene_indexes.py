@@ -100,7 +100,7 @@ class TestMemory:
                 indexes.entries(SCENE, StageContext())
         assert not indexes.is_damaged(SCENE, "r0")
         indexes.report_damaged(SCENE, "r0", DataLoss("lost"))
-        assert (indexes.size_bytes, dict(indexes._cached)) == (0, {})
+        assert (indexes.size_bytes, dict(indexes._cached._entries)) == (0, {})
 
     def test_least_recently_used_scenes_make_room_the_last_stays(self, store: Store) -> None:
         keys = [SceneKey(f"many-{i}") for i in range(4)]
@@ -111,9 +111,9 @@ class TestMemory:
         two = indexes_of(store, capacity_bytes=2 * one.size_bytes)
         for key in (*keys, keys[2]):
             two.entries(key, StageContext())
-        assert list(two._cached) == [keys[3], keys[2]]
+        assert list(two._cached._entries) == [keys[3], keys[2]]
         assert two.size_bytes == 2 * one.size_bytes
         none = indexes_of(store, capacity_bytes=0)
         for key in keys:
             none.entries(key, StageContext())
-        assert list(none._cached) == [keys[3]]
+        assert list(none._cached._entries) == [keys[3]]

@@ -31,7 +31,7 @@ from mapless.geometry import RigidTransform
 from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
-from mapless_server.engine.interface import EngineOptions
+from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.query import Result, Tier
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.stages import Method

@@ -17,7 +17,7 @@ from mapless.geometry import Quaternion, RigidTransform
 from mapless.messages import answer_from_message
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
-from mapless_server.engine.interface import EngineOptions
+from mapless_server.engine.options import EngineOptions
 from mapless_server.images import ImageLimits
 from mapless_server.method.options import IntrinsicsSigma
 from mapless_server.method.rejection import IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason

@@ -68,15 +68,15 @@ async def test_a_slow_reader_misses_the_oldest_and_learns_how_many() -> None:
 
 async def test_nothing_is_kept_without_watchers() -> None:
     watchers = Watchers(True)
-    assert not watchers.is_watched(HALL)
+    assert HALL not in watchers.by_scene
     publish(watchers, 1)
     watch = watchers.watch(HALL)
-    assert watchers.is_watched(HALL)
-    assert not watchers.is_watched(OTHER)
+    assert HALL in watchers.by_scene
+    assert OTHER not in watchers.by_scene
     publish(watchers, 2)
     assert inliers_of(await next_of(watch)) == 2  # not what came before it began
     await watch.aclose()
-    assert not watchers.is_watched(HALL)
+    assert HALL not in watchers.by_scene
     kept = weakref.ref(watch)
     del watch
     gc.collect()

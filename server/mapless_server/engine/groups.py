@@ -1,16 +1,21 @@
 """The photographs of a rig or a sequence, each localized like any other; `joint` poses them together."""
 
+from __future__ import annotations
+
 import asyncio
 import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from mapless_server.errors import Overloaded, RequestError
 from mapless_server.scheduling import StageRecord
 
-from .interface import Engine
 from .query import Caller, Query, Result
+
+if TYPE_CHECKING:  # services need not load what computes
+    from .queue_engine import QueueEngine
 
 MAX_RIG_IMAGES = 8
 MIN_FRAMES, MAX_FRAMES = 2, 16
@@ -35,7 +40,7 @@ class PhotoGroup:
     `records` are the stages that each photograph has been through, also if one of them fails.
     """
 
-    def __init__(self, engine: Engine, queries: Sequence[Query], caller: Caller, list_name: str) -> None:
+    def __init__(self, engine: QueueEngine, queries: Sequence[Query], caller: Caller, list_name: str) -> None:
         """Makes a group whose computation has not begun.
 
         Messages about a photograph name the request's field, `list_name`.
@@ -54,7 +59,7 @@ class PhotoGroup:
 
         All of them together would exceed the number that a caller may have waiting. A photograph for which the queue
         has no room waits until another one of the group is done; only the first one can be refused. RequestError as in
-        `Engine.run`, with the field's path in the list.
+        `QueueEngine.run`, with the field's path in the list.
         """
         count = min(len(self._queries), self._engine.parallel_queries)
         workers = [asyncio.ensure_future(self._work()) for _ in range(count)]

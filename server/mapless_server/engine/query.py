@@ -1,23 +1,35 @@
-"""Inputs and results of the engine."""
+"""Inputs and results of the engine, and the state of a query between its stages."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+import hashlib
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
 
 from mapless_server import __version__
+from mapless_server.images import ImageLimits, decode_image
+from mapless_server.method.options import StageContext, Variant
 from mapless_server.method.priors.known import NO_PRIORS, Priors
+from mapless_server.method.views import Photograph, reduce_image
+from mapless_server.scenes import Selection
+from mapless_server.scenes.retrieval.ranking import THINNED_LATER
+from mapless_server.scheduling import Step
 from mapless_server.store import SceneAttributes, calibration_kind
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # services need not load what computes
     from mapless.geometry import Camera
     from mapless_server.method.answer import Answer
     from mapless_server.method.features import FeatureExtractor
     from mapless_server.method.options import LocalizeOptions
     from mapless_server.method.pipeline import Pipeline
-    from mapless_server.method.views import PosedView, View
+    from mapless_server.method.views import Matches, PosedView, View
     from mapless_server.scenes import Choice, Narrowing, Vector
+    from mapless_server.scenes.library import Loaded
     from mapless_server.scheduling import Flow
     from mapless_server.security import SceneKey
 
@@ -33,8 +45,18 @@ TRACK = "track"
 UNFINISHED = "/unfinished"
 """Ends the name of a stage: its tier came to no answer, see `Result`."""
 
+MAX_TRACKED_SIGMA_DEG = 20.0
+"""Priors of a less certain rotation do not say what the photograph shows."""
+
 DEFAULT_REFERENCE_COUNT = 10
 """References that are chosen where the request does not say how many."""
+
+SHORTLIST = 2
+"""So many times the references wanted are matched with a sample of the photograph, and the best of them used (see
+BENCHMARKS.md)."""
+
+_COUNTS = (2, 5, 10, 20, 64)
+"""Queries with about as many references cost about as much."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +148,15 @@ class Query:
         """Whether the server chooses the references, by their similarity to the photograph."""
         return self.rerank or not self.reference_ids
 
+    @property
+    def can_be_tracked(self) -> bool:
+        """Whether its prior and options allow tracking, see `tracking`."""
+        prior = self.priors.pose
+        if prior is None or self.reference_ids or self.is_part or self.options.variant is not Variant.BEST:
+            return False
+        sigma = math.sqrt(float(np.linalg.eigvalsh(prior.covariance[3:, 3:])[-1]))
+        return sigma <= math.radians(MAX_TRACKED_SIGMA_DEG)
+
 
 @dataclass(frozen=True, eq=False)
 class Result:
@@ -168,3 +199,166 @@ class Description:
 
     views: Mapping[str, View]
     descriptors: Mapping[str, Vector]
+
+
+class QueryViews:
+    """Decodes a photograph once, and describes it once with each extractor, when first needed."""
+
+    def __init__(self, photo: Photo, limits: ImageLimits) -> None:
+        self._photo = photo
+        self._limits = limits
+        self._photograph: Photograph | None = None
+        self._views: dict[str, View] = {}
+        self._max_pixels: int | None = None
+
+    def view(self, extractor: FeatureExtractor, context: StageContext) -> View:
+        """The photograph's view with this extractor's features; InvalidArgument if the image is bad."""
+        if extractor.name not in self._views:
+            photograph = self._decoded(context)
+            with context.stage("features"):
+                pixels, camera = photograph.read(), photograph.camera
+                if self._max_pixels is not None:
+                    share = min(1.0, math.sqrt(self._max_pixels / (camera.width_px * camera.height_px)))
+                    pixels, camera = reduce_image(pixels, camera, round(share * max(camera.width_px, camera.height_px)))
+                view = extractor.extract(pixels, camera)
+            self._views[extractor.name] = replace(view, photograph=photograph)
+        return self._views[extractor.name]
+
+    def reduced(self, max_pixels: int, context: StageContext) -> QueryViews:
+        """The same photograph, decoded once, whose features are found in a reduced image with about so many pixels."""
+        views = QueryViews(self._photo, self._limits)
+        views._photograph, views._max_pixels = self._decoded(context), max_pixels
+        return views
+
+    def _decoded(self, context: StageContext) -> Photograph:
+        if self._photograph is None:
+            photo = self._photo
+            with context.stage("decode"):
+                pixels = decode_image(photo.image, self._limits, photo.field)
+            identify = lambda: hashlib.sha256(photo.image).hexdigest()  # noqa: E731
+            self._photograph = Photograph(identify, photo.camera, lambda: pixels)
+        return self._photograph
+
+
+class ReferenceSource(Protocol):
+    """Source of a query's references: `References`, or recorded or rendered ones."""
+
+    def load(
+        self,
+        scene_key: SceneKey,
+        reference_ids: Sequence[str],
+        extractor: FeatureExtractor,
+        context: StageContext,
+        waits: bool,
+    ) -> Loaded:
+        """Loads references of a scene, in the order given, with the scene's generation."""
+        ...
+
+    def attributes(self, scene_key: SceneKey) -> SceneAttributes:
+        """Returns the attributes of a scene."""
+        ...
+
+    def choose(self, scene_key: SceneKey, views: QueryViews, selection: Selection, context: StageContext) -> Choice:
+        """Chooses references for a photograph."""
+        ...
+
+    def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
+        """Reports that a chosen reference is not used because it is damaged."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class QueryRun:
+    """The state of a query between its stages, in one tier.
+
+    Attributes:
+        query: the query.
+        source: source of the references.
+        views: the photograph.
+        deadline_s: time after which the answer is useless, by `time.monotonic`.
+        on_coarse: called with the first tier's coarse result as soon as there is one, in the computing thread.
+        tier: index of the tier that computes.
+        best: best result so far; None in the first search of the first tier.
+        start_s: when this tier began, by `time.monotonic`.
+        give_up_s: time after which `best` is the answer, if this tier has none by then.
+        narrowed: the query with the soft priors' choice of references, if references elsewhere are now searched.
+        ambiguous: the rejection as ambiguous, if the references of the place that the priors decided for are now used.
+        listings: how often the scene was listed in this tier.
+        context: cancels and times this tier's stages; from here on set by the stage `prepare`.
+        references: the references that are used, in order.
+        generation: generation of the scene when they were read.
+        attributes: attributes of the scene.
+        view: the photograph with this tier's features; None until the tier's first step has found them.
+        choice: how the references were chosen; None if the caller named them.
+        query_matches: matches of the photograph with each reference, if references were chosen by these or are matched
+            one by one.
+        unmatched: indices of the references that the photograph is still to be matched with again (`Matcher.rematch`),
+            each in a step of its own, so that a busy server computes for other callers in between.
+        part: the method's intermediate result between two stages.
+    """
+
+    query: Query
+    source: ReferenceSource
+    views: QueryViews
+    deadline_s: float
+    on_coarse: Callable[[Result], object] | None = None
+    tier: int = 0
+    best: Result | None = None
+    start_s: float = field(default_factory=time.monotonic)
+    give_up_s: float = math.inf
+    narrowed: Query | None = None
+    ambiguous: Result | None = None
+    listings: int = 1
+    context: StageContext = field(default_factory=StageContext)
+    references: tuple[PosedView, ...] = ()
+    generation: int = 0
+    attributes: SceneAttributes = field(default_factory=SceneAttributes)
+    view: View | None = None
+    choice: Choice | None = None
+    query_matches: tuple[Matches, ...] | None = None
+    unmatched: tuple[int, ...] = ()
+    part: Any = None
+
+    def but(self, **changes: Any) -> QueryRun:
+        """A copy with these values; `dataclasses.replace` takes ten times as long, which six copies a query show."""
+        assert vars(self).keys() >= changes.keys()
+        copy = object.__new__(QueryRun)
+        vars(copy).update(vars(self), **changes)
+        return copy
+
+    @property
+    def kind(self) -> str:
+        """Kind of the query's jobs; jobs of one kind take about the same time."""
+        if self.tracks:
+            return "tracked"
+        ids = self.query.reference_ids
+        count = next((count for count in _COUNTS if len(ids) <= count), _COUNTS[-1])
+        return f"tier {self.tier}, {'chosen' if self.query.chooses else f'up to {count}'}"
+
+    @property
+    def tracks(self) -> bool:
+        """Whether this tier begins with the references near the prior."""
+        return self.best is None and self.query.can_be_tracked
+
+    @property
+    def earlier(self) -> Result | None:
+        """The result if this computation comes to none."""
+        return self.best or self.ambiguous
+
+    @property
+    def first_step(self) -> Step:
+        """The first step of the query in its tier."""
+        kind = self.kind
+        return Step(PREPARE, kind, kind, self)
+
+    def choose(self, narrowing: Narrowing) -> Choice:
+        """Chooses the shortlist of references within limits and likely values of the pose."""
+        query = self.query
+        selection = Selection(SHORTLIST * query.reference_count, narrowing, query.reference_ids, THINNED_LATER)
+        return self.source.choose(query.scene_key, self.views, selection, self.context)
+
+    def load(self, reference_ids: Sequence[str], tier: Tier) -> Loaded:
+        """Loads references with the tier's features."""
+        # Only the first tier waits for its references' features: before a stronger one there is an answer.
+        waits = self.best is None
+        return self.source.load(self.query.scene_key, reference_ids, tier.extractor, self.context, waits)

@@ -1,18 +1,13 @@
-"""The engine on the work queue: localizes photographs, and describes and audits references, in the queue's threads."""
+"""The engine, as services call it: localizes photographs, describes and audits references, in the queue's threads."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from functools import partial
 from typing import Any, TypeVar, cast
 
-from mapless.geometry import RigidTransform
 from mapless_server.errors import DeadlineExceeded, Overloaded, RequestError, Unavailable
-from mapless_server.method.groups.rig import RigEstimate
-from mapless_server.method.groups.sequence import SequenceEstimate
 from mapless_server.method.options import StageContext
-from mapless_server.method.rejection import Rejection
 from mapless_server.scenes import Choice, Coverage, Narrowing, ReferenceAudit, Selection, Viewpoint
 from mapless_server.scenes.background import BackgroundMatching
 from mapless_server.scheduling import (
@@ -34,11 +29,23 @@ from mapless_server.scheduling import (
 )
 from mapless_server.security import SceneKey
 
-from . import joint
 from .failures import failure_of
-from .interface import EngineOptions
-from .query import COARSE, PREPARE, REFINE, Caller, Description, Photo, Query, Result, Tier
-from .references import QueryRun, QueryViews, References, ReferenceSource
+from .options import EngineOptions
+from .query import (
+    COARSE,
+    PREPARE,
+    REFINE,
+    Caller,
+    Description,
+    Photo,
+    Query,
+    QueryRun,
+    QueryViews,
+    ReferenceSource,
+    Result,
+    Tier,
+)
+from .references import References
 from .stages import Method, QueryStages
 
 ItemT = TypeVar("ItemT")
@@ -59,6 +66,9 @@ _QUERY, _UPLOAD = Step(PREPARE, "", "", None), Step(DESCRIBE, DESCRIBE, DESCRIBE
 
 class QueueEngine:
     """The engine that computes through one work queue. Its coroutines run on one event loop.
+
+    The methods that compute raise RequestError for a bad image, an unknown scene or reference, a full queue, or a
+    passed deadline.
 
     Attributes:
         tiers: the tiers, the cheapest first.
@@ -114,7 +124,12 @@ class QueueEngine:
         *,
         on_coarse: Callable[[Result], None] | None = None,
     ) -> Job:
-        """Implements Engine, with another source of references for the warm-up."""
+        """Makes the job of localizing a photograph, for `run`; its `records` list the stages that it has been through.
+
+        `source` replaces the references, for the warm-up. `on_coarse` is called on the event loop, before the answer,
+        with the first tier's localization before its refinement, if there is one; nothing has checked it. It is called
+        again if references are deleted while they are used. The answer does not depend on it.
+        """
         views = QueryViews(query.photo, self.options.image_limits)
         run = QueryRun(query, source or self.references, views, caller.deadline_s)
         if on_coarse is not None:
@@ -124,13 +139,13 @@ class QueueEngine:
         return Job(caller.flow, run.first_step, caller.deadline_s, size_bytes)
 
     async def run(self, job: Job) -> Result:
-        """Implements Engine."""
+        """Computes a query's job and returns its result."""
         with _as_request_errors():
             return cast(Result, await self.queue.run(job))
 
     @contextmanager
     def hold(self, queries: Sequence[Query], caller: Caller) -> Iterator[None]:
-        """Implements Engine."""
+        """Reserves the memory of a group's photographs for its whole call, however many of them are queued."""
         with ExitStack() as stack:
             with _as_request_errors():
                 size_bytes = sum(len(query.photo.image) for query in queries)
@@ -138,21 +153,21 @@ class QueueEngine:
             yield
 
     def check_room(self, flow: Flow, is_query: bool = True) -> None:
-        """Implements Engine."""
+        """Raises RequestError if no query of a caller would be admitted now, or no upload; its message is not read."""
         try:
             self.queue.check_room(flow, _QUERY if is_query else _UPLOAD)
         except Refused as refused:
             raise _refusal(refused) from None
 
     async def describe(self, photos: Sequence[Photo], caller: Caller) -> list[Description]:
-        """Implements Engine."""
+        """Computes features and descriptors of photographs, in order."""
         size_bytes = sum(len(photo.image) for photo in photos)
         return await self._each(DESCRIBE, photos, self.references.describe, caller, size_bytes)
 
     async def retrieve(
         self, scene_key: SceneKey, photo: Photo, count: int, narrowing: Narrowing, caller: Caller
     ) -> Choice:
-        """Implements Engine."""
+        """Chooses the references of a scene that resemble a photograph most."""
 
         def choose(photo: Photo, check: Callable[[], None]) -> Choice:
             views = QueryViews(photo, self.options.image_limits)
@@ -164,13 +179,16 @@ class QueueEngine:
     async def audit(
         self, scene_key: SceneKey, reference_ids: Sequence[str], caller: Caller, are_listed: bool = False
     ) -> tuple[int, list[ReferenceAudit]]:
-        """Implements Engine."""
+        """Audits references of a scene by their neighbours; returns the scene's generation and the audits, in order.
+
+        References that do not exist any more are left out if `are_listed`, that is, if the caller did not name them.
+        """
         auditor = self.references.auditor(scene_key, () if are_listed else reference_ids)
         audits = await self._each(AUDIT, reference_ids, auditor.audit, caller, 0, jobs=1)
         return auditor.generation, [audit for audit in audits if audit is not None]
 
     async def check_coverage(self, scene_key: SceneKey, view: Viewpoint, caller: Caller) -> tuple[int, Coverage]:
-        """Implements Engine."""
+        """Predicts whether a photograph would be localized at a viewpoint; also returns the scene's generation."""
         auditor = self.references.auditor(scene_key)
         (coverage,) = await self._each(COVERAGE, [view], auditor.check_coverage, caller, 0)
         return auditor.generation, coverage
@@ -179,28 +197,6 @@ class QueueEngine:
     def parallel_queries(self) -> int:
         """How many queries of one call are worth computing concurrently."""
         return max(self.options.workers, self.options.max_batch)
-
-    async def pose_rig(
-        self,
-        queries: Sequence[Query],
-        results: Sequence[Result],
-        rig_from_camera: Sequence[RigidTransform],
-        caller: Caller,
-    ) -> RigEstimate | Rejection:
-        """Estimates the pose of the rig that took the photographs."""
-        return await self.join(lambda: joint.pose_rig(queries, results, rig_from_camera), caller)
-
-    async def pose_sequence(
-        self,
-        queries: Sequence[Query],
-        results: Sequence[Result],
-        session_from_camera: Sequence[RigidTransform],
-        estimate_scale: bool,
-        caller: Caller,
-    ) -> SequenceEstimate | Rejection:
-        """Estimates the poses of a sequence's frames, in OpenCV's axes."""
-        work = partial(joint.pose_sequence, queries, results, session_from_camera, estimate_scale)
-        return await self.join(work, caller)
 
     async def join(self, compute: Callable[[], Joined], caller: Caller) -> Joined:
         """Computes from several photographs' answers, in its turn in the queue, which does not refuse it.

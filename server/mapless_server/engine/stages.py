@@ -9,9 +9,10 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
-from mapless_server.errors import NotFound, Unavailable
+from mapless_server.errors import DataLoss, NotFound, Unavailable
 from mapless_server.method import localize as method
 from mapless_server.method import pipeline
 from mapless_server.method.answer import Answer, Localization
@@ -22,16 +23,16 @@ from mapless_server.method.pipeline import Coarse, Pipeline, Prepared
 from mapless_server.method.rejection import Hint, Hypothesis, Rejection, RejectionReason
 from mapless_server.method.results import Support
 from mapless_server.method.trust.judge import trust_in_scene
-from mapless_server.scenes import Selection
-from mapless_server.scenes.library import FeaturesMissing
+from mapless_server.scenes import ANYWHERE, Selection
+from mapless_server.scenes.library import FeaturesMissing, Loaded, load_usable
 from mapless_server.scenes.retrieval.ranking import spread_choice
 from mapless_server.scheduling import Abandoned, Done, Ending, Failure, Fallback, Job, Next, StageResult, Step
 
 from . import tracking
 from .failures import failure_of
-from .query import COARSE, PREPARE, REFINE, TRACK, UNFINISHED, Query, Result, Tier
-from .references import QueryRun
-from .tiers import EscalationOptions, better_of, inlier_count, is_doubtful, of_two_places, place_of_priors
+from .options import EscalationOptions
+from .query import COARSE, PREPARE, REFINE, TRACK, UNFINISHED, Query, QueryRun, Result, Tier
+from .tiers import better_of, inlier_count, is_doubtful, of_two_places, place_of_priors
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +55,6 @@ class Method:
     refine: Callable[[Coarse], Answer] = method.refine
     coarse_answer: Callable[[Coarse], Answer | None] = pipeline.coarse_answer
     tracked_support: Callable[[Prepared], Support | None] = tracked_support
-    track: Callable[..., Answer] = tracking.track
 
 
 class QueryStages:
@@ -190,18 +190,18 @@ class QueryStages:
             near = run.source.choose(query.scene_key, run.views, selection, context)
         if len(near.references) < 2:
             return None
-        generation, references = run.load_chosen([it.reference_id for it in near.references], tier)
+        generation, references = _load_chosen(run, [it.reference_id for it in near.references], tier)
         views = run.views.reduced(tracking.MAX_PIXELS, context)
         tier = tracking.tracking_tier(tier)
         view, pipeline = views.view(tier.extractor, context), _pipeline_in(run, tier)
-        answer = self._method.track(view, references, pipeline, query.options, context, query.priors)
+        answer = tracking.track(view, references, pipeline, query.options, context, query.priors)
         if not tracking.suffices(answer, pipeline.options.weak_inliers, self._doubt_in(run)):
             return None
         selection = Selection(query.reference_count, query.narrowing.limits)
         alike = run.source.choose(query.scene_key, views, selection, context)
         others = [it.reference_id for it in tracking.elsewhere(near, alike)]
         with context.stage(TRACK):
-            rivals = run.load_chosen(others, tier)[1] if others else ()
+            rivals = _load_chosen(run, others, tier)[1] if others else ()
             if tracking.is_contradicted(answer, view, rivals, pipeline.matcher):
                 return None
         tracked = run.but(generation=generation, references=references, view=view, choice=near)
@@ -218,7 +218,7 @@ class QueryStages:
         """Chooses, among the references that resemble the photograph most, those with the most matches."""
         query, context = run.query, run.context
         choice = run.choose(query.narrowing)
-        generation, shortlist = run.load_chosen([it.reference_id for it in choice.references], tier)
+        generation, shortlist = _load_chosen(run, [it.reference_id for it in choice.references], tier)
         view = run.views.view(tier.extractor, context)
 
         def choose(indices: Sequence[int], match_counts: Sequence[int]) -> list[int]:
@@ -260,9 +260,11 @@ class QueryStages:
 
     def _conclude(self, run: QueryRun, answer: Answer) -> StageResult:
         """Ends a search: returns the better of two answers, or searches elsewhere or in a stronger tier for another."""
-        place = place_of_priors(answer.outcome, run.query.priors, self._escalation)
-        if isinstance(place, Hint) and isinstance(answer.outcome, Rejection):
-            answer = replace(answer, outcome=replace(answer.outcome, hint=place))
+        place = None
+        if isinstance(answer.outcome, Rejection):
+            place = place_of_priors(answer.outcome, run.query.priors, self._escalation)
+            if isinstance(place, Hint):
+                answer = replace(answer, outcome=replace(answer.outcome, hint=place))
         result, query = self._result(run, answer), run.query
         if isinstance(place, Hypothesis) and len(place.references) < len(run.references):
             return self._at_place(run, place, result)
@@ -333,7 +335,7 @@ class QueryStages:
         tier = self._tiers[run.tier]
         others = [it.reference_id for it in alike if it.reference_id not in inside][: tracking.OTHERS]
         with run.context.stage("correspond"):
-            rivals = run.load_chosen(others, tier)[1]
+            rivals = _load_chosen(run, others, tier)[1]
             return tracking.is_contradicted(answer, run.view, rivals, tier.pipeline.matcher)
 
     def _doubt_in(self, run: QueryRun) -> EscalationOptions:
@@ -363,8 +365,10 @@ class QueryStages:
         assert run.view is not None
         tier, narrowing = self._tiers[run.tier], run.query.narrowing
         outcome = answer.outcome
-        if isinstance(outcome, Localization) and (beyond := narrowing.contradiction(outcome.world_from_camera)):
-            answer = replace(answer, outcome=Rejection(RejectionReason.PRIOR_CONFLICT, beyond))
+        if isinstance(outcome, Localization) and narrowing is not ANYWHERE:
+            beyond = narrowing.contradiction(outcome.world_from_camera)
+            if beyond:
+                answer = replace(answer, outcome=Rejection(RejectionReason.PRIOR_CONFLICT, beyond))
         if isinstance(answer.outcome, Rejection):
             answer = hinted(answer, run.view, run.references, _is_searched(run) and not narrowing.is_empty)
         prefix = "" if run.best is None else f"{tier.features}/"
@@ -373,6 +377,14 @@ class QueryStages:
             seconds[f"{prefix}{stage}"] = spent_s
         used = run.references, run.generation, run.view.camera, run.choice, run.attributes
         return Result(answer, tier, *used, seconds)
+
+
+def _load_chosen(run: QueryRun, reference_ids: Sequence[str], tier: Tier) -> Loaded:
+    """Loads chosen references without damaged ones; a damaged reference that the caller named is an error."""
+    if run.query.reference_ids:
+        return run.load(reference_ids, tier)
+    report = partial(run.source.report_damaged, run.query.scene_key)
+    return load_usable(lambda some: run.load(some, tier), reference_ids, (DataLoss,), report)
 
 
 def _pipeline_in(run: QueryRun, tier: Tier) -> Pipeline:

@@ -24,18 +24,16 @@ from mapless_server.method.coarse.geometric import GeometricReconstructor
 from mapless_server.method.correspond import Matcher
 from mapless_server.method.localize import prepare, solve
 from mapless_server.method.nearest import epipolar_distance_px
-from mapless_server.method.options import LocalizeOptions, StageContext, Variant
+from mapless_server.method.options import LocalizeOptions, StageContext
 from mapless_server.method.pipeline import Pipeline, reconstruct
 from mapless_server.method.priors.known import Priors
 from mapless_server.method.trust.evidence import EPIPOLAR_PX
 from mapless_server.method.views import PosedView, View
 from mapless_server.scenes import Choice, RankedReference
 
-from .query import Query, Tier
-from .tiers import EscalationOptions, is_doubtful
-
-MAX_SIGMA_DEG = 20.0
-"""Priors of a less certain rotation do not say what the photograph shows."""
+from .options import EscalationOptions
+from .query import Tier
+from .tiers import is_doubtful
 
 MAX_PIXELS = 384 * 288
 """Of the reduced photograph: features take a third of the time of 640x480, matching and adjusting them half. Medians of
@@ -60,15 +58,6 @@ _GEOMETRIC = GeometricReconstructor()
 def tracking_tier(tier: Tier) -> Tier:
     """The tier with the backend that triangulates."""
     return replace(tier, pipeline=replace(tier.pipeline, reconstructor=_GEOMETRIC))
-
-
-def can_track(query: Query) -> bool:
-    """Whether the query's prior and options allow tracking."""
-    prior = query.priors.pose
-    if prior is None or query.reference_ids or query.is_part or query.options.variant is not Variant.BEST:
-        return False
-    sigma = math.sqrt(float(np.linalg.eigvalsh(prior.covariance[3:, 3:])[-1]))
-    return sigma <= math.radians(MAX_SIGMA_DEG)
 
 
 def track(

@@ -11,17 +11,20 @@ Value = TypeVar("Value")
 class LruCache(Generic[Value]):
     """Holds values whose sizes, in bytes or in any other unit, add up to at most a capacity; 0 holds nothing.
 
+    Of a cache that `keeps_latest`, the latest value is held however large it is.
+
     Attributes:
         hits, misses: numbers of calls of `get` that found or missed a value.
         evictions: values dropped for lack of room.
         used: sum of the sizes of the values held.
     """
 
-    def __init__(self, capacity: int) -> None:
+    def __init__(self, capacity: int, keeps_latest: bool = False) -> None:
         """Raises ValueError if the capacity is negative."""
         if capacity < 0:
             raise ValueError(f"cache capacity must not be negative, is {capacity}")
         self._capacity = capacity
+        self._keeps_latest = keeps_latest
         self.hits = self.misses = self.evictions = self.used = 0
         self._entries: OrderedDict[Hashable, tuple[Value, int]] = OrderedDict()
         self._lock = threading.Lock()
@@ -51,13 +54,13 @@ class LruCache(Generic[Value]):
 
     def put(self, key: Hashable, value: Value, size: int = 1) -> None:
         """Stores a value, unless it is larger than the whole cache."""
-        if size > self._capacity:
+        if size > self._capacity and not self._keeps_latest:
             return
         with self._lock:
             _, replaced = self._entries.pop(key, (None, 0))
             self._entries[key] = (value, size)
             self.used += size - replaced
-            while self.used > self._capacity:
+            while self.used > self._capacity and len(self._entries) > self._keeps_latest:
                 _, (_, dropped) = self._entries.popitem(last=False)
                 self.used -= dropped
                 self.evictions += 1

@@ -1,4 +1,7 @@
-"""Traces by OpenTelemetry: names and attributes follow its conventions for RPC; OTLP sends them in the background."""
+"""Traces by OpenTelemetry: names and attributes follow its conventions for RPC; OTLP sends them in the background.
+
+Methods are called on the event loop, so they return at once and never raise.
+"""
 
 import json
 import threading
@@ -18,13 +21,15 @@ from mapless_server import __version__
 from mapless_server.scheduling import StageRecord
 
 from .logs import plain
-from .tracing import MAX_STAGES, CallSpan, Metadata, Tracer
 
 EXPORT_LIMIT_S = 5.0
 """Time that a collector may take for a batch, retries included."""
 _SERVER_FAULTS = frozenset({"UNKNOWN", "DEADLINE_EXCEEDED", "UNIMPLEMENTED", "INTERNAL", "UNAVAILABLE", "DATA_LOSS"})
 """Statuses that a server's span counts as errors; the others are the caller's."""
 _CANCEL_LIMIT_S = 1.0
+
+MAX_STAGES = 64
+"""Stages in one trace; of a rig with many photographs only the first."""
 
 Attribute = str | bool | int | float
 
@@ -41,8 +46,8 @@ def make_otlp_tracer(endpoint: str) -> "OtlpTracer":
     return OtlpTracer(OTLPSpanExporter(endpoint=endpoint, insecure=is_insecure, timeout=EXPORT_LIMIT_S))
 
 
-class OtlpTracer(Tracer):
-    """Implements Tracer. Buffers at most 2048 spans, and drops further ones."""
+class OtlpTracer:
+    """Traces calls. Buffers at most 2048 spans, and drops further ones."""
 
     def __init__(self, exporter: SpanExporter) -> None:
         resource = Resource({"service.name": "mapless", "service.version": __version__})
@@ -55,8 +60,8 @@ class OtlpTracer(Tracer):
         self._tracer = self._provider.get_tracer("mapless", __version__)
         self._propagator = TraceContextTextMapPropagator()
 
-    def begin(self, method: str, metadata: Metadata, start_s: float) -> "_OtlpSpan":
-        """Implements Tracer."""
+    def begin(self, method: str, metadata: Sequence[tuple[str, str | bytes]], start_s: float) -> "CallSpan":
+        """Begins the span of a call of "/package.Service/Method", at a time of `time.monotonic`."""
         keys = ("traceparent", "tracestate")
         carrier = {key: value for key, value in metadata if key in keys and isinstance(value, str)}
         span = self._tracer.start_span(
@@ -66,10 +71,10 @@ class OtlpTracer(Tracer):
             attributes={"rpc.system.name": "grpc", "rpc.method": method.removeprefix("/")},
             start_time=_epoch_ns(start_s),
         )
-        return _OtlpSpan(self, span)
+        return CallSpan(self, span)
 
     def close(self, limit_s: float) -> None:
-        """Implements Tracer."""
+        """Sends the remaining spans and ends; takes at most about `limit_s`."""
         flushing = threading.Thread(target=self._provider.shutdown, name="traces", daemon=True)
         flushing.start()
         flushing.join(limit_s)
@@ -90,7 +95,9 @@ class OtlpTracer(Tracer):
         span.end(_epoch_ns(end_s))
 
 
-class _OtlpSpan(CallSpan):
+class CallSpan:
+    """The trace of one call, with 32 hexadecimal digits as its id; empty if the call is not traced."""
+
     def __init__(self, tracer: OtlpTracer, span: Span) -> None:
         self._tracer = tracer
         self._span = span
@@ -98,7 +105,7 @@ class _OtlpSpan(CallSpan):
         self.trace_id = f"{context.trace_id:032x}" if context.trace_flags.sampled else ""
 
     def end(self, code: str, stages: Sequence[StageRecord], attributes: Mapping[str, object]) -> None:
-        """Implements CallSpan."""
+        """Ends the span with a gRPC status; called once."""
         if not self._span.is_recording():
             return
         self._span.set_attributes({"rpc.response.status_code": code, **_attributes(attributes)})

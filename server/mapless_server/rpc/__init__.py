@@ -1,11 +1,10 @@
 """What all calls have in common: deadline, identity, errors, receiving, sending, and the line in the log.
 
 May import observability and everything below it. Begin with `guard.CallGuard`, which wraps every handler: it makes the
-`call.Call`, has `receiving` read its message and `sending` write its messages, and turns errors into statuses.
+`Call`, has `receiving` read its message and `sending` write its messages, and turns errors into statuses.
 """
 
-from .call import CLIENT_ID_KEY, REQUEST_ID_KEY, Call
-from .guard import Authenticate, CallGuard
-from .sending import to_status
+from .guard import CLIENT_ID_KEY, Authenticate, Call, CallGuard
+from .sending import REQUEST_ID_KEY, to_status
 
 __all__ = ["CLIENT_ID_KEY", "REQUEST_ID_KEY", "Authenticate", "Call", "CallGuard", "to_status"]

@@ -1,31 +1,56 @@
-"""Wraps the handlers of all methods: id, authentication, deadline, log line, and errors as google.rpc.Status."""
+"""Wraps the handlers of all methods: id, authentication, deadline, log line, and errors as google.rpc.Status.
+
+A servicer gets a `Call`: its id, caller and deadline, and a record of its steps.
+"""
+
+from __future__ import annotations
 
 import asyncio
 import inspect
 import logging
+import math
+import random
+import re
 import time
-from collections.abc import AsyncGenerator, Callable, Coroutine, Iterable, Iterator, Mapping
+from collections.abc import AsyncGenerator, Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
 from contextlib import aclosing, contextmanager, suppress
-from dataclasses import dataclass, replace
-from typing import Any, Protocol, TypeVar
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, TypeVar
+from urllib.parse import unquote
 
 import grpc
 from google.protobuf.message import DecodeError
 
 from mapless.wire import FieldError
+from mapless_server import __version__
+from mapless_server.engine.query import Caller
 from mapless_server.errors import DeadlineExceeded, InvalidArgument, RequestError, Unavailable
-from mapless_server.observability.tracing import CallSpan, Metadata, Tracer
-from mapless_server.scheduling import Flow
+from mapless_server.scheduling import Flow, StageRecord
 from mapless_server.security import ENDLESS_METHODS, OPEN_METHODS, Principal
 
-from .call import Call, Deadlines, begin_call, metadata_of
-from .pace import PACED_CODES, Pace
 from .receiving import Context, OpenMethods, Receiver, quiet_ended_calls
-from .sending import ENDLESS_SEND_LIMIT_S, SEND_LIMIT_S, Sender
+from .sending import ENDLESS_SEND_LIMIT_S, PACED_CODES, REQUEST_ID_KEY, SEND_LIMIT_S, Pace, Sender
+
+if TYPE_CHECKING:
+    from mapless_server.observability.metrics import Metrics
+    from mapless_server.observability.otlp import CallSpan, OtlpTracer
 
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
+
+CLIENT_ID_KEY = "x-client-id"
+TIME_KEY, VERSION_KEY = "x-mapless-time", "x-mapless-version"
+ANSWER_MARGIN_SHARE = 0.02
+"""Share of the time given by which the answer is early: gRPC rounds the time up when it sends it, by at most 1 %."""
+ANSWER_MARGIN_S = 0.01
+"""Least time by which it is early, because the answer has to be written and sent as well ..."""
+_MAX_MARGIN_SHARE = 0.1
+"""... and the largest share of the time that this may take."""
+_ID = re.compile(r"[A-Za-z0-9_.-]{1,64}", re.ASCII)  # it is logged: no line breaks, no escapes
+
+Metadata = Sequence[tuple[str, str | bytes]]
+"""The keys and values that a caller sends beside its message."""
 
 Authenticate = Callable[[Metadata, str, Mapping[str, Iterable[bytes]]], Principal]
 """The caller of a method ("/package.Service/Method"), from the call's metadata and the connection's auth_context.
@@ -37,22 +62,53 @@ Opening = Coroutine[Any, Any, AsyncGenerator[Any, None]]
 """A servicer's method of a stream: gives an iterator of messages."""
 
 
-class CallObserver(Protocol):
-    """Counts calls; called on the event loop, so its methods return at once and never raise."""
+@dataclass(frozen=True)
+class Call:
+    """A call, for its servicer; times are by `time.monotonic`.
 
-    def call_started(self, method: str) -> None:
-        """A call arrived; `method` is "/package.Service/Method"."""
+    The request id identifies it in the log; it is the caller's own if that is well-formed. The message may arrive later
+    than the headers, at `arrived_s`. `client` distinguishes callers: the id that the caller gives, else the address of
+    its connection. `notes` are fields of its line in the log, `stages` those of the queue that its jobs have passed.
+    """
 
-    def call_handled(self, method: str, code: str, seconds: float, trace_id: str) -> None:
-        """A call ended with a gRPC status; called exactly once. The id is empty if the call is not traced."""
+    request_id: str
+    arrived_s: float
+    deadline_s: float
+    principal: Principal = field(default_factory=Principal)
+    client: str = ""
+    notes: dict[str, object] = field(default_factory=dict, repr=False, compare=False)
+    stages: list[StageRecord] = field(default_factory=list, repr=False, compare=False)
+
+    @property
+    def caller(self) -> Caller:
+        """The caller in the engine's form."""
+        return Caller(Flow(self.principal.tenant, self.client), self.deadline_s)
+
+    @property
+    def trailers(self) -> tuple[tuple[str, str], ...]:
+        """Trailers of a successful answer: its caller is authenticated, and may know the version."""
+        return (REQUEST_ID_KEY, self.request_id), (TIME_KEY, f"{time.time():.3f}"), (VERSION_KEY, __version__)
+
+    def note(self, **fields: object) -> None:
+        """Adds fields to the call's line in the log and to its trace; they cannot replace the standard fields."""
+        self.notes.update(fields)
+
+    def record(self, stages: Iterable[StageRecord]) -> None:
+        """Records the queue's stages that a job of the call has passed."""
+        self.stages.extend(stages)
 
 
 @dataclass
 class _Result:
-    """The span and the gRPC status with which a call is logged at its end."""
+    """The gRPC status with which a call is logged at its end, and its span, if it is traced."""
 
-    span: CallSpan
+    span: CallSpan | None
     code: str = "UNKNOWN"
+
+    @property
+    def trace_id(self) -> str:
+        """32 hexadecimal digits; empty if the call is not traced."""
+        return "" if self.span is None else self.span.trace_id
 
 
 class CallGuard:
@@ -68,8 +124,8 @@ class CallGuard:
         *,
         authenticate: Authenticate | None = None,
         check_admission: Callable[[str, Flow], None] = lambda method, flow: None,
-        observer: CallObserver | None = None,
-        tracer: Tracer | None = None,
+        observer: Metrics | None = None,
+        tracer: OtlpTracer | None = None,
     ) -> None:
         """Without `authenticate`, every caller is admitted.
 
@@ -82,11 +138,12 @@ class CallGuard:
             observer: counts calls.
             tracer: traces calls; its owner closes it.
         """
-        self._deadlines = Deadlines(default_deadline_s, max_deadline_s)
+        self._default_deadline_s = default_deadline_s
+        self._max_deadline_s = max_deadline_s
         self._authenticate = authenticate
         self._check_admission = check_admission
         self._observer = observer
-        self._tracer = tracer or Tracer()
+        self._tracer = tracer
         self._active = 0
         self._idle = asyncio.Event()
         self._idle.set()
@@ -105,7 +162,7 @@ class CallGuard:
         reply = self._stream if streams else self._answer
 
         async def answer(_: object, context: Context) -> bytes | None:
-            call = begin_call(context, self._deadlines, method in ENDLESS_METHODS)
+            call = self._begun(context, method in ENDLESS_METHODS)
             with self._recorded(method, call, context) as result:
                 try:
                     principal = self._principal(method, context)
@@ -120,7 +177,7 @@ class CallGuard:
                     if error.code in PACED_CODES:
                         error.__traceback__ = error.__context__ = None  # they hold the message
                         await self._pace.turn(call.deadline_s)
-                    await self._sender.error(context, call, error, streams)
+                    await self._sender.error(context, call.request_id, error, streams)
                     raise  # not reached: sending it raises
                 except asyncio.CancelledError:
                     # When the caller's deadline passes, grpc may notice it first.
@@ -129,11 +186,10 @@ class CallGuard:
                 except Exception as error:
                     result.code = "INTERNAL"
                     call.note(reason=type(error).__name__)
-                    ids = {"request_id": call.request_id, "trace_id": result.span.trace_id}
+                    ids = {"request_id": call.request_id, "trace_id": result.trace_id}
                     log.exception("%s failed", method, extra=ids)
-                    await self._sender.error(
-                        context, call, RequestError(f"internal error, id={call.request_id}"), streams
-                    )
+                    internal = RequestError(f"internal error, id={call.request_id}")
+                    await self._sender.error(context, call.request_id, internal, streams)
                     raise
 
         # Not as a unary method, whose message grpc receives first: a rejected call must cost nothing, and one without a
@@ -142,6 +198,24 @@ class CallGuard:
             return grpc.stream_stream_rpc_method_handler(answer, None, None)
         return grpc.stream_unary_rpc_method_handler(answer, None, None)
 
+    def _begun(self, context: Context, is_endless: bool) -> Call:
+        """Makes the call whose headers have just arrived; it is not authenticated yet."""
+        now_s, asked_s = time.monotonic(), context.time_remaining()
+        usual_s = math.inf if is_endless else self._default_deadline_s
+        given_s = usual_s if asked_s is None else asked_s
+        if not is_endless:
+            given_s = min(given_s, self._max_deadline_s)
+        margin_s = 0.0
+        if math.isfinite(given_s):
+            margin_s = min(max(ANSWER_MARGIN_S, ANSWER_MARGIN_SHARE * given_s), _MAX_MARGIN_SHARE * given_s)
+        metadata = metadata_of(context)
+        request_id = _well_formed(metadata, REQUEST_ID_KEY) or f"{random.getrandbits(128):032x}"
+        client = _well_formed(metadata, CLIENT_ID_KEY) or unquote(context.peer())
+        call = Call(request_id, now_s, now_s + given_s - margin_s, client=client)
+        if math.isfinite(given_s):
+            call.note(deadline_ms=round(1000 * given_s))
+        return call
+
     @contextmanager
     def _recorded(self, method: str, call: Call, context: Context) -> Iterator[_Result]:
         """Counts and traces a call, and logs it at its end with the status of the result."""
@@ -149,7 +223,8 @@ class CallGuard:
         self._active += is_awaited
         if self._active:
             self._idle.clear()
-        result = _Result(self._tracer.begin(method, metadata_of(context), call.arrived_s))
+        tracer = self._tracer
+        result = _Result(None if tracer is None else tracer.begin(method, metadata_of(context), call.arrived_s))
         if self._observer is not None:
             self._observer.call_started(method)
         log.debug("%s begins", method, extra={"request_id": call.request_id})
@@ -161,7 +236,7 @@ class CallGuard:
                 self._idle.set()
             seconds = time.monotonic() - call.arrived_s
             if self._observer is not None:
-                self._observer.call_handled(method, result.code, seconds, result.span.trace_id)
+                self._observer.call_handled(method, result.code, seconds, result.trace_id)
             # Behind the answer, which grpc sends when this handler returns.
             asyncio.get_running_loop().call_soon(self._log_end, method, call, result, seconds)
 
@@ -253,7 +328,7 @@ class CallGuard:
         """Receives the call's message; returns it, and the call with its principal."""
         limit_s = call.deadline_s - time.monotonic()
         if method in ENDLESS_METHODS:  # which may have no deadline
-            limit_s = min(limit_s, self._deadlines.default_deadline_s)
+            limit_s = min(limit_s, self._default_deadline_s)
         data = await self._receiver.message(context, limit_s)
         call.note(bytes_in=len(data))
         call = replace(call, principal=self._principal(method, context))
@@ -299,17 +374,32 @@ class CallGuard:
             log.error("a call failed after it was abandoned", exc_info=error)
 
     def _log_end(self, method: str, call: Call, result: _Result, seconds: float) -> None:
-        span, record = result.span, call.history
-        fields: dict[str, object] = {**record.notes, "request_id": call.request_id, "client": call.client}
-        span.end(result.code, record.stages, fields)
-        if span.trace_id:
-            fields["trace_id"] = span.trace_id
-        if record.stages:
-            fields["queue_ms"] = _ms(record.queue_s)
-            fields["stages_ms"] = {name: _ms(spent_s) for name, spent_s in record.stage_seconds.items()}
+        fields: dict[str, object] = {**call.notes, "request_id": call.request_id, "client": call.client}
+        if result.span is not None:
+            result.span.end(result.code, call.stages, fields)
+        if result.trace_id:
+            fields["trace_id"] = result.trace_id
+        if call.stages:
+            spent_s: dict[str, float] = {}
+            for it in call.stages:
+                if it.jobs:
+                    spent_s[it.stage] = spent_s.get(it.stage, 0.0) + it.end_s - it.start_s
+            fields["queue_ms"] = _ms(sum(it.waited_s for it in call.stages))
+            fields["stages_ms"] = {name: _ms(seconds) for name, seconds in spent_s.items()}
         fields |= {"method": method, "code": result.code, "duration_ms": _ms(seconds)}
         log.info("%s %s", method.rpartition("/")[2], result.code, extra={"fields": fields})
 
 
 def _ms(seconds: float) -> float:
     return round(1000 * seconds, 1)
+
+
+def metadata_of(context: Context) -> Metadata:
+    """The caller's metadata, in order."""
+    return context.invocation_metadata() or ()
+
+
+def _well_formed(metadata: Metadata, wanted: str) -> str:
+    """The value of a key of the metadata; empty if it is missing or cannot be written to the log."""
+    given = next((str(value) for key, value in metadata if key == wanted), "")
+    return given if _ID.fullmatch(given) else ""

@@ -1,11 +1,14 @@
 """Sends a stream's messages, and the errors of all calls, in limited time.
 
+Refusals beyond a rate are delayed, so that callers that call again at once leave the processor to the answers.
+
 A message waits in grpc until flow control lets it through, which it does not while the caller reads nothing. A handler
 that ends by CancelledError, without a status, does not end its call: the caller would wait for the status for ever. So
 a status is always sent, behind the earlier messages, and waits for its reader without the handler.
 """
 
 import asyncio
+import time
 from collections.abc import Coroutine
 from typing import Any
 
@@ -16,8 +19,9 @@ from grpc_status import rpc_status
 
 from mapless_server.errors import AlreadyExists, DeadlineExceeded, NotFound, RequestError
 
-from .call import REQUEST_ID_KEY, Call
 from .receiving import Context, has_ended, retrieve
+
+REQUEST_ID_KEY = "x-request-id"
 
 SEND_LIMIT_S = 10.0
 """For the caller of a finite stream to read a message that is ready. Answers of unary calls wait in grpc and cost only
@@ -52,13 +56,13 @@ class Sender:
         """
         await self._in_time(context.write(data), limit_s)
 
-    async def error(self, context: Context, call: Call, error: RequestError, is_stream: bool) -> None:
+    async def error(self, context: Context, request_id: str, error: RequestError, is_stream: bool) -> None:
         """Ends a call with an error: always raises, and the handler must not catch that exception.
 
         It does not wait for a caller that does not read a stream, which gets the status after the earlier messages.
         """
-        status = rpc_status.to_status(to_status(error, call.request_id))
-        metadata = (*status.trailing_metadata, (REQUEST_ID_KEY, call.request_id))
+        status = rpc_status.to_status(to_status(error, request_id))
+        metadata = (*status.trailing_metadata, (REQUEST_ID_KEY, request_id))
         abort = context.abort(status.code, status.details, metadata)
         if not is_stream:  # nothing is before it
             try:
@@ -122,3 +126,40 @@ def to_status(error: RequestError, request_id: str = "") -> status_pb2.Status:
     for detail in details:
         status.details.add().Pack(detail)
     return status
+
+
+PACED_CODES = frozenset({"RESOURCE_EXHAUSTED", "UNAUTHENTICATED", "PERMISSION_DENIED"})
+"""Of what a caller may repeat as fast as it is answered. UNAVAILABLE is not among them, which sends it elsewhere."""
+
+PER_S = 50
+"""Refusals a second, of all callers, that are not delayed: 2 % of a core. A server of twenty answers a second refuses
+fewer at three times what it can do."""
+
+BURST = 50
+"""So many are not delayed although they come at once."""
+
+LONGEST_S = 1.0
+"""The longest delay."""
+
+MOST_DELAYED = 256
+"""Calls that are delayed at a time, a small part of those that may be open; a further one is refused at once."""
+
+
+class Pace:
+    """Gives refusals their turns; runs on the event loop."""
+
+    def __init__(self) -> None:
+        self._free_s = 0.0
+        self._delayed = 0
+
+    async def turn(self, deadline_s: float) -> None:
+        """Returns when the next refusal may be sent, before the call's deadline, by `time.monotonic`."""
+        now_s = time.monotonic()
+        self._free_s = min(max(self._free_s, now_s - BURST / PER_S) + 1 / PER_S, now_s + LONGEST_S)
+        wait_s = min(self._free_s, deadline_s) - now_s
+        if wait_s > 0 and self._delayed < MOST_DELAYED:
+            self._delayed += 1
+            try:
+                await asyncio.sleep(wait_s)
+            finally:
+                self._delayed -= 1

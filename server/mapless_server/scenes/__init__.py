@@ -7,10 +7,11 @@ package itself has the values that other rooms exchange with it.
 
 from .audit.verdict import AuditVerdict, Coverage, CoverageVerdict, ReferenceAudit, Viewpoint
 from .retrieval.index import GlobalDescriptor, Vector
-from .retrieval.narrowing import Cone, Narrowing, Sphere
+from .retrieval.narrowing import ANYWHERE, Cone, Narrowing, Sphere
 from .retrieval.ranking import Choice, RankedReference, RankOptions, Selection, rank_references
 
 __all__ = [
+    "ANYWHERE",
     "AuditVerdict",
     "Choice",
     "Cone",

@@ -29,7 +29,7 @@ from .indexes import SceneIndexes
 from .library import Closed, ReferenceLibrary
 from .observer import BackgroundObserver
 from .retrieval.ranking import rank_beside
-from .stored_pairs import Matching, PairFinder
+from .stored import Matching, PairFinder
 
 log = logging.getLogger(__name__)
 

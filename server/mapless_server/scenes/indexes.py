@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections import OrderedDict
 from collections.abc import Sequence
 
 from mapless_server.errors import DataLoss, NotFound, RequestError
+from mapless_server.method.cache import LruCache
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import StageContext
 from mapless_server.method.views import PosedView
@@ -40,16 +40,13 @@ class SceneIndexes:
         self._library = library
         self._descriptor = descriptor
         self._extractor = extractor
-        self._capacity_bytes = capacity_bytes
-        self._cached: OrderedDict[SceneKey, _CachedIndex] = OrderedDict()
-        self._size_bytes = 0
+        self._cached: LruCache[_CachedIndex] = LruCache(capacity_bytes, keeps_latest=True)
         self._lock = threading.Lock()
 
     @property
     def size_bytes(self) -> int:
         """Memory of all indexes, bytes."""
-        with self._lock:
-            return self._size_bytes
+        return self._cached.used
 
     def entries(self, scene_key: SceneKey, context: StageContext) -> Entries:
         """Returns the references of a scene as it is now.
@@ -71,13 +68,12 @@ class SceneIndexes:
 
     def forget(self, scene_key: SceneKey) -> None:
         """Frees the index of a deleted scene."""
-        cached = self._find(scene_key)
-        if cached is not None:
-            self._drop(scene_key, cached)
+        with self._lock:
+            self._cached.forget(lambda key, _: key == scene_key)
 
     def is_damaged(self, scene_key: SceneKey, reference_id: str) -> bool:
         """Whether a reference is missing from the entries of its scene because its pose or descriptor is damaged."""
-        cached = self._find(scene_key)
+        cached = self._cached.get(scene_key)
         if cached is None or reference_id not in cached.damaged_ids:
             return False
         try:
@@ -91,7 +87,7 @@ class SceneIndexes:
 
     def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
         """Logs that a reference is not used because it is damaged; once while the scene is in memory."""
-        cached = self._find(scene_key)
+        cached = self._cached.get(scene_key)
         if cached is None or reference_id not in cached.reported_ids:
             if cached is not None:
                 cached.reported_ids.add(reference_id)
@@ -147,45 +143,26 @@ class SceneIndexes:
             entries = cached.refresh(self._store, scene_key, self._descriptor.name)
         except Exception:
             # An index that cannot be updated is not valid, and that of a deleted scene wastes memory.
-            self._drop(scene_key, cached)
+            with self._lock:
+                self._cached.forget(lambda _, it: it is cached)
             raise
-        self._make_room(scene_key, cached)
+        with self._lock:
+            if self._cached.get(scene_key) is cached:
+                self._cached.put(scene_key, cached, cached.index.size_bytes)
         return entries
 
-    def _find(self, scene_key: SceneKey) -> _CachedIndex | None:
-        with self._lock:
-            return self._cached.get(scene_key)
-
     def _get(self, scene_key: SceneKey) -> _CachedIndex:
-        """Returns the scene's index, created if missing, as the most recently used one."""
+        """Returns the scene's index, created if missing."""
         with self._lock:
             cached = self._cached.get(scene_key)
             if cached is None:
-                cached = self._cached[scene_key] = _CachedIndex(SceneIndex(self._descriptor.dimension))
-            self._cached.move_to_end(scene_key)
+                cached = _CachedIndex(SceneIndex(self._descriptor.dimension))
+                self._cached.put(scene_key, cached, 0)
             return cached
-
-    def _drop(self, scene_key: SceneKey, cached: _CachedIndex) -> None:
-        with self._lock:
-            if self._cached.get(scene_key) is cached:
-                del self._cached[scene_key]
-                self._size_bytes -= cached.counted_bytes
-
-    def _make_room(self, used: SceneKey, cached: _CachedIndex) -> None:
-        """Updates the size of an index, and evicts the least recently used ones until all fit."""
-        with self._lock:
-            if self._cached.get(used) is not cached:
-                return
-            size_bytes = cached.index.size_bytes
-            self._size_bytes += size_bytes - cached.counted_bytes
-            cached.counted_bytes = size_bytes
-            while self._size_bytes > self._capacity_bytes and len(self._cached) > 1:
-                _, oldest = self._cached.popitem(last=False)
-                self._size_bytes -= oldest.counted_bytes
 
 
 class _CachedIndex:
-    """An index with its size when last counted, and the lock `updating` of the thread that updates it.
+    """An index, and the lock `updating` of the thread that updates it.
 
     `damaged_ids` are of references that are not in the index, of which some may have been deleted; `undescribable` are
     keys of references found damaged when they were to be described; of `reported_ids` the damage has been logged.
@@ -193,7 +170,6 @@ class _CachedIndex:
 
     def __init__(self, index: SceneIndex) -> None:
         self.index = index
-        self.counted_bytes = 0
         self.damaged_ids: set[str] = set()
         self.undescribable: set[str] = set()
         self.reported_ids: set[str] = set()

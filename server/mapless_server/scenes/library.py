@@ -23,7 +23,7 @@ from mapless_server.method.views import Photograph, PosedView, View
 from mapless_server.security import SceneKey
 from mapless_server.store import DescribedReference, ReferenceRecord, SceneAttributes, Store
 
-from .depth.finder import DepthFinder
+from .stored import DepthFinder
 
 log = logging.getLogger(__name__)
 

@@ -1,12 +1,152 @@
-"""Authentication and authorization: one table has the role that each method needs; other methods are rejected."""
+"""Who may do what: callers and their roles, the keys of their scenes, tokens, and the role that each method needs.
 
+A scene's key contains its tenant, and only this module makes and reads keys. The store and its caches use only keys, so
+that scenes of another tenant do not exist for a caller. Callers use ids, and never see keys.
+"""
+
+import hashlib
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from datetime import datetime, timezone
+from enum import IntEnum
+from functools import cached_property
+from typing import Annotated, Literal, NewType
 
+from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field, model_validator
+
+from mapless.names import check_id
 from mapless_server.errors import PermissionDenied, Unauthenticated
 
-from .tenancy import Principal, Role
-from .tokens import Tokens
+DEFAULT_TENANT = "default"
+"""The tenant of all scenes on a server without tokens."""
+
+
+class Role(IntEnum):
+    """The rights of a caller; each role includes those before it."""
+
+    READ = 1
+    """Read scenes and references."""
+    LOCALIZE = 2
+    """Localize photographs."""
+    WRITE = 3
+    """Create and delete scenes and references."""
+
+
+@dataclass(frozen=True)
+class Principal:
+    """A caller, with its rights on its tenant's scenes, and the name of its token or certificate, if any."""
+
+    tenant: str = DEFAULT_TENANT
+    role: Role = Role.WRITE
+    name: str = ""
+
+
+SceneKey = NewType("SceneKey", str)
+"""The id of a scene of the default tenant, as in stores without tenants; "tenant/scene" for all others.
+
+Neither tenants nor ids contain a slash, so that no two scenes share a key.
+"""
+
+KEY_SEPARATOR = "/"
+_NEXT_CHARACTER = "0"
+
+
+def check_tenant(tenant: str) -> str:
+    """Returns the tenant's name; raises ValueError if it breaks the rules, which are those of ids."""
+    return check_id(tenant)
+
+
+def key_of(tenant: str, scene_id: str) -> SceneKey:
+    """The key of a tenant's scene; both names must have been checked."""
+    return SceneKey(scene_id if tenant == DEFAULT_TENANT else f"{tenant}{KEY_SEPARATOR}{scene_id}")
+
+
+def tenant_of(key: SceneKey) -> str:
+    """The tenant of a scene."""
+    tenant, separator, _ = key.partition(KEY_SEPARATOR)
+    return tenant if separator else DEFAULT_TENANT
+
+
+def scene_id_of(key: SceneKey) -> str:
+    """The scene's id among those of its tenant."""
+    tenant, separator, scene_id = key.partition(KEY_SEPARATOR)
+    return scene_id if separator else tenant
+
+
+def end_of_keys(tenant: str) -> str:
+    """The first text, by code point, after all keys of a tenant that is not the default one.
+
+    Between "tenant/" and "tenant0" there are only the tenant's keys.
+    """
+    return f"{tenant}{_NEXT_CHARACTER}"
+
+
+Name = Annotated[str, AfterValidator(check_id)]
+
+
+class Token(BaseModel):
+    """An entry of the file, with the unique name of its holder, and the hexadecimal hash of the token."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: Name
+    tenant: Name = DEFAULT_TENANT
+    role: Literal["read", "localize", "write"]
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    expires: AwareDatetime | None = None
+
+    @property
+    def allows(self) -> Role:
+        """The role as an enum."""
+        return Role[self.role.upper()]
+
+
+class TenantLimits(BaseModel):
+    """Limits of one tenant; `rate_ms` replaces the setting tenant_rate_ms, 0 for no limit."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rate_ms: float | None = Field(default=None, ge=0, allow_inf_nan=False)
+
+
+class Tokens(BaseModel):
+    """The contents of the file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    tokens: tuple[Token, ...] = ()
+    tenants: dict[Name, TenantLimits] = {}
+
+    @model_validator(mode="after")
+    def _check_unique(self) -> "Tokens":
+        for what, values in (("name", [it.name for it in self.tokens]), ("sha256", [it.sha256 for it in self.tokens])):
+            value, count = next(iter(Counter(values).most_common(1)), ("", 0))
+            if count > 1:
+                raise ValueError(f"two tokens have the {what} {value!r}")
+        return self
+
+    def find(self, token: str) -> Token | None:
+        """The entry of a token; None if it is unknown.
+
+        The look-up is by hash, so its duration depends only on the caller's own token.
+        """
+        return self._by_hash.get(sha256_of(token))
+
+    def rate_ms(self, tenant: str) -> float | None:
+        """Computing time that a tenant may use, milliseconds per second; None if the file does not set it."""
+        limits = self.tenants.get(tenant)
+        return limits.rate_ms if limits else None
+
+    @cached_property
+    def _by_hash(self) -> dict[str, Token]:
+        return {it.sha256: it for it in self.tokens}
+
+
+def sha256_of(token: str) -> str:
+    """The hash of a token, hexadecimal."""
+    return hashlib.sha256(token.encode()).hexdigest()
+
 
 METHOD_ROLES: Mapping[str, Role] = {
     "/mapless.v1.LocalizationService/Localize": Role.LOCALIZE,

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 from mapless_server.settings import Settings
 
-from .access import Authenticator
+from .access import Authenticator, Tokens
 from .binding import assess_binding
 from .rate import RateLimiter
 from .reloading import Reloading, SecurityError
 from .tls import Tls, TlsFiles
-from .tokens import Tokens, read_tokens
+from .tokens import read_tokens
 
 log = logging.getLogger(__name__)
 

@@ -9,94 +9,23 @@ is JSON, which programs can read and write:
 """
 
 import fcntl
-import hashlib
 import os
 import secrets
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
-from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Literal
 
-from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import ValidationError
 
-from mapless.names import check_id
-
+from .access import Token, Tokens, sha256_of
 from .reloading import SecurityError, read_file
-from .tenancy import DEFAULT_TENANT, Role
 
 PREFIX = "mapless_"
 """First characters of every token, by which scanners for leaked secrets find it."""
 
 _TOKEN_BYTES = 32
 _FILE_MODE = 0o600
-
-Name = Annotated[str, AfterValidator(check_id)]
-
-
-class Token(BaseModel):
-    """An entry of the file, with the unique name of its holder, and the hexadecimal hash of the token."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    name: Name
-    tenant: Name = DEFAULT_TENANT
-    role: Literal["read", "localize", "write"]
-    sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
-    expires: AwareDatetime | None = None
-
-    @property
-    def allows(self) -> Role:
-        """The role as an enum."""
-        return Role[self.role.upper()]
-
-
-class TenantLimits(BaseModel):
-    """Limits of one tenant; `rate_ms` replaces the setting tenant_rate_ms, 0 for no limit."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    rate_ms: float | None = Field(default=None, ge=0, allow_inf_nan=False)
-
-
-class Tokens(BaseModel):
-    """The contents of the file."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    tokens: tuple[Token, ...] = ()
-    tenants: dict[Name, TenantLimits] = {}
-
-    @model_validator(mode="after")
-    def _check_unique(self) -> "Tokens":
-        for what, values in (("name", [it.name for it in self.tokens]), ("sha256", [it.sha256 for it in self.tokens])):
-            value, count = next(iter(Counter(values).most_common(1)), ("", 0))
-            if count > 1:
-                raise ValueError(f"two tokens have the {what} {value!r}")
-        return self
-
-    def find(self, token: str) -> Token | None:
-        """The entry of a token; None if it is unknown.
-
-        The look-up is by hash, so its duration depends only on the caller's own token.
-        """
-        return self._by_hash.get(sha256_of(token))
-
-    def rate_ms(self, tenant: str) -> float | None:
-        """Computing time that a tenant may use, milliseconds per second; None if the file does not set it."""
-        limits = self.tenants.get(tenant)
-        return limits.rate_ms if limits else None
-
-    @cached_property
-    def _by_hash(self) -> dict[str, Token]:
-        return {it.sha256: it for it in self.tokens}
-
-
-def sha256_of(token: str) -> str:
-    """The hash of a token, hexadecimal."""
-    return hashlib.sha256(token.encode()).hexdigest()
 
 
 def read_tokens(path: Path) -> Tokens:

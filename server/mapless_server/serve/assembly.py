@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
-from mapless_server.engine.interface import EngineOptions
+from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.query import Tier
 from mapless_server.engine.queue_engine import QueueEngine, check_tiers
 from mapless_server.engine.references import References
@@ -28,13 +28,12 @@ from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.audit.scene_auditor import AuditTools
 from mapless_server.scenes.background import BackgroundMatching
 from mapless_server.scenes.calibration.calibrator import Calibrator, SceneCalibrations
-from mapless_server.scenes.depth.finder import DepthFinder
 from mapless_server.scenes.depth.scene_depths import DepthMaker, SceneDepths
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.scenes.retrieval.vlad import VladDescriptor
-from mapless_server.scenes.stored_pairs import Matching, PairFinder
+from mapless_server.scenes.stored import DepthFinder, Matching, PairFinder
 from mapless_server.scheduling import Observer, Quota, WorkQueueOptions
 from mapless_server.security import RateLimiter
 from mapless_server.settings import Settings, available_cores

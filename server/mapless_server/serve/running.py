@@ -6,7 +6,8 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass
-from typing import Any, Protocol
+from functools import partial
+from typing import TYPE_CHECKING, Any, Protocol
 
 import grpc
 
@@ -14,9 +15,8 @@ from mapless_server import __version__
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.errors import RequestError
 from mapless_server.observability.exporter import MetricsServer
-from mapless_server.observability.metrics import Metrics
+from mapless_server.observability.metrics import Metrics, watch_event_loop
 from mapless_server.observability.scraped import gpu_memory
-from mapless_server.observability.tracing import Tracer
 from mapless_server.scheduling import Fatal
 from mapless_server.security import SecurityError
 from mapless_server.security.protection import Protection
@@ -29,6 +29,9 @@ from mapless_server.store import Store
 
 from .assembly import MakeEngine, StartupError, make_engine, open_store, what_is_missing
 from .warm_up import warm_up, warm_up_stronger
+
+if TYPE_CHECKING:
+    from mapless_server.observability.otlp import OtlpTracer
 
 MAX_CONCURRENT_RPCS = 2048
 """Calls at a time, of all connections. Far above what the queue admits: health probes count, and calls of which only
@@ -175,7 +178,8 @@ async def _start(
     store.observer = metrics
     stack.push_async_callback(asyncio.to_thread, store.close)
     tracer = _make_tracer(settings)
-    stack.push_async_callback(asyncio.to_thread, tracer.close, _TRACES_FLUSH_S)
+    if tracer is not None:
+        stack.push_async_callback(asyncio.to_thread, tracer.close, _TRACES_FLUSH_S)
     metrics_address = _serve_metrics(settings, metrics, store, protection, stack)
     recorder = await asyncio.to_thread(open_recorder, settings, store, metrics)
     if recorder is not None:
@@ -192,8 +196,9 @@ async def _start(
     failed: asyncio.Future[Fatal] = asyncio.get_running_loop().create_future()
     _observe_engine(engine, metrics)
     engine.queue.on_fatal = lambda fatal: _on_fatal(fatal, failed, metrics)
-    _run_task(stack, watch_event_loop(metrics, lambda: engine.queue.is_alive_within(_HEARTBEAT_LIMIT_S)))
-    _run_task(stack, keep_fresh(protection.refreshes))
+    _run_task(stack, watch_event_loop(metrics, partial(engine.queue.is_alive_within, _HEARTBEAT_LIMIT_S)))
+    if protection.refreshes:
+        _run_task(stack, keep_fresh(protection.refreshes))
     _run_task(stack, watch_store(store, services.set_changeable))
 
     async def stop_serving() -> None:
@@ -213,9 +218,9 @@ async def _start(
     return Running(listener.address, metrics_address, engine, failed)
 
 
-def _make_tracer(settings: Settings) -> Tracer:
+def _make_tracer(settings: Settings) -> "OtlpTracer | None":
     if not settings.otlp_endpoint:
-        return Tracer()
+        return None
     try:
         from mapless_server.observability.otlp import make_otlp_tracer
 
@@ -294,25 +299,6 @@ def _run_task(stack: AsyncExitStack, work: Coroutine[Any, Any, None]) -> None:
 
     task.add_done_callback(log_failure)
     stack.push_async_callback(end)
-
-
-TICK_S = 0.01
-"""The timer's period, by which a lag may be underestimated; waking up so often costs 1 to 2 % of a core."""
-WARN_S = 1.0
-"""Less is usual where other processes take the processors; the metric has all."""
-
-
-async def watch_event_loop(metrics: Metrics, is_alive: Callable[[], bool] = lambda: True) -> None:
-    """Measures until it is cancelled, and calls `beat` as long as the scheduler is alive."""
-    while True:
-        due_s = time.monotonic() + TICK_S
-        await asyncio.sleep(TICK_S)
-        lag_s = max(0.0, time.monotonic() - due_s)
-        metrics.loop_lagged(lag_s)
-        if lag_s > WARN_S:
-            log.warning("the event loop was blocked", extra={"lag_ms": round(1000 * lag_s)})
-        if is_alive():
-            metrics.beat()
 
 
 CHECK_INTERVAL_S = 5.0

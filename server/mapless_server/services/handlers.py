@@ -1,8 +1,10 @@
 """The handlers of all RPCs: both services, health and reflection, each behind the call guard."""
 
+from __future__ import annotations
+
 import asyncio
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
@@ -15,10 +17,8 @@ from mapless.v1 import (
     reference_service_pb2,
     reference_service_pb2_grpc,
 )
-from mapless_server.engine.interface import Engine
 from mapless_server.errors import Unavailable
 from mapless_server.observability.metrics import Metrics
-from mapless_server.observability.tracing import Tracer
 from mapless_server.rpc import Authenticate, CallGuard
 from mapless_server.scheduling import Flow
 from mapless_server.settings import Settings
@@ -28,6 +28,10 @@ from .capture.recorder import Recorder
 from .localization import LocalizationService
 from .references import ReferenceService
 from .watching import Watchers
+
+if TYPE_CHECKING:
+    from mapless_server.engine.queue_engine import QueueEngine
+    from mapless_server.observability.otlp import OtlpTracer
 
 SERVICE_NAMES = (
     localization_service_pb2.DESCRIPTOR.services_by_name["LocalizationService"].full_name,
@@ -75,11 +79,11 @@ class Services:
         metrics: Metrics,
         *,
         authenticate: Authenticate | None = None,
-        tracer: Tracer | None = None,
+        tracer: OtlpTracer | None = None,
         recorder: Recorder | None = None,
     ) -> None:
         self._metrics = metrics
-        self._engine: Engine | None = None
+        self._engine: QueueEngine | None = None
         self._health = _Health()
         self._is_serving = self._is_draining = False
         self._is_changeable = True
@@ -126,7 +130,7 @@ class Services:
         for service in (reflection.SERVICE_NAME, "grpc.reflection.v1.ServerReflection"):
             self.add_registered_method_handlers(service, {"ServerReflectionInfo": method})
 
-    async def open(self, engine: Engine) -> None:
+    async def open(self, engine: QueueEngine) -> None:
         """Starts to serve, with an engine that has been warmed up."""
         self._engine = engine
         await self.set_serving(True)
@@ -172,7 +176,7 @@ class Services:
         if (is_query := _NEEDS_ROOM.get(method)) is not None:
             engine.check_room(flow, is_query)
 
-    def _ready_engine(self) -> Engine:
+    def _ready_engine(self) -> QueueEngine:
         if self._engine is None:
             raise Unavailable("the server is starting", reason="STARTING", retry_after_s=1.0)
         return self._engine

@@ -1,17 +1,18 @@
 """LocalizationService: a request becomes queries, the engine answers them, and the results become a response."""
 # ruff: noqa: N802  methods carry the names of their RPCs
 
+from __future__ import annotations
+
 import asyncio
 import time
 from collections.abc import AsyncGenerator, Awaitable, Callable, Coroutine, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import localization_service_pb2_grpc as rpcs
 from mapless_server.engine.groups import MAX_FRAMES, MAX_RIG_IMAGES, MIN_FRAMES, GroupResult, PhotoGroup
-from mapless_server.engine.interface import Engine
 from mapless_server.engine.query import TRACK, Query, Result
 from mapless_server.errors import RequestError
 from mapless_server.method.answer import Localization
@@ -36,6 +37,9 @@ from .messages.groups import (
 from .messages.queries import needs_attributes, query_from_message, scene_key_from_name
 from .watching import Watcher, Watchers
 
+if TYPE_CHECKING:  # services do not load what computes
+    from mapless_server.engine.queue_engine import QueueEngine
+
 Joint = TypeVar("Joint")
 
 FutureCoarseAnswer = asyncio.Future[pb.LocalizeResponse]
@@ -47,7 +51,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
 
     def __init__(
         self,
-        engine: Callable[[], Engine],
+        engine: Callable[[], QueueEngine],
         metrics: Metrics,
         store: Store,
         watchers: Watchers,
@@ -79,10 +83,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
     async def _query(self, request: pb.LocalizeRequest, call: Call) -> tuple[Query, AnswerFrames]:
         """Converts a request to a query; FieldError or RequestError names the wrong field."""
         options, tenant = self._engine().options, call.principal.tenant
-        frames, attributes = answer_frames_of(request), SceneAttributes()
-        if needs_attributes(request):
-            scene_key = scene_key_from_name(request.scene, "scene", tenant)
-            attributes = await asyncio.to_thread(self._store.get_attributes, scene_key)
+        frames, attributes = answer_frames_of(request), await self._attributes([request], request.scene, tenant)
         query = query_from_message(request, tenant, options, attributes)
         call.note(scene=query.scene_key, references=len(query.reference_ids))
         return query, frames
@@ -129,49 +130,38 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
             call.note(pose_stage=answer.outcome.pose_stage.value)
         self._report(answer.outcome, response.localization, [result], call, answer.scale)
         debug = None
-        if answer.support is not None and (request.options.include_debug or self._watchers.is_watched(query.scene_key)):
+        is_watched = query.scene_key in self._watchers.by_scene
+        if answer.support is not None and (request.options.include_debug or is_watched):
             debug = await asyncio.to_thread(debug_to_message, answer.support)
         if request.options.include_debug and debug is not None:
             response.debug.CopyFrom(debug)
         self._capture(request, response, call, [(query, result)])
-        if not request.options.confidential:
+        if query.scene_key in self._watchers.by_scene and not request.options.confidential:
             self._watchers.publish(query.scene_key, request, response, debug)
         return response
 
     async def LocalizeRig(self, request: pb.LocalizeRigRequest, call: Call) -> pb.LocalizeRigResponse:
         """Implements LocalizationService.LocalizeRig."""
-        engine = self._engine()
+        from mapless_server.engine.joint import pose_rig  # services do not load what computes
+
         queries = await self._queries(request, "images", (1, MAX_RIG_IMAGES), call)
         rig_from_camera = poses_from_message(request.images, "images", "rig_from_camera")
         session_from_rig = session_from_rig_from_message(request)
-        with engine.hold(queries, call.caller):
-            group, outcome = await localize_group(
-                engine,
-                queries,
-                call,
-                "images",
-                lambda asked, results: engine.pose_rig(asked, results, rig_from_camera, call.caller),
-            )
+        pose = partial(pose_rig, rig_from_camera=rig_from_camera)
+        group, outcome = await self._localize_group(queries, call, "images", pose)
         response = rig_to_message(outcome, group, queries, request, session_from_rig)
         self._finish_group(request, response, outcome, queries, group.results, call)
         return response
 
     async def LocalizeSequence(self, request: pb.LocalizeSequenceRequest, call: Call) -> pb.LocalizeSequenceResponse:
         """Implements LocalizationService.LocalizeSequence."""
-        engine = self._engine()
+        from mapless_server.engine.joint import pose_sequence  # services do not load what computes
+
         queries = await self._queries(request, "frames", (MIN_FRAMES, MAX_FRAMES), call)
         axes, session_from_camera = session_poses_from_message(request)
         scale_is_free = request.estimate_session_scale
-        with engine.hold(queries, call.caller):
-            group, outcome = await localize_group(
-                engine,
-                queries,
-                call,
-                "frames",
-                lambda asked, results: engine.pose_sequence(
-                    asked, results, session_from_camera, scale_is_free, call.caller
-                ),
-            )
+        pose = partial(pose_sequence, session_from_camera=session_from_camera, estimate_scale=scale_is_free)
+        group, outcome = await self._localize_group(queries, call, "frames", pose)
         response = sequence_to_message(outcome, group, queries, request, axes)
         self._finish_group(request, response, outcome, queries, group.results, call)
         return response
@@ -192,11 +182,29 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         call: Call,
     ) -> tuple[Query, ...]:
         """Converts the photographs of a request to queries; FieldError or RequestError names the wrong field."""
-        tenant, attributes = call.principal.tenant, SceneAttributes()
-        if any(map(needs_attributes, getattr(request, list_name))):
-            scene_key = scene_key_from_name(request.scene, "scene", tenant)
-            attributes = await asyncio.to_thread(self._store.get_attributes, scene_key)
+        tenant = call.principal.tenant
+        attributes = await self._attributes(getattr(request, list_name), request.scene, tenant)
         return queries_from_message(request, list_name, bounds, tenant, self._engine().options, attributes)
+
+    async def _attributes(self, photos: Sequence[Any], scene: str, tenant: str) -> SceneAttributes:
+        """Attributes of the scene, if the priors of one of the photographs' messages need them."""
+        if not any(map(needs_attributes, photos)):
+            return SceneAttributes()
+        return await asyncio.to_thread(self._store.get_attributes, scene_key_from_name(scene, "scene", tenant))
+
+    async def _localize_group(
+        self,
+        queries: Sequence[Query],
+        call: Call,
+        list_name: str,
+        pose: Callable[[Sequence[Query], Sequence[Result]], Joint],
+    ) -> tuple[GroupResult, Joint]:
+        """`localize_group` within the engine's queue, with memory for all of the photographs."""
+        engine = self._engine()
+        with engine.hold(queries, call.caller):
+            return await localize_group(
+                engine, queries, call, list_name, lambda *asked: engine.join(partial(pose, *asked), call.caller)
+            )
 
     def _finish_group(
         self,
@@ -247,7 +255,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
 
 
 async def localize_group(
-    engine: Engine,
+    engine: QueueEngine,
     queries: Sequence[Query],
     call: Call,
     list_name: str,
@@ -271,7 +279,9 @@ async def localize_group(
     return (group, outcome) if isinstance(found, Rejection) else (again, found)
 
 
-async def localize_photographs(engine: Engine, queries: Sequence[Query], call: Call, list_name: str) -> GroupResult:
+async def localize_photographs(
+    engine: QueueEngine, queries: Sequence[Query], call: Call, list_name: str
+) -> GroupResult:
     """Localizes each photograph of a rig or a sequence, and records their stages even if one of them fails.
 
     The photographs, of one scene, are in the request's field `list_name`. RequestError as in `PhotoGroup.localize`.

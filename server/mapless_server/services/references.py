@@ -1,18 +1,19 @@
 """ReferenceService: scenes and references as resources; images are described before they are stored."""
 # ruff: noqa: N802  methods carry the names of their RPCs
 
+from __future__ import annotations
+
 import asyncio
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from mapless import names, wire
 from mapless.geometry import MAX_COORDINATE_M, RigidTransform
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.v1 import reference_service_pb2_grpc as rpcs
 from mapless.wire import FieldError
-from mapless_server.engine.interface import Engine
 from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Photo
 from mapless_server.errors import AlreadyExists, DataLoss
 from mapless_server.rpc import Call
@@ -47,6 +48,9 @@ from .messages.references import (
     scene_to_message,
 )
 
+if TYPE_CHECKING:  # services do not load what computes
+    from mapless_server.engine.queue_engine import QueueEngine
+
 MAX_BATCH = 1000
 MAX_RETRIEVED = 1000
 DEFAULT_AUDITS, MAX_AUDITS = 10, 100
@@ -64,7 +68,7 @@ Draft = tuple[str, Photo, RigidTransform]
 class ReferenceService(rpcs.ReferenceServiceServicer):
     """Stores scenes and their references."""
 
-    def __init__(self, engine: Callable[[], Engine], store: Store) -> None:
+    def __init__(self, engine: Callable[[], QueueEngine], store: Store) -> None:
         """`engine` returns the engine; it raises Unavailable while the server starts."""
         self._engine = engine
         self._store = store
@@ -145,7 +149,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         await self._stored(self._delete_scene, self._engine(), scene_key)
         return pb.DeleteSceneResponse()
 
-    def _delete_scene(self, engine: Engine, scene_key: SceneKey) -> None:
+    def _delete_scene(self, engine: QueueEngine, scene_key: SceneKey) -> None:
         # The scene may be deleted although this fails late, or although the call has ended.
         try:
             engine.forget_references(self._store.delete_scene(scene_key))
@@ -207,7 +211,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         await self._stored(self._delete_reference, self._engine(), *named)
         return pb.DeleteReferenceResponse()
 
-    def _delete_reference(self, engine: Engine, scene_key: SceneKey, reference_id: str) -> None:
+    def _delete_reference(self, engine: QueueEngine, scene_key: SceneKey, reference_id: str) -> None:
         engine.forget_references({self._store.delete_reference(scene_key, reference_id)})
 
     async def RetrieveReferences(

@@ -75,25 +75,18 @@ class Watcher:
 
 
 class Watchers:
-    """The watchers of all scenes."""
+    """The watchers of all scenes; only scenes that are watched are in `by_scene`."""
 
     def __init__(self, are_allowed: bool, max_message_bytes: int = 32 * 2**20) -> None:
         """Makes the object without watchers; `are_allowed` is the setting `allow_watching`."""
         self._are_allowed = are_allowed
         self._max_message_bytes = max_message_bytes
-        self._by_scene: dict[SceneKey, set[Watcher]] = {}
-
-    def is_watched(self, scene_key: SceneKey) -> bool:
-        """Whether the scene has a watcher, so that its answers need their matches."""
-        return scene_key in self._by_scene
+        self.by_scene: dict[SceneKey, set[Watcher]] = {}
 
     def publish(
         self, scene_key: SceneKey, request: pb.LocalizeRequest, response: pb.LocalizeResponse, debug: pb.Debug | None
     ) -> None:
         """Sends a copy of an answer to the watchers of its scene; no matches if the computation ended before."""
-        watchers = self._by_scene.get(scene_key)
-        if watchers is None:
-            return
         answer = pb.LocalizeResponse()
         answer.CopyFrom(response)
         if debug is not None:
@@ -102,7 +95,7 @@ class Watchers:
         intrinsics = geometry_pb.CameraIntrinsics()
         intrinsics.CopyFrom(request.intrinsics)
         watched = request.image, intrinsics, answer
-        for watcher in watchers:
+        for watcher in self.by_scene.get(scene_key, ()):
             watcher.put(watched)
 
     def check(self, tenant: str) -> None:
@@ -115,7 +108,7 @@ class Watchers:
                 "the server does not show callers' photographs; its setting allow_watching lets it",
                 reason="WATCHING_NOT_ALLOWED",
             )
-        counts = {key: len(watchers) for key, watchers in self._by_scene.items()}
+        counts = {key: len(watchers) for key, watchers in self.by_scene.items()}
         of_tenant = sum(count for key, count in counts.items() if tenant_of(key) == tenant)
         if sum(counts.values()) >= MAX_WATCHERS or of_tenant >= MAX_WATCHERS_OF_TENANT:
             raise Overloaded("there are too many watchers", reason="TOO_MANY_WATCHERS", retry_after_s=5.0)
@@ -127,17 +120,17 @@ class Watchers:
         """
         self.check(tenant_of(scene_key))
         watcher = Watcher(lambda it: self._unregister(scene_key, it), self._max_message_bytes)
-        self._by_scene.setdefault(scene_key, set()).add(watcher)
+        self.by_scene.setdefault(scene_key, set()).add(watcher)
         return watcher
 
     def close(self) -> None:
         """Ends all watchers, when the server stops."""
-        for watchers in self._by_scene.values():
+        for watchers in self.by_scene.values():
             for watcher in watchers:
                 watcher.end()
 
     def _unregister(self, scene_key: SceneKey, watcher: Watcher) -> None:
-        watchers = self._by_scene[scene_key]
+        watchers = self.by_scene[scene_key]
         watchers.remove(watcher)
         if not watchers:
-            del self._by_scene[scene_key]
+            del self.by_scene[scene_key]

@@ -18,7 +18,7 @@ from mapless_server.security import SceneKey
 
 from . import codec, queries, rows
 from .database import Database
-from .pairs import FIRST_RETRY_S, LONGEST_RETRY_S
+from .pairs import next_try
 from .queries import is_detached
 from .records import SelfCalibration
 from .store import Store
@@ -66,9 +66,7 @@ def postpone(database: Database, claim: CalibrationClaim) -> float:
     """Ends the claim of a scene that failed; returns the seconds until it may be claimed again."""
     count = select(scene_calibration.c.failure_count).where(_is_it(claim))
     with database.write() as connection:
-        failure_count = connection.scalar(count) or 0
-        wait_s = min(LONGEST_RETRY_S, FIRST_RETRY_S * 2.0 ** min(failure_count, 20))
-        values = {"due_time_us": rows.now_us() + round(wait_s * 1e6), "failure_count": failure_count + 1}
+        wait_s, values = next_try(connection.scalar(count) or 0)
         connection.execute(_of(claim).values(values))
     return wait_s
 

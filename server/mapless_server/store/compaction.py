@@ -13,8 +13,7 @@ from mapless_server.errors import NotFound
 from mapless_server.method.views import Features, rounded_descriptors
 
 from . import codec, queries, rows
-from .database import Database
-from .faults import unless_damaged
+from .database import Database, unless_damaged
 from .tables import features
 
 log = logging.getLogger(__name__)

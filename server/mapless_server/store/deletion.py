@@ -16,8 +16,7 @@ from sqlalchemy import Column, Connection, ScalarSelect, delete, func, insert, l
 from mapless_server.errors import Overloaded
 from mapless_server.security import SceneKey
 
-from .database import Database
-from .faults import DamagedPages
+from .database import DamagedPages, Database
 from .queries import DETACHED, is_detached
 from .tables import features, global_descriptor, image, reference, reference_depth, reference_pair, scene
 

@@ -21,8 +21,7 @@ from mapless_server.method.views import Matches
 from mapless_server.security import SceneKey
 
 from . import codec, queries, rows
-from .database import Database
-from .faults import unless_damaged
+from .database import Database, unless_damaged
 from .queries import is_detached
 from .tables import (
     matching_use,
@@ -157,10 +156,7 @@ class PairStore:
         column = reference_matching.c
         count = select(column.failure_count).where(column.reference_key == claim.key, column.matching == matching)
         with self._database.write() as connection:
-            failure_count = connection.scalar(count) or 0
-            wait_s = min(LONGEST_RETRY_S, FIRST_RETRY_S * 2.0 ** min(failure_count, 20))
-            due_us = rows.now_us() + round(wait_s * 1e6)
-            values = {"due_time_us": due_us, "failure_count": failure_count + 1}
+            wait_s, values = next_try(connection.scalar(count) or 0)
             connection.execute(_of_claim(matching, claim).values(values))
         return wait_s
 
@@ -186,6 +182,12 @@ class PairStore:
         waiting = select(func.count()).select_from(reference).where(~is_detached(reference.c.scene_id), ~is_complete)
         with self._database.read() as connection:
             return connection.scalar(waiting) or 0
+
+
+def next_try(failure_count: int) -> tuple[float, dict[str, int]]:
+    """Seconds until a claim that failed after so many other failures may be tried again, and its row's new values."""
+    wait_s = min(LONGEST_RETRY_S, FIRST_RETRY_S * 2.0 ** min(failure_count, 20))
+    return wait_s, {"due_time_us": rows.now_us() + round(wait_s * 1e6), "failure_count": failure_count + 1}
 
 
 def _due(connection: Connection, matching: str) -> Sequence[Row[Any]]:

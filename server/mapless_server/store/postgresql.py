@@ -18,8 +18,7 @@ from sqlalchemy.exc import ArgumentError, DBAPIError
 
 from mapless_server.errors import RequestError
 
-from .database import StoreError
-from .faults import DamagedPages, disk_full, is_damage, translating, unavailable
+from .database import DamagedPages, StoreError, disk_full, is_damage, translating, unavailable
 from .migrations import migrate, read_version
 from .tables import SCHEMA_VERSION
 

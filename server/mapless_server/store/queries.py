@@ -16,7 +16,7 @@ from mapless_server.errors import AlreadyExists, NotFound
 from mapless_server.security import DEFAULT_TENANT, KEY_SEPARATOR, SceneKey, end_of_keys, key_of, scene_id_of
 
 from . import rows
-from .faults import unless_damaged
+from .database import unless_damaged
 from .records import IndexedReference, SceneChanges
 from .tables import (
     features,

@@ -14,8 +14,7 @@ from mapless_server.method.cache import LruCache
 from mapless_server.security import SceneKey
 
 from . import queries, rows, tables
-from .database import Database
-from .faults import DamagedPages, unless_damaged
+from .database import DamagedPages, Database, unless_damaged
 from .queries import read_changes
 from .records import DescribedReference, ReferenceRecord, SceneAttributes, SceneChanges, SceneRecord, SceneSnapshot
 

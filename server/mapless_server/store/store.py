@@ -22,9 +22,8 @@ from mapless_server.method.views import View
 from mapless_server.security import SceneKey, scene_id_of
 
 from . import deletion, queries, rows, tables
-from .database import Database
+from .database import DamagedPages, Database
 from .deletion import PendingDeletions
-from .faults import DamagedPages
 from .postgresql import PostgresqlDatabase
 from .reader import NAME_CACHE_BYTES, StoreReader, observed
 from .records import DescribedReference, NewReference, ReferenceRecord, SceneAttributes, SceneRecord

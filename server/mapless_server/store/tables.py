@@ -21,7 +21,7 @@ metadata = MetaData()
 
 # Lists are paginated by comparing ids, so both databases must compare them by code point.
 _Id = String(128).with_variant(String(128, collation="C"), "postgresql")
-# A column called scene_id holds the scene's key, which includes the tenant and a slash, see security.tenancy.
+# A column called scene_id holds the scene's key, which includes the tenant and a slash, see security.access.
 _SceneKey = String(257).with_variant(String(257, collation="C"), "postgresql")
 _Key = String(32)
 _Sha256 = String(64)

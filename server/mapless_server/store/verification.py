@@ -13,7 +13,7 @@ from mapless_server.errors import DataLoss
 from mapless_server.security import SceneKey, scene_id_of, tenant_of
 
 from . import codec, queries, rows
-from .faults import is_damage, unless_damaged
+from .database import is_damage, unless_damaged
 from .migrations import read_version
 from .queries import is_detached
 from .tables import features, global_descriptor, image, reference, scene

@@ -9,33 +9,40 @@ import asyncio
 import hashlib
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import RigidTransform
 from mapless.names import reference_name
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_server.engine.interface import Engine, EngineOptions
-from mapless_server.engine.joint import pose_rig, pose_sequence
-from mapless_server.engine.query import COARSE, POSE_PRIOR, PREPARE, REFINE, UNFINISHED, Caller, Query, Result, Tier
-from mapless_server.engine.references import QueryRun, QueryViews
+from mapless_server.engine.options import EngineOptions
+from mapless_server.engine.query import (
+    COARSE,
+    POSE_PRIOR,
+    PREPARE,
+    REFINE,
+    UNFINISHED,
+    Caller,
+    Query,
+    QueryRun,
+    QueryViews,
+    Result,
+    Tier,
+)
+from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.stages import Method, QueryStages
 from mapless_server.errors import DataLoss
 from mapless_server.images import decode_image
 from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.groups.rig import RigEstimate
-from mapless_server.method.groups.sequence import SequenceEstimate
 from mapless_server.method.localize import refine
 from mapless_server.method.options import StageContext
 from mapless_server.method.pipeline import coarse_answer
-from mapless_server.method.rejection import Rejection
 from mapless_server.method.views import Photograph, PosedView, View
 from mapless_server.observability.metrics import Metrics
 from mapless_server.rpc import Call
@@ -56,6 +63,8 @@ from mapless_server.services.capture.files import blob_path
 from mapless_server.services.localization import LocalizationService
 from mapless_server.services.watching import Watchers
 from mapless_server.store import LruCache, SceneAttributes, Store, codec
+
+Joined = TypeVar("Joined")
 
 RETRIEVAL = "retrieval"
 """The stage in which references are chosen."""
@@ -187,7 +196,7 @@ def recompute(call: CapturedCall, blobs: Blobs, tiers: Sequence[Tier], options: 
     """
     then = response_of(call)
     request = MESSAGES[call.method][0].FromString(call.request)
-    engine = cast(Engine, _Recomputing(call, request, then, blobs, tiers, options))
+    engine = cast(QueueEngine, _Recomputing(call, request, then, blobs, tiers, options))
     service = LocalizationService(lambda: engine, Metrics(), cast(Store, _Attributes(call)), Watchers(False))
     now = Call(call.request_id, time.monotonic(), math.inf, Principal(tenant=call.tenant))
     return cast(Response, asyncio.run(getattr(service, call.method)(request, now)))
@@ -245,24 +254,8 @@ class _Recomputing:
     def hold(self, queries: Sequence[Query], caller: Caller) -> Iterator[None]:
         yield
 
-    async def pose_rig(
-        self,
-        queries: Sequence[Query],
-        results: Sequence[Result],
-        rig_from_camera: Sequence[RigidTransform],
-        caller: Caller,
-    ) -> RigEstimate | Rejection:
-        return await asyncio.to_thread(pose_rig, queries, results, rig_from_camera)
-
-    async def pose_sequence(
-        self,
-        queries: Sequence[Query],
-        results: Sequence[Result],
-        session_from_camera: Sequence[RigidTransform],
-        estimate_scale: bool,
-        caller: Caller,
-    ) -> SequenceEstimate | Rejection:
-        return await asyncio.to_thread(pose_sequence, queries, results, session_from_camera, estimate_scale)
+    async def join(self, compute: Callable[[], Joined], caller: Caller) -> Joined:
+        return await asyncio.to_thread(compute)
 
 
 def _compute(stages: QueryStages, job: Job) -> Result:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 
-from mapless_server.engine.interface import EngineOptions
+from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.query import Tier
 from mapless_server.networks.weights import WeightsError, WeightsMissing
 from mapless_server.serve.assembly import engine_options, make_tiers, what_is_missing

@@ -23,8 +23,8 @@ from ..indexes import SceneIndexes
 from ..library import Closed, ReferenceLibrary
 from ..observer import BackgroundObserver
 from ..retrieval.ranking import rank_beside, spread_choice
+from ..stored import DepthFinder
 from .check import DepthCheckOptions, checked_depths
-from .finder import DepthFinder
 
 NEIGHBOURS, SHORTLIST = 7, 14
 """References that the network gets besides the wanted one, and those that are matched with it, of which the best are

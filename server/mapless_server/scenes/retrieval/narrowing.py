@@ -169,5 +169,9 @@ class Narrowing:
         return likely if likely.any() else kept
 
 
+ANYWHERE = Narrowing()
+"""Of queries without priors."""
+
+
 def _likely(forward: Array, sigma_deg: float) -> Cone:
     return Cone(forward, min(180.0, REACH_SIGMA * sigma_deg))

@@ -46,7 +46,7 @@ from .queries import (
 
 if TYPE_CHECKING:
     from mapless_server.engine.groups import GroupResult
-    from mapless_server.engine.interface import EngineOptions
+    from mapless_server.engine.options import EngineOptions
     from mapless_server.method.groups.images import PosedImage
     from mapless_server.method.groups.rig import RigEstimate
     from mapless_server.method.groups.sequence import SequenceEstimate

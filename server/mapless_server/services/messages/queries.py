@@ -19,11 +19,12 @@ from mapless.geometry import MAX_COORDINATE_M, Array, lens_model_of
 from mapless.v1 import geometry_pb2
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError, camera_from_message, joined, transform_from_message, vector_from_message
-from mapless_server.engine.interface import EngineOptions
+from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Photo, Query
 from mapless_server.images import ImageLimits, image_size
 from mapless_server.method.options import IntrinsicsSigma, LocalizeOptions
 from mapless_server.method.priors.known import (
+    NO_PRIORS,
     GravityPrior,
     HeadingPrior,
     PosePrior,
@@ -32,7 +33,7 @@ from mapless_server.method.priors.known import (
     check_covariance,
 )
 from mapless_server.method.views import seen_share
-from mapless_server.scenes import Cone, Narrowing, Sphere
+from mapless_server.scenes import ANYWHERE, Cone, Narrowing, Sphere
 from mapless_server.security import SceneKey, key_of
 from mapless_server.store import SceneAttributes
 
@@ -249,9 +250,10 @@ def priors_from_message(request: Any, attributes: SceneAttributes) -> tuple[Narr
         soft["gravity"] = _gravity(request.gravity_prior, attributes, "gravity_prior")
     if _has(request, "pose_prior"):
         soft["pose"] = _pose(request.pose_prior, "pose_prior")
+    if not limits and not soft:
+        return ANYWHERE, NO_PRIORS
     priors = Priors(**soft)
-    narrowing = Narrowing.of(priors)
-    return (replace(narrowing, **limits) if limits else narrowing), priors
+    return replace(Narrowing.of(priors), **limits), priors
 
 
 def _has(request: Any, field: str) -> bool:
