@@ -15,7 +15,7 @@ from mapless_server.errors import NotFound, Unavailable
 from mapless_server.method.views import PosedView, View
 from mapless_server.scenes import AuditVerdict, CoverageVerdict, Viewpoint
 from mapless_server.scenes.audit.neighbourhood import PairMatches
-from mapless_server.scenes.audit.scene_auditor import AuditTools, SceneAuditor
+from mapless_server.scenes.audit.scene_auditor import SceneAuditor, SceneTools
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.security import SceneKey
@@ -61,9 +61,9 @@ def store(tmp_path: Path) -> Iterator[Store]:
         yield store
 
 
-def tools_of(store: Store) -> AuditTools:
+def tools_of(store: Store) -> SceneTools:
     library, descriptor, extractor = ReferenceLibrary(store), Descriptor(), Extractor()
-    return AuditTools(
+    return SceneTools(
         library, SceneIndexes(store, library, descriptor, extractor, 2**30), descriptor, extractor, PairMatches()
     )
 

@@ -8,10 +8,8 @@ from mapless_server.errors import DataLoss, NotFound
 from mapless_server.images import ImageLimits
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import StageContext
-from mapless_server.scenes import Choice, GlobalDescriptor, Selection, rank_references
-from mapless_server.scenes.audit.scene_auditor import AuditTools, SceneAuditor
-from mapless_server.scenes.indexes import SceneIndexes
-from mapless_server.scenes.library import ReferenceLibrary
+from mapless_server.scenes import Choice, Selection, rank_references
+from mapless_server.scenes.audit.scene_auditor import SceneAuditor, SceneTools
 from mapless_server.scenes.retrieval.ranking import nearest_references
 from mapless_server.security import SceneKey, scene_id_of
 
@@ -21,25 +19,17 @@ from .query import POSE_PRIOR, Description, Photo, QueryViews
 class References:
     """The references of all scenes: loaded, chosen, described, audited. Safe to use from several threads."""
 
-    def __init__(
-        self,
-        library: ReferenceLibrary,
-        indexes: SceneIndexes,
-        descriptor: GlobalDescriptor,
-        extractors: Sequence[FeatureExtractor],
-        audit_tools: AuditTools,
-        limits: ImageLimits,
-    ) -> None:
+    def __init__(self, tools: SceneTools, extractors: Sequence[FeatureExtractor], limits: ImageLimits) -> None:
         """Raises ValueError unless the descriptor is computed from the first extractor's features."""
+        descriptor = tools.descriptor
         if descriptor.extractor not in (None, extractors[0].name):
             raise ValueError(f"{descriptor.name} is made of {descriptor.extractor}, not of {extractors[0].name}")
-        self.load, self.attributes = library.load, library.attributes
-        self.report_damaged = indexes.report_damaged
-        self._library = library
-        self._indexes = indexes
+        self.load, self.attributes = tools.library.load, tools.library.attributes
+        self.report_damaged = tools.indexes.report_damaged
+        self._tools = tools
+        self._indexes = tools.indexes
         self._descriptor = descriptor
         self._extractors = extractors
-        self._audit_tools = audit_tools
         self._limits = limits
 
     def choose(self, scene_key: SceneKey, views: QueryViews, selection: Selection, context: StageContext) -> Choice:
@@ -81,7 +71,7 @@ class References:
 
     def auditor(self, scene_key: SceneKey, named: Sequence[str] = ()) -> SceneAuditor:
         """Makes an auditor of a scene's references; the caller named those in `named`."""
-        return SceneAuditor(self._audit_tools, scene_key, named)
+        return SceneAuditor(self._tools, scene_key, named)
 
     def forget_scene(self, scene_key: SceneKey) -> None:
         """Frees the memory of a deleted scene."""
@@ -94,4 +84,4 @@ class References:
 
     def close(self) -> None:
         """Ends the background work of the library."""
-        self._library.close()
+        self._tools.library.close()

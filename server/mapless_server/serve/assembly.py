@@ -25,7 +25,7 @@ from mapless_server.networks.weights.folder import Status, look_up
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scenes import GlobalDescriptor
 from mapless_server.scenes.audit.neighbourhood import PairMatches
-from mapless_server.scenes.audit.scene_auditor import AuditTools
+from mapless_server.scenes.audit.scene_auditor import SceneTools
 from mapless_server.scenes.background import BackgroundMatching
 from mapless_server.scenes.calibration.calibrator import Calibrator, SceneCalibrations
 from mapless_server.scenes.depth.scene_depths import DepthMaker, SceneDepths
@@ -150,8 +150,8 @@ def engine_over(
     library = ReferenceLibrary(store, depths if any(tier.uses_depths for tier in tiers) else None)
     indexes = SceneIndexes(store, library, descriptor, first, options.index_cache_bytes)
     pairs = PairMatches(tiers[0].pipeline.matcher.options.reference_ratio, CACHED_AUDIT_PAIRS)
-    audit_tools = AuditTools(library, indexes, descriptor, first, pairs)
-    references = References(library, indexes, descriptor, extractors, audit_tools, options.image_limits)
+    tools = SceneTools(library, indexes, descriptor, first, pairs)
+    references = References(tools, extractors, options.image_limits)
     engine = QueueEngine(tiers, references, options, observer, quota, method)
     maker = None
     if depth_network is not None:

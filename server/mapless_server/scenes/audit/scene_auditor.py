@@ -45,8 +45,8 @@ PROCESSED_SIDE_PX = 1024
 
 
 @dataclass(frozen=True, eq=False)
-class AuditTools:
-    """What audits need, for all scenes.
+class SceneTools:
+    """What chooses, loads and compares the references of all scenes.
 
     The extractor is the first tier's, whose features every reference has; `pairs` caches matches, for all calls
     together.
@@ -65,7 +65,7 @@ class SceneAuditor:
     If a reference that it uses is deleted meanwhile, it reads the scene again.
     """
 
-    def __init__(self, tools: AuditTools, scene_key: SceneKey, named: Sequence[str] = ()) -> None:
+    def __init__(self, tools: SceneTools, scene_key: SceneKey, named: Sequence[str] = ()) -> None:
         """`named` has the ids that the caller named; it is an error if one of these references is missing."""
         self._tools = tools
         self._scene_key = scene_key
