@@ -192,12 +192,6 @@ class TestTiers:
         usual = JudgeOptions()
         assert setting.judges == [usual.with_trust(quantiles), usual, usual]
 
-    def test_the_times_of_both_tiers_are_separate(self, setting: Setting) -> None:
-        setting.replies = {"cheap": rejected(), "strong": localized(SURE_INLIERS)}
-        seconds = setting.localize().stage_seconds
-        assert list(seconds) == [*("decode", "features", "correspond"), *("strong/features", "strong/coarse")]
-        assert (seconds["correspond"], seconds["strong/coarse"]) == (0.125, 0.25)
-
     def test_contradicting_poses_are_rejected_by_name(self, setting: Setting) -> None:
         near, far = localized(DOUBTFUL_INLIERS), localized(DOUBTFUL_INLIERS, at=pose(3.0))
         setting.replies = {"cheap": near, "strong": far}
@@ -234,11 +228,6 @@ class TestTiers:
         assert len(setting.extractors["cheap"].seen) == len(setting.extractors["strong"].seen) == 1
         assert setting.extractors["cheap"].seen[0] is setting.extractors["strong"].seen[0]
         assert [it.key for it in first_references] == [it.key for it in second_references]
-
-    def test_where_the_server_chooses_each_tier_chooses(self, setting: Setting) -> None:
-        setting.replies = {"cheap": rejected(), "strong": localized(SURE_INLIERS)}
-        seconds = setting.localize(reference_ids=()).stage_seconds
-        assert {"retrieval", "strong/retrieval"} <= set(seconds)
 
     @pytest.mark.parametrize("steps", ["long", "short"])
     def test_no_answer_is_lost_because_a_better_one_comes_too_late(self, setting: Setting, steps: str) -> None:

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import scipy.linalg
 from support.compare import assert_jacobian, assert_pose_close, pose_error
 from support.planted import NOISE, disturbed, drifted, stages, true_correspondences, true_structure
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
@@ -73,36 +72,6 @@ def test_the_optimum_is_near_that_of_many_steps() -> None:
 def residuals(problem: BundleProblem, state: Bundle) -> Array:
     """(O, 2)."""
     return problem.by_view.linearized(state)[0].T
-
-
-def dense_system(problem: BundleProblem, state: Bundle) -> tuple[Array, Array]:
-    """The whole matrix and gradient of the normal equations, from derivatives by differences."""
-    size = 6 * len(state.poses.rotation) + 3 * len(state.points)
-    step = 1e-6
-    columns = []
-    for axis in np.eye(size):
-        ahead, behind = from_vector(state, step * axis), from_vector(state, -step * axis)
-        there, back = residuals(problem, ahead), residuals(problem, behind)
-        prior = problem.reference_motion(ahead) - problem.reference_motion(behind)
-        columns.append(np.concatenate([(there - back).ravel(), prior.ravel()]) / (2 * step))
-    jacobian = np.stack(columns, axis=1)
-    residual = residuals(problem, state)
-    weight = 1 / (1 + (residual**2).sum(axis=1) / problem.loss_scale_sigma**2)
-    weights = scipy.linalg.block_diag(np.diag(np.repeat(weight, 2)), problem.information)
-    errors = np.concatenate([residual.ravel(), problem.reference_motion(state).ravel()])
-    return jacobian.T @ weights @ jacobian, jacobian.T @ weights @ errors
-
-
-@pytest.mark.parametrize("damping", [0.0, 1e-3, 1.0])
-def test_reduced_step_equals_the_step_of_the_full_system(damping: float) -> None:
-    problem, state = problem_of("dense", 1e-3)
-    matrix, gradient = dense_system(problem, state)
-    expected = -np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), gradient)
-    there = problem.step(state, problem.linearize(state), damping)
-    assert there
-    motion = there.poses.motion_from(state.poses)
-    actual = np.concatenate([motion.ravel(), (there.points - state.points).ravel()])
-    np.testing.assert_allclose(actual, expected, atol=2e-3 * np.abs(expected).max())
 
 
 # The adjustment

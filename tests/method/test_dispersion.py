@@ -1,7 +1,5 @@
 """Dispersion of a pose without parts of its data: against the dense equations, and in undetermined cases."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import scipy.linalg
@@ -10,7 +8,7 @@ from support.scenes import SceneOptions, make_scene, random_for
 
 from mapless.geometry import Array
 from mapless_server.method.bundle import Bundle, BundleProblem
-from mapless_server.method.pose_problem import AdjustOptions, pose_problem, with_intrinsics
+from mapless_server.method.pose_problem import AdjustOptions, pose_problem
 from mapless_server.method.uncertainty.dispersion import LEAST_LEFT, Dispersion, disperse
 
 
@@ -87,23 +85,6 @@ def test_the_regions_together_are_the_whole_gradient() -> None:
     found = disperse(problem, start, 1000)
     assert found
     np.testing.assert_allclose(found.regions.sum(axis=0), found.offset, atol=1e-9)
-
-
-def test_the_regions_together_say_all_of_the_intrinsics() -> None:
-    """Where the references are held, and so have no part in what the matches say."""
-    scene = make_scene(random_for("lens"), SceneOptions(point_count=60))
-    structure, matches = true_structure(scene, NOISE)
-    given = scene.query, scene.references, structure, matches, np.arange(len(matches)), scene.world_from_query
-    problem, start = pose_problem(*given, AdjustOptions())
-    problem = replace(problem, information=1e6 * problem.information)
-    found = disperse(*with_intrinsics(problem, start, scene.query), 1000)
-    assert found
-    assert found.intrinsics
-    whole = found.intrinsics
-    np.testing.assert_allclose(whole.region_gradients.sum(axis=0), whole.gradients[0], rtol=1e-3)
-    unit = np.sqrt(np.diag(whole.matrices[0]))
-    difference = (whole.region_matrices.sum(axis=0) - whole.matrices[0]) / np.outer(unit, unit)
-    assert np.abs(difference).max() < 1e-3
 
 
 def test_covariance_of_three_poses_equals_the_jackknife() -> None:

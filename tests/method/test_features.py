@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -71,16 +70,6 @@ def test_planted_blobs_are_found_at_their_positions() -> None:
     assert np.abs(missed.mean(axis=0)).max() < 0.02
     assert view.camera == CAMERA
     assert_is_well_formed(view.features)
-
-
-def test_keypoint_sizes_grow_with_the_blobs() -> None:
-    near, _ = blobs(random_for("sizes"), CAMERA)
-    far = cv2.resize(near, (200, 150), interpolation=cv2.INTER_AREA)
-    sizes = [
-        np.median(SiftExtractor().extract(image, CAMERA.resized(image.shape[1], image.shape[0])).features.sizes_px)
-        for image in (near, np.asarray(far, np.uint8))
-    ]
-    assert sizes[0] / sizes[1] == pytest.approx(2, rel=0.1)
 
 
 @pytest.mark.parametrize("max_side_px", [400, 300, 211, 200])

@@ -99,13 +99,6 @@ def test_expected_poses_and_their_bound_in_words(log10: float, number: str) -> N
     assert format_false_alarms(log10, -15.0) == f"{number} such poses expected by chance, at most 10^-15 allowed"
 
 
-def test_false_alarms_fall_with_inliers_and_rise_with_matches() -> None:
-    of_inliers = [false_alarms(100, k, 1e-3) for k in range(4, 101)]
-    assert np.all(np.diff(of_inliers) < 0)
-    assert np.all(np.diff([false_alarms(n, 10, 1e-3) for n in range(10, 2000, 50)]) > 0)
-    assert np.all(np.diff([false_alarms(100, 10, p) for p in np.geomspace(1e-5, 0.9, 20)]) > 0)
-
-
 def test_guided_and_other_matches_have_their_own_chance() -> None:
     inliers = np.arange(100) < 40
     disc = INLIER_PX**2

@@ -27,7 +27,6 @@ from mapless_server.method.features.edgepoint2 import SIZE_OF_WIDTH, EdgePoint2E
 from mapless_server.method.features.network import (  # noqa: E402
     LearnedOptions,
     image_tensor,
-    strict_maxima,
 )
 from mapless_server.method.features.xfeat import SHIFT_PX, XfeatExtractor  # noqa: E402
 from mapless_server.networks.edgepoint2 import VARIANTS, EdgePoint2  # noqa: E402
@@ -219,35 +218,6 @@ def test_edgepoint2_finds_nothing_at_the_border(edgepoint2: EdgePoint2Extractor)
     assert len(view.features) > 50
     assert (view.features.keypoints > 3.4).all()
     assert (view.features.keypoints < np.array([330, 250]) - 4.4).all()
-
-
-def test_strict_maxima_equal_brute_force() -> None:
-    scores = torch.from_numpy(random_for("maxima").integers(0, 40, (24, 31))).float()
-    expected = []
-    for y in range(2, 22):
-        for x in range(2, 29):
-            others = scores[y - 2 : y + 3, x - 2 : x + 3].flatten().tolist()
-            others.remove(scores[y, x])
-            if scores[y, x] > max(others) and scores[y, x] > 10:
-                expected.append([x, y])
-    assert strict_maxima(scores, 5, 10.0).tolist() == expected
-    assert 3 < len(expected) < 40
-
-
-@pytest.mark.parametrize("name", ["aliked", "xfeat", "edgepoint2"])
-def test_a_shifted_photograph_has_shifted_keypoints(name: str, request: pytest.FixtureRequest) -> None:
-    """By 32 px, a step of the networks' coarsest grid, and far from borders: all else is the same to rounding."""
-    extractor: FeatureExtractor = request.getfixturevalue(name)
-    wide = textured(480, 384, seed=5)
-    first, second = (
-        extractor.extract(np.ascontiguousarray(wide[s : s + 256, s : s + 320]), CAMERA).features.keypoints
-        for s in (32, 64)
-    )
-    back = second + 32
-    inside = (np.abs(first - [176, 144]) < [70, 50]).all(axis=1)
-    distance = np.linalg.norm(first[inside][:, None] - back, axis=2).min(axis=1)
-    assert inside.sum() > 5
-    assert (distance < 0.05).mean() > 0.5
 
 
 @pytest.mark.parametrize(("name", "dimension"), [("aliked", 128), ("xfeat", 64), ("edgepoint2", 64)])

@@ -87,16 +87,6 @@ def test_the_jacobian_is_the_derivative_about_fixed_world_axes(kind: str) -> Non
         assert_jacobian(jacobian, residual, np.zeros(6), tolerance=1e-7)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_gradient_and_information_are_half_the_derivatives(kind: str) -> None:
-    prior = planted(kind, POSE, random_for("gradient", kind))
-    at = moved(POSE, np.full(6, 0.02))
-    gradient, information = Priors(**{kind: prior}).gradient_and_information(at)  # type: ignore[arg-type]
-    cost = Priors(**{kind: prior}).cost  # type: ignore[arg-type]
-    assert_jacobian(2 * gradient[None], lambda error: cost(moved(at, error)), np.zeros(6), tolerance=1e-5)
-    assert np.linalg.matrix_rank(information) == prior.degrees_of_freedom
-
-
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 1.0, 3.0, math.pi])
 def test_the_rotation_vector_is_the_inverse_of_rodrigues(angle: float) -> None:
     axis = unit(np.array([0.3, -0.5, 0.8]))

@@ -10,20 +10,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from support.compare import assert_jacobian
 from support.fake_network import FakeNetwork, FakeNetworkOptions
 from support.planted import metric_scale, true_correspondences, true_tracks
 from support.scenes import CAMERA, SceneOptions, SyntheticScene, arc_poses, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform
 from mapless_server.method import structure as stage
-from mapless_server.method.arrays import SYMMETRIC, columns, invert_symmetric, rows, solve_columns
+from mapless_server.method.arrays import SYMMETRIC, invert_symmetric, solve_columns
 from mapless_server.method.cache import LruCache
 from mapless_server.method.correspond import Correspondences, CorrespondOptions, MatchedReferences, Matcher
 from mapless_server.method.observations import (
     MIN_NOISE_LEVEL_PX,
     ONE_PIXEL,
-    Columns,
     Observations,
     adjust_points,
     better_start,
@@ -99,47 +97,7 @@ def test_residuals_are_projections_minus_observations() -> None:
         np.testing.assert_allclose(residuals[o], expected, atol=1e-9)
 
 
-def test_jacobians_equal_finite_differences() -> None:
-    _, observations, truth = planted("jacobians", SceneOptions(point_count=20), KeypointNoise(0.4, 0.05))
-    _, jacobians = observations.linearized(truth)
-    for o in range(0, len(observations.point), 7):
-        point = observations.point[o]
-
-        def residual(x: Array, row: int = o, index: int = int(point)) -> Array:
-            moved = truth.copy()
-            moved[index] = x
-            return np.asarray(observations.residuals(moved)[row])
-
-        assert_jacobian(jacobians[o], residual, truth[point], tolerance=1e-6)
-
-
-def test_columns_equal_the_plain_rows() -> None:
-    _, observations, truth = planted("columns", SceneOptions(point_count=40), KeypointNoise(0.4, 0.05))
-    residuals, jacobians = observations.linearized(truth)
-    in_columns, slopes = Columns.of(observations).linearized(columns(truth))
-    np.testing.assert_allclose(rows(in_columns), residuals, atol=1e-10)
-    np.testing.assert_allclose(rows(slopes), jacobians, rtol=1e-10, atol=1e-10)
-    starts = observations.tracks.starts
-    sums = np.add.reduceat(jacobians, starts, axis=0)
-    np.testing.assert_allclose(observations.sum_by_point(jacobians), sums, rtol=1e-12, atol=1e-9)
-    in_columns = observations.tracks.sum_columns(columns(residuals))
-    np.testing.assert_allclose(rows(in_columns), np.add.reduceat(residuals, starts, axis=0), rtol=1e-12, atol=1e-9)
-
-
 # Small systems
-
-
-def test_solutions_equal_lapacks() -> None:
-    random = random_for("systems")
-    roots = random.standard_normal((200, 3, 3)) * 10.0 ** random.uniform(-3, 3, (200, 1, 1))
-    matrices, vectors = roots @ np.swapaxes(roots, 1, 2), random.standard_normal((200, 3))
-    well = np.linalg.cond(matrices) < 1e6
-    assert well.sum() > 150
-    inverses = invert_symmetric(matrices)[well]
-    np.testing.assert_allclose(matrices[well] @ inverses, np.tile(np.eye(3), (well.sum(), 1, 1)), atol=1e-6)
-    expected = np.linalg.solve(matrices[well], vectors[well, :, None])[..., 0]
-    elements = np.stack([matrices[:, i, j] for i, j in SYMMETRIC])
-    np.testing.assert_allclose(solve_columns(elements, vectors.T).T[well], expected, rtol=1e-5, atol=1e-12)
 
 
 @pytest.mark.parametrize("matrix", [np.zeros((3, 3)), np.diag([1.0, 1.0, 0.0]), np.ones((3, 3)) * 1e8])

@@ -101,15 +101,6 @@ def test_the_order_of_pairs_does_not_change_the_tracks(drawn: tuple[Pairs, list[
         np.testing.assert_array_equal(getattr(actual, name), getattr(expected, name))
 
 
-@given(random_pairs())
-def test_tracks_from_an_anchor_begin_in_it(drawn: tuple[Pairs, list[int]]) -> None:
-    pairs, counts = drawn
-    tracks = build_tracks(pairs, counts, anchor=0)
-    assert (tracks.view[tracks.starts] == 0).all()
-    without_others = {pair: m for pair, m in pairs.items() if 0 in pair}
-    assert as_sets(tracks) == as_sets(build_tracks(without_others, counts))
-
-
 @given(random_pairs(), st.data())
 def test_select_keeps_the_chosen_and_renumbers(drawn: tuple[Pairs, list[int]], data: st.DataObject) -> None:
     tracks = build_tracks(*drawn)

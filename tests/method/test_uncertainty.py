@@ -8,20 +8,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.compare import assert_jacobian, finite_differences
+from support.compare import finite_differences
 from support.planted import NOISE, disturbed, drift_field, drifted, metric_scale, stages, true_structure
 from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
 from mapless_server.method.adjust import adjust_pose, with_covariance
 from mapless_server.method.perturbation import (
-    motion_jacobian,
     moved,
-    perturbed,
     pose_hessian,
     rotation_vector,
     world_covariance,
-    world_jacobian,
 )
 from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.pose_errors import PoseErrorOptions, PoseErrors, most_probable, pose_errors
@@ -204,34 +201,6 @@ def test_without_evidence_the_usual_sizes_are_taken(value: float) -> None:
 
 
 # Errors in world coordinates
-
-
-POSE = RigidTransform(rotation_from_vector([0.7, -1.1, 0.4]), np.array([3.0, -2.0, 1.5]))
-
-
-def error_in_world(pose: RigidTransform) -> Array:
-    """X y z rx ry rz: the centre's shift, and the turn about fixed world axes."""
-    return np.concatenate([pose.translation - POSE.translation, rotation_vector(pose.rotation @ POSE.rotation.T)])
-
-
-def perturbed_camera(error: Array) -> RigidTransform:
-    """world_from_camera after an error (v, w) of camera_from_world."""
-    return perturbed(POSE.inverse(), error).inverse()
-
-
-def test_world_jacobian_is_the_derivative_of_the_world_error() -> None:
-    assert_jacobian(
-        world_jacobian(POSE), lambda error: error_in_world(perturbed_camera(error)), np.zeros(6), tolerance=1e-7
-    )
-
-
-def test_motion_jacobian_equals_finite_differences() -> None:
-    for x in random_for("motion").normal(size=(5, 3)):
-
-        def moved_point(motion: Array, x: Array = x) -> Array:
-            return np.asarray(rotation_from_vector(motion[3:]) @ x + motion[:3])
-
-        assert_jacobian(motion_jacobian(x), moved_point, np.zeros(6), tolerance=1e-7)
 
 
 def test_covariance_from_projections_is_in_world_axes() -> None:

@@ -16,7 +16,6 @@ import torch
 from numpy.typing import NDArray
 from safetensors.torch import save_file
 from support.parity_rule import (
-    SMALL_MAPANYTHING,
     deviation,
     existing,
     images,
@@ -28,7 +27,7 @@ from support.parity_rule import full_network as make_full_network
 from torch import Tensor
 
 from mapless_server.networks.checkpoint import load_strictly
-from mapless_server.networks.mapanything import Decoded, MapAnything, MapAnythingSizes, as_output, canonical_name
+from mapless_server.networks.mapanything import Decoded, MapAnything, as_output, canonical_name
 from mapless_server.networks.view_conditions import (
     GivenMaps,
     RelativePoses,
@@ -322,9 +321,3 @@ def test_version_1_is_refused_by_name(network: MapAnything, file: Path) -> None:
     save_file({**network.state_dict(), "scale_token": torch.zeros(768)}, file)
     with pytest.raises(CheckpointError, match="it is version 1 of MapAnything"):
         load_strictly(network_without_weights("mapanything"), file)
-
-
-def test_sizes_of_the_official_network_are_the_default() -> None:
-    assert MapAnythingSizes() != SMALL_MAPANYTHING
-    with torch.device("meta"):
-        assert sum(it.numel() for it in MapAnything().parameters()) == 1_228_491_222

@@ -1,6 +1,5 @@
 """The audit reports a planted fault with its kind and size, and nothing else."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +11,8 @@ from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.method.trust.judge import JudgeOptions
 from mapless_server.method.views import Features, PosedView
 from mapless_server.scenes import AuditVerdict, Coverage, CoverageVerdict, ReferenceAudit
-from mapless_server.scenes.audit import auditor, comparison
+from mapless_server.scenes.audit import comparison
 from mapless_server.scenes.audit.coverage import REPEATABILITY, check_coverage
-from mapless_server.scenes.audit.finder import ReferenceGone
 from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.audit.resection import with_focal
 
@@ -182,46 +180,6 @@ def test_the_verdict_does_not_depend_on_other_references(references: list[PosedV
     neighbour = VICTIM + 1
     alone = audit_references([scene[neighbour].name], finder_of(scene), pairs=pairs)
     assert alone == [together[neighbour]]
-
-
-def test_references_are_loaded_as_they_are_needed(
-    references: list[PosedView], pairs: PairMatches, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of a scene with a far part only the near part is read."""
-    far = [moved(replace(r, name=f"{r.name}-far"), (1000.0 + i, 0.0, 0.0)) for i, r in enumerate(references)]
-    by_name = {r.name: r for r in [*references, *far]}
-    loaded: list[str] = []
-
-    def load(names: Sequence[str]) -> list[PosedView]:
-        loaded.extend(names)
-        return [by_name[name] for name in names]
-
-    finder = finder_of(list(by_name.values()), load)
-    monkeypatch.setattr(auditor, "CANDIDATE_COUNT", 4)
-    monkeypatch.setattr(auditor, "NEIGHBOUR_COUNT", 4)
-    assert audit_references([references[0].name], finder, pairs)[0].verdict is AuditVerdict.CONSISTENT
-    assert set(loaded) <= {r.name for r in references}
-    assert len(loaded) == len(set(loaded)) == 5
-
-
-def test_a_neighbour_that_cannot_be_loaded_is_no_witness(references: list[PosedView], pairs: PairMatches) -> None:
-    """The verdict is the same as if it had never been there, and it is asked for once."""
-    lost = references[VICTIM + 1].name
-    scene = altered(references, VICTIM, moved(references[VICTIM], (0.05, 0.0, 0.0)))
-    left = {r.name: r for r in scene if r.name != lost}
-    asked: list[str] = []
-
-    def load(names: Sequence[str]) -> list[PosedView]:
-        asked.extend(names)
-        return [left[name] for name in names if name in left]
-
-    finder = finder_of(scene, load)
-    names = [r.name for r in scene if r.name != lost]
-    audits = audit_references(names, finder, pairs=pairs)
-    assert [a.verdict for a in audits] == [a.verdict for a in audit(list(left.values()), pairs)]
-    assert asked.count(lost) == 1
-    with pytest.raises(ReferenceGone):
-        audit_references([lost], finder, pairs=pairs)
 
 
 def test_one_among_many_faulty_ones_is_never_consistent(references: list[PosedView], pairs: PairMatches) -> None:

@@ -174,21 +174,6 @@ def test_changes_at_once_lose_none_of_each_other(store: Store) -> None:
     assert store.get_scene(OFFICE).generation == 1 + 6 * rounds
 
 
-def test_a_store_without_a_cache_sees_every_change(place: Place) -> None:
-    with place.open() as store:
-        store.create_scene(OFFICE, SceneAttributes(DATUM))
-        store.add_references(OFFICE, [make_reference("a")])
-        other = store.uncached()
-        assert other.get_attributes(OFFICE).down_in_world is None
-        assert other.load_references(OFFICE, ["a"], EXTRACTOR).generation == 2
-        store.update_scene(OFFICE, down_in_world=DOWN)
-        assert other.get_attributes(OFFICE).down_in_world == DOWN
-        store.delete_scene(OFFICE)
-        with pytest.raises(errors.NotFound):
-            other.get_attributes(OFFICE)
-        assert [it.used for it in (other.reference_cache, other._resolved, other._attributes)] == [0, 0, 0]
-
-
 factor = st.floats(0.01, 1000)
 vector = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
 quaternion = vector.map(lambda it: Quaternion.from_matrix(rotation_from_vector(it)))
