@@ -1,5 +1,7 @@
 """Matching: planted pairs, votes, and the guided search against loops."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -177,3 +179,16 @@ def test_the_guided_search_keeps_the_votes() -> None:
     np.testing.assert_array_equal(found.guided, np.arange(len(found)) >= len(voted))
     assert len(pairs_of(found) & pairs_of(true)) > 0.95 * len(true)
     assert len(pairs_of(found) - pairs_of(true)) < 0.01 * len(true)
+
+
+def test_similarity_is_the_best_observations() -> None:
+    """A point seen by two references, one of which shows it changed: the other is enough."""
+    scene = make_scene(random_for("best"), SceneOptions(reference_count=2, descriptor_noise=0.0, seen_share=1.0))
+    structure, true = true_structure(scene)
+    last = scene.references[1]
+    random = random_for("best descriptors")
+    others = random.permutation(last.view.features.descriptors)
+    changed = replace(last, view=replace(last.view, features=replace(last.view.features, descriptors=others)))
+    references = (scene.references[0], changed)
+    found = search(scene.query, references, structure, scene.world_from_query, NOTHING, MatchOptions(radius_px=5.0))
+    assert len(pairs_of(found) & pairs_of(true)) > 0.95 * len(true)

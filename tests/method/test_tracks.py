@@ -4,7 +4,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapless_server.method.tracks import Tracks, build_tracks
@@ -76,6 +76,7 @@ def random_pairs(draw: st.DrawFn) -> tuple[Pairs, list[int]]:
     return pairs_of(pairs), counts
 
 
+@settings(max_examples=40)
 @given(random_pairs(), st.sampled_from([None, 0, 1]))
 def test_tracks_equal_those_of_a_union_find(drawn: tuple[Pairs, list[int]], anchor: int | None) -> None:
     pairs, counts = drawn
@@ -91,6 +92,7 @@ def test_tracks_equal_those_of_a_union_find(drawn: tuple[Pairs, list[int]], anch
             assert degree[view, keypoint] == max(degree[node] for node in group if node[0] == view)
 
 
+@settings(max_examples=40)
 @given(random_pairs(), st.randoms(use_true_random=False))
 def test_the_order_of_pairs_does_not_change_the_tracks(drawn: tuple[Pairs, list[int]], shuffler: object) -> None:
     pairs, counts = drawn
@@ -101,6 +103,7 @@ def test_the_order_of_pairs_does_not_change_the_tracks(drawn: tuple[Pairs, list[
         np.testing.assert_array_equal(getattr(actual, name), getattr(expected, name))
 
 
+@settings(max_examples=40)
 @given(random_pairs(), st.data())
 def test_select_keeps_the_chosen_and_renumbers(drawn: tuple[Pairs, list[int]], data: st.DataObject) -> None:
     tracks = build_tracks(*drawn)
@@ -113,6 +116,7 @@ def test_select_keeps_the_chosen_and_renumbers(drawn: tuple[Pairs, list[int]], d
             np.testing.assert_array_equal(of_new, getattr(tracks, name)[tracks.point == old])
 
 
+@settings(max_examples=40)
 @given(random_pairs(), st.data())
 def test_prune_drops_observations_and_single_leftovers(drawn: tuple[Pairs, list[int]], data: st.DataObject) -> None:
     tracks = build_tracks(*drawn)

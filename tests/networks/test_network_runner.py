@@ -78,7 +78,8 @@ def test_the_runner_has_the_networks_output() -> None:
     runner.close()
 
 
-@pytest.mark.parametrize("name", [nightly("pi3"), "pi3x", nightly("mapanything")])
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", ["pi3", "pi3x", "mapanything"])
 def test_a_compiled_runner_does_not_compile_again(name: str) -> None:
     """That it compiles as a whole also shows that nothing in it waits for the device: that would break the graph."""
     plain = NetworkRunner(shallow_network(name), name, "sha")

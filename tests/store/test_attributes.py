@@ -179,7 +179,7 @@ vector = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
 quaternion = vector.map(lambda it: Quaternion.from_matrix(rotation_from_vector(it)))
 
 
-@settings(deadline=None)
+@settings(max_examples=30)
 @given(
     st.none() | st.builds(Datum, st.floats(-90, 90), st.floats(-180, 180), st.floats(-12_000, 1e5), quaternion),
     st.none()
