@@ -8,6 +8,7 @@ from support.planted import true_correspondences, true_structure
 from support.pnp_problems import POSE, problem_of
 from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for
 
+from mapless.geometry import RigidTransform
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.rejection import Rejection, RejectionReason
@@ -171,6 +172,23 @@ def test_keypoints_without_a_place_are_no_evidence() -> None:
     query = replace(support.query, features=replace(support.query.features, keypoints=keypoints))
     counts, pose = support.inliers_by_reference(), support.estimate.world_from_camera
     assert epipolar_share(query, support.references, matches, counts, pose) == pytest.approx(0.25, abs=0.06)
+
+
+def test_the_unit_of_the_world_is_no_evidence() -> None:
+    support = support_of()
+    assert support.estimate is not None
+
+    def scaled(pose: RigidTransform) -> RigidTransform:
+        return RigidTransform(pose.rotation, 1000 * pose.translation)
+
+    references = tuple(replace(r, world_from_camera=scaled(r.world_from_camera)) for r in support.references)
+    larger = replace(
+        support,
+        references=references,
+        structure=replace(support.structure, x_in_world=1000 * support.structure.x_in_world),
+        estimate=replace(support.estimate, world_from_camera=scaled(support.estimate.world_from_camera)),
+    )
+    assert evidence(larger).score == pytest.approx(evidence(support).score, abs=0.05)
 
 
 def test_degenerate_evidence_has_a_finite_score() -> None:

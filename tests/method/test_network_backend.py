@@ -29,10 +29,9 @@ from support.grey_network import (
     greys_of,
 )
 from support.images import textured
+from support.parity_rule import SMALL_MAPANYTHING, SMALL_PI3
 from support.programs import printed
 from support.small_networks import (
-    MAPANYTHING,
-    PI3,
     photograph,
     references_of,
     small_network,
@@ -154,8 +153,8 @@ def test_a_network_needs_its_weights(tmp_path: Path) -> None:
 
 
 def test_a_network_is_loaded_from_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pi3, "Pi3", lambda: Pi3(PI3))
-    network = small_network("pi3", seed=4)
+    monkeypatch.setattr(pi3, "Pi3", lambda: Pi3(SMALL_PI3))
+    network = small_network("pi3")
     save_file(network.state_dict(), tmp_path / "pi3.safetensors")
     made = make_reconstructor("pi3", tmp_path, "cpu", OPTIONS)
     assert made.name == "pi3"
@@ -172,7 +171,7 @@ def test_a_network_is_loaded_from_its_file(tmp_path: Path, monkeypatch: pytest.M
 
 def test_a_file_under_another_licence_does_not_serve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also if it is put into the folder by hand: its tensors are those of the file that a company may use."""
-    monkeypatch.setattr(mapanything, "MapAnything", lambda: MapAnything(MAPANYTHING))
+    monkeypatch.setattr(mapanything, "MapAnything", lambda: MapAnything(SMALL_MAPANYTHING))
     file = tmp_path / "mapanything.safetensors"
     save_file(small_network("mapanything").state_dict(), file)
     assert make_reconstructor("mapanything", tmp_path, "cpu", OPTIONS).name == "mapanything"

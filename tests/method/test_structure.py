@@ -294,6 +294,21 @@ def test_predictions_are_scaled_depths_of_the_first_keypoint() -> None:
     assert np.quantile(error_m, 0.9) < 1e-3
 
 
+def test_without_optimization_points_are_as_predicted() -> None:
+    scene = make_scene(random_for("stay"), SceneOptions(point_count=200))
+    options = replace(PAPER_STRUCTURE, optimize=False)
+    structure, shown = build(scene, options, FakeNetworkOptions(depth_noise_m=0.1))
+    network = FakeNetwork(scene, options=FakeNetworkOptions(depth_noise_m=0.1))
+    predicted = predicted_points(
+        network.reconstruct(scene.query, scene.references),
+        metric_scale(network.world_from_local, scene.world_from_query),
+        scene.references,
+        structure.tracks,
+    )
+    np.testing.assert_array_equal(structure.x_in_world, predicted)
+    assert len(shown) > 100
+
+
 @pytest.mark.parametrize("options", [StructureOptions(), PAPER_STRUCTURE], ids=["ours", "paper"])
 def test_the_planted_points_are_found(options: StructureOptions) -> None:
     scene = make_scene(random_for("stage"), SceneOptions(noise_px=0.0))

@@ -8,13 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.compare import finite_differences
+from support.compare import assert_jacobian, finite_differences
 from support.planted import NOISE, disturbed, drift_field, drifted, metric_scale, stages, true_structure
 from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
 from mapless_server.method.adjust import adjust_pose, with_covariance
 from mapless_server.method.perturbation import (
+    motion_jacobian,
     moved,
     pose_hessian,
     rotation_vector,
@@ -24,7 +25,8 @@ from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.pose_errors import PoseErrorOptions, PoseErrors, most_probable, pose_errors
 from mapless_server.method.pose_problem import AdjustOptions
 from mapless_server.method.results import PoseEstimate, PoseStage, Structure, Support
-from mapless_server.method.uncertainty.covariance import UncertaintyOptions, scale_covariance
+from mapless_server.method.uncertainty.covariance import UncertaintyOptions, dispersed_covariance, scale_covariance
+from mapless_server.method.uncertainty.dispersion import Dispersion
 from mapless_server.method.uncertainty.radii import error_radii
 
 POSITION, ROTATION = slice(0, 3), slice(3, 6)
@@ -125,6 +127,19 @@ def test_an_initial_poses_covariance_covers_its_errors() -> None:
     assert np.sqrt(along @ refined[:3, :3] @ along) < 0.02
 
 
+def test_covariance_grows_with_the_gap() -> None:
+    """As the gap to twice its exponent."""
+    one = np.diag([1.0, 2.0, 3.0, 1.0, 2.0, 3.0])
+    options = replace(PLAIN, gap_growth=0.1)
+
+    def trace(gap: float) -> float:
+        found = Dispersion(one, np.zeros((9, 6)), np.zeros(6), gap)
+        return float(np.trace(dispersed_covariance(found, RigidTransform(np.eye(3), np.zeros(3)), options)))
+
+    assert trace(0.2) / trace(0.1) == pytest.approx(2**0.2)
+    assert trace(5.0) == trace(0.5)
+
+
 def test_matches_with_one_point_keep_the_former_covariance() -> None:
     scene = make_scene(random_for("spot"), FEW)
     structure, _, estimate = stages(scene, scene.references)
@@ -201,6 +216,15 @@ def test_without_evidence_the_usual_sizes_are_taken(value: float) -> None:
 
 
 # Errors in world coordinates
+
+
+def test_motion_jacobian_equals_finite_differences() -> None:
+    for x in random_for("motion").normal(size=(5, 3)):
+
+        def moved_point(motion: Array, x: Array = x) -> Array:
+            return np.asarray(rotation_from_vector(motion[3:]) @ x + motion[:3])
+
+        assert_jacobian(motion_jacobian(x), moved_point, np.zeros(6), tolerance=1e-7)
 
 
 def test_covariance_from_projections_is_in_world_axes() -> None:

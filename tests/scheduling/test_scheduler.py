@@ -151,6 +151,15 @@ class TestAdmission:
             toy.scheduler.check_room(toy.jobs[0].flow, toy.jobs[0].step, toy.now_s)
         toy.admit(client="another")
 
+    def test_a_job_is_booked_for_no_more_than_it_was_admitted_for(self) -> None:
+        toy = Toy()
+        job = toy.admit()
+        toy.finish(toy.take("host"), onward(job))
+        for _ in range(100):
+            toy.learn("refine", "toy", 9.0)
+        toy.finish(toy.take("device"), onward(job))
+        assert job.booked_s["host"] == pytest.approx(COST_S["refine"])
+
     def test_memory_is_bounded(self) -> None:
         toy = Toy()
         toy.admit(size_bytes=700)

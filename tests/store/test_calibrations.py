@@ -1,6 +1,7 @@
 """Self-calibrations in the store: each scene is claimed by one server, and what is stored holds for its kind alone."""
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from support.stores import Place, let_pass, make_reference
@@ -15,6 +16,8 @@ from mapless_server.store.calibrations import (
     count_waiting,
     discard_damaged,
     list_newest,
+    postpone,
+    release,
     renew,
 )
 from mapless_server.store.pairs import delete_unused, record_use
@@ -72,6 +75,12 @@ def test_frequent_changes_do_not_keep_servers_busy(store: Store, monkeypatch: py
     assert claim_scene(store.database, KIND) is not None
 
 
+def test_of_two_servers_one_calibrates(store: Store) -> None:
+    with ThreadPoolExecutor(4) as pool:
+        claims = list(pool.map(lambda _: claim_scene(store.database, KIND), range(8)))
+    assert sum(it is not None for it in claims) == 1
+
+
 def test_the_claim_of_a_killed_server_ends(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     killed = claimed(store)
     let_pass(monkeypatch, CLAIM_S - 1)
@@ -92,6 +101,20 @@ def test_a_renewed_claim_lasts(store: Store, monkeypatch: pytest.MonkeyPatch) ->
     let_pass(monkeypatch, CLAIM_S - 1)
     assert claim_scene(store.database, KIND) is None
     assert add(store, renewed, of(store), 0.0)
+
+
+def test_failures_are_tried_again_later_and_later(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    waits = []
+    for _ in range(3):
+        waits.append(postpone(store.database, claimed(store)))
+        assert claim_scene(store.database, KIND) is None
+        let_pass(monkeypatch, waits[-1] + 1)
+    assert waits == [30, 60, 120]
+
+
+def test_a_closed_server_leaves_the_scene_to_others(store: Store) -> None:
+    release(store.database, claimed(store))
+    assert claim_scene(store.database, KIND) is not None
 
 
 def test_a_deleted_scene_takes_its_calibration_along(store: Store, place: Place) -> None:

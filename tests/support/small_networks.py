@@ -11,53 +11,32 @@ from torch import Tensor
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_server.method.coarse.grids import GridOptions
 from mapless_server.method.views import Features, Photograph, PosedView, View
-from mapless_server.networks.mapanything import MapAnything, MapAnythingSizes
+from mapless_server.networks.mapanything import MapAnything
 from mapless_server.networks.megaloc import MegaLoc, MegaLocSizes
 from mapless_server.networks.network import Network
-from mapless_server.networks.pi3 import Pi3, Pi3X, Sizes
 from mapless_server.networks.runner import NetworkRunner
 from support.images import textured
-from support.parity_rule import weights
+from support.parity_rule import ruled_network, weights
 
-PI3 = Sizes(64, 4, encoder_depth=3, decoder_depth=4, head_depth=2, camera_width=32)
-PI3X = Sizes(64, 4, 3, 10, 2, 32, (64, 32, 16), 8, metric_width=32, metric_heads=2, metric_depth=2)
-MAPANYTHING = MapAnythingSizes(64, 4, 3, 4, 6, (1, 3), (32, 48), (16, 32), (8, 8, 16, 16), 16, 8, 32, 16)
 GRIDS = GridOptions(pixel_limit=20 * 14**2)
 """5 x 4 patches for 4:3."""
 NOTHING = Features(np.empty((0, 2), np.float32), np.empty((0, 4), np.float32), np.empty(0, np.float32))
 
 
-def small_network(name: str, seed: int = 0) -> Network:
-    """A small network whose every part has an effect, and which masks no pixel."""
-    network = network_without_weights(name)
-    random = torch.Generator().manual_seed(seed)
+def small_network(name: str) -> Network:
+    """A small network of the rule's weights, whose every part has an effect, and which masks no pixel."""
+    network = ruled_network(name)
     for key, parameter in network.named_parameters():
-        noise = torch.randn(parameter.shape, generator=random)
         if key.endswith("gamma"):
-            noise = 0.3 + 0.1 * noise
-        elif "token" in key or "emb" in key.rsplit(".", 1)[-1]:
-            noise = 0.3 * noise
-        elif parameter.ndim == 1:
-            noise = (1.0 if key.endswith("weight") else 0.0) + 0.1 * noise
-        else:
-            noise = noise / parameter[0].numel() ** 0.5
-        parameter.data.copy_(noise)
+            parameter *= 6.0
     if isinstance(network, MapAnything):
-        network.info_sharing.view_pos_table.copy_(torch.arange(MAPANYTHING.width) % 2)
-        network.get_parameter("dense_head.1.conv2.2.bias").data[5] = 50.0
+        network.get_parameter("dense_head.1.conv2.2.bias")[5] = 50.0
     return network
 
 
-def network_without_weights(name: str) -> Network:
-    """A small network, on the CPU."""
-    if name == "mapanything":
-        return MapAnything(MAPANYTHING)
-    return Pi3(PI3) if name == "pi3" else Pi3X(PI3X)
-
-
-def small_runner(name: str, seed: int = 0) -> NetworkRunner:
+def small_runner(name: str) -> NetworkRunner:
     """The network on the CPU."""
-    return NetworkRunner(small_network(name, seed), name, f"sha of {name} {seed}", "cpu")
+    return NetworkRunner(small_network(name), name, f"sha of {name}", "cpu")
 
 
 def photograph(image: NDArray[np.uint8], camera: Camera | None = None, reads: list[str] | None = None) -> Photograph:

@@ -9,8 +9,9 @@ import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812
 import typer
-from support.small_networks import MAPANYTHING, PI3, PI3X, references_of, small_runner
+from support.parity_rule import SMALL_MAPANYTHING, SMALL_PI3, SMALL_PI3X
 from support.small_networks import photograph as photograph_of
+from support.small_networks import references_of, small_runner
 
 from mapless.geometry import Camera
 from mapless_server.method.choices import NETWORKS
@@ -28,7 +29,7 @@ from mapless_tools.bench_network.report import Figure
 from mapless_tools.bench_network.subject import AnySizes, Work, make_network, operations_of
 
 GRID = (3, 4)
-SIZES = PI3
+SIZES = SMALL_PI3
 
 
 @pytest.mark.nightly
@@ -82,7 +83,7 @@ def test_bytes_between_products_are_read_and_written_once() -> None:
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_a_random_network_is_nowhere_zero_and_finite(name: str) -> None:
-    small: dict[str, AnySizes] = {"pi3": PI3, "pi3x": PI3X, "mapanything": MAPANYTHING}
+    small: dict[str, AnySizes] = {"pi3": SMALL_PI3, "pi3x": SMALL_PI3X, "mapanything": SMALL_MAPANYTHING}
     network = make_network(name, small[name], seed=3)
     assert all(float((parameter != 0).float().mean()) > 0.99 for parameter in network.parameters())
     layout = network.layout((3, 4))
