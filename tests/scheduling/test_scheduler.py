@@ -184,6 +184,13 @@ class TestAdmission:
         """Else a prediction that is wrong once would be wrong for ever."""
         Toy().admit(deadline_s=0.01)
 
+    def test_a_light_caller_is_not_refused_for_a_heavy_ones_queue(self) -> None:
+        toy = Toy()
+        for _ in range(5):
+            toy.admit(client="heavy")
+        assert toy.refusal(client="heavy", deadline_s=1.7).reason is Refusal.QUEUE_FULL
+        toy.admit(client="light", deadline_s=1.7)
+
     def test_an_expensive_caller_prices_no_other_out(self) -> None:
         toy = Toy()
         for _ in range(20):

@@ -99,6 +99,27 @@ def test_what_is_no_descriptor_is_refused(store: Store, wrong: np.ndarray) -> No
     assert store.get_scene(OFFICE).generation == 2
 
 
+def test_a_descriptor_found_later_is_a_change_once(store: Store) -> None:
+    store.create_scene(OFFICE)
+    a, _ = store.add_references(OFFICE, [make_reference("a"), make_reference("b")])
+    first, second = (make_descriptor(np.random.default_rng(seed), 16) for seed in (1, 2))
+    store.add_descriptor(a.key, NAME, first)
+    changes = store.list_changes(OFFICE, 2, NAME)
+    assert changes.generation == store.get_scene(OFFICE).generation == 3
+    assert [(it.key, it.descriptor is not None) for it in changes.added] == [(a.key, True)]
+    store.add_descriptor(a.key, NAME, second)
+    assert store.list_changes(OFFICE, 2, NAME).generation == 3
+    (found,) = (it for it in store.list_changes(OFFICE, None, NAME).added if it.key == a.key)
+    assert found.descriptor is not None
+    assert_same_bits(found.descriptor, first.astype(np.float16).astype(np.float32))
+    store.delete_reference(OFFICE, "a")
+    with pytest.raises(errors.NotFound, match="deleted"):
+        store.add_descriptor(a.key, "other", first)
+    store.delete_scene(OFFICE)
+    with pytest.raises(errors.NotFound):
+        store.add_descriptor(a.key, "other", first)
+
+
 def test_one_of_many_descriptors_wins_and_counts_once(store: Store) -> None:
     store.create_scene(OFFICE)
     (a,) = store.add_references(OFFICE, [make_reference("a")])
