@@ -28,7 +28,7 @@ def small_network(name: str) -> Network:
     network = ruled_network(name)
     for key, parameter in network.named_parameters():
         if key.endswith("gamma"):
-            parameter *= 6.0
+            parameter.data *= 6.0
     if isinstance(network, MapAnything):
         network.get_parameter("dense_head.1.conv2.2.bias")[5] = 50.0
     return network
