@@ -1,6 +1,5 @@
 """The report of an import, for people and for programs."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 from rich.console import Console
 
 from mapless_tools.dataset import Dataset, Frame, Refusal
+from mapless_tools.output_files import finite
 
 from .check import Verdict
 
@@ -139,14 +139,14 @@ def to_json(report: ImportReport) -> dict[str, Any]:
 
 def _verdict_json(verdict: Verdict, frames: Sequence[Frame]) -> dict[str, Any]:
     return {
-        "median_px": _number(verdict.median_px),
-        "bad_share": _number(verdict.bad_share),
+        "median_px": finite(verdict.median_px),
+        "bad_share": finite(verdict.bad_share),
         "threshold_px": verdict.threshold_px,
         "median_depth": verdict.median_depth,
         "pairs_without_matches": verdict.unmatched_count,
         "wrong": verdict.is_wrong,
         "explanation": verdict.explanation,
-        "explained_px": _number(verdict.explained_px),
+        "explained_px": finite(verdict.explained_px),
         "suspects": [frames[i].name for i in verdict.suspects],
         "pairs": [
             {
@@ -158,10 +158,6 @@ def _verdict_json(verdict: Verdict, frames: Sequence[Frame]) -> dict[str, Any]:
             for pair in verdict.pairs
         ],
     }
-
-
-def _number(value: float) -> float | None:
-    return None if math.isnan(value) else value
 
 
 def _print_reasons(title: str, items: Sequence[Refusal], console: Console) -> None:

@@ -16,11 +16,14 @@ _ALLOW_WATCHING = {"MAPLESS_ALLOW_WATCHING": "true"}
 def view_command(
     scene: Scene,
     host: Annotated[str, typer.Option(help="Loopback address that the page is served on.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="Port of the page; 0 takes any free one.")] = 8080,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 takes any free one.")] = 8080,
     no_open: Annotated[bool, typer.Option("--no-open", help="Do not open a browser.")] = False,
-    max_pictured: Annotated[int, typer.Option(help="References drawn with their photographs; others are dots.")] = 300,
+    max_pictured: Annotated[
+        int, typer.Option(min=1, help="References drawn with their photographs; others are dots.")
+    ] = 300,
     seeds: Annotated[
-        int, typer.Option(help="References localized against their neighbours, to have points to show; 0.5 s each.")
+        int,
+        typer.Option(min=0, help="References localized against their neighbours, to have points to show; 0.5 s each."),
     ] = 8,
     *,
     connection: Connection,
@@ -41,14 +44,13 @@ def view_command(
             f"photographs; from another machine, use a tunnel: ssh -L {port}:127.0.0.1:{port} THIS-MACHINE"
         )
     with failures_end_command(ValueError, failure=RuntimeError):
-        from .viewer import ViewOptions, viewer
+        from .viewer import viewer
 
-        options = ViewOptions(host, port, max_pictured, seeds)
         settings = load_settings({}).settings
         with (
             terminable(),
             reachable(connection, settings, _ALLOW_WATCHING) as (server, connect),
-            viewer(server, connect, scene, options) as page,
+            viewer(server, connect, scene, host=host, port=port, max_pictured=max_pictured, seeds=seeds) as page,
         ):
             _announce(page, "" if connection.address else server, no_open)
             threading.Event().wait()

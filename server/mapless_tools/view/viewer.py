@@ -6,14 +6,12 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from mapless import Client, ConnectOptions, MaplessError, Reference
 from mapless_server.errors import InvalidArgument
-from mapless_server.method.options import check_bounds
 
 from .feed import THUMBNAIL_PX, Feed, Picture, Query, colours_at, read_picture
 from .guarded import GuardedViser
@@ -28,45 +26,32 @@ SEED_NEIGHBOURS = 8
 """References that one is localized against to show points."""
 
 
-@dataclass(frozen=True)
-class ViewOptions:
-    """What the viewer shows, and where: a loopback address, since there is no authentication, and a port, 0 for any.
-
-    References drawn with their photographs are spread over the scene; more make browsers slow. The others are dots. So
-    many `seeds` are localized against their neighbours for the first points; half a second of the server's computing
-    each.
-    """
-
-    host: str = "127.0.0.1"
-    port: int = 8080
-    max_pictured: int = 300
-    seeds: int = 8
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "max_pictured", at_least=1)
-        check_bounds(self, "seeds", at_least=0)
-        check_bounds(self, "port", at_least=0, at_most=65535)
-
-
 @contextmanager
-def viewer(address: str, connect: ConnectOptions, scene: str, options: ViewOptions) -> Iterator[str]:
-    """Shows a scene until the block ends; yields the page's address. Errors as in `lay_out` and `GuardedViser`."""
+def viewer(
+    address: str, connect: ConnectOptions, scene: str, *, host: str, port: int, max_pictured: int, seeds: int
+) -> Iterator[str]:
+    """Shows a scene until the block ends; yields the page's address. Errors as in `lay_out` and `GuardedViser`.
+
+    It is shown on a loopback address, since there is no authentication, and a port, 0 for any. `max_pictured`
+    references are drawn with their photographs, spread over the scene: more make browsers slow. So many `seeds` are
+    localized against their neighbours for the first points; half a second of the server's computing each.
+    """
     with ExitStack() as stack:
         client = stack.enter_context(Client(address, connect))
-        scenery = lay_out(client.get_scene(scene), list(client.list_references(scene)), options.max_pictured)
+        scenery = lay_out(client.get_scene(scene), list(client.list_references(scene)), max_pictured)
 
         def open_photo(reference_id: str) -> bytes:
             return client.get_reference(scene, reference_id, include_image=True).image or b""
 
-        server = GuardedViser(options.host, options.port, f"mapless: {scene}")
+        server = GuardedViser(host, port, f"mapless: {scene}")
         stack.callback(server.stop)
         stage = Stage(server, scenery, scene, open_photo)
         work = _Background(client, scene, scenery, stage)
         stack.callback(work.close)
         feed = Feed(address, connect, scene, work.show_query, stage.report)
         stack.callback(feed.close)
-        work.begin(feed, options.seeds)
-        yield f"http://{options.host}:{server.get_port()}"
+        work.begin(feed, seeds)
+        yield f"http://{host}:{server.get_port()}"
 
 
 class _Background:

@@ -15,25 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from mapless.geometry import Array
 
-from .textures import (
-    OAK,
-    PINE,
-    WALNUT,
-    WHITE,
-    Image,
-    Random,
-    Texture,
-    book,
-    brick,
-    cover,
-    framed,
-    panelled,
-    plain,
-    rows,
-    shapes,
-    some_colour,
-    wood,
-)
+from . import textures as tx
+from .textures import Image, Random, Texture
 
 ROOM_M = np.array([5.0, 4.0, 2.6])
 FACES = {
@@ -190,53 +173,55 @@ def _irradiance(quad: Quad, boxes: list[Box]) -> Image:
 def shell(room: Room) -> None:
     """Floor, rug, ceiling, walls, door, and a window with the sky outside."""
     x, y, z = np.diag(ROOM_M)
-    room.panel(y, x, -y, rows(wood(OAK), 60, (300, 700), 0.45))
-    room.panel(z, x, y, plain((0.93, 0.93, 0.91)), 200)
-    room.panel(y + z, x, -z, rows(brick, 32, (80, 120), 1.5))
-    room.panel(x + z, -x, -z, rows(plain((0.80, 0.76, 0.62)), 300, (40, 60), 0.9))
-    room.panel(x + y + z, -y, -z, plain((0.60, 0.68, 0.66)))
+    room.panel(y, x, -y, tx.rows(tx.wood(tx.OAK), 60, (300, 700), 0.45))
+    room.panel(z, x, y, tx.plain((0.93, 0.93, 0.91)), 200)
+    room.panel(y + z, x, -z, tx.rows(tx.brick, 32, (80, 120), 1.5))
+    room.panel(x + z, -x, -z, tx.rows(tx.plain((0.80, 0.76, 0.62)), 300, (40, 60), 0.9))
+    room.panel(x + y + z, -y, -z, tx.plain((0.60, 0.68, 0.66)))
     room.outline += Box(ROOM_M / 2, ROOM_M, np.eye(3)).edges()
-    room.box([1.35, 1.2, 0], [2.3, 1.6, 0.012], plain((0.3, 0.2, 0.2)), faces={"top": shapes}, yaw_deg=4)
-    room.box([0, 3.985, 0], [5, 0.015, 0.09], wood(WHITE))
-    room.box([0.35, 0, 0], [0.85, 0.03, 2.02], wood(PINE), faces={"back": panelled})
+    room.box([1.35, 1.2, 0], [2.3, 1.6, 0.012], tx.plain((0.3, 0.2, 0.2)), faces={"top": tx.shapes}, yaw_deg=4)
+    room.box([0, 3.985, 0], [5, 0.015, 0.09], tx.wood(tx.WHITE))
+    room.box([0.35, 0, 0], [0.85, 0.03, 2.02], tx.wood(tx.PINE), faces={"back": tx.panelled})
     y0, y1, z0, z1 = 1.1, 2.8, 0.9, 2.25
     for a, b, top, bottom in ((0, y0, 2.6, 0), (y1, 4, 2.6, 0), (y0, y1, 2.6, z1), (y0, y1, z0, 0)):
-        room.panel([0, a, top], [0, b - a, 0], [0, 0, bottom - top], plain((0.82, 0.80, 0.77)))
+        room.panel([0, a, top], [0, b - a, 0], [0, 0, bottom - top], tx.plain((0.82, 0.80, 0.77)))
     for side in (y0, (y0 + y1) / 2, y1 - 0.06):
-        room.box([-0.1, side, z0], [0.11, 0.06, z1 - z0], wood(WHITE))
+        room.box([-0.1, side, z0], [0.11, 0.06, z1 - z0], tx.wood(tx.WHITE))
     for height in (z0, z1 - 0.06):
-        room.box([-0.1, y0, height], [0.12, y1 - y0, 0.06], wood(WHITE))
-    room.panel([-7, -9, 7.5], [0, 22, 0], [0, 0, -10], plain((0.6, 0.76, 0.95)), 100)
+        room.box([-0.1, y0, height], [0.12, y1 - y0, 0.06], tx.wood(tx.WHITE))
+    room.panel([-7, -9, 7.5], [0, 22, 0], [0, 0, -10], tx.plain((0.6, 0.76, 0.95)), 100)
 
 
 def table(room: Room) -> None:
     """A table in the middle, chairs around it, a lamp over it, things on it."""
-    room.box([1.8, 1.6, 0.71], [1.4, 0.8, 0.03], wood(OAK))
+    room.box([1.8, 1.6, 0.71], [1.4, 0.8, 0.03], tx.wood(tx.OAK))
     for x, y in itertools.product((1.85, 3.09), (1.65, 2.29)):
-        room.box([x, y, 0], [0.06, 0.06, 0.71], wood(OAK))
+        room.box([x, y, 0], [0.06, 0.06, 0.71], tx.wood(tx.OAK))
     for x, y, yaw_deg in ((2.1, 1.28, 8), (2.85, 1.3, -14), (2.2, 2.72, 170), (2.95, 2.7, 196)):
         turned: dict[str, Any] = {"yaw_deg": yaw_deg, "about": (x, y)}
-        room.box([x - 0.21, y - 0.21, 0.43], [0.42, 0.42, 0.05], plain(some_colour(room.random)), **turned)
+        room.box([x - 0.21, y - 0.21, 0.43], [0.42, 0.42, 0.05], tx.plain(tx.some_colour(room.random)), **turned)
         for side in (x - 0.21, x + 0.17):
-            room.box([side, y + 0.17, 0], [0.04, 0.04, 0.43], wood(WALNUT), **turned)
-            room.box([side, y - 0.21, 0], [0.04, 0.04, 0.92], wood(WALNUT), **turned)
+            room.box([side, y + 0.17, 0], [0.04, 0.04, 0.43], tx.wood(tx.WALNUT), **turned)
+            room.box([side, y - 0.21, 0], [0.04, 0.04, 0.92], tx.wood(tx.WALNUT), **turned)
         for z in (0.58, 0.70, 0.82):
-            room.box([x - 0.17, y - 0.2, z], [0.34, 0.022, 0.07], wood(WALNUT), **turned)
-    room.box([2.44, 1.99, 2.2], [0.02, 0.02, 0.4], plain(WALNUT))
-    room.box([2.25, 1.8, 2.02], [0.4, 0.4, 0.2], plain((0.85, 0.75, 0.55)))
+            room.box([x - 0.17, y - 0.2, z], [0.34, 0.022, 0.07], tx.wood(tx.WALNUT), **turned)
+    room.box([2.44, 1.99, 2.2], [0.02, 0.02, 0.4], tx.plain(tx.WALNUT))
+    room.box([2.25, 1.8, 2.02], [0.4, 0.4, 0.2], tx.plain((0.85, 0.75, 0.55)))
     pile(room, 1.92, 1.68, 0.74, 4)
     pile(room, 2.85, 2.08, 0.74, 3)
     pile(room, 2.38, 1.68, 0.74, 1)
     for x, y, *size in ((2.35, 2.1, 0.19, 0.065, 0.29), (2.62, 1.75, 0.14, 0.05, 0.21), (2.98, 1.72, 0.1, 0.1, 0.13)):
-        room.box([x, y, 0.74], size, cover, yaw_deg=room.random.uniform(-40, 40))
+        room.box([x, y, 0.74], size, tx.cover, yaw_deg=room.random.uniform(-40, 40))
 
 
 def pile(room: Room, x: float, y: float, z: float, count: int) -> None:
     """Books lying on one another."""
     for _ in range(count):
         size = room.random.uniform([0.19, 0.13, 0.02], [0.26, 0.18, 0.045])
-        paper = plain((0.85, 0.82, 0.73))
-        room.box([x, y, z], size, paper, faces={"front": cover, "top": cover}, yaw_deg=room.random.uniform(-30, 30))
+        paper = tx.plain((0.85, 0.82, 0.73))
+        room.box(
+            [x, y, z], size, paper, faces={"front": tx.cover, "top": tx.cover}, yaw_deg=room.random.uniform(-30, 30)
+        )
         z += size[2]
 
 
@@ -244,20 +229,20 @@ def bookshelf(room: Room) -> None:
     """A bookshelf at the wall x = 5, filled, in two columns."""
     for y in (1.0, 2.0):
         for board in range(5):
-            faces = {"left": rows(book, 230, (12, 38), 0.5)}
-            room.box([4.75, y + 0.03, 0.06 + 0.4 * board], [0.25, 0.94, 0.353], wood(PINE), faces=faces)
-            room.box([4.68, y, 0.41 + 0.4 * board], [0.32, 1.0, 0.03], wood(PINE))
+            faces = {"left": tx.rows(tx.book, 230, (12, 38), 0.5)}
+            room.box([4.75, y + 0.03, 0.06 + 0.4 * board], [0.25, 0.94, 0.353], tx.wood(tx.PINE), faces=faces)
+            room.box([4.68, y, 0.41 + 0.4 * board], [0.32, 1.0, 0.03], tx.wood(tx.PINE))
     for y in (1.0, 1.985, 2.97):
-        room.box([4.68, y, 0], [0.32, 0.03, 2.04], wood(PINE))
+        room.box([4.68, y, 0], [0.32, 0.03, 2.04], tx.wood(tx.PINE))
 
 
 def sideboard(room: Room) -> None:
     """A cupboard at the wall y = 4 with things on it."""
-    room.box([1.7, 3.55, 0], [1.9, 0.44, 0.86], wood(WALNUT), faces={"front": panelled})
+    room.box([1.7, 3.55, 0], [1.9, 0.44, 0.86], tx.wood(tx.WALNUT), faces={"front": tx.panelled})
     for x, width, height in ((1.82, 0.2, 0.26), (2.1, 0.15, 0.2), (3.25, 0.22, 0.3)):
-        room.box([x, 3.8, 0.86], [width, 0.02, height], wood(WALNUT), faces={"front": framed}, yaw_deg=10)
+        room.box([x, 3.8, 0.86], [width, 0.02, height], tx.wood(tx.WALNUT), faces={"front": tx.framed}, yaw_deg=10)
     pile(room, 2.5, 3.66, 0.86, 5)
-    room.box([2.98, 3.68, 0.86], [0.2, 0.14, 0.12], cover, yaw_deg=-15)
+    room.box([2.98, 3.68, 0.86], [0.2, 0.14, 0.12], tx.cover, yaw_deg=-15)
 
 
 def corners(room: Room) -> None:
@@ -268,10 +253,10 @@ def corners(room: Room) -> None:
         ([0.16, 3.08, 0.1], [0.13, 0.6, 0.5]),
         ([0.92, 3.08, 0.1], [0.13, 0.6, 0.5]),
     ):
-        room.box(low, size, plain((0.34, 0.42, 0.52)), yaw_deg=-38, about=(0.62, 3.38))
-    room.box([4.2, 0.2, 0], [0.5, 0.4, 0.34], cover, yaw_deg=12)
-    room.box([4.28, 0.24, 0.34], [0.36, 0.3, 0.26], cover, yaw_deg=-9)
-    room.box([4.4, 3.4, 0], [0.42, 0.42, 0.7], cover, yaw_deg=30)
+        room.box(low, size, tx.plain((0.34, 0.42, 0.52)), yaw_deg=-38, about=(0.62, 3.38))
+    room.box([4.2, 0.2, 0], [0.5, 0.4, 0.34], tx.cover, yaw_deg=12)
+    room.box([4.28, 0.24, 0.34], [0.36, 0.3, 0.26], tx.cover, yaw_deg=-9)
+    room.box([4.4, 3.4, 0], [0.42, 0.42, 0.7], tx.cover, yaw_deg=30)
 
 
 def wall_pictures(room: Room) -> None:
@@ -288,4 +273,4 @@ def wall_pictures(room: Room) -> None:
             low, size = [along, ROOM_M[1] - t if face == "front" else 0, z], [width, t, height]
             if face in ("left", "right"):
                 low, size = [ROOM_M[0] - t if face == "left" else 0, along, z], [t, width, height]
-            room.box(low, size, wood(WALNUT), faces={face: framed})
+            room.box(low, size, tx.wood(tx.WALNUT), faces={face: tx.framed})
