@@ -97,8 +97,10 @@ def looks_often(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @contextmanager
 def served(folder: Path) -> Iterator[HealthClient]:
-    with serving(folder) as server, HealthClient(server.address) as client:
-        yield client
+    with serving(folder) as server:
+        client = HealthClient(server.address)
+        with client:
+            yield client
 
 
 def fill(client: Client, count: int = 3) -> None:

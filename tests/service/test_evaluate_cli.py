@@ -45,19 +45,6 @@ def test_leaves_one_out(folder: Path, tmp_path: Path) -> None:
         assert len(query["references"]) == 8
 
 
-@pytest.mark.nightly
-def test_chosen_references(folder: Path, tmp_path: Path) -> None:
-    done = run("evaluate", folder, "--references", 4, "--queries", 3, "--k", 3, "--json", tmp_path / "figures.json")
-    assert done.exit_code == 0, done.output
-    figures = json.loads((tmp_path / "figures.json").read_text())
-    references = {"0", "3", "5", "8"}
-    assert figures["references"] == 4
-    for query in figures["per_query"]:
-        assert query["name"] not in references
-        assert len(query["references"]) == 3
-        assert set(query["references"]) <= references
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

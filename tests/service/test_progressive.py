@@ -1,7 +1,6 @@
 """LocalizeProgressively through a real server: the order of messages, their content, and how a stream ends."""
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -298,10 +297,3 @@ def test_the_log_has_the_time_of_the_coarse_answer(server: Serving, caplog: pyte
     assert {"prepare", "coarse", "refine"} == set(fields["stages_ms"])
     assert (fields["outcome"], fields["pose_stage"], fields["code"]) == ("localized", "refined", "OK")
     assert fields["bytes_out"] > 0
-
-
-def test_many_at_a_time_get_two_answers_each_in_order(server: Serving) -> None:
-    server.method.gate.set()
-    with ThreadPoolExecutor(8) as threads:
-        streams = list(threads.map(lambda i: list(asking(server, metadata=(("x-client-id", f"c{i % 4}"),))), range(40)))
-    assert {tuple(it.is_final for it in messages) for messages in streams} == {(False, True)}

@@ -139,14 +139,6 @@ def test_the_coarse_answer_is_printed_before_the_final_one(kind: Any) -> None:
     assert (request.options.variant, request.options.axes) == (pb.VARIANT_FULL, pb.AXES_UNITY)
 
 
-def test_a_rejection_is_final(kind: Any) -> None:
-    with playing(([COARSE, rejected()], None)) as (address, _):
-        (first, last), error = ending_of(kind, address)
-    assert error is None
-    assert (first.is_final, last.is_final) == (False, True)
-    assert isinstance(last, Rejected)
-
-
 BROKEN, FULL = status("UNAVAILABLE"), status("RESOURCE_EXHAUSTED", retry_after_s=0.01)
 
 

@@ -172,9 +172,3 @@ def test_bad_requests_name_their_field(client: Client, changes: dict[str, object
     with pytest.raises(InvalidArgument) as caught:
         client.retrieve_references(**request)  # type: ignore[arg-type]
     assert caught.value.field == field
-
-
-def test_an_unknown_scene_is_not_found(client: Client) -> None:
-    with pytest.raises(NotFound) as caught:
-        client.retrieve_references(PHOTOS[0], CAMERA, "nowhere")
-    assert caught.value.field == "scene"

@@ -5,17 +5,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import datetime, timezone
+from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from mapless import DataLoss, ReferenceAudit, RigidTransform, Scene, Unavailable
 from mapless_tools.cli.app import app
-from mapless_tools.cli.audit import Examined, cells_of, summary_of, to_html, to_json, worst_first
+from mapless_tools.cli.audit import Examined, cells_of, summary_of, table_of, to_html, to_json, worst_first
 
 
 def finding(name: str, verdict: str, offset_m: float = 0.0, focal_ratio: float = 1.0) -> ReferenceAudit:
@@ -108,3 +110,7 @@ def test_reports_hold_every_reference_and_escape_names() -> None:
     assert page.count('<tr class="alarm">') == 3
     assert "&lt;far&gt;" in page
     assert "<far>" not in page
+    console = Console(width=80, record=True, file=StringIO())  # as wide as a terminal
+    console.print(table_of(FINDINGS))
+    text = console.export_text()
+    assert all(a.name.rpartition("/")[2] in text for a in FINDINGS)

@@ -2,11 +2,14 @@
 
 import asyncio
 import itertools
+import json
 import math
+import os
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import grpc
@@ -32,12 +35,16 @@ from mapless_tools.load.calls import (
     poisson_times,
     regular_times,
 )
+from mapless_tools.load.charts import LATENCIES, RATES, draw_load
 from mapless_tools.load.no_op import CAMERA, padded_photo
+from mapless_tools.load.pipeline import PipelineOptions, PipelineResult, pipeline_checks, pipeline_json
+from mapless_tools.load.report import check_lines, report_part, step_lines
 from mapless_tools.load.sender import Target, connected, send_closed_loop, send_open_loop
-from mapless_tools.load.step import Step
+from mapless_tools.load.step import Step, run_step
 from mapless_tools.load.watch import (
     ProcessSample,
     Scrape,
+    ServerUnderLoad,
     parse_metrics,
     reconcile,
 )
@@ -365,3 +372,76 @@ def step(name: str, asked_per_s: float | None, records: Sequence[CallRecord], sc
     account = account_of(records, 10.0)
     codes = [r.code for r in records]
     return Step(name, asked_per_s, 10.0, account, codes, samples, 0.0, scraped, 0.1, 10.0)
+
+
+def planted_result(slowest_refusal_s: float = 0.004) -> PipelineResult:
+    """A server that answers 8 a second in 0.2 s, and refuses the rest."""
+
+    def calls(answered: int, refused: int) -> list[CallRecord]:
+        answers = [record(at_s=10 * i / max(answered, 1) * 0.9, took_s=0.2 + 0.001 * i) for i in range(answered)]
+        refusals = [record(Fate.REFUSED, at_s=10 * i / max(refused, 1), took_s=0.003) for i in range(refused)]
+        if refusals:
+            refusals[-1] = replace(refusals[-1], ended_s=refusals[-1].at_s + slowest_refusal_s)
+        return answers + refusals
+
+    scraped = Scrape(0, {}, {}, {0.01: 100, math.inf: 100})
+    options = PipelineOptions(shares=(0.7, 1.0, 3.0))
+    steps = [
+        step("70 %", 5.6, calls(56, 0), scraped),
+        step("100 %", 8.0, calls(78, 2), scraped),
+        step("300 %", 24.0, calls(79, 161), scraped),
+    ]
+    ramp = [step("2 at a time", None, calls(80, 0), scraped)]
+    unloaded = step("unloaded", None, calls(80, 0), scraped)
+    regular = step("70 %, regular", 5.6, calls(56, 0), scraped)
+    hammered = step("hammering", None, calls(70, 900), scraped)
+    return PipelineResult("a planted place", options, unloaded, ramp, 8.0, steps, regular, hammered)
+
+
+def test_a_good_server_meets_bars_and_slow_refusals_miss_one() -> None:
+    def by_figure(result: PipelineResult) -> dict[str, bool | None]:
+        return {check.figure: check.met for check in pipeline_checks(result)}
+
+    good, slow = by_figure(planted_result()), by_figure(planted_result(slowest_refusal_s=0.051))
+    ours = {figure: met for figure, met in good.items() if "CPU" not in figure}  # the machine's cores decide that
+    assert set(ours.values()) == {True}
+    different = [figure for figure in good if good[figure] is not slow[figure]]
+    assert different == ["slowest of 161 refusals at 3 times saturation"]
+
+
+def test_the_report_has_every_figure_and_keeps_earlier_parts(tmp_path: Path) -> None:
+    """Also of a step without any answer."""
+    planted = planted_result()
+    refused = [record(Fate.REFUSED, at_s=0.1 * i, took_s=0.003) for i in range(50)]
+    result = replace(planted, steps=[*planted.steps[:2], step("300 %", 24.0, refused)])
+    checks = pipeline_checks(result)
+    assert next(it for it in checks if it.figure.startswith("goodput")).met is False
+    assert any("300 %" in line for line in step_lines(result.all_steps))
+    file = tmp_path / "load.json"
+    report_part(file, "pipeline", [], checks, pipeline_json(result))
+    report_part(file, "soak", [], [], {"figure": 1})
+    content = json.loads(file.read_text())
+    assert sorted(content) == ["pipeline", "soak"]
+    assert content["pipeline"]["steps"][2]["refusals"]["count"] == 50
+    verdicts = [line for line in check_lines(checks) if "| yes |" in line or "**no**" in line]
+    assert len(verdicts) == len(content["pipeline"]["checks"])
+    for axes, names in zip(draw_load(result).axes, (LATENCIES, RATES), strict=True):
+        drawn = [label.partition(":")[0] for label in axes.get_legend_handles_labels()[1]]
+        assert set(names) <= set(drawn)
+
+
+async def test_a_step_uses_the_servers_account_of_its_time_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    pages = iter([Scrape(10, {"OK": 10}, {}, {}), Scrape(13, {"OK": 13}, {}, {})])
+    monkeypatch.setattr("mapless_tools.load.watch.read_metrics", lambda _: next(pages))
+
+    async def send() -> list[CallRecord]:
+        await asyncio.sleep(0.05)
+        return [record(at_s=0.01 * i, took_s=0.01) for i in range(3)]
+
+    under_load = ServerUnderLoad(os.getpid(), "nowhere")
+    measured = await run_step("toy", under_load, send, 1.0, sample_every_s=0.01)
+    assert measured.scraped is not None
+    assert (measured.scraped.started, measured.scraped.handled) == (3, {"OK": 3})
+    assert measured.answers == 3
+    assert len(measured.samples) >= 2
+    assert [s.at_s for s in measured.samples] == sorted(s.at_s for s in measured.samples)

@@ -1,6 +1,8 @@
 """A soak's verdict: planted leaks are found, and neither noise, waves nor a curve that has settled is taken for one."""
 
+import os
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,7 +11,7 @@ import pytest
 from mapless.geometry import Array
 from mapless_tools.load.slopes import MIN_SAMPLES, Slope, slope
 from mapless_tools.load.soak import MIN_SETTLED_S, UNITS, SoakOptions, least_minutes, slopes_of
-from mapless_tools.load.watch import ServerState
+from mapless_tools.load.watch import Scrape, ServerState, ServerUnderLoad, read_state
 
 EVERY_S = 10.0
 TIMES_S = np.arange(0.0, 2400.0, EVERY_S)
@@ -104,4 +106,19 @@ def test_the_minimum_of_minutes_gives_slopes_and_less_none(options: SoakOptions)
     assert looked_at(least - 3) == {}
 
 
-# What is called
+def test_a_process_is_read_with_its_files_sockets_and_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pages = [
+        Scrape(0, {}, {}, {}, {"mapless_event_loop_lag_seconds_sum": s, "mapless_event_loop_lag_seconds_count": n})
+        for s, n in ((1.0, 100.0), (1.5, 200.0))
+    ]
+    monkeypatch.setattr("mapless_tools.load.watch.read_metrics", lambda _: pages.pop(0))
+    (tmp_path / "below").mkdir()
+    (tmp_path / "below" / "file").write_bytes(bytes(2**20))
+    watched = ServerUnderLoad(os.getpid(), "nowhere", tmp_path)
+    first, series = read_state(watched, 0.0, None)
+    second, _ = read_state(watched, 1.0, series)
+    assert first.data_mib == pytest.approx(1.0, abs=0.1)
+    assert 0 < first.unique_mib <= first.resident_mib
+    assert first.threads >= 1
+    assert first.sockets <= first.descriptors
+    assert second.loop_lag_ms == pytest.approx(5.0)
