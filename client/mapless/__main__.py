@@ -18,7 +18,11 @@ EXIT_INTERRUPTED = 130  # as in shells
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; exits."""
     try:
-        parsed = make_parser().parse_args(arguments)
+        parser = make_parser()
+        if not (sys.argv[1:] if arguments is None else arguments):
+            parser.print_help(sys.stderr)
+            sys.exit(EXIT_USAGE)
+        parsed = parser.parse_args(arguments)
         with Client(parsed.address, connect_options(parsed)) as client, suggesting(client):
             sys.exit(parsed.run(client, parsed))
     except MaplessError as error:

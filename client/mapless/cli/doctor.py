@@ -273,6 +273,7 @@ _ADVICE = {
     "TOKEN_MISSING": _TOKENS,
     "TOKEN_INVALID": _TOKENS,
     "TOKEN_EXPIRED": _TOKENS,
+    "NOT_FOUND": "`mapless scene list` lists the scenes that there are",
     "ROLE_TOO_LOW": "use a token of the role localize or write",
     "STARTING": "it starts: wait until it is ready, some seconds",
     "DRAINING": "it stops, and answers only the calls that it has: use another server, or start it again",

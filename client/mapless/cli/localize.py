@@ -46,6 +46,8 @@ def run(client: Client, arguments: argparse.Namespace) -> int:
     if arguments.parallel < 1:
         raise ValueError(f"--parallel must be at least 1, is {arguments.parallel}")
     if arguments.draw is not None:
+        if arguments.draw.is_file():
+            raise ValueError(f"--draw names a folder for the pages, but {arguments.draw} is a file")
         arguments.draw.mkdir(parents=True, exist_ok=True)
     if not arguments.photo.is_dir():
         return _one(client, arguments)

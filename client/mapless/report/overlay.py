@@ -1,6 +1,5 @@
 """The photograph with its matches: inliers with residuals, and outliers."""
 
-import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -79,34 +78,6 @@ def magnification(residual: Array, width_px: int) -> int:
         return 1
     wanted = _SEEN_SHARE * width_px / max(float(np.median(lengths)), 1e-6)
     return max((it for it in _MAGNIFICATIONS if it <= wanted), default=1)
-
-
-def histogram(debug: Debug) -> str:
-    """Histogram of the errors of inliers and outliers, up to twice the 95 % quantile of inliers."""
-    known = np.isfinite(debug.error_px)
-    if not (known & debug.is_inlier).any():
-        return ""
-    limit = max(1, math.ceil(2 * float(np.quantile(debug.error_px[known & debug.is_inlier], 0.95))))
-    edges = np.linspace(0.0, limit, 33)
-    counts = [np.histogram(debug.error_px[known & part], edges)[0] for part in (debug.is_inlier, ~debug.is_inlier)]
-    highest = max(int((counts[0] + counts[1]).max()), 1)
-    bars = []
-    for i, (good, bad) in enumerate(zip(*counts, strict=True)):
-        x, below, above = 10 * i, 90 * good / highest, 90 * bad / highest
-        bars.append(f'<rect class="inlier" x="{x}" y="{number(100 - below)}" width="9" height="{number(below)}"/>')
-        top = number(100 - below - above)
-        bars.append(f'<rect class="outlier" x="{x}" y="{top}" width="9" height="{number(above)}"/>')
-    ticks = "".join(
-        f'<text x="{number(320 * share)}" y="114" text-anchor="{anchor}">{limit * share:g}</text>'
-        for share, anchor in ((0, "start"), (0.5, "middle"), (1, "end"))
-    )
-    beyond = int((debug.error_px[known] > limit).sum() + (~known).sum())
-    more = f" {beyond} are larger or undefined." if beyond else ""
-    return (
-        '<figure class="histogram"><svg viewBox="0 0 320 118" role="img" aria-label="Histogram of the errors">'
-        f'{"".join(bars)}<path class="axis" d="M0 100H320"/>{ticks}</svg>'
-        f"<figcaption>Reprojection errors, pixels of the processed photograph.{more}</figcaption></figure>"
-    )
 
 
 def _switch(layer: str, label: str) -> str:

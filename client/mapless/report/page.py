@@ -12,7 +12,7 @@ from ..geometry import Camera, RigidTransform
 from ..results import Reference
 from . import sections
 from .markup import reference_id, section, text
-from .overlay import best_references, define, histogram, image_of, overlay, pairs
+from .overlay import best_references, define, image_of, overlay, pairs
 from .pictures import Picture, picture
 from .plan import plan_view
 
@@ -22,19 +22,6 @@ REFERENCE_BYTES = 450_000
 has less than 5 MB, which any mailbox accepts."""
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 """Permits no external resources and no scripts."""
-HEADLINES = {
-    "NO_USABLE_REFERENCES": "there were no usable references",
-    "DEGENERATE_REFERENCES": "all references have the same position",
-    "LOW_TEXTURE": "the photograph shows too little",
-    "LOW_OVERLAP": "it has nothing in common with the references",
-    "SCALE_UNRELIABLE": "the metric scale could not be established",
-    "TOO_FEW_MATCHES": "too few matches",
-    "PNP_FAILED": "no pose explains the matches",
-    "GATE": "the evidence for the pose does not suffice",
-    "AMBIGUOUS": "several places fit the photograph",
-    "PRIOR_CONFLICT": "the pose contradicts a prior",
-}
-"""Of a rejection, by its reason."""
 
 
 def report_html(
@@ -95,8 +82,7 @@ def _header(answer: LocalizationResult | Rejected, title: str) -> str:
     why = ""
     headline = f'<span class="{kind}">{_verdict(answer)}</span>'
     if isinstance(answer, Rejected):
-        known = HEADLINES.get(answer.reason)
-        headline += f": {text(known)}" if known else ""
+        headline += f": {text(answer.reason.replace('_', ' ').lower())}"
         why = f'<p class="why">{text(answer.message)} <span class="note">({text(answer.reason)})</span></p>'
     return (
         f'<header><p class="kicker">{text(" · ".join(parts) or "mapless")}</p><h1>{headline}</h1>{why}'
@@ -108,9 +94,7 @@ def _photograph_section(answer: LocalizationResult | Rejected, camera: Camera, p
     note = f'<p class="note">{text(photograph.note)}</p>' if photograph.note else ""
     if answer.debug is not None and len(answer.debug.is_inlier):
         pose = answer.world_from_camera if isinstance(answer, LocalizationResult) else None
-        return section(
-            "The photograph and its matches", note, overlay(answer.debug, camera, pose), histogram(answer.debug)
-        )
+        return section("The photograph and its matches", note, overlay(answer.debug, camera, pose))
     if answer.debug is not None:
         why = "It has no matches."
     elif "pnp" in answer.diagnostics.stage_s:

@@ -210,19 +210,6 @@ def _deviations(covariance: Array) -> str:
 
 
 def _covariance(covariance: Array) -> str:
-    sigma = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    correlation = covariance / np.outer(sigma, sigma)
-    rows = []
-    for i, name in enumerate(_AXES):
-        cells = [f"<b>{name}</b>"]
-        for j in range(6):
-            share = 0.0 if i == j else float(np.clip(np.nan_to_num(correlation[i, j]), -1, 1))
-            colour = "36,120,220" if share > 0 else "220,90,30"
-            tint = f"background:rgba({colour},{0.45 * abs(share):.2f})"
-            cells.append(f'<span class="tint" style="{tint}">{covariance[i, j]:.2e}</span>')
-        rows.append(cells)
-    return (
-        "<h3>Covariance, metres and radians, fixed world axes (ROS's order)</h3>"
-        + table(("", *_AXES), rows, "matrix")
-        + '<p class="note">Coloured by correlation: blue positive, orange negative.</p>'
-    )
+    rows = [[f"<b>{name}</b>", *(f"{it:.2e}" for it in row)] for name, row in zip(_AXES, covariance, strict=True)]
+    title = "<h3>Covariance, metres and radians, fixed world axes (ROS's order)</h3>"
+    return title + table(("", *_AXES), rows, "matrix")
