@@ -74,6 +74,13 @@ def residuals(problem: BundleProblem, state: Bundle) -> Array:
     return problem.by_view.linearized(state)[0].T
 
 
+def test_a_point_that_is_not_determined_gives_no_step() -> None:
+    problem, state = problem_of("singular")
+    equations = problem.linearize(state)
+    equations.point_block[:, 3] = 0.0
+    assert problem.step(state, equations, 1e-4) is None
+
+
 # The adjustment
 
 

@@ -218,6 +218,16 @@ def test_a_prior_on_a_frame_is_used_where_it_agrees() -> None:
     np.testing.assert_array_equal(wrong.world_from_camera[-1].matrix(), none.world_from_camera[-1].matrix())
 
 
+def test_one_wrong_own_pose_does_not_change_the_sequence() -> None:
+    random = random_for("outvoted")
+    truth = walk(random, 5)
+    images = images_of(random, truth, alone=True, own_noise_m=0.005)
+    wrong = images_of(random_for("outvoted"), truth, alone=True, own_noise_m=3.0)[4]
+    found = estimate(solve_sequence([*images[:4], wrong], drifting(random, truth, 0.01), False, OPTIONS))
+    assert error_m(found.world_from_camera[-1], truth[-1]) < 0.02
+    assert not found.jumps
+
+
 def test_a_session_without_motion_has_no_scale() -> None:
     random = random_for("still")
     pose = walk(random, 3)[1]

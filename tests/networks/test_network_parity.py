@@ -151,6 +151,16 @@ def assert_close(found: Tensor, expected: Tensor, tolerance: float = 1e-5) -> No
     assert (found - expected).abs().max() <= tolerance * expected.abs().max()
 
 
+def test_omitted_maps_do_not_change_the_rest(network: Network) -> None:
+    given = some_images(4)
+    everything, some = reconstruct(network, given, 4), reconstruct(network, given, 2)
+    assert some.local_points.shape[1] == some.confidence_logits.shape[1] == 2
+    assert_close(some.local_points, everything.local_points[:, :2])
+    assert_close(some.confidence_logits, everything.confidence_logits[:, :2])
+    torch.testing.assert_close(some.camera_poses, everything.camera_poses, rtol=0, atol=0)
+    assert reconstruct(network, given, 0).local_points.shape[1] == 0
+
+
 def test_in_low_precision_only_the_main_residual_stays_float32() -> None:
     network = ruled_network("pi3")
     network.set_compute_type(torch.bfloat16)

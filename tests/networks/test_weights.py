@@ -191,6 +191,12 @@ def test_a_file_under_another_licence_is_never_taken(folder: Path, file: Path) -
         add(weights, file, folder)
 
 
+def test_weights_without_a_known_digest_are_added_and_recorded(folder: Path, file: Path) -> None:
+    weights = entry_of(sha256=None)
+    assert add(weights, file, folder).is_official is None
+    assert look_up(weights, folder).status is Status.RECORDED
+
+
 def test_a_check_reports_damage_and_records_files_added_by_hand(weights: Weights, folder: Path) -> None:
     with pytest.raises(WeightsMissing):
         check(weights, folder)
@@ -245,6 +251,11 @@ def test_an_interruption_leaves_the_folder_unchanged(weights: Weights, folder: P
         add(weights, file, folder, progress=interrupt)
     assert path.read_bytes() == CONTENT
     assert look_up(weights, folder).status is Status.OFFICIAL
+
+
+def test_a_folder_that_cannot_be_created_is_reported(weights: Weights, file: Path) -> None:
+    with pytest.raises(FolderError, match="cannot be written: Not a directory"):
+        add(weights, file, file / "weights")
 
 
 def test_a_full_disk_is_reported_and_leaves_nothing(weights: Weights, file: Path, folder: Path) -> None:
@@ -313,6 +324,12 @@ def test_an_unreachable_hub_is_reported_with_the_manual_way(
         "then run `mapless-server weights add net FILE`"
     )
     assert names_in(folder) == []
+
+
+def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch, weights: Weights, folder: Path) -> None:
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    with pytest.raises(FetchError, match="huggingface_hub is not installed: pip install"):
+        fetched(weights, folder)
 
 
 class Pip:
@@ -447,6 +464,11 @@ def aliked_file(path: Path, **changes: Any) -> Path:
     return path
 
 
+def test_an_unofficial_file_is_added_if_the_network_fits(tmp_path: Path, folder: Path) -> None:
+    installed = add(named("aliked"), aliked_file(tmp_path / "own"), folder, unofficial=True)
+    assert (installed.is_official, installed.not_compared) == (False, None)
+
+
 @pytest.mark.parametrize(
     ("tensor", "words"),
     [
@@ -474,3 +496,10 @@ def test_without_torch_the_reason_for_no_comparison_is_given(
     reason = add(named(name), file, folder, unofficial=True).not_compared
     assert reason is not None
     assert "pip install 'mapless[" in reason
+
+
+def test_missing_converters_are_reported_before_a_download(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(FetchError, match=r"cannot be converted: .* torch is not installed: pip install"):
+        install.require_converter(named("aliked"))
+    install.require_converter(named("pi3"))

@@ -92,6 +92,14 @@ def test_a_wrong_focal_length_is_named_with_what_puts_it_right(
     assert f"{100 * (ratio - 1):+.1f} %" in found.message
 
 
+def test_a_focal_length_off_by_less_than_two_per_cent_is_not_named(
+    references: list[PosedView], pairs: PairMatches
+) -> None:
+    view = references[VICTIM].view
+    victim = replace(references[VICTIM], view=replace(view, camera=with_focal(view.camera, 1.015)))
+    assert not any(a.verdict.is_alarm for a in audit(altered(references, VICTIM, victim), pairs))
+
+
 def test_a_pose_that_looks_away_has_no_error_in_pixels(references: list[PosedView], pairs: PairMatches) -> None:
     pose = references[VICTIM].world_from_camera
     away = RigidTransform(pose.rotation @ np.diag([-1.0, 1.0, -1.0]), pose.translation)
@@ -172,6 +180,10 @@ def test_a_reference_without_neighbours_is_unverifiable(references: list[PosedVi
     assert [a.verdict for a in audits] == [AuditVerdict.CONSISTENT] * 6 + [AuditVerdict.UNVERIFIABLE]
     assert not audits[-1].verdict.is_alarm
     assert audits[-1].position_offset_m is None
+
+
+def test_one_reference_alone_is_unverifiable(references: list[PosedView], pairs: PairMatches) -> None:
+    assert [a.verdict for a in audit(references[:1], pairs)] == [AuditVerdict.UNVERIFIABLE]
 
 
 def test_the_verdict_does_not_depend_on_other_references(references: list[PosedView], pairs: PairMatches) -> None:

@@ -449,6 +449,23 @@ class TestPriority:
             server.background._match_claimed(library, *found)
         assert server.counts.failures == 0
 
+    def test_what_is_made_before_the_claim_ends_is_stored(
+        self, store: Store, monkeypatch: pytest.MonkeyPatch, compared: Counter[int]
+    ) -> None:
+        monkeypatch.setattr("mapless_server.scenes.background.CLAIM_S", 0.0)
+        server = Server(store, widths=[False])
+        usual = server.background._let_callers_first
+        steps = iter(range(1000))
+
+        def sometimes(_: float = 0.25) -> None:
+            usual()
+            in_time = next(steps) % 3
+            monkeypatch.setattr("mapless_server.scenes.background.CLAIM_S", 60.0 if in_time else 0.0)
+
+        monkeypatch.setattr(server.background, "_let_callers_first", sometimes)
+        server.background.match_waiting()
+        assert len(compared) == compared.total() == 10
+
     def test_a_store_that_can_only_be_read_is_left_alone(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
         server = Server(store, BackgroundOptions(poll_s=0.01))
         monkeypatch.setattr(store.database, "only_reads", True)

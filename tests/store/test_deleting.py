@@ -17,7 +17,7 @@ from mapless_server.security import DEFAULT_TENANT, SceneKey
 from mapless_server.store import Store, deletion, postgresql, reader
 from mapless_server.store.backup import back_up, restore
 from mapless_server.store.deletion import PendingDeletions
-from mapless_server.store.sqlite import DATABASE_FILE
+from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
 
 OFFICE, HALL = SceneKey("office"), SceneKey("hall")
 TABLES = ("reference", "image", "features", "global_descriptor", "removed_reference")
@@ -197,6 +197,17 @@ def test_where_that_fails_the_store_opens_and_logs_it(
             assert store.list_scenes(DEFAULT_TENANT, 10) == []
     assert "stays until the next start or deletion of a scene: the store is not there" in caplog.text
     assert row_counts(place)["reference"] == COUNT
+
+
+def test_a_store_that_can_only_be_read_leaves_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    place = Folder(tmp_path)
+    leave_some(place, monkeypatch)
+    monkeypatch.setattr(SqliteDatabase, "open", lambda it: SqliteDatabase._open_read_only(it / DATABASE_FILE))
+    with place.open() as store:
+        assert store._pending_deletions._thread is None
+    assert "interrupted" not in caplog.text
 
 
 @pytest.mark.parametrize(("portion_bytes", "expected"), [(0, range(COUNT, 0, -1)), (40_000, range(COUNT, 0, -2))])

@@ -38,32 +38,9 @@ def median(values: AnyArray, where: AnyArray) -> AnyArray:
     return xp.where(count > 0, middle.mean(), np.nan)
 
 
-def identity(like: AnyArray) -> AnyArray:
-    """The identity (3, 3) with the library, dtype and device of `like`."""
-    xp = namespace(like)
-    return np.eye(3, dtype=like.dtype) if xp is np else xp.eye(3, dtype=like.dtype, device=like.device)
-
-
 def length(vectors: AnyArray) -> AnyArray:
     """Euclidean length (...) of vectors (..., D)."""
     return (vectors**2).sum(-1) ** 0.5
-
-
-def apply(matrices: AnyArray, vectors: AnyArray) -> AnyArray:
-    """Multiplies many small matrices (N, I, J) with one vector (N, J) each: (N, I).
-
-    NumPy's matmul takes three times as long; on a GPU, matmul launches a group of threads for each matrix.
-    """
-    if namespace(matrices) is np:
-        return np.einsum("nij,nj->ni", matrices, vectors)
-    return (matrices * vectors[:, None, :]).sum(-1)
-
-
-def multiply(first: AnyArray, second: AnyArray) -> AnyArray:
-    """Multiplies many small matrices (N, I, J) with one matrix (N, J, K) each: (N, I, K)."""
-    if namespace(first) is np:
-        return first @ second
-    return (first[:, :, :, None] * second[:, None, :, :]).sum(2)
 
 
 def columns(values: AnyArray) -> AnyArray:

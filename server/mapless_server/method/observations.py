@@ -12,12 +12,10 @@ import numpy as np
 
 from .arrays import (
     AnyArray,
-    apply,
     apply_columns,
     columns,
     length,
     median,
-    multiply,
     namespace,
     normalize,
     normalize_jacobian,
@@ -77,7 +75,7 @@ class Observations:
     def linearized(self, x_in_world: AnyArray) -> tuple[AnyArray, AnyArray]:
         """Returns residuals (O, 2) and the derivative (O, 2, 3) of each by its point, per metre."""
         x_in_camera = self.in_camera(x_in_world)
-        return self.camera_residuals(x_in_camera), multiply(self.camera_jacobians(x_in_camera), self.rotation)
+        return self.camera_residuals(x_in_camera), self.camera_jacobians(x_in_camera) @ self.rotation
 
     def camera_residuals(self, x_in_camera: AnyArray) -> AnyArray:
         """Residuals (O, 2) of points (O, 3) in the camera's frame, in standard deviations."""
@@ -103,7 +101,8 @@ class Observations:
 
     def in_camera(self, x_in_world: AnyArray) -> AnyArray:
         """The point (O, 3) of each observation in its camera's frame, from points (P, 3) in the world."""
-        return apply(self.rotation, x_in_world[self.point]) + self.translation
+        # Three times as fast as matmul.
+        return np.einsum("oij,oj->oi", self.rotation, x_in_world[self.point]) + self.translation
 
     def weighted(self, noise: KeypointNoise) -> Observations:
         """Returns the same observations with another noise."""
