@@ -15,11 +15,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
 
 from mapless.geometry import Camera
 from mapless_server.method.features import make_extractor
 from mapless_server.networks.weights import find_weights
-from mapless_server.scenes.retrieval.vlad import LEARNED, REDUCED, SEED, WORDS, Floats, Vocabulary, nearest_words
+from mapless_server.scenes.retrieval.vlad import LEARNED, REDUCED, SEED, WORDS, Floats, Vocabulary
 
 from .rendered_room.furniture import lit_room
 from .rendered_room.photographs import photograph, scatter
@@ -68,7 +69,7 @@ def of_kind(kind: str, photographs: Sequence[View], weights_dir: Path) -> Vocabu
     return learned(descriptors[np.sort(drawn)])
 
 
-def learned(descriptors: Floats, iterations: int = 25) -> Vocabulary:
+def learned(descriptors: Floats) -> Vocabulary:
     """A vocabulary from descriptors (N, d), N at least WORDS: principal directions, and k-means.
 
     Its numbers are rounded to float16, as the file keeps them.
@@ -82,12 +83,7 @@ def learned(descriptors: Floats, iterations: int = 25) -> Vocabulary:
     mean, projection = _rounded(mean), _rounded(directions)
     points: Floats = ((descriptors - mean) @ projection).astype(np.float32)
     words: Floats = points[random.choice(len(points), WORDS, replace=False)]
-    for _ in range(iterations):
-        nearest = nearest_words(points, words)
-        members = nearest[:, None] == np.arange(WORDS)
-        # A word that is nearest to no point stays where it is.
-        sums, counts = members.T.astype(np.float32) @ points, members.sum(axis=0)[:, None]
-        words = np.where(counts > 0, sums / np.maximum(counts, 1), words).astype(np.float32)
+    words, _ = kmeans2(points, words, iter=25, minit="matrix")  # a word that is nearest to no point stays where it is
     return Vocabulary(mean, projection, _rounded(words))
 
 

@@ -28,6 +28,7 @@ from mapless_server.method.results import Support
 from mapless_server.method.views import PosedView, View
 from mapless_tools.dataset import Frame
 from mapless_tools.evaluate.metrics import pose_error
+from mapless_tools.evaluate.plan import evenly_spread
 from mapless_tools.evaluate.references import choose_references
 from mapless_tools.ingest.formats.cameras import read_folder
 
@@ -176,8 +177,8 @@ def right_pairs(
     indices = sorted(place.views)
     references, queries = indices, indices
     if reference_count is not None:
-        references = spread(indices, reference_count)
-        queries = spread([i for i in indices[1:-1] if i not in references], QUERIES)
+        references = evenly_spread(indices, reference_count)
+        queries = evenly_spread([i for i in indices[1:-1] if i not in references], QUERIES)
     title = place.name if reference_count is None else f"{place.name}, {reference_count}"
     available = len(references) - (1 if reference_count is None else 0)
     wanted = dict.fromkeys(min(k, available) for k in ks)
@@ -201,10 +202,10 @@ def natural_pairs(place: Place, features: str = "sift") -> Iterator[Pair]:
 def cross_pairs(places: Sequence[Place], queries_each: int, k: int = 10, features: str = "sift") -> Iterator[Pair]:
     """Queries of each scene, evenly spread, with references of every other."""
     for place in places:
-        queries = spread(sorted(place.views), queries_each)
+        queries = evenly_spread(sorted(place.views), queries_each)
         for other in places:
             if other is not place:
-                references = spread(sorted(other.views), CROSS_REFERENCES)
+                references = evenly_spread(sorted(other.views), CROSS_REFERENCES)
                 for query in queries:
                     view = place.views[query]
                     chosen = other.posed(other.most_matching(view, references, k, features))
@@ -229,11 +230,6 @@ def answered(
             yield Measured(pair, answer, _error(pair, answer))
     finally:
         pipeline.matcher.close()
-
-
-def spread(items: Sequence[int], count: int) -> list[int]:
-    """At most `count` of the items, evenly spread, the first and the last included."""
-    return [items[i] for i in dict.fromkeys(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int))]
 
 
 def weights_alike(scenes: Sequence[str]) -> Array:

@@ -27,8 +27,9 @@ from mapless_server.scenes.calibration.calibrator import left_out
 from mapless_server.scenes.calibration.fit import FitOptions, LeftOut, fit
 from mapless_server.services.messages.answers import Factors, scaled_accuracy
 from mapless_server.store import SelfCalibration
+from mapless_tools.evaluate.plan import evenly_spread
 
-from .places import KITCHEN, QUERIES, Pair, Place, answered, read_places, samples_of_command, spread
+from .places import KITCHEN, QUERIES, Pair, Place, answered, read_places, samples_of_command
 
 SETTINGS: dict[str, tuple[int | None, ...]] = {
     KITCHEN: (30, 10, 5),
@@ -76,7 +77,7 @@ def collect(data: Path, features: str, extractor: FeatureExtractor) -> Iterator[
         indices = sorted(place.views)
         for setting, references, queries in (it for count in counts for it in _settings(indices, count)):
             scene = f"{name}:{setting}"
-            for is_reference, asked in ((True, spread(references, SAMPLE)), (False, queries)):
+            for is_reference, asked in ((True, evenly_spread(references, SAMPLE)), (False, queries)):
                 pairs = [_pair(place, scene, i, references, features) for i in asked]
                 for i, it in zip(asked, answered(pairs, LocalizeOptions(coverage=1.0), features), strict=True):
                     yield Sample(scene, features, is_reference, it.right, left_out(place.posed([i])[0], it.answer))
@@ -87,8 +88,8 @@ def _settings(indices: Sequence[int], count: int | None) -> Iterator[tuple[str, 
     if count is None:
         yield from ((f"without {query}", [i for i in indices if i != query], [query]) for query in indices)
     else:
-        references = spread(indices, count)
-        yield str(count), references, spread([i for i in indices[1:-1] if i not in references], QUERIES)
+        references = evenly_spread(indices, count)
+        yield str(count), references, evenly_spread([i for i in indices[1:-1] if i not in references], QUERIES)
 
 
 def _pair(place: Place, title: str, index: int, references: Sequence[int], features: str) -> Pair:
