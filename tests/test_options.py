@@ -7,8 +7,7 @@ import pytest
 
 NAN = float("nan")
 OUTSIDE: dict[str, list[tuple[str, Any]]] = {
-    "engine.options.EscalationOptions": [("doubtful_trust", -1.0), ("doubtful_radius_m", -1.0), ("clearly_more", 0.5)]
-    + [("time_share", 0.0), ("time_share", 1.5), ("same_position_m", NAN), ("same_rotation_deg", -1.0)],
+    "engine.options.EscalationOptions": [("doubtful_trust", -1.0), ("doubtful_radius_m", NAN)],
     "method.pose_problem.AdjustOptions": [("max_error_px", 0.0), ("iterations", 0), ("loss_scale_sigma", -1.0)],
     "method.coarse.geometric.GeometricOptions": [("min_baseline_m", 0.0)],
     "method.coarse.grids.GridOptions": [("pixel_limit", 10), ("aspects", ()), ("max_stretch", 0.9)]
@@ -46,8 +45,7 @@ OUTSIDE: dict[str, list[tuple[str, Any]]] = {
     + [("max_matches", 0), ("position_factor", 0.0)],
     "scenes.retrieval.ranking.RankOptions": [("apart_m", -1.0), ("apart_deg", 181.0), ("nearby_weight", 1.5)]
     + [("nearby_weight", NAN), ("same_place_m", -1.0), ("per_place", 0), ("pool", 0), ("smallest_pool", 0)],
-    "scheduling.admission.WorkQueueOptions": [("max_queued_s", 0.0), ("max_bytes", -1), ("flow_share", 1.1)]
-    + [("time_margin", 0.9), ("first_stage_interval", 1)],
+    "scheduling.admission.WorkQueueOptions": [("max_queued_s", 0.0), ("max_bytes", -1)],
 }
 
 

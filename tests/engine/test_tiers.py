@@ -15,6 +15,8 @@ from mapless_server.engine.failures import failure_of
 from mapless_server.engine.options import EscalationOptions
 from mapless_server.engine.query import Result, Tier
 from mapless_server.engine.tiers import (
+    SAME_POSITION_M,
+    SAME_SHARE,
     UNRECOVERABLE,
     better_of,
     is_doubtful,
@@ -91,7 +93,7 @@ def rejected(reason: RejectionReason = RejectionReason.TOO_FEW_MATCHES) -> Answe
 
 
 def better(cheap: Answer, strong: Answer) -> Result:
-    return better_of(Result(cheap, CHEAP, (), 1, CAMERA), Result(strong, STRONG, (), 1, CAMERA), OPTIONS)
+    return better_of(Result(cheap, CHEAP, (), 1, CAMERA), Result(strong, STRONG, (), 1, CAMERA))
 
 
 class TestDoubt:
@@ -157,7 +159,7 @@ class TestBetter:
         self, reason: RejectionReason, inliers: int, is_answered: bool
     ) -> None:
         for share, expected in ((0.9, True), (1.1, is_answered)):
-            x_m = share * OPTIONS.same_share * DISTANCE_M
+            x_m = share * SAME_SHARE * DISTANCE_M
             first = found(rejected(reason), 0.0, 30)
             second = found(localized(x_m, inliers=inliers), x_m, inliers)
             chosen = better(first, second)
@@ -187,8 +189,8 @@ class TestBetter:
     def test_poses_agree_within_the_sum_of_95_radii_or_the_distance(self, apart_m: float, sigma_m: float) -> None:
         chosen = better(localized(0.0, sigma_m, inliers=40), localized(apart_m, 0.01, inliers=40))
         reach_m = sum(accuracy_from_covariance(np.eye(6) * it**2).position_95_m for it in (sigma_m, 0.01))
-        if abs(apart_m - max(reach_m, OPTIONS.same_position_m)) > 1e-9:
-            agree = apart_m < max(reach_m, OPTIONS.same_position_m)
+        if abs(apart_m - max(reach_m, SAME_POSITION_M)) > 1e-9:
+            agree = apart_m < max(reach_m, SAME_POSITION_M)
             assert isinstance(chosen.answer.outcome, Localization if agree else Rejection)
 
 
@@ -212,14 +214,14 @@ class TestTwoPlaces:
     )
     def test_prior_decides_unless_more_is_seen_elsewhere(self, there: Answer, elsewhere: Answer, chosen: str) -> None:
         results = {"there": Result(there, CHEAP, (), 1, CAMERA), "elsewhere": Result(elsewhere, CHEAP, (), 1, CAMERA)}
-        assert of_two_places(results["there"], results["elsewhere"], OPTIONS) is results[chosen]
+        assert of_two_places(results["there"], results["elsewhere"]) is results[chosen]
 
     @pytest.mark.parametrize(("x_m", "turn_deg"), [(30.0, 0.0), (0.0, 180.0)])
     def test_two_poses_are_ambiguous_if_more_is_seen_elsewhere(self, x_m: float, turn_deg: float) -> None:
         there = found(localized(), 0.0, 100)
         elsewhere = found(localized(x_m, inliers=150, turn_deg=turn_deg), x_m, 150)
         results = [Result(it, CHEAP, (), 1, CAMERA) for it in (there, elsewhere)]
-        outcome = of_two_places(results[0], results[1], OPTIONS).answer.outcome
+        outcome = of_two_places(results[0], results[1]).answer.outcome
         assert isinstance(outcome, Rejection)
         assert outcome.reason is RejectionReason.AMBIGUOUS
         assert [it.inlier_count for it in outcome.hypotheses] == [150, 100]
@@ -229,7 +231,7 @@ class TestTwoPlaces:
         here, there = (RigidTransform(np.eye(3), np.array([x_m, 0.0, 0.0])) for x_m in (0.0, 6.0))
         hypotheses = Hypothesis(there, 150, ("there",)), Hypothesis(here, inliers, ("here",))
         outcome = Rejection(RejectionReason.AMBIGUOUS, "planted", hypotheses=hypotheses)
-        place = place_of_priors(outcome, Priors(position=PositionPrior(np.zeros(3), 0.05**2 * np.eye(3))), OPTIONS)
+        place = place_of_priors(outcome, Priors(position=PositionPrior(np.zeros(3), 0.05**2 * np.eye(3))))
         if decides:
             assert place is hypotheses[1]
         else:

@@ -17,7 +17,8 @@ from mapless_server.errors import DataLoss, NotFound, Unavailable
 from mapless_server.method.correspond import Correspondences, Matcher
 from mapless_server.method.results import MetricScale, ScaleStage
 from mapless_server.method.views import KeptDepth, PosedView, ReconstructedView, Reconstruction
-from mapless_server.scenes.depth.check import DepthCheckOptions, checked_depths
+from mapless_server.scenes.depth import check
+from mapless_server.scenes.depth.check import MIN_SIGMA, checked_depths
 from mapless_server.scenes.depth.scene_depths import SceneDepths
 from mapless_server.scenes.library import Closed, ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
@@ -257,16 +258,18 @@ def predicted(index: int, depth: Array) -> ReconstructedView:
 def checked(
     change: Change = lambda _, depth: depth,
     found: RigidTransform = WALL.world_from_query,
-    options: DepthCheckOptions | None = None,
     unit: float = 2.0,
+    **limits: float,
 ) -> list[KeptDepth | None]:
-    """What is kept of the true depths, changed, in a unit of its own."""
+    """What is kept of the true depths, changed, in a unit of its own, with other limits."""
     views = tuple(predicted(i, change(i, wall_depth(i)) / unit) for i in range(len(WALL.references)))
     nothing = ReconstructedView(views[0].camera, views[0].point_map, views[0].confidence, IDENTITY)
     scale = MetricScale(unit, ScaleStage.TRIANGULATION, 0.0, 0, Similarity(unit, np.eye(3), np.zeros(3)), found)
     reconstruction = Reconstruction(nothing, views)
-    given = WALL.references, WALL.world_from_query, correspondences(), options or DepthCheckOptions()
-    return checked_depths(reconstruction, scale, *given)
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in limits.items():
+            patch.setattr(check, name, value)
+        return checked_depths(reconstruction, scale, WALL.references, WALL.world_from_query, correspondences())
 
 
 def off(kept: KeptDepth | None, index: int) -> Array:
@@ -285,7 +288,7 @@ def test_right_depths_are_kept_in_metres() -> None:
         assert kept is not None
         assert np.isfinite(kept.depth).mean() > 0.95
         assert np.abs(off(kept, index)).max() < 0.01
-        assert kept.relative_sigma == DepthCheckOptions().min_sigma
+        assert kept.relative_sigma == MIN_SIGMA
 
 
 @pytest.mark.parametrize("factor", [0.85, 1.15])
@@ -297,8 +300,7 @@ def test_a_references_scale_follows_its_triangulated_points(factor: float) -> No
 @pytest.mark.parametrize("sigma", [0.02, 0.05])
 def test_the_standard_deviation_is_that_of_the_errors(sigma: float) -> None:
     random = np.random.default_rng(0)
-    options = DepthCheckOptions(max_step=2.0)
-    kept = checked(lambda _, depth: depth * np.exp(random.normal(0, sigma, depth.shape)), options=options)
+    kept = checked(lambda _, depth: depth * np.exp(random.normal(0, sigma, depth.shape)), MAX_STEP=2.0)
     for it in kept:
         assert it is not None
         assert it.relative_sigma == pytest.approx(sigma, rel=0.25)
@@ -317,7 +319,7 @@ def test_the_standard_deviation_is_that_of_the_errors(sigma: float) -> None:
     ids=["another scale", "noise", "nothing", "behind", "zero", "another shape"],
 )
 def test_a_reference_with_wrong_depths_is_dropped_alone(change: Callable[[Array], Array]) -> None:
-    kept = checked(only(2, change), options=DepthCheckOptions(max_step=3.0))
+    kept = checked(only(2, change), MAX_STEP=3.0)
     assert kept[2] is None
     assert all(kept[i] is not None for i in (0, 1, 3))
 
@@ -344,7 +346,7 @@ def test_edges_of_depth_are_dropped() -> None:
         depth[:, 48:] *= 1.4
         return depth
 
-    kept = checked(only(3, stepped), options=DepthCheckOptions(max_sigma=0.5, max_scale=2.0, max_wrong=1.0))[3]
+    kept = checked(only(3, stepped), MAX_SIGMA=0.5, MAX_SCALE=2.0, MAX_WRONG=1.0)[3]
     assert kept is not None
     assert np.isnan(kept.depth[:, 47:49]).all()
 
@@ -371,5 +373,5 @@ def test_without_confidence_nothing_is_kept() -> None:
     scale = MetricScale(
         1.0, ScaleStage.TRIANGULATION, 0.0, 0, Similarity(1.0, np.eye(3), np.zeros(3)), WALL.world_from_query
     )
-    given = WALL.references, WALL.world_from_query, correspondences(), DepthCheckOptions()
+    given = WALL.references, WALL.world_from_query, correspondences()
     assert checked_depths(Reconstruction(views[0], doubted), scale, *given) == [None] * 4

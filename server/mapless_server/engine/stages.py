@@ -39,6 +39,14 @@ log = logging.getLogger(__name__)
 MAX_LISTINGS = 3
 """When a reference is deleted while it is used, the scene is listed again; more often than this it is being emptied."""
 
+TIME_SHARE = 0.8
+"""Of the remaining time, that a stronger tier may take. After that the first answer is returned, since a doubtful
+answer is better than none; the rest of the time suffices to send it."""
+
+REMATCH_SHARE = 0.7
+"""Of a tier's time, after which it stops matching the photograph again by a slow network (see `Matcher.rematch`); the
+rest is for the pose, which takes a second if matches are few."""
+
 ANSWER_MARGIN_S = 0.05
 """Before the deadline, for an answer that exists to reach its caller."""
 
@@ -168,7 +176,7 @@ class QueryStages:
         if not run.unmatched:
             return False
         until_s = run.give_up_s if run.best is not None else run.deadline_s
-        until_s = run.start_s + self._escalation.rematch_share * (until_s - run.start_s)
+        until_s = run.start_s + REMATCH_SHARE * (until_s - run.start_s)
         return time.monotonic() + (tier.pipeline.matcher.pair_s or 0.0) <= until_s
 
     def _tracked(self, run: QueryRun, tier: Tier) -> StageResult | None:
@@ -262,7 +270,7 @@ class QueryStages:
         """Ends a search: returns the better of two answers, or searches elsewhere or in a stronger tier for another."""
         place = None
         if isinstance(answer.outcome, Rejection):
-            place = place_of_priors(answer.outcome, run.query.priors, self._escalation)
+            place = place_of_priors(answer.outcome, run.query.priors)
             if isinstance(place, Hint):
                 answer = replace(answer, outcome=replace(answer.outcome, hint=place))
         result, query = self._result(run, answer), run.query
@@ -270,7 +278,7 @@ class QueryStages:
             return self._at_place(run, place, result)
         if run.narrowed is not None:
             assert run.best is not None
-            better = of_two_places(run.best, result, self._escalation)
+            better = of_two_places(run.best, result)
             if better not in (run.best, result):  # two places: stronger features would search only one of them
                 return Done(replace(better, stage_seconds=result.stage_seconds), _ending(better))
             # Stronger features search the whole scene after two rejections, unless the priors' references showed more.
@@ -278,7 +286,7 @@ class QueryStages:
             query = run.narrowed if better is run.best and is_near else query
             result = replace(better, stage_seconds=result.stage_seconds)
         elif run.best is not None:
-            result = replace(better_of(run.best, result, self._escalation), stage_seconds=result.stage_seconds)
+            result = replace(better_of(run.best, result), stage_seconds=result.stage_seconds)
         elif self._searches_elsewhere(run, answer):
             return self._again(run, replace(query, narrowing=query.narrowing.limits), run.tier, result)
         if run.tier + 1 < len(self._tiers) and is_doubtful(result.answer, self._doubt_in(run)):
@@ -296,7 +304,7 @@ class QueryStages:
 
     def _give_up_s(self, run: QueryRun) -> float:
         now_s = time.monotonic()
-        return now_s + self._escalation.time_share * (run.deadline_s - now_s)
+        return now_s + TIME_SHARE * (run.deadline_s - now_s)
 
     def _again(self, run: QueryRun, query: Query, tier: int, best: Result) -> StageResult:
         """Starts another search; if it finds nothing better in time, the best result so far is returned."""

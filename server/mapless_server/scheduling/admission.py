@@ -26,12 +26,6 @@ class WorkQueueOptions:
             caller's only job (see `Admission.check_queue`). The result of a job admitted beyond it would be late, and a
             longer queue has no higher throughput.
         max_bytes: largest memory of admitted jobs, and of calls that consist of several jobs, together.
-        flow_share: share, 0 to 1, that one caller may use of what other callers leave of either bound, so that there is
-            always room for the next caller.
-        time_margin: a job is admitted if at least this many times its predicted time remains until its deadline; 1 or
-            more. Predictions are averages, and a result that comes too late is wasted for everyone.
-        first_stage_interval: one of this many batches of a lane is of the first stage, if several stages wait; 2 or
-            more.
         quantum_s: computing time credited to a caller in each round of the fair queue; about what one job of a stage
             takes.
         stall_limit_s: a batch without any progress (its end, or a job's `check`) for longer is considered hung: its
@@ -41,23 +35,21 @@ class WorkQueueOptions:
 
     max_queued_s: float = 2.0
     max_bytes: int = 256 * 2**20
-    flow_share: float = 0.75
-    time_margin: float = 1.2
-    first_stage_interval: int = 4
     quantum_s: float = 0.2
     stall_limit_s: float = 120.0
     heartbeat_s: float = 1.0
 
     def __post_init__(self) -> None:
-        least = {"time_margin": 1, "first_stage_interval": 2}
         for name, value in vars(self).items():
-            if not (value > 0 and value >= least.get(name, 0)):
-                bound = f"at least {least[name]}" if name in least else "above 0"
-                raise ValueError(f"WorkQueueOptions.{name} must be {bound}, is {value}")
-        if self.flow_share > 1:
-            raise ValueError(f"WorkQueueOptions.flow_share must be at most 1, is {self.flow_share}")
+            if not value > 0:
+                raise ValueError(f"WorkQueueOptions.{name} must be above 0, is {value}")
 
 
+FLOW_SHARE = 0.75
+"""That one caller may use of what other callers leave of either bound, so that there is always room for the next."""
+TIME_MARGIN = 1.2
+"""A job is admitted if at least so many times its predicted time remains until its deadline. Predictions are averages,
+and a result that comes too late is wasted for everyone."""
 FIRST_GUESS_S = 0.25
 """Predicted before anything is observed."""
 _EXPECTED = ", if reached"
@@ -234,7 +226,7 @@ class Admission:
 
     def check(self, job: Job, cost_s: Counter[str], now_s: float) -> None:
         """Raises Refused if a job with this predicted computing time, by lane, cannot be admitted."""
-        options, ledger = self._options, self._ledger
+        ledger = self._ledger
         self._check_size(job.size_bytes)
         if now_s >= job.deadline_s:
             raise Refused(Refusal.DEADLINE_INFEASIBLE, "the deadline has passed")
@@ -246,7 +238,7 @@ class Admission:
             return
         own_s = cost_s.total()
         waits_s = (ledger.ahead_s(job.flow, lane, it) / self._threads[lane] for lane, it in cost_s.items())
-        late_s = now_s + options.time_margin * (max(waits_s) + own_s) - job.deadline_s
+        late_s = now_s + TIME_MARGIN * (max(waits_s) + own_s) - job.deadline_s
         if late_s > 0:
             retry_s = None if now_s + own_s > job.deadline_s else max(MIN_RETRY_S, late_s)
             message = f"the answer would come after the deadline, by about {late_s:.1g} s"
@@ -312,7 +304,7 @@ class Admission:
 
     def _share(self, bound: float, held: float, held_by_flow: float) -> float:
         """The part of a bound that one caller may have, given what it and all callers have."""
-        return self._options.flow_share * (bound - (held - held_by_flow))
+        return FLOW_SHARE * (bound - (held - held_by_flow))
 
 
 MAX_DEBTORS = 100

@@ -35,6 +35,9 @@ from .jobs import (
     Step,
 )
 
+FIRST_STAGE_INTERVAL = 4
+"""One of so many batches of a lane is of the first stage, if several stages wait."""
+
 _TRY_ONE_IN = 8
 
 _ENDED_TIMERS = 16
@@ -189,7 +192,7 @@ class Scheduler:
         if not waiting:
             return None
         # Late stages first: jobs that have begun hold memory, and time has been spent on them.
-        is_first_due = lane.passed_over >= self._options.first_stage_interval - 1
+        is_first_due = lane.passed_over >= FIRST_STAGE_INTERVAL - 1
         stage = waiting[0] if is_first_due else waiting[-1]
         lane.passed_over = 0 if stage is waiting[0] else lane.passed_over + 1
         lane.free -= 1

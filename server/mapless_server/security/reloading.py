@@ -67,10 +67,10 @@ class Reloading(Generic[T]):
         return tuple((it.st_ino, it.st_size, it.st_mtime_ns, it.st_ctime_ns) for it in found)
 
 
-async def keep_fresh(refreshes: Sequence[Callable[[], bool]], interval_s: float = CHECK_INTERVAL_S) -> None:
+async def keep_fresh(refreshes: Sequence[Callable[[], bool]]) -> None:
     """Calls each `refresh` in a thread, until it is cancelled, so that the event loop never waits for the disk."""
     while True:
-        await asyncio.sleep(interval_s)
+        await asyncio.sleep(CHECK_INTERVAL_S)
         for refresh in refreshes:
             await asyncio.to_thread(refresh)
 

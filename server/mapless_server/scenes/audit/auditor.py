@@ -45,6 +45,7 @@ _SWAP_REACH = 4.0
 """A reference within this many tolerances of where a photograph was taken may be its partner in a swap; many, because
 that pose was fitted to neighbours of the wrong place."""
 _CACHED_COMPARISONS = 10
+_CACHED_FINDINGS = 3000
 
 
 @dataclass(frozen=True)
@@ -83,19 +84,13 @@ class Auditor:
     last few comparisons are cached whole, about 2 MiB each with their references; the finder caches more references.
     """
 
-    def __init__(
-        self,
-        finder: ReferenceFinder,
-        pairs: PairMatches,
-        check: Callable[[], None] = lambda: None,
-        cached_findings: int = 3000,
-    ) -> None:
+    def __init__(self, finder: ReferenceFinder, pairs: PairMatches, check: Callable[[], None] = lambda: None) -> None:
         """Makes the auditor of a scene; `check` is called before each comparison, and may raise.
 
-        The pairs cache matches between calls; `cached_findings` is the number of findings that are kept.
+        The pairs cache matches between calls.
         """
         self._finder, self._pairs, self._check = finder, pairs, check
-        self._findings: LruCache[_Finding] = LruCache(cached_findings)
+        self._findings: LruCache[_Finding] = LruCache(_CACHED_FINDINGS)
         self._comparisons: LruCache[tuple[Comparison, _Twin]] = LruCache(_CACHED_COMPARISONS)
 
     def audit(self, name: str) -> ReferenceAudit:

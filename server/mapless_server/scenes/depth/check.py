@@ -14,7 +14,6 @@ pixels are wrong. Pixels at edges of depth are dropped, because a keypoint there
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -22,50 +21,31 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
 from mapless_server.method.correspond import Correspondences
-from mapless_server.method.options import check_bounds
 from mapless_server.method.results import MetricScale, Structure
 from mapless_server.method.structure import StructureOptions, triangulated_structure
 from mapless_server.method.views import KeptDepth, PosedView, ReconstructedView, Reconstruction, map_cells
 
-
-@dataclass(frozen=True)
-class DepthCheckOptions:
-    """Options of the check.
-
-    Attributes:
-        max_off, max_off_deg: largest error of the predicted pose that was not given: of its position as a share of the
-            median depth, and of its rotation. Networks are better by far where they understand a place.
-        min_parallax_deg: least parallax of triangulated points: at 2 degrees a keypoint's error of half a pixel, at a
-            focal length of 500 px, is 3 % of the depth.
-        min_points: least number of triangulated points of a reference.
-        max_scale: largest factor between a reference's scale and that of all together.
-        max_sigma: largest relative standard deviation of depths; less accurate ones are no better than matches.
-        min_sigma: least assumed standard deviation.
-        agreeing_sigma: depths of two references that differ by less, in their standard deviations, are of one surface.
-        max_wrong: largest share of wrong pixels, of those that another reference sees.
-        max_step: largest factor between the depths of neighbouring pixels that are of one surface.
-        min_confidence: least confidence of the network for which a depth is kept.
-    """
-
-    max_off: float = 0.1
-    max_off_deg: float = 5.0
-    min_parallax_deg: float = 2.0
-    min_points: int = 20
-    max_scale: float = 1.25
-    max_sigma: float = 0.1
-    min_sigma: float = 0.01
-    agreeing_sigma: float = 3.0
-    max_wrong: float = 0.3
-    max_step: float = 1.1
-    min_confidence: float = 0.1
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "max_off max_off_deg min_parallax_deg agreeing_sigma", above=0)
-        check_bounds(self, "min_points", at_least=3)
-        check_bounds(self, "max_scale max_step", above=1)
-        check_bounds(self, "max_sigma", at_least=self.min_sigma)
-        check_bounds(self, "min_sigma max_wrong", above=0, at_most=1)
-        check_bounds(self, "min_confidence", at_least=0, at_most=1)
+MAX_OFF, MAX_OFF_DEG = 0.1, 5.0
+"""Largest error of the predicted pose that was not given: of its position as a share of the median depth, and of its
+rotation. Networks are better by far where they understand a place."""
+MIN_PARALLAX_DEG = 2.0
+"""Of triangulated points: at 2 degrees a keypoint's error of half a pixel, at a focal length of 500 px, is 3 % of the
+depth."""
+MIN_POINTS = 20
+"""Triangulated points of a reference."""
+MAX_SCALE = 1.25
+"""Largest factor between a reference's scale and that of all together."""
+MIN_SIGMA, MAX_SIGMA = 0.01, 0.1
+"""Relative standard deviation of depths: the least that is assumed, and the largest; less accurate ones are no better
+than matches."""
+AGREEING_SIGMA = 3.0
+"""Depths of two references that differ by less, in their standard deviations, are of one surface."""
+MAX_WRONG = 0.3
+"""Largest share of wrong pixels, of those that another reference sees."""
+MAX_STEP = 1.1
+"""Largest factor between the depths of neighbouring pixels that are of one surface."""
+MIN_CONFIDENCE = 0.1
+"""Of the network, for which a depth is kept."""
 
 
 def checked_depths(
@@ -74,29 +54,27 @@ def checked_depths(
     references: Sequence[PosedView],
     world_from_query: RigidTransform,
     correspondences: Correspondences,
-    options: DepthCheckOptions,
 ) -> list[KeptDepth | None]:
     """Returns the part of each reference's predicted depths that is kept; None if nothing is.
 
     The reconstruction is of the references and of the photograph whose pose, `world_from_query`, was not given; the
     correspondences are those of the references with one another.
     """
-    structure = triangulated_structure(
-        references, correspondences, StructureOptions(min_parallax_deg=options.min_parallax_deg)
-    )
+    options = StructureOptions(min_parallax_deg=MIN_PARALLAX_DEG)
+    structure = triangulated_structure(references, correspondences, options)
     off = scale.world_from_query.translation - world_from_query.translation
     off_deg = rotation_angle_deg(scale.world_from_query.rotation.T @ world_from_query.rotation)
     depths = [
-        _scaled(view, scale.metres_per_unit, reference, _seen(structure, index), structure, options)
+        _scaled(view, scale.metres_per_unit, reference, _seen(structure, index), structure)
         for index, (view, reference) in enumerate(zip(reconstruction.references, references, strict=True))
     ]
     known = [float(np.nanmedian(it.depth)) for it in depths if it is not None]
     if not known:
         return [None] * len(references)
-    is_found = np.linalg.norm(off) <= options.max_off * np.median(known) and off_deg <= options.max_off_deg
+    is_found = np.linalg.norm(off) <= MAX_OFF * np.median(known) and off_deg <= MAX_OFF_DEG
     if not is_found:  # also if it is NaN
         return [None] * len(references)
-    return [_confirmed(index, depths, references, options) for index in range(len(references))]
+    return [_confirmed(index, depths, references) for index in range(len(references))]
 
 
 def _seen(structure: Structure, index: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -111,39 +89,36 @@ def _scaled(
     reference: PosedView,
     seen: tuple[NDArray[np.intp], NDArray[np.intp]],
     structure: Structure,
-    options: DepthCheckOptions,
 ) -> KeptDepth | None:
     """A reference's depth at the scale of its triangulated points; None if it disagrees with them."""
     point, keypoint = seen
     predicted = metres_per_unit * view.point_map[..., 2].astype(np.float64)
-    usable = np.isfinite(predicted) & (predicted > 0) & (view.confidence >= options.min_confidence)
+    usable = np.isfinite(predicted) & (predicted > 0) & (view.confidence >= MIN_CONFIDENCE)
     depth = np.where(usable, predicted, np.nan)
-    depth[~_is_smooth(depth, options.max_step)] = np.nan
+    depth[~_is_smooth(depth)] = np.nan
     at_points = KeptDepth(view.camera, depth.astype(np.float32), 1.0).at_keypoints(reference.view).depth[keypoint]
     triangulated = reference.world_from_camera.inverse().apply(structure.x_in_world[point])[:, 2]
     ratio = np.log(triangulated / at_points)
     ratio = ratio[np.isfinite(ratio)]
-    if len(ratio) < options.min_points:
+    if len(ratio) < MIN_POINTS:
         return None
     middle = float(np.median(ratio))
-    sigma = max(options.min_sigma, 1.4826 * float(np.median(np.abs(ratio - middle))))
-    if abs(middle) > np.log(options.max_scale) or sigma > options.max_sigma:
+    sigma = max(MIN_SIGMA, 1.4826 * float(np.median(np.abs(ratio - middle))))
+    if abs(middle) > np.log(MAX_SCALE) or sigma > MAX_SIGMA:
         return None
     return KeptDepth(view.camera, (depth * np.exp(middle)).astype(np.float32), sigma)
 
 
-def _is_smooth(depth: Array, max_step: float) -> NDArray[np.bool_]:
+def _is_smooth(depth: Array) -> NDArray[np.bool_]:
     """Mask (H, W) of the pixels that are of one surface with their neighbours."""
     known = np.isfinite(depth)
     around = np.ones((3, 3), np.uint8)
     nearest = cv2.erode(np.where(known, depth, np.inf), around)
     farthest = cv2.dilate(np.where(known, depth, 0.0), around)
-    return np.asarray(known & (farthest / max_step**2 <= nearest))
+    return np.asarray(known & (farthest / MAX_STEP**2 <= nearest))
 
 
-def _confirmed(
-    index: int, depths: Sequence[KeptDepth | None], references: Sequence[PosedView], options: DepthCheckOptions
-) -> KeptDepth | None:
+def _confirmed(index: int, depths: Sequence[KeptDepth | None], references: Sequence[PosedView]) -> KeptDepth | None:
     """Removes pixels in front of what others see there from a reference's depth; None if these are too many."""
     kept = depths[index]
     if kept is None:
@@ -162,12 +137,12 @@ def _confirmed(
         row, column, inside = map_cells(other.camera, pixels, other.camera)
         there = np.where(inside, other.depth[row, column], np.nan)
         off = np.log(np.where(inside, x_in_camera[:, 2], np.nan) / there)
-        limit = options.agreeing_sigma * np.hypot(kept.relative_sigma, other.relative_sigma)
+        limit = AGREEING_SIGMA * np.hypot(kept.relative_sigma, other.relative_sigma)
         votes += (np.abs(off) <= limit).astype(int) - (off < -limit)
         is_seen |= np.abs(off) <= limit
         is_seen |= off < -limit
     is_wrong = votes < 0
-    if not is_seen.any() or is_wrong.sum() > options.max_wrong * is_seen.sum():
+    if not is_seen.any() or is_wrong.sum() > MAX_WRONG * is_seen.sum():
         return None
     depth = kept.depth.copy()
     depth[rows[is_wrong], columns[is_wrong]] = np.nan

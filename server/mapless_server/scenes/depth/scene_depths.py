@@ -24,12 +24,11 @@ from ..library import Closed, ReferenceLibrary
 from ..observer import BackgroundObserver
 from ..retrieval.ranking import rank_beside, spread_choice
 from ..stored import DepthFinder
-from .check import DepthCheckOptions, checked_depths
+from .check import MIN_POINTS, checked_depths
 
 NEIGHBOURS, SHORTLIST = 7, 14
 """References that the network gets besides the wanted one, and those that are matched with it, of which the best are
 used. As many as in a query of ten references need half of its memory."""
-_CHECK = DepthCheckOptions()
 
 
 class DepthMaker:
@@ -81,7 +80,7 @@ class DepthMaker:
         if isinstance(scale, Rejection):
             return nothing
         true_pose = query.world_from_camera.shifted(-origin)
-        depths = checked_depths(reconstruction, scale, given, true_pose, correspondences, _CHECK)
+        depths = checked_depths(reconstruction, scale, given, true_pose, correspondences)
         return dict(zip(nothing, depths, strict=True))
 
     def _neighbours(
@@ -100,7 +99,7 @@ class DepthMaker:
         others = self._indexes.load_existing(library, scene_key, wanted, self._extractor, context)
         matches = [self._matcher.match_references(subject, other) for other in others]
         context.check()
-        sharing = [i for i, found in enumerate(matches) if len(found) >= _CHECK.min_points]
+        sharing = [i for i, found in enumerate(matches) if len(found) >= MIN_POINTS]
         centres = [others[i].world_from_camera.translation for i in sharing]
         return [others[sharing[i]] for i in spread_choice([len(matches[i]) for i in sharing], centres, NEIGHBOURS)]
 
