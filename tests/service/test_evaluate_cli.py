@@ -65,10 +65,12 @@ def test_wrong_folders_are_one_line(folder: Path, tmp_path: Path) -> None:
     content = json.loads((folder / "cameras.json").read_text())
     (tmp_path / "cameras.json").write_text(json.dumps(content))
     assert "there is no file" in refusal("evaluate", tmp_path)
-    (tmp_path / "images").symlink_to(folder / "images")
+    shutil.copytree(folder / "images", tmp_path / "images")
     content["frames"][4]["width"] = 640
     (tmp_path / "cameras.json").write_text(json.dumps(content))
     assert "4.png has 480x360 pixels" in refusal("evaluate", tmp_path)
+    (tmp_path / "images" / "0.png").write_text("no image")
+    assert "0.png: " in refusal("evaluate", tmp_path)
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds the server through /proc")

@@ -105,6 +105,8 @@ def test_single_frames_are_refused_by_name_and_the_rest_is_in(
     (folder / "images" / "p03.png").unlink()
     cut = folder / "images" / "p04.png"
     cut.write_bytes(cut.read_bytes()[:300])
+    dry = run_import(server, folder, scene, "--skip-check", "--dry-run")
+    assert (dry.exit_code, "96x64 pixels, its camera 640x64" in dry.stdout) == (1, True)
     done = run_import(server, folder, scene, "--skip-check")
     assert done.exit_code == 1
     assert "8 added" in done.stdout

@@ -295,6 +295,20 @@ def test_a_blob_that_was_cut_is_written_anew(tmp_path: Path, content: bytes) -> 
     folder.close()
 
 
+def test_a_file_unreadable_at_start_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_one(tmp_path / "c")
+
+    def refused(path: Path) -> bytes:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    read = Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda it: refused(it) if it.suffix == ".call" else read(it))
+    with pytest.raises(CaptureError, match=r"cannot be used: .*\.call: Permission denied"):
+        opened(tmp_path / "c")
+    monkeypatch.undo()
+    opened(tmp_path / "c").close()
+
+
 def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = opened(tmp_path / "c")
 
