@@ -70,6 +70,13 @@ async def test_an_error_comes_in_the_place_of_the_final_answer(coarse: Sequence[
         await anext(messages)
 
 
+async def test_a_caller_that_stops_reading_ends_the_job() -> None:
+    """Which does not end by itself."""
+    messages = Planted([1]).messages()
+    await anext(messages)
+    await asyncio.wait_for(messages.aclose(), 10)
+
+
 async def test_an_error_of_an_abandoned_call_is_not_logged(caplog: pytest.LogCaptureFixture) -> None:
     planted = Planted([1], KeyError("planted"))
     planted.may_end.set()
