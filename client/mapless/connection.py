@@ -80,7 +80,7 @@ class Connection:
 
     def __init__(self, address: str, options: ConnectOptions, channel: Any) -> None:
         self.options = options
-        self._address = address
+        self.address = address
         self._channel = channel
         self._methods = {
             **vars(LocalizationServiceStub(channel)),
@@ -220,7 +220,7 @@ class Connection:
     async def _explained(self, error: grpc.RpcError) -> MaplessError:
         failure = from_rpc_error(error)
         if is_unreached(failure):
-            return await self.unblocked(explained, failure, self._address, self.options)
+            return await self.unblocked(explained, failure, self.address, self.options)
         return failure
 
     async def unblocked(self, function: Callable[..., T], *arguments: Any) -> T:

@@ -157,10 +157,18 @@ _UNREACHED = re.compile(
     f"{REFUSED}|Cannot assign requested address|Network is unreachable|No route to host|Address family not supported"
 )
 """In errors of an address at which no server was reached, as IPv6's in a container without IPv6."""
-_NAMED = re.compile(r"([A-Za-z][A-Za-z0-9.-]*)(?::(\d+))?")
 _DEFAULT_PORT = "443"  # gRPC's
 _CONNECT_LIMIT_S = 2.0
 _ANSWER_LIMIT_S = 10.0  # a server with much to do, or a busy machine, may need seconds for a handshake
+
+
+def host_and_port(address: str) -> tuple[str, int]:
+    """Splits "host:port"; the host is empty for gRPC's other forms of an address."""
+    host, colon, port = address.rpartition(":")
+    if not colon or (":" in host and not host.startswith("[")):
+        host, port = address, _DEFAULT_PORT
+    is_plain = "/" not in address and not address.startswith(tuple(f"{scheme}:" for scheme in _SCHEMES))
+    return (host.strip("[]"), int(port)) if is_plain and port.isdecimal() else ("", 0)
 
 
 def is_unreached(error: MaplessError) -> bool:
@@ -174,10 +182,9 @@ def explained(error: MaplessError, address: str, options: ConnectOptions) -> Map
     Connects to the other addresses, which takes milliseconds. An address that does not answer takes 2 seconds; one that
     accepts connections and sends nothing, 10 seconds, or the options' timeout if that is less.
     """
-    named = _NAMED.fullmatch(address)
-    if named is None or not is_unreached(error):
+    host, port = host_and_port(address)
+    if not host[:1].isalpha() or not is_unreached(error):  # an IP address is the only one
         return error
-    host, port = named[1], named[2] or _DEFAULT_PORT
     try:
         found = {it[4][0]: it for it in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)}
     except OSError:

@@ -1,4 +1,4 @@
-"""The size of a JPEG, PNG or WebP image from its header, without decoding; the server rejects images by it, too."""
+"""Format and size of a JPEG, PNG or WebP image by its header, without decoding; the server rejects images so, too."""
 
 _MAX_JPEG_SEGMENTS = 2000  # 64 KiB each; bounds the walk through a file of nothing but empty ones
 # Start-of-frame markers: C0 to CF without DHT (C4), JPG (C8) and DAC (CC).
@@ -14,21 +14,27 @@ class BadHeader(ValueError):
         self.reason = reason
 
 
+def format_of_image(data: bytes) -> str:
+    """The format by the first bytes, "jpeg", "png" or "webp"; empty for another file."""
+    if data.startswith(b"\xff\xd8\xff"):
+        return "jpeg"
+    if data.startswith(b"\x89PNG\r\n\x1a\n"):
+        return "png"
+    return "webp" if data.startswith(b"RIFF") and data[8:12] == b"WEBP" else ""
+
+
 def size_of_image(data: bytes, what: str = "photograph") -> tuple[int, int]:
     """Width and height of the raster as it is stored, pixels; EXIF orientation is not applied.
 
     BadHeader, which says `what` it is, for neither a JPEG nor a PNG nor a WebP file, or one without a whole header.
     """
+    kind = format_of_image(data)
+    if not kind:
+        raise BadHeader(f"the {what} is not a JPEG, PNG or WebP file", "IMAGE_UNKNOWN_FORMAT")
     try:
-        if data.startswith(b"\xff\xd8\xff"):
-            return _size_of_jpeg(data)
-        if data.startswith(b"\x89PNG\r\n\x1a\n"):
-            return _size_of_png(data)
-        if data.startswith(b"RIFF") and data[8:12] == b"WEBP":
-            return _size_of_webp(data)
+        return {"jpeg": _size_of_jpeg, "png": _size_of_png, "webp": _size_of_webp}[kind](data)
     except IndexError:
         raise BadHeader(f"the {what} ends within its header", "IMAGE_TRUNCATED") from None
-    raise BadHeader(f"the {what} is not a JPEG, PNG or WebP file", "IMAGE_UNKNOWN_FORMAT")
 
 
 def _size_of_jpeg(data: bytes) -> tuple[int, int]:

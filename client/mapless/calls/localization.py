@@ -27,6 +27,7 @@ from ..v1 import localization_service_pb2 as pb
 
 P = ParamSpec("P")
 T = TypeVar("T")
+M = TypeVar("M", pb.RigImage, pb.SequenceFrame)
 
 
 async def _localize_request(
@@ -250,25 +251,22 @@ def _uncertainty_to_message(uncertainty: IntrinsicsUncertainty) -> pb.Intrinsics
     return pb.IntrinsicsUncertainty(**asdict(uncertainty))
 
 
-def _rig_image_to_message(image: RigImage, scene: str) -> pb.RigImage:
-    message = pb.RigImage(
-        image=read_image(image.image),
-        intrinsics=wire.camera_to_message(image.camera),
-        rig_from_camera=wire.transform_to_message(image.rig_from_camera),
-        references=reference_names(scene, image.references),
-    )
-    set_priors(message, image.priors)
+def _photograph_to_message(message: M, given: RigImage | SequenceFrame, scene: str) -> M:
+    """Sets what the photographs of rigs and of sequences have in common; reads the file."""
+    message.image = read_image(given.image)
+    message.intrinsics.CopyFrom(wire.camera_to_message(given.camera))
+    message.references.extend(reference_names(scene, given.references))
+    set_priors(message, given.priors)
     return message
+
+
+def _rig_image_to_message(image: RigImage, scene: str) -> pb.RigImage:
+    message = pb.RigImage(rig_from_camera=wire.transform_to_message(image.rig_from_camera))
+    return _photograph_to_message(message, image, scene)
 
 
 def _frame_to_message(frame: SequenceFrame, scene: str) -> pb.SequenceFrame:
-    message = pb.SequenceFrame(
-        image=read_image(frame.image),
-        intrinsics=wire.camera_to_message(frame.camera),
-        session_from_camera=wire.transform_to_message(frame.session_from_camera),
-        references=reference_names(scene, frame.references),
-    )
-    set_priors(message, frame.priors)
+    message = pb.SequenceFrame(session_from_camera=wire.transform_to_message(frame.session_from_camera))
     if frame.capture_time is not None:
         message.capture_time.FromDatetime(frame.capture_time)
-    return message
+    return _photograph_to_message(message, frame, scene)

@@ -11,6 +11,7 @@ from ..client import Client
 from ..geodesy import Datum
 from ..geometry import Quaternion, RigidTransform, lens_model_of
 from ..names import check_id
+from ..pixels import format_of_image
 from ..requests import NewReference
 from ..results import Reference, Scene
 from .folder import EXIT_FAILED, EXIT_REJECTED
@@ -187,8 +188,8 @@ def download_reference(client: Client, arguments: argparse.Namespace) -> int:
     if str(arguments.output) == "-":
         sys.stdout.buffer.write(image)
         return 0
-    kind = {b"\xff\xd8": ".jpg", b"\x89P": ".png", b"RI": ".webp"}.get(image[:2], "")
-    file = arguments.output or Path(f"{found.reference_id}{kind}")
+    ending = format_of_image(image).replace("jpeg", "jpg")
+    file = arguments.output or Path(f"{found.reference_id}.{ending}")
     try:
         with file.open("wb" if arguments.force else "xb") as target:
             target.write(image)

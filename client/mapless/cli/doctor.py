@@ -15,9 +15,10 @@ import numpy as np
 from ..answers import Rejected
 from ..client import Client
 from ..errors import DeadlineExceeded, MaplessError, from_rpc_error
-from ..options import ConnectOptions, explained
+from ..options import explained, host_and_port
 from ..results import Reference
 from ..v1 import reference_service_pb2 as pb
+from ..v1.reference_service_pb2_grpc import ReferenceServiceStub
 from .folder import EXIT_FAILED
 from .output import serving_states, show, suggesting
 
@@ -49,8 +50,6 @@ class _Session:
     """What the checks share; `trailers` and `clock_error_s` are known after `_check_token`."""
 
     client: Client
-    address: str
-    options: ConnectOptions
     scene: str | None
     trailers: dict[str, str] = field(default_factory=dict)
     sent_s: float = 0.0
@@ -62,7 +61,7 @@ def run(client: Client, arguments: argparse.Namespace) -> int:
     options = replace(client.options, timeout_s=min(client.options.timeout_s, _CALL_LIMIT_S), max_attempts=1)
     findings: list[Finding] = []
     with Client(arguments.address, options) as own:
-        session = _Session(own, arguments.address, options, arguments.scene)
+        session = _Session(own, arguments.scene)
         for check, (examine, _) in _CHECKS.items():
             if any(it.state == WRONG and _CHECKS[it.check][1] for it in findings):
                 findings.append(Finding(check, SKIPPED))
@@ -88,9 +87,9 @@ _Result = tuple[str, str, str]
 
 def _check_address(session: _Session) -> _Result:
     """Resolves the host's name and connects to each of its addresses."""
-    host, port = _host_and_port(session.address)
+    host, port = host_and_port(session.client.address)
     if not host:
-        return NOTE, f"{session.address} has a form of gRPC's own, which is not examined", ""
+        return NOTE, f"{session.client.address} has a form of gRPC's own, which is not examined", ""
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     except (OSError, UnicodeError) as error:
@@ -101,7 +100,7 @@ def _check_address(session: _Session) -> _Result:
         return OK, f"{found[answers.index('')][4][0]} port {port} accepts connections", ""
     refused = "; ".join(f"{it[4][0]}: {answer}" for it, answer in zip(found, answers, strict=True))
     advice = f"start the server (mapless-server serve), or correct --address (host:port); is port {port} open?"
-    return WRONG, f"nothing answers at {session.address} ({refused})", advice
+    return WRONG, f"nothing answers at {session.client.address} ({refused})", advice
 
 
 def _connected(family: int, endpoint: tuple[object, ...]) -> str:
@@ -117,7 +116,7 @@ def _connected(family: int, endpoint: tuple[object, ...]) -> str:
 
 def _check_protocol(session: _Session) -> _Result:
     """Makes a gRPC call, encrypted or not as the options say."""
-    tls = session.options.tls
+    tls = session.client.options.tls
     try:
         session.client.is_serving()
     except DeadlineExceeded:
@@ -125,8 +124,8 @@ def _check_protocol(session: _Session) -> _Result:
     except MaplessError as error:
         if error.code != "UNAVAILABLE" or not error.message.startswith("cannot connect"):
             raise
-        failed = explained(error, session.address, session.options).message.partition(": ")[2]
-        speaks_tls = _speaks_tls(session.address)
+        failed = explained(error, session.client.address, session.client.options).message.partition(": ")[2]
+        speaks_tls = _speaks_tls(session.client.address)
         if speaks_tls and not tls:
             advice = "give --tls, or --ca FILE with the authority's certificate"
             return WRONG, "the server uses TLS, and --tls is not given", advice
@@ -135,10 +134,10 @@ def _check_protocol(session: _Session) -> _Result:
             return WRONG, "the server does not use TLS", advice
         advice = "give --cert and --key where the server requires a client certificate" if "closes" in failed else ""
         return WRONG, failed, advice
-    host, _ = _host_and_port(session.address)
+    host, _ = host_and_port(session.client.address)
     if tls:
         return OK, "gRPC, encrypted, and the server's certificate is valid", ""
-    if session.options.token is None or host == "localhost" or host.startswith(_LOOPBACK):
+    if session.client.options.token is None or host == "localhost" or host.startswith(_LOOPBACK):
         return OK, "gRPC, not encrypted", ""
     advice = "serve with TLS (settings tls_certificate and tls_key)"
     return NOTE, "gRPC, not encrypted: the token is sent in clear text", advice
@@ -164,16 +163,11 @@ def _advice_of_silent(session: _Session) -> str:
 
 def _check_token(session: _Session) -> _Result:
     """Lists one scene, which every role may do; keeps the trailers."""
-    options = session.options
-    with options.channel(session.address) as channel:
-        method = channel.unary_unary(
-            "/mapless.v1.ReferenceService/ListScenes",
-            request_serializer=pb.ListScenesRequest.SerializeToString,
-            response_deserializer=pb.ListScenesResponse.FromString,
-        )
+    options = session.client.options
+    with options.channel(session.client.address) as channel:
+        method, request = ReferenceServiceStub(channel).ListScenes, pb.ListScenesRequest(page_size=1)
         session.sent_s = time.time()
         try:
-            request = pb.ListScenesRequest(page_size=1)
             _, call = method.with_call(request, timeout=options.timeout_s, metadata=options.metadata())
         except grpc.RpcError as error:
             raise from_rpc_error(error) from error
@@ -232,18 +226,9 @@ def _check_query(session: _Session) -> _Result:
     return OK, f"{what} was localized {took}, {error:.3f} {unit} from its stored pose", ""
 
 
-def _host_and_port(address: str) -> tuple[str, int]:
-    """Splits "host:port"; the host is empty for gRPC's other forms of an address."""
-    host, colon, port = address.rpartition(":")
-    if not colon or (":" in host and not host.startswith("[")):
-        host, port = address, "443"
-    is_plain = "/" not in address and not address.startswith(("ipv4:", "ipv6:", "dns:", "unix:", "xds:"))
-    return (host.strip("[]"), int(port)) if is_plain and port.isdecimal() else ("", 0)
-
-
 def _speaks_tls(address: str) -> bool:
     """Whether the server answers a TLS handshake with a certificate, valid or not."""
-    host, port = _host_and_port(address)
+    host, port = host_and_port(address)
     context = ssl.create_default_context()
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     context.set_alpn_protocols(["h2"])

@@ -9,6 +9,8 @@ import io
 import re
 from dataclasses import dataclass
 
+from ..pixels import format_of_image
+
 REDUCED_SIDE_PX = 1600
 _SEGMENTS_WITHOUT_LENGTH = {0x01, *range(0xD0, 0xD9)}
 _START_OF_SCAN, _END_OF_IMAGE, _COMMENT = 0xDA, 0xD9, 0xFE
@@ -32,11 +34,12 @@ class Picture:
 
 def picture(image: bytes, max_bytes: int) -> Picture:
     """A JPEG, PNG or WebP for a page, of at most `max_bytes` before its encoding as text."""
-    kind = _kind(image)
+    kind = format_of_image(image)
     if not kind:
         return Picture(note="The photograph is not a JPEG, PNG or WebP file, and is omitted.")
-    data = _without_metadata(image, kind)
-    if data is None:
+    try:
+        data = {"jpeg": _clean_jpeg, "png": _clean_png, "webp": _clean_webp}[kind](image)
+    except IndexError:
         return Picture(note="The photograph's file is damaged, and is omitted.")
     if len(data) > max_bytes:
         reduced = _reduced(data)
@@ -49,27 +52,10 @@ def picture(image: bytes, max_bytes: int) -> Picture:
     return Picture(f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}")
 
 
-def _kind(image: bytes) -> str:
-    if image.startswith(b"\xff\xd8\xff"):
-        return "jpeg"
-    if image.startswith(b"\x89PNG\r\n\x1a\n"):
-        return "png"
-    return "webp" if image.startswith(b"RIFF") and image[8:12] == b"WEBP" else ""
-
-
-def _without_metadata(image: bytes, kind: str) -> bytes | None:
-    """The file without metadata; None if its structure is damaged."""
-    cut = {"jpeg": _clean_jpeg, "png": _clean_png, "webp": _clean_webp}[kind]
-    try:
-        return cut(image)
-    except IndexError:
-        return None
-
-
 def _clean_jpeg(image: bytes) -> bytes:
     """Cuts a JPEG after its end, and removes comments and application segments that a decoder does not need.
 
-    A missing end marker, which decoders accept, is added.
+    A missing end marker, which decoders accept, is added. IndexError if the structure is damaged, as of the others.
     """
     parts, position = [image[:2]], 2
     while True:
