@@ -24,7 +24,7 @@ from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import StageOptions
 from mapless_server.method.pose_problem import AdjustOptions
-from mapless_server.method.uncertainty.covariance import UncertaintyOptions
+from mapless_server.method.uncertainty.dispersion import UncertaintyOptions
 from mapless_server.method.uncertainty.radii import error_radii
 
 from .places import ALL, KS, answered, natural_pairs, read_places, samples_of_command, weights_alike

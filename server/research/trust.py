@@ -26,7 +26,7 @@ from mapless_server.method.correspond import make_matcher
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.rejection import RejectionReason
-from mapless_server.method.trust.evidence import AgreementOptions, Evidence, evidence_of, votes_of
+from mapless_server.method.trust.evidence import Evidence, evidence_of, votes_of
 from mapless_server.method.trust.judge import LEVELS
 from mapless_server.method.views import Features
 from mapless_tools.ingest.formats.cameras import read_folder
@@ -99,7 +99,7 @@ def _samples(kind: str, pairs: Iterable[Pair], features: str) -> Iterator[Sample
             matches = matcher.match_query(it.pair.query, it.pair.references)
             votes = votes_of(support, matches)
             place = it.pair.references[0].name.split("/")[1]
-            yield Sample(kind, place, features, it.right, evidence_of(support, votes, matches, AgreementOptions()))
+            yield Sample(kind, place, features, it.right, evidence_of(support, votes, matches))
     matcher.close()
 
 

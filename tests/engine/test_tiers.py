@@ -24,6 +24,7 @@ from mapless_server.engine.tiers import (
     place_of_priors,
 )
 from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.observations import KeypointNoise, Tracks
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.priors.known import PositionPrior, Priors
 from mapless_server.method.rejection import (
@@ -35,16 +36,7 @@ from mapless_server.method.rejection import (
     Rejection,
     RejectionReason,
 )
-from mapless_server.method.results import (
-    KeypointNoise,
-    PointMatches,
-    PoseEstimate,
-    PoseStage,
-    Structure,
-    Support,
-    TwoViewSupport,
-)
-from mapless_server.method.tracks import Tracks
+from mapless_server.method.results import PointMatches, PoseEstimate, PoseStage, Structure, Support, TwoViewSupport
 from mapless_server.method.uncertainty.radii import accuracy_from_covariance, error_radii
 from mapless_server.scheduling import Failure
 

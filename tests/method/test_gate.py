@@ -24,9 +24,7 @@ from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.pnp import PnpOptions, ransac, solve_pose
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import PointMatches, PoseEstimate
-from mapless_server.method.trust import ambiguity
 from mapless_server.method.trust.gate import (
-    GateOptions,
     false_alarms,
     format_false_alarms,
     gate_failure,
@@ -37,18 +35,18 @@ from mapless_server.method.views import PosedView, View
 INLIER_PX = PnpOptions().inlier_px
 
 
-def failure_of(problem: Problem, initial: RigidTransform = POSE, options: GateOptions | None = None) -> str:
+def failure_of(problem: Problem, initial: RigidTransform = POSE) -> str:
     """Why the solver's pose fails the gate, or the solver's rejection; empty if the pose passes."""
     estimate = solve_pose(*problem, initial, PnpOptions())
     if isinstance(estimate, Rejection):
         assert estimate.reason is RejectionReason.PNP_FAILED
         return estimate.message
-    return said(problem, estimate, options or GateOptions())
+    return said(problem, estimate)
 
 
-def said(problem: Problem, estimate: PoseEstimate, options: GateOptions) -> str:
+def said(problem: Problem, estimate: PoseEstimate) -> str:
     query, _, matches = problem
-    return gate_failure(query.camera, matches, estimate.inliers, INLIER_PX, options) or ""
+    return gate_failure(query.camera, matches, estimate.inliers, INLIER_PX) or ""
 
 
 @pytest.mark.parametrize("outlier_share", [0.0, 0.5])
@@ -187,7 +185,7 @@ def test_poses_within_the_bounds_are_one_place() -> None:
 def test_outliers_without_a_common_pose_are_no_second_place(monkeypatch: pytest.MonkeyPatch) -> None:
     """Half of the keypoints lie anywhere."""
     search = Mock(wraps=ransac)
-    monkeypatch.setattr(ambiguity, "ransac", search)
+    monkeypatch.setattr("mapless_server.method.trust.judge.ransac", search)
     query, random = SCENE.query, random_for("outliers")
     keypoints = query.features.keypoints.copy()
     wrong = random.permutation(len(keypoints))[: len(keypoints) // 2]

@@ -15,7 +15,6 @@ from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import PoseEstimate, Support
 from mapless_server.method.trust.evidence import (
     NO_AGREEMENT,
-    AgreementOptions,
     Evidence,
     disagreement_of_matches,
     disagreement_of_references,
@@ -128,7 +127,7 @@ def test_worse_matches_and_fewer_points_lower_the_trust() -> None:
 
 def evidence(support: Support) -> Evidence:
     matches = query_matches_of(support)
-    return evidence_of(support, votes_of(support, matches), matches, AgreementOptions())
+    return evidence_of(support, votes_of(support, matches), matches)
 
 
 def test_expected_share_is_the_median_of_each_references_own() -> None:
@@ -229,7 +228,7 @@ def test_findable_points_are_in_front_and_inside_the_image() -> None:
 # Halves of the data
 
 
-AGREEMENT, DISTANCE_M = AgreementOptions(), 4.0
+DISTANCE_M = 4.0
 
 
 def scene_of(case: object, **options: object) -> SyntheticScene:
@@ -246,8 +245,8 @@ def solved(scene: SyntheticScene) -> Support:
 def both(scene: SyntheticScene, support: Support) -> tuple[float, float]:
     votes = votes_of(support, true_correspondences(scene).query_matches)
     return (
-        disagreement_of_matches(support, DISTANCE_M, AGREEMENT),
-        disagreement_of_references(support, votes, DISTANCE_M, AGREEMENT),
+        disagreement_of_matches(support, DISTANCE_M),
+        disagreement_of_references(support, votes, DISTANCE_M),
     )
 
 
@@ -278,7 +277,7 @@ def test_a_line_of_points_does_not_say_that_halves_agree() -> None:
     keypoints[support.matches.keypoint] = pixels[support.matches.point]
     query = replace(scene.query, features=replace(scene.query.features, keypoints=keypoints))
     line = replace(support, query=query, structure=replace(support.structure, x_in_world=x_in_world))
-    assert disagreement_of_matches(line, DISTANCE_M, AGREEMENT) > 0.1
+    assert disagreement_of_matches(line, DISTANCE_M) > 0.1
 
 
 def test_halves_of_random_matches_disagree() -> None:
@@ -286,7 +285,7 @@ def test_halves_of_random_matches_disagree() -> None:
     support = solved(scene)
     shuffled = random_for("shuffled").permutation(support.matches.point)
     wrong = replace(support, matches=replace(support.matches, point=shuffled))
-    assert disagreement_of_matches(wrong, DISTANCE_M, AGREEMENT) > 0.1
+    assert disagreement_of_matches(wrong, DISTANCE_M) > 0.1
 
 
 def test_halves_of_references_with_wrong_poses_disagree() -> None:
@@ -296,8 +295,8 @@ def test_halves_of_references_with_wrong_poses_disagree() -> None:
     votes = votes_of(support, true_correspondences(scene).query_matches)
     shift = np.array([1.0, 0.0, 0.0])
     moved = replace(votes, x_in_world=votes.x_in_world + np.where((votes.reference % 2 == 0)[:, None], shift, 0.0))
-    assert disagreement_of_references(support, votes, DISTANCE_M, AGREEMENT) < 0.01
-    assert disagreement_of_references(support, moved, DISTANCE_M, AGREEMENT) > 0.05
+    assert disagreement_of_references(support, votes, DISTANCE_M) < 0.01
+    assert disagreement_of_references(support, moved, DISTANCE_M) > 0.05
 
 
 def test_fewer_matches_than_two_poses_need_give_none() -> None:
@@ -305,7 +304,7 @@ def test_fewer_matches_than_two_poses_need_give_none() -> None:
     support, few = solved(scene), slice(0, 6)
     matches = support.matches
     kept = replace(matches, point=matches.point[few], keypoint=matches.keypoint[few], guided=matches.guided[few])
-    assert disagreement_of_matches(replace(support, matches=kept), DISTANCE_M, AGREEMENT) == NO_AGREEMENT
+    assert disagreement_of_matches(replace(support, matches=kept), DISTANCE_M) == NO_AGREEMENT
 
 
 def test_guided_matches_take_no_part_beside_others() -> None:
@@ -315,6 +314,6 @@ def test_guided_matches_take_no_part_beside_others() -> None:
     guided = np.arange(len(wrong)) % 3 > 0
     point = np.where(guided, wrong, support.matches.point)
     mixed = replace(support, matches=replace(support.matches, point=point, guided=guided))
-    assert disagreement_of_matches(mixed, DISTANCE_M, AGREEMENT) < 0.01
+    assert disagreement_of_matches(mixed, DISTANCE_M) < 0.01
     only = replace(support, matches=replace(support.matches, guided=np.ones(len(wrong), bool)))
-    assert disagreement_of_matches(only, DISTANCE_M, AGREEMENT) < 0.01
+    assert disagreement_of_matches(only, DISTANCE_M) < 0.01

@@ -10,19 +10,19 @@ from mapless.geometry import Array
 from mapless_server.method.answer import Localization
 from mapless_server.method.bundle import BundleProblem, bundle_of
 from mapless_server.method.correspond import Correspondences, Matcher
-from mapless_server.method.kept_depth import KeptDepthOptions, with_kept_depths
+from mapless_server.method.kept_depth import with_kept_depths
 from mapless_server.method.localize import localize
+from mapless_server.method.observations import Tracks
 from mapless_server.method.options import LocalizeOptions, Variant
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.results import Structure
 from mapless_server.method.structure import StructureOptions, triangulated_structure
 from mapless_server.method.structure import observe as observations_of
-from mapless_server.method.tracks import Tracks
 from mapless_server.method.views import Features, KeptDepth, KeypointDepths, PosedView
 
 SCENE = make_scene(random_for("kept depth"), SceneOptions(point_count=500, reference_count=3, baseline_m=0.8))
 SIGMA = 0.02
-ALWAYS = KeptDepthOptions(enough_matches=10**6)
+ALWAYS = 10**6
 """Also where many triangulated points are matched."""
 
 
@@ -91,8 +91,8 @@ def test_a_point_moves_to_the_weighted_mean_with_its_depth() -> None:
     structure, correspondences = matched(references)
     found = with_kept_depths(structure, references, correspondences, ALWAYS)
     assert found.planes is not None
-    _, jacobian = observations_of(structure.tracks, references, structure.noise).linearized(structure.x_in_world)
-    information = structure.tracks.sum_by_point(np.swapaxes(jacobian, 1, 2) @ jacobian)
+    observations = observations_of(structure.tracks, references, structure.noise)
+    information = np.linalg.inv(observations.point_covariances(structure.x_in_world))
     used = found.planes.information[: len(structure.x_in_world)] > 0
     assert used.sum() > 20
     for point in np.flatnonzero(used)[:20]:

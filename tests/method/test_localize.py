@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from support.compare import assert_pose_close, pose_error
-from support.device import on_device
 from support.fake_network import FakeNetwork, FakeNetworkOptions
 from support.planted import moved_references
 from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for, unit_rows
@@ -18,8 +17,7 @@ import mapless_server.method.localize as method
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg, rotation_from_vector
 from mapless_server.method import alternatives, pnp
 from mapless_server.method.answer import Answer, Localization
-from mapless_server.method.coarse import Bucket, Outcome, Reconstructor, Request
-from mapless_server.method.coarse.device import DeviceReconstruction
+from mapless_server.method.coarse import Bucket, Outcome, Request
 from mapless_server.method.coarse.geometric import GeometricReconstructor
 from mapless_server.method.correspond import Correspondences, Matcher
 from mapless_server.method.localize import MIN_FEATURES, localize, prepare, refine
@@ -41,7 +39,7 @@ class ChangedNetwork:
     """A network whose reconstruction is changed."""
 
     network: FakeNetwork
-    change: Callable[[Reconstruction], Reconstruction | DeviceReconstruction]
+    change: Callable[[Reconstruction], Reconstruction]
     name: str = "changed"
     weights_sha256: str = ""
     uses_correspondences: bool = False
@@ -58,10 +56,7 @@ class ChangedNetwork:
 
 
 def pipeline_of(backend: str, scene: SyntheticScene = SCENE, options: FakeNetworkOptions | None = None) -> Pipeline:
-    reconstructor: Reconstructor = GeometricReconstructor()
-    if backend != "geometric":
-        network = FakeNetwork(scene, 0, options)
-        reconstructor = network if backend == "network" else ChangedNetwork(network, on_device)
+    reconstructor = GeometricReconstructor() if backend == "geometric" else FakeNetwork(scene, 0, options)
     return Pipeline(reconstructor, MATCHER if scene is SCENE else Matcher())
 
 
@@ -107,21 +102,6 @@ def test_every_variant_finds_the_planted_pose(backend: str, variant: Variant, st
         assert np.linalg.eigvalsh(found.covariance).min() > 0
         assert 0.8 * found.match_count < found.inlier_count <= found.match_count
         assert 0.2 < found.reprojection_error_px < 2
-
-
-@pytest.mark.parametrize("strategy", ScaleStrategy)
-@pytest.mark.parametrize("variant", Variant)
-def test_the_answer_of_the_device_equals_the_hosts(variant: Variant, strategy: ScaleStrategy) -> None:
-    options = LocalizeOptions(variant, strategy)
-    there, here = (answer_of(pipeline_of(backend, options=ROUGH), options) for backend in ("device", "network"))
-    found, expected = pose_of(there), pose_of(here)
-    # Poses on the device are float32, as from a network.
-    assert_pose_close(found.world_from_camera, expected.world_from_camera, metres=1e-5, degrees=1e-4)
-    assert (found.inlier_count, found.match_count) == (expected.inlier_count, expected.match_count)
-    assert there.reference_inlier_counts == here.reference_inlier_counts
-    adjusted = ["adjust"] if variant is Variant.BEST else []
-    later = [] if variant is Variant.COARSE else ["pnp", *adjusted, *JUDGED]
-    assert list(there.stage_seconds)[2:] == ["refine", *later]
 
 
 def test_refinement_makes_a_rough_pose_accurate() -> None:
@@ -471,7 +451,7 @@ def same_bits(first: Answer, second: Answer) -> bool:
 
 
 @pytest.mark.parametrize("weak_inliers", [0, 10**6])
-@pytest.mark.parametrize("backend", ["geometric", "network", "device"])
+@pytest.mark.parametrize("backend", ["geometric", "network"])
 def test_queries_of_a_batch_have_the_answers_they_have_alone(backend: str, weak_inliers: int) -> None:
     """To the bit, where the backend itself gives the same bits; with their own options."""
     pipeline = weak_below(weak_inliers, pipeline_of(backend, options=None if backend == "geometric" else ROUGH))
@@ -495,7 +475,7 @@ def test_two_views_rescue_no_pose_that_was_not_accepted(reason: RejectionReason)
 
 
 def test_a_coarse_answer_has_the_initial_pose_and_its_stage() -> None:
-    for backend in ("geometric", "network", "device"):
+    for backend in ("geometric", "network"):
         offset = np.full(3, 1e5)
         far = [replace(r, world_from_camera=r.world_from_camera.shifted(offset)) for r in SCENE.references]
         pipeline = replace(pipeline_of(backend, options=ROUGH), matcher=Matcher())  # the structure is another one

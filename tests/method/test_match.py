@@ -12,9 +12,8 @@ from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, ran
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.method.correspond import Correspondences
 from mapless_server.method.match import PAPER_MATCH, MatchOptions, match_points, one_to_one, search, vote
-from mapless_server.method.observations import ONE_PIXEL
+from mapless_server.method.observations import ONE_PIXEL, Tracks
 from mapless_server.method.results import PointMatches, Structure
-from mapless_server.method.tracks import Tracks
 
 NOTHING = PointMatches(np.empty(0, np.intp), np.empty(0, np.intp), np.empty(0, bool), 0.0)
 

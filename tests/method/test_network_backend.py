@@ -43,7 +43,6 @@ from support.small_networks import (
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.method.choices import NETWORKS
 from mapless_server.method.coarse import Request, make, reconstruct_one
-from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.geometric import GeometricReconstructor
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.coarse.network import NetworkReconstructor, condition_poses
@@ -116,18 +115,6 @@ def test_output_that_is_not_finite_is_rejected(name: str, part: str, caplog: pyt
     assert outcome.reason is RejectionReason.SCALE_UNRELIABLE
     assert name in outcome.message
     assert [record.message for record in caplog.records] == [f"{name}: the network's output is not finite"]
-    kept = reconstruct_one(NetworkReconstructor(runner, replace(OPTIONS, keep_on_device=True)), *small_request(2))
-    assert isinstance(kept, DeviceReconstruction)
-    assert kept.local_from_camera.isnan().any() or kept.broken_pixels() > 0
-
-
-@pytest.mark.parametrize("name", NETWORKS)
-def test_a_reconstruction_on_the_device_equals_the_fetched_one(name: str) -> None:
-    runner, request = small_runner(name), small_request(3)
-    kept = reconstruct_one(NetworkReconstructor(runner, replace(OPTIONS, keep_on_device=True)), *request)
-    assert isinstance(kept, DeviceReconstruction)
-    assert kept.backend == name
-    assert_same_bits(kept.fetch(), reconstruct_one(NetworkReconstructor(runner, OPTIONS), *request))
 
 
 # Odd input

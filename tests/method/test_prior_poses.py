@@ -14,12 +14,13 @@ from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, ran
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.adjust import adjust_pose
+from mapless_server.method.optimize import MinimizeOptions
 from mapless_server.method.perturbation import moved
 from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.pose_problem import AdjustOptions, pose_problem
-from mapless_server.method.priors.gravity import ransac_with_gravity, solve_pairs
+from mapless_server.method.priors import informed
+from mapless_server.method.priors.informed import ransac_with_gravity, refine_pose, solve_pairs
 from mapless_server.method.priors.known import NO_PRIORS, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
-from mapless_server.method.priors.pose_only import PoseOnlyOptions, refine_pose
 from mapless_server.method.results import PointMatches, PoseEstimate, PoseStage, Structure
 
 POSE = RigidTransform(rotation_from_vector([0.2, -0.3, 0.1]), np.array([0.4, -0.2, -4.0]))
@@ -93,7 +94,6 @@ def test_the_refinement_is_at_a_minimum_of_matches_and_priors() -> None:
     """No small motion lowers the cost, written down here a second time."""
     rng = random_for("minimum")
     x_in_world, pixels = seen(rng, 12)
-    options = PoseOnlyOptions(iterations=40, min_decrease=1e-12)
     priors = Priors(
         PositionPrior(POSE.translation + 0.05, 0.02**2 * np.eye(3)),
         HeadingPrior.looking(POSE.rotation[:, 2], 2.0),
@@ -103,11 +103,11 @@ def test_the_refinement_is_at_a_minimum_of_matches_and_priors() -> None:
 
     def cost(pose: RigidTransform) -> float:
         errors = CAMERA.project(pose.inverse().apply(x_in_world)) - pixels
-        squared = (errors**2).sum(axis=1) / options.sigma_px**2
-        scale = options.loss_scale_sigma**2
-        return float((scale * np.log1p(squared / scale)).sum()) + options.prior_weight * priors.cost(pose)
+        squared = (errors**2).sum(axis=1) / informed.SIGMA_PX**2
+        scale = informed.LOSS_SCALE_SIGMA**2
+        return float((scale * np.log1p(squared / scale)).sum()) + informed.PRIOR_WEIGHT * priors.cost(pose)
 
-    found = refine_pose(CAMERA, x_in_world, pixels, POSE, priors, options)
+    found = refine_pose(CAMERA, x_in_world, pixels, POSE, priors, steps=MinimizeOptions(40, 1e-12))
     for axis in np.eye(6):
         for step in (-1e-4, 1e-4):
             assert cost(moved(found, step * axis)) > cost(found)

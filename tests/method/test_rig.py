@@ -17,7 +17,7 @@ from mapless_server.method.groups.checks import check_mounting, check_tracking, 
 from mapless_server.method.groups.generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
 from mapless_server.method.groups.images import rejection_without_matches
 from mapless_server.method.groups.jumps import Jump
-from mapless_server.method.groups.rig import RigEstimate, RigOptions, RigState, solve_rig
+from mapless_server.method.groups.rig import RigEstimate, RigState, solve_rig
 from mapless_server.method.groups.sequence import SequenceEstimate
 from mapless_server.method.groups.start import CHECK_TRACKING
 from mapless_server.method.perturbation import rotation_vector
@@ -29,7 +29,6 @@ from mapless_server.method.results import MetricScale, PoseStage, ScaleStage
 WORLD_FROM_RIG = RigidTransform(rotation_from_vector([0.1, 0.2, -0.1]), np.array([0.3, 0.1, -3.8]))
 CAMERAS = looking((-0.5, 0, -4), (0.2, -0.1, -4.2), (0.6, 0.2, -3.9))
 RIG_FROM_CAMERA = [WORLD_FROM_RIG.inverse().compose(pose) for pose in CAMERAS]
-OPTIONS = RigOptions()
 UNGUIDED = SceneOptions(point_count=60, noise_px=0.5, descriptor_noise=3.0)
 """Descriptors that say nothing: no match is found near where it should be."""
 
@@ -47,7 +46,7 @@ def rejection(outcome: RigEstimate | Rejection) -> Rejection:
 @pytest.mark.parametrize("wrong_share", [0.0, 0.5])
 def test_the_planted_rig_pose_is_found_in_the_callers_world(wrong_share: float) -> None:
     images = images_of(random_for("rig", wrong_share), CAMERAS, wrong_share=wrong_share)
-    found = estimate(solve_rig(images, RIG_FROM_CAMERA, OPTIONS))
+    found = estimate(solve_rig(images, RIG_FROM_CAMERA))
     assert_pose_close(found.world_from_rig, caller_pose(WORLD_FROM_RIG), metres=0.006, degrees=0.1)
     assert [it.source.image for it in found.matched] == [0, 1, 2]
     assert min(int(it.inliers.sum()) for it in found.matched) > 100
@@ -56,23 +55,23 @@ def test_the_planted_rig_pose_is_found_in_the_callers_world(wrong_share: float) 
 def test_cameras_with_too_few_matches_alone_are_posed_together() -> None:
     """Five matches a camera, and nothing else is found near where it should be."""
     images = images_of(random_for("weak"), CAMERAS, UNGUIDED, keep=5)
-    found = estimate(solve_rig(images, RIG_FROM_CAMERA, OPTIONS))
+    found = estimate(solve_rig(images, RIG_FROM_CAMERA))
     assert_pose_close(found.world_from_rig, caller_pose(WORLD_FROM_RIG), metres=0.03, degrees=0.5)
     for image, camera in zip(images, RIG_FROM_CAMERA, strict=True):
-        assert rejection(solve_rig([image], [camera], OPTIONS)).reason is not RejectionReason.LOW_TEXTURE
+        assert rejection(solve_rig([image], [camera])).reason is not RejectionReason.LOW_TEXTURE
 
 
 def test_one_wrong_own_pose_does_not_change_the_rigs() -> None:
     images = images_of(random_for("outvoted"), CAMERAS, alone=[True, False, False], own_noise_m=1.0)
-    found = estimate(solve_rig(images, RIG_FROM_CAMERA, OPTIONS))
+    found = estimate(solve_rig(images, RIG_FROM_CAMERA))
     assert_pose_close(found.world_from_rig, caller_pose(WORLD_FROM_RIG), metres=0.006, degrees=0.1)
 
 
 def test_a_rig_is_rejected_by_its_trust() -> None:
     images = images_of(random_for("trust"), CAMERAS, keep=30)
-    found = estimate(solve_rig(images, RIG_FROM_CAMERA, OPTIONS))
+    found = estimate(solve_rig(images, RIG_FROM_CAMERA))
     assert 0.01 < found.trust < 1
-    outcome = rejection(solve_rig(images, RIG_FROM_CAMERA, RigOptions(coverage=(1 - found.trust) * 0.9)))
+    outcome = rejection(solve_rig(images, RIG_FROM_CAMERA, (1 - found.trust) * 0.9))
     assert outcome.reason is RejectionReason.GATE
     assert "its trust of" in outcome.message
 
@@ -81,22 +80,22 @@ def test_a_prior_on_one_camera_is_used_for_the_rig() -> None:
     images = images_of(random_for("prior"), CAMERAS, UNGUIDED, keep=8)
     at = caller_pose(CAMERAS[1]).translation
     prior = Priors(position=PositionPrior(at, 1e-8 * np.eye(3)))
-    found = estimate(solve_rig([images[0], replace(images[1], priors=prior), images[2]], RIG_FROM_CAMERA, OPTIONS))
+    found = estimate(solve_rig([images[0], replace(images[1], priors=prior), images[2]], RIG_FROM_CAMERA))
     assert [(it.used, it.conflict) for it in found.prior_checks[1]] == [(True, False)]
     assert np.linalg.norm(found.world_from_rig.compose(RIG_FROM_CAMERA[1]).translation - at) < 1e-3
 
 
 def test_a_blank_image_has_no_effect() -> None:
     images = images_of(random_for("blank"), CAMERAS)
-    whole = estimate(solve_rig([images[0], NOTHING, images[2]], RIG_FROM_CAMERA, OPTIONS))
-    without = estimate(solve_rig([images[0], images[2]], [RIG_FROM_CAMERA[0], RIG_FROM_CAMERA[2]], OPTIONS))
+    whole = estimate(solve_rig([images[0], NOTHING, images[2]], RIG_FROM_CAMERA))
+    without = estimate(solve_rig([images[0], images[2]], [RIG_FROM_CAMERA[0], RIG_FROM_CAMERA[2]]))
     np.testing.assert_allclose(whole.world_from_rig.matrix(), without.world_from_rig.matrix(), atol=1e-9)
     assert [it.source.image for it in whole.matched] == [0, 2]
 
 
 def test_a_rig_of_one_camera_is_posed() -> None:
     images = images_of(random_for("one"), CAMERAS[:1])
-    found = estimate(solve_rig(images, RIG_FROM_CAMERA[:1], OPTIONS))
+    found = estimate(solve_rig(images, RIG_FROM_CAMERA[:1]))
     assert_pose_close(found.world_from_rig, caller_pose(WORLD_FROM_RIG), metres=0.02, degrees=0.3)
 
 
@@ -107,33 +106,33 @@ def test_a_rig_of_cameras_at_one_place_is_posed() -> None:
         RigidTransform(CAMERAS[0].rotation @ rotation_from_vector([0, 0.2, 0]), CAMERAS[0].translation),
     ]
     fixed = [poses[0].inverse().compose(pose) for pose in poses]
-    found = estimate(solve_rig(images_of(random_for("bundle"), poses), fixed, OPTIONS))
+    found = estimate(solve_rig(images_of(random_for("bundle"), poses), fixed))
     assert_pose_close(found.world_from_rig, caller_pose(poses[0]), metres=0.006, degrees=0.1)
 
 
 def test_the_same_image_twice_is_no_second_measurement() -> None:
     images = images_of(random_for("twice"), CAMERAS[:1])
-    once = estimate(solve_rig(images, RIG_FROM_CAMERA[:1], OPTIONS))
-    twice = estimate(solve_rig(images * 2, RIG_FROM_CAMERA[:1] * 2, OPTIONS))
+    once = estimate(solve_rig(images, RIG_FROM_CAMERA[:1]))
+    twice = estimate(solve_rig(images * 2, RIG_FROM_CAMERA[:1] * 2))
     sigma_once, sigma_twice = (np.sqrt(np.diag(it.covariance)) for it in (once, twice))
     np.testing.assert_allclose(sigma_twice, sigma_once, rtol=0.1)
 
 
 def test_wrong_matches_alone_are_rejected() -> None:
     images = images_of(random_for("chance"), CAMERAS, UNGUIDED, keep=60, wrong_share=1.0)
-    outcome = rejection(solve_rig(images, RIG_FROM_CAMERA, OPTIONS))
+    outcome = rejection(solve_rig(images, RIG_FROM_CAMERA))
     assert outcome.reason in {RejectionReason.GATE, RejectionReason.PNP_FAILED}
     assert "images" in outcome.message or "rig" in outcome.message
 
 
 def test_without_matches_the_reason_is_the_furthest_images() -> None:
-    outcome = rejection(solve_rig([NOTHING, NOTHING], RIG_FROM_CAMERA[:2], OPTIONS))
+    outcome = rejection(solve_rig([NOTHING, NOTHING], RIG_FROM_CAMERA[:2]))
     assert outcome.reason is RejectionReason.LOW_TEXTURE
     assert "image 0: blank" in outcome.message
 
 
 def test_too_few_matches_are_rejected() -> None:
-    outcome = rejection(solve_rig(images_of(random_for("few"), CAMERAS, keep=1), RIG_FROM_CAMERA, OPTIONS))
+    outcome = rejection(solve_rig(images_of(random_for("few"), CAMERAS, keep=1), RIG_FROM_CAMERA))
     assert outcome.reason is RejectionReason.TOO_FEW_MATCHES
     assert "3 2D-3D matches in 3 images" in outcome.message
 
@@ -144,7 +143,7 @@ def test_errors_are_as_large_as_the_covariance() -> None:
     whitened = []
     for case in range(40):
         images = images_of(random_for("covariance", case), CAMERAS, UNGUIDED, keep=60)
-        found = estimate(solve_rig(images, RIG_FROM_CAMERA, OPTIONS))
+        found = estimate(solve_rig(images, RIG_FROM_CAMERA))
         truth = caller_pose(WORLD_FROM_RIG)
         turn = rotation_vector(found.world_from_rig.rotation @ truth.rotation.T)
         error = np.concatenate([found.world_from_rig.translation - truth.translation, turn])

@@ -17,9 +17,9 @@ from mapless_server.method.correspond import Correspondences
 from mapless_server.method.options import ScaleStrategy
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.results import MetricScale, ScaleStage
-from mapless_server.method.scale import estimate_scale
-from mapless_server.method.scale_equations import (
+from mapless_server.method.scale import (
     ScaleOptions,
+    estimate_scale,
     pairs_of,
     trajectory_scale,
     triangulate_depths,
@@ -47,10 +47,10 @@ def scale_of(
     network: FakeNetwork,
     options: ScaleOptions | None = None,
     matches: Correspondences | None = None,
+    metre_sigma: float | None = None,
 ) -> MetricScale:
-    outcome = estimate_scale(
-        network.reconstruct(scene.query, scene.references), scene.references, matches or true_matches(scene), options
-    )
+    predicted = replace(network.reconstruct(scene.query, scene.references), metre_sigma=metre_sigma)
+    outcome = estimate_scale(predicted, scene.references, matches or true_matches(scene), options)
     assert isinstance(outcome, MetricScale), outcome
     return outcome
 
@@ -222,11 +222,11 @@ def test_a_stage_that_contradicts_the_networks_metre_is_not_used() -> None:
     faults = FakeNetworkOptions(bad_depth_share=1.0, bad_depth_factors=(1.2, 1.2), bad_pose_count=1, bad_pose_m=1.0)
     network = FakeNetwork(scene, 11, faults)
     network.world_from_local = replace(network.world_from_local, scale=1.0)
-    arbitrary, wide, metric = (scale_of(scene, network, ScaleOptions(metre_sigma=it)) for it in (None, 0.2, 0.05))
+    arbitrary, wide, metric = (scale_of(scene, network, metre_sigma=it) for it in (None, 0.2, 0.05))
     assert arbitrary.stage is wide.stage is ScaleStage.TRIANGULATION
     assert metric.stage is ScaleStage.TRAJECTORY
     assert abs(np.log(metric.metres_per_unit)) < 0.15 < abs(np.log(arbitrary.metres_per_unit))
-    alone = scale_of(scene, network, replace(TRIANGULATION, metre_sigma=0.05))
+    alone = scale_of(scene, network, TRIANGULATION, metre_sigma=0.05)
     assert alone.metres_per_unit == arbitrary.metres_per_unit, "there is no other"
 
 
@@ -235,7 +235,7 @@ def test_two_stages_that_agree_outvote_the_networks_metre(metre: float) -> None:
     scene = make_scene(random_for("metre"))
     network = FakeNetwork(scene, 7, FakeNetworkOptions(depth_noise_m=0.01, pose_noise_m=0.002))
     network.world_from_local = replace(network.world_from_local, scale=metre)
-    found = [scale_of(scene, network, ScaleOptions(metre_sigma=sigma)) for sigma in (None, 0.2)]
+    found = [scale_of(scene, network, metre_sigma=sigma) for sigma in (None, 0.2)]
     assert found[0].metres_per_unit == found[1].metres_per_unit == pytest.approx(metre, rel=0.02)
     assert found[0].stage is found[1].stage is ScaleStage.TRIANGULATION
 

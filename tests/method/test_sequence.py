@@ -9,16 +9,14 @@ from support.compare import assert_jacobian, assert_pose_close, pose_error
 from support.groups import NOTHING, caller_pose, drifting, error_m, images_of, rescaled, walk
 from support.scenes import SceneOptions, look_at, random_for
 
-from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method.groups.drift import DriftOptions, SequenceState
+from mapless.geometry import Array, RigidTransform, rotation_angle_deg, rotation_from_vector
+from mapless_server.method.groups.drift import SequenceState, step_sigma
 from mapless_server.method.groups.jumps import find_jumps
-from mapless_server.method.groups.rig import RigOptions, solve_rig
+from mapless_server.method.groups.rig import solve_rig
 from mapless_server.method.groups.sequence import SequenceEstimate, solve_sequence
-from mapless_server.method.groups.start import SequenceOptions
 from mapless_server.method.priors.known import PositionPrior, Priors
 from mapless_server.method.rejection import Rejection, RejectionReason
 
-OPTIONS = SequenceOptions()
 UNGUIDED = SceneOptions(point_count=80, noise_px=0.5, descriptor_noise=3.0)
 
 
@@ -40,7 +38,7 @@ def test_every_planted_frame_is_found_in_the_callers_world(alone: bool, scale: f
     truth = walk(random, 6)
     session = rescaled(drifting(random, truth, 0.02), 1 / scale)
     images = images_of(random, truth, keep=60, wrong_share=0.5, alone=alone, own_noise_m=0.01)
-    found = estimate(solve_sequence(images, session, is_free, OPTIONS))
+    found = estimate(solve_sequence(images, session, is_free))
     for pose, true_pose in zip(found.world_from_camera, truth, strict=True):
         assert_pose_close(pose, caller_pose(true_pose), metres=0.008, degrees=0.15)
     assert found.world_from_session.scale == pytest.approx(scale, rel=0.05)
@@ -66,8 +64,8 @@ def test_drift_makes_the_last_pose_no_worse_than_alone(share: float, deg: float)
         truth = walk(random, 5)
         session = drifting(random, truth, share, deg)
         images = images_of(random, truth, UNGUIDED, keep=40, alone=True, own_noise_m=0.005)
-        found = estimate(solve_sequence(images, session, False, OPTIONS))
-        single = solve_rig([images[-1]], [RigidTransform.identity()], RigOptions())
+        found = estimate(solve_sequence(images, session, False))
+        single = solve_rig([images[-1]], [RigidTransform.identity()])
         assert not isinstance(single, Rejection)
         together.append(error_m(found.world_from_camera[-1], truth[-1]))
         alone.append(error_m(single.world_from_rig, truth[-1]))
@@ -79,7 +77,7 @@ def test_frames_without_matches_are_posed_by_tracking() -> None:
     truth = walk(random, 6)
     images = images_of(random, truth, alone=[True] * 4 + [False] * 2)
     images[4] = images[5] = NOTHING
-    found = estimate(solve_sequence(images, drifting(random, truth, 0.01), False, OPTIONS))
+    found = estimate(solve_sequence(images, drifting(random, truth, 0.01), False))
     assert error_m(found.world_from_camera[-1], truth[-1]) < 0.02
     sigma_m = np.sqrt(np.trace(found.covariances[:, :3, :3], axis1=1, axis2=2))
     assert sigma_m[5] > sigma_m[4] > sigma_m[3]
@@ -102,7 +100,7 @@ def test_a_jump_is_found_with_its_size_and_cut(at: int, scale: float, is_free: b
     truth = walk(random, 6)
     session = rescaled(jumping(drifting(random, truth, 0.01), at, JUMP), 1 / scale)
     images = images_of(random, truth, alone=True, own_noise_m=0.005)
-    found = estimate(solve_sequence(images, session, is_free, OPTIONS))
+    found = estimate(solve_sequence(images, session, is_free))
     assert max(error_m(*it) for it in zip(found.world_from_camera, truth, strict=True)) < 0.008
     (jump,) = found.jumps
     assert (jump.before, jump.after) == (at - 1, at)
@@ -118,7 +116,7 @@ def test_of_two_frames_the_last_is_where_its_photograph_says(apart_m: float) -> 
     jump = RigidTransform(np.eye(3), np.array([0, apart_m, 0]))
     session = jumping(drifting(random, truth, 0.01), 1, jump)
     images = images_of(random, truth, alone=True, own_noise_m=0.005)
-    found = estimate(solve_sequence(images, session, False, OPTIONS))
+    found = estimate(solve_sequence(images, session, False))
     assert error_m(found.world_from_camera[-1], truth[-1]) < 0.008
     assert [(it.before, it.after) for it in found.jumps] == [(0, 1)]
     assert found.jumps[0].shift_m == pytest.approx(apart_m, abs=0.05)
@@ -131,7 +129,7 @@ def test_a_jump_before_frames_without_matches_is_found() -> None:
     truth = walk(random, 6)
     images = images_of(random, truth, alone=True, own_noise_m=0.005)
     images[2] = images[3] = NOTHING
-    found = estimate(solve_sequence(images, jumping(drifting(random, truth, 0.01), 3, JUMP), False, OPTIONS))
+    found = estimate(solve_sequence(images, jumping(drifting(random, truth, 0.01), 3, JUMP), False))
     assert [(it.before, it.after) for it in found.jumps] == [(1, 4)]
     assert error_m(found.world_from_camera[-1], truth[-1]) < 0.008
 
@@ -144,7 +142,7 @@ def test_a_jump_is_found_at_a_frame_with_too_few_matches_alone() -> None:
     images = images_of(random, truth, keep=[200, 200, 12, 200, 200, 200], alone=posed, own_noise_m=0.005)
     for at in (2, 3):
         session = jumping(drifting(random, truth, 0.01), at, JUMP)
-        found = estimate(solve_sequence(images, session, False, OPTIONS))
+        found = estimate(solve_sequence(images, session, False))
         assert [(it.before, it.after) for it in found.jumps] == [(at - 1, at)]
         assert error_m(found.world_from_camera[2], truth[2]) < 0.02
 
@@ -156,8 +154,8 @@ def test_a_last_frame_that_contradicts_tracking_is_rejected() -> None:
     images = images_of(random, truth, UNGUIDED, keep=[60, 60, 60, 40], alone=[True] * 3 + [False], own_noise_m=0.005)
     wrong = images_of(random_for("lost"), truth, UNGUIDED, keep=40, wrong_share=1.0)[3]
     right = drifting(random, truth, 0.01)
-    assert not estimate(solve_sequence(images, right, False, OPTIONS)).jumps
-    outcome = rejection(solve_sequence([*images[:3], wrong], jumping(right, 3, JUMP), False, OPTIONS))
+    assert not estimate(solve_sequence(images, right, False)).jumps
+    outcome = rejection(solve_sequence([*images[:3], wrong], jumping(right, 3, JUMP), False))
     assert outcome.reason is RejectionReason.GATE
     assert "contradicts its tracked pose" in outcome.message
 
@@ -167,7 +165,7 @@ def test_a_last_frame_not_localized_alone_is_cut_by_its_matches() -> None:
     truth = walk(random, 4)
     images = images_of(random, truth, alone=[True] * 3 + [False], own_noise_m=0.005)
     session = jumping(drifting(random, truth, 0.01), 3, JUMP)
-    found = estimate(solve_sequence(images, session, False, OPTIONS))
+    found = estimate(solve_sequence(images, session, False))
     assert [(it.before, it.after) for it in found.jumps] == [(2, 3)]
     assert error_m(found.world_from_camera[-1], truth[-1]) < 0.01
 
@@ -177,24 +175,26 @@ def test_steps_that_fit_no_unit_are_rejected() -> None:
     truth = walk(random, 3)
     session = rescaled(jumping(drifting(random, truth, 0.01), 2, JUMP), 2.0)
     images = images_of(random, truth, alone=True, own_noise_m=0.002)
-    outcome = rejection(solve_sequence(images, session, True, OPTIONS))
+    outcome = rejection(solve_sequence(images, session, True))
     assert outcome.reason is RejectionReason.SCALE_UNRELIABLE
     assert "in any unit" in outcome.message
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_drift_within_the_stated_noise_is_not_cut(seed: int) -> None:
-    """Steps with exactly the noise of the options."""
+    """Steps with exactly the noise that is stated."""
     random = random_for("stated", seed)
     truth = walk(random, 8)
     session = [truth[0]]
     for first, second in itertools.pairwise(truth):
         step = first.inverse().compose(second)
-        error = random.normal(0, OPTIONS.drift.sigma(step))
+        turn_deg = rotation_angle_deg(step.rotation)
+        sigma = step_sigma(np.array([np.linalg.norm(step.translation)]), np.array([turn_deg]))
+        error = random.normal(0, np.repeat(np.concatenate(sigma), 3))
         turned = rotation_from_vector(error[3:]) @ step.rotation
         session.append(session[-1].compose(RigidTransform(turned, step.translation + error[:3])))
     own = {i: (pose, np.diag([1e-5] * 3 + [1e-6] * 3)) for i, pose in enumerate(truth)}
-    chain = find_jumps(own, session, 1.0, OPTIONS.drift, OPTIONS.jumps)
+    chain = find_jumps(own, session, 1.0)
     assert chain is not None
     assert (chain.frames, chain.jumps) == (tuple(range(8)), ())
 
@@ -208,9 +208,9 @@ def test_a_prior_on_a_frame_is_used_where_it_agrees() -> None:
     def with_prior(off_m: float) -> SequenceEstimate:
         at = caller_pose(truth[-1]).translation + np.array([off_m, 0, 0])
         prior = Priors(position=PositionPrior(at, 1e-8 * np.eye(3)))
-        return estimate(solve_sequence([*images[:2], replace(images[2], priors=prior)], session, False, OPTIONS))
+        return estimate(solve_sequence([*images[:2], replace(images[2], priors=prior)], session, False))
 
-    right, wrong, none = with_prior(0.0), with_prior(1.0), estimate(solve_sequence(images, session, False, OPTIONS))
+    right, wrong, none = with_prior(0.0), with_prior(1.0), estimate(solve_sequence(images, session, False))
     assert error_m(right.world_from_camera[-1], truth[-1]) < 1e-3
     assert np.trace(right.covariances[-1][:3, :3]) < 0.1 * np.trace(none.covariances[-1][:3, :3])
     assert [(it.used, it.conflict) for it in right.prior_checks[2]] == [(True, False)]
@@ -223,7 +223,7 @@ def test_one_wrong_own_pose_does_not_change_the_sequence() -> None:
     truth = walk(random, 5)
     images = images_of(random, truth, alone=True, own_noise_m=0.005)
     wrong = images_of(random_for("outvoted"), truth, alone=True, own_noise_m=3.0)[4]
-    found = estimate(solve_sequence([*images[:4], wrong], drifting(random, truth, 0.01), False, OPTIONS))
+    found = estimate(solve_sequence([*images[:4], wrong], drifting(random, truth, 0.01), False))
     assert error_m(found.world_from_camera[-1], truth[-1]) < 0.02
     assert not found.jumps
 
@@ -233,11 +233,11 @@ def test_a_session_without_motion_has_no_scale() -> None:
     pose = walk(random, 3)[1]
     images = images_of(random, [pose] * 3, alone=True)
     session = [RigidTransform(np.eye(3), np.array([4.0, 5.0, 6.0]))] * 3
-    outcome = rejection(solve_sequence(images, session, True, OPTIONS))
+    outcome = rejection(solve_sequence(images, session, True))
     assert outcome.reason is RejectionReason.SCALE_UNRELIABLE
     assert "does not move" in outcome.message
     assert_pose_close(
-        estimate(solve_sequence(images, session, False, OPTIONS)).world_from_camera[-1],
+        estimate(solve_sequence(images, session, False)).world_from_camera[-1],
         caller_pose(pose),
         metres=0.02,
         degrees=0.3,
@@ -249,7 +249,7 @@ def test_a_session_with_little_motion_has_no_scale() -> None:
     random = random_for("turning")
     truth = [look_at([0.001 * i, 0, -4.0], [0.2 * i - 0.3, 0.1, 0]) for i in range(4)]
     images = images_of(random, truth, alone=True, own_noise_m=0.003)
-    outcome = rejection(solve_sequence(images, drifting(random, truth, 0.01), True, OPTIONS))
+    outcome = rejection(solve_sequence(images, drifting(random, truth, 0.01), True))
     assert outcome.reason is RejectionReason.SCALE_UNRELIABLE
 
 
@@ -258,7 +258,7 @@ def test_a_straight_walk_is_posed() -> None:
     random = random_for("straight")
     truth = [RigidTransform(np.eye(3), np.array([0.2 * i - 0.5, 0, -4.0])) for i in range(5)]
     session = rescaled(drifting(random, truth, 0.01), 2.0)
-    found = estimate(solve_sequence(images_of(random, truth, keep=40), session, True, OPTIONS))
+    found = estimate(solve_sequence(images_of(random, truth, keep=40), session, True))
     assert found.world_from_session.scale == pytest.approx(0.5, rel=0.05)
     assert error_m(found.world_from_camera[-1], truth[-1]) < 0.008
 
@@ -268,8 +268,8 @@ def test_repeated_frames_add_no_information() -> None:
     truth = walk(random, 3)
     images = images_of(random, truth, alone=True)
     session = drifting(random, truth, 0.0)
-    found = estimate(solve_sequence([images[2]] * 4, [session[2]] * 4, False, OPTIONS))
-    single = solve_rig([images[2]], [RigidTransform.identity()], RigOptions())
+    found = estimate(solve_sequence([images[2]] * 4, [session[2]] * 4, False))
+    single = solve_rig([images[2]], [RigidTransform.identity()])
     assert not isinstance(single, Rejection)
     assert pose_error(found.world_from_camera[-1], single.world_from_rig)[0] < 0.002
     sigma_m = np.sqrt(np.diag(found.covariances[-1]))
@@ -282,9 +282,9 @@ def test_wrong_matches_alone_are_rejected() -> None:
     images = images_of(random, truth, UNGUIDED, keep=50, wrong_share=1.0)
     session = drifting(random, truth, 0.01)
     for is_free in (False, True):
-        reason = rejection(solve_sequence(images, session, is_free, OPTIONS)).reason
+        reason = rejection(solve_sequence(images, session, is_free)).reason
         assert reason in {RejectionReason.GATE, RejectionReason.PNP_FAILED, RejectionReason.SCALE_UNRELIABLE}
-    nothing = rejection(solve_sequence([NOTHING] * 4, session, False, OPTIONS))
+    nothing = rejection(solve_sequence([NOTHING] * 4, session, False))
     assert nothing.reason is RejectionReason.LOW_TEXTURE
 
 
@@ -294,7 +294,7 @@ def test_wrong_matches_alone_are_rejected() -> None:
 def moved_state(scale_is_free: bool, moved: float) -> SequenceState:
     random = random_for("freedom", scale_is_free)
     truth = walk(random, 3)
-    state = SequenceState.of(truth, rescaled(truth, 2.0), 0.5, scale_is_free, DriftOptions())
+    state = SequenceState.of(truth, rescaled(truth, 2.0), 0.5, scale_is_free)
     return state.moved(random.normal(0, moved, state.size))
 
 

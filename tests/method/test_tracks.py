@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapless_server.method.tracks import Tracks, build_tracks
+from mapless_server.method.observations import Tracks, build_tracks
 from mapless_server.method.views import Matches
 
 Pairs = Mapping[tuple[int, int], Matches]

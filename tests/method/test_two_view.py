@@ -28,22 +28,20 @@ from mapless_server.method.structure import StructureOptions
 from mapless_server.method.trust.intrinsics import WrongCameraOptions, wrong_camera_by_lines
 from mapless_server.method.trust.two_view import (
     TwoViewEvidence,
-    TwoViewGateOptions,
     lacks_distance,
     two_view_evidence,
     two_view_failure,
     two_view_trust,
 )
 from mapless_server.method.two_view.matches import TwoViewMatches
-from mapless_server.method.two_view.solve import TwoViewOptions, solve_two_view
-from mapless_server.method.uncertainty.covariance import UncertaintyOptions
+from mapless_server.method.two_view.solve import solve_two_view
+from mapless_server.method.uncertainty.dispersion import UncertaintyOptions
 from mapless_server.method.views import Features, Matches, PosedView, View
 from mapless_tools.ingest.check.errors import sampson_px
 
 TRUE = RigidTransform(rotation_from_vector([0.1, -0.15, 0.05]), np.array([0.3, -0.1, -4.2]))
 CENTRES = ((-1.2, 0.1, -4.0), (1.0, -0.2, -4.4), (0.2, 0.5, -3.6))
 ORIGIN = np.zeros(3)
-GATE = TwoViewGateOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,14 +52,12 @@ class Planted:
     references: tuple[PosedView, ...]
     correspondences: Correspondences
 
-    def solved(self, options: TwoViewOptions | None = None) -> Support | None:
+    def solved(self) -> Support | None:
         stages = StructureOptions(), MatchOptions(), AdjustOptions()
-        return solve_two_view(
-            self.query, self.references, self.correspondences, (), ORIGIN, *stages, options or TwoViewOptions()
-        )
+        return solve_two_view(self.query, self.references, self.correspondences, (), ORIGIN, *stages)
 
     def evidence(self, support: Support) -> TwoViewEvidence:
-        return two_view_evidence(support, self.correspondences.query_matches, GATE)
+        return two_view_evidence(support, self.correspondences.query_matches)
 
 
 class Given(Matcher):
@@ -152,7 +148,7 @@ def test_wrong_matches_among_right_ones_are_no_inliers(wrong_share: float) -> No
         support = problem.solved()
         assert np.linalg.norm(error_of(pose_of(support))[:3]) < 0.05
         assert support is not None
-        assert two_view_failure(problem.evidence(support), GATE) is None
+        assert two_view_failure(problem.evidence(support)) is None
 
 
 @pytest.mark.parametrize("pose_noise_px", [0.0, 1.0])
@@ -164,7 +160,7 @@ def test_covariance_is_right_against_planted_noise(pose_noise_px: float) -> None
         problem = planted((60, 60, 60), 0.5, 0.0, seed, pose_noise_px)
         support = solve_two_view(
             problem.query, problem.references, problem.correspondences, (), ORIGIN,
-            StructureOptions(), MatchOptions(), plain, TwoViewOptions(),
+            StructureOptions(), MatchOptions(), plain,
         )  # fmt: skip
         assert support is not None
         assert support.estimate is not None
@@ -285,7 +281,7 @@ def test_random_matches_have_no_accepted_pose() -> None:
     for seed in range(2):
         problem = planted((150, 120, 100), 0.0, 1.0, seed)
         support = problem.solved()
-        assert support is None or two_view_failure(problem.evidence(support), GATE) is not None
+        assert support is None or two_view_failure(problem.evidence(support)) is not None
 
 
 def test_a_second_reference_of_another_place_is_no_support() -> None:
@@ -297,7 +293,7 @@ def test_a_second_reference_of_another_place_is_no_support() -> None:
     problem = replace(right, query=replace(right.query, features=replace(features, keypoints=mixed)))
     support = problem.solved()
     assert support is not None
-    assert lacks_distance(problem.evidence(support), GATE)
+    assert lacks_distance(problem.evidence(support))
 
 
 def test_sampson_distances_are_those_of_the_fundamental_matrix() -> None:
@@ -333,7 +329,7 @@ def test_triangulated_points_are_the_planted_ones() -> None:
 
 def test_trust_rises_with_the_second_references_share() -> None:
     shares = np.linspace(0, 1, 21)
-    trusts = [two_view_trust(TwoViewEvidence(-50, -20, 100, 200, 40, it, 0.5), GATE) for it in shares]
+    trusts = [two_view_trust(TwoViewEvidence(-50, -20, 100, 200, 40, it, 0.5)) for it in shares]
     assert trusts == sorted(trusts)
     assert (trusts[0], trusts[-1]) == (0, 1)
 
@@ -348,5 +344,5 @@ def test_trust_rises_with_the_second_references_share() -> None:
     ],
 )
 def test_each_lack_of_evidence_is_named(evidence: TwoViewEvidence, part: str) -> None:
-    assert part in (two_view_failure(evidence, GATE) or "")
-    assert two_view_failure(TwoViewEvidence(-50.0, -20.0, 100, 200, 40, 0.5, 0.5), GATE) is None
+    assert part in (two_view_failure(evidence) or "")
+    assert two_view_failure(TwoViewEvidence(-50.0, -20.0, 100, 200, 40, 0.5, 0.5)) is None

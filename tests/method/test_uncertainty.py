@@ -22,11 +22,23 @@ from mapless_server.method.perturbation import (
     world_covariance,
 )
 from mapless_server.method.pnp import PnpOptions, solve_pose
-from mapless_server.method.pose_errors import PoseErrorOptions, PoseErrors, most_probable, pose_errors
-from mapless_server.method.pose_problem import AdjustOptions
+from mapless_server.method.pose_problem import (
+    DRIFT_INFLATION,
+    OWN_INFLATION,
+    USUAL_DRIFT,
+    USUAL_OWN,
+    AdjustOptions,
+    PoseErrors,
+    most_probable,
+    pose_errors,
+)
 from mapless_server.method.results import PoseEstimate, PoseStage, Structure, Support
-from mapless_server.method.uncertainty.covariance import UncertaintyOptions, dispersed_covariance, scale_covariance
-from mapless_server.method.uncertainty.dispersion import Dispersion
+from mapless_server.method.uncertainty.dispersion import (
+    Dispersion,
+    UncertaintyOptions,
+    dispersed_covariance,
+    scale_covariance,
+)
 from mapless_server.method.uncertainty.radii import error_radii
 
 POSITION, ROTATION = slice(0, 3), slice(3, 6)
@@ -189,7 +201,6 @@ def test_references_at_one_place_have_a_finite_covariance() -> None:
 @pytest.mark.parametrize(("own", "drift"), [(0.05, 2.0), (0.8, 0.1), (0.4, 0.4)])
 def test_planted_sizes_are_found(own: float, drift: float) -> None:
     """Within a factor of two, in the mean over gradients drawn from their distribution."""
-    options = PoseErrorOptions(own_inflation=1.0, drift_inflation=1.0)
     found = []
     for seed in range(20):
         _, _, _, errors = planted(f"sizes {seed}", 10)
@@ -199,8 +210,8 @@ def test_planted_sizes_are_found(own: float, drift: float) -> None:
         matrix = factor.T @ factor
         error = random.multivariate_normal(np.zeros(60), errors.covariance(own, drift))
         gradient = factor.T @ random.normal(size=200) - matrix @ np.append(error, np.zeros(6))
-        found.append(most_probable(errors, matrix, gradient, options))
-    mean_own, mean_drift = np.exp(np.log(found).mean(axis=0))
+        found.append(most_probable(errors, matrix, gradient))
+    mean_own, mean_drift = np.exp(np.log(found).mean(axis=0)) / (OWN_INFLATION, DRIFT_INFLATION)
     # The smaller part, below a third of the larger one, is only known to be small.
     assert own / 2 < mean_own < 2 * own or mean_own < drift / 3
     assert drift / 2 < mean_drift < 2 * drift or mean_drift < own / 3
@@ -209,10 +220,9 @@ def test_planted_sizes_are_found(own: float, drift: float) -> None:
 @pytest.mark.parametrize("value", [np.nan, 0.0])
 def test_without_evidence_the_usual_sizes_are_taken(value: float) -> None:
     _, _, _, errors = planted("no evidence", 3)
-    options = PoseErrorOptions(usual_own=0.2, usual_drift=1.0, own_inflation=1.0, drift_inflation=3.0)
-    own, drift = most_probable(errors, np.full((24, 24), value), np.full(24, value), options)
-    assert own == pytest.approx(0.2)
-    assert drift == pytest.approx(3.0)
+    own, drift = most_probable(errors, np.full((24, 24), value), np.full(24, value))
+    assert own == OWN_INFLATION * USUAL_OWN
+    assert drift == DRIFT_INFLATION * USUAL_DRIFT
 
 
 # Errors in world coordinates

@@ -10,11 +10,17 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
 from mapless_server.method.correspond import Correspondences
 from mapless_server.method.nearest import mutual_matches
-from mapless_server.method.observations import ONE_PIXEL, adjust_points, estimate_noise, triangulate
+from mapless_server.method.observations import (
+    ONE_PIXEL,
+    KeypointNoise,
+    Tracks,
+    adjust_points,
+    estimate_noise,
+    triangulate,
+)
 from mapless_server.method.pnp import PnpOptions, solve_pose
-from mapless_server.method.results import KeypointNoise, MetricScale, PointMatches, PoseEstimate, ScaleStage, Structure
+from mapless_server.method.results import MetricScale, PointMatches, PoseEstimate, ScaleStage, Structure
 from mapless_server.method.structure import observe
-from mapless_server.method.tracks import Tracks
 from mapless_server.method.views import Matches, PosedView, View
 from support.scenes import SyntheticScene
 

@@ -3,9 +3,8 @@
 import numpy as np
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method.observations import ONE_PIXEL
+from mapless_server.method.observations import ONE_PIXEL, Tracks
 from mapless_server.method.results import PointMatches, Structure
-from mapless_server.method.tracks import Tracks
 from mapless_server.method.views import Features, View
 from support.scenes import CAMERA
 

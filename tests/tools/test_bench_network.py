@@ -16,8 +16,7 @@ from support.small_networks import references_of, small_runner
 from mapless.geometry import Camera
 from mapless_server.method.choices import NETWORKS
 from mapless_server.method.coarse import reconstruct_one
-from mapless_server.method.coarse.device import DeviceReconstruction
-from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
+from mapless_server.method.coarse.network import NetworkReconstructor
 from mapless_server.method.views import Features, Reconstruction, View
 from mapless_tools.bench.turns import Measured, main, ratio_with_interval, report
 from mapless_tools.bench_network import command
@@ -121,8 +120,7 @@ def test_planted_points_lie_on_the_true_surface() -> None:
     np.testing.assert_allclose(on_plane, 2.0, atol=0.01)  # depth is read at the nearest of coarser pixels
 
 
-@pytest.mark.parametrize("keep_on_device", [True, False])
-def test_planted_reconstruction_is_the_truth_up_to_scale(keep_on_device: bool) -> None:
+def test_planted_reconstruction_is_the_truth_up_to_scale() -> None:
     pictures = [photograph_of(np.full((72, 96, 3), 40 * i, np.uint8), plane().camera) for i in range(3)]
     references = references_of(pictures[1:])
     poses = [plane().world_from_camera, *(reference.world_from_camera for reference in references)]
@@ -131,11 +129,9 @@ def test_planted_reconstruction_is_the_truth_up_to_scale(keep_on_device: bool) -
     }
     nothing = Features(np.empty((0, 2), np.float32), np.empty((0, 4), np.float32), np.empty(0, np.float32))
     query = View(plane().camera, nothing, pictures[0])
-    network = NetworkReconstructor(small_runner("pi3"), NetworkOptions(keep_on_device=keep_on_device))
-    outcome = reconstruct_one(PlantedReconstructor(network, truth, torch.device("cpu")), query, references)
+    network = NetworkReconstructor(small_runner("pi3"))
+    outcome = reconstruct_one(PlantedReconstructor(network, truth), query, references)
     network.close()
-    if isinstance(outcome, DeviceReconstruction):
-        outcome = outcome.fetch()
     assert isinstance(outcome, Reconstruction)
     anchor = poses[1].inverse()
     for view, pose in zip((*outcome.references, outcome.query), (*poses[1:], poses[0]), strict=True):

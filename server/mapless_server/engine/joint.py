@@ -5,9 +5,8 @@ from collections.abc import Mapping, Sequence
 from mapless.geometry import RigidTransform
 from mapless_server.method.groups.checks import check_mounting, check_tracking, check_unit, hinted_group
 from mapless_server.method.groups.images import GroupImage
-from mapless_server.method.groups.rig import RigEstimate, RigOptions, solve_rig
+from mapless_server.method.groups.rig import RigEstimate, solve_rig
 from mapless_server.method.groups.sequence import SequenceEstimate, solve_sequence
-from mapless_server.method.groups.start import SequenceOptions
 from mapless_server.method.options import Variant
 from mapless_server.method.rejection import Rejection, RejectionReason
 
@@ -18,8 +17,7 @@ def pose_rig(
     queries: Sequence[Query], results: Sequence[Result], rig_from_camera: Sequence[RigidTransform]
 ) -> RigEstimate | Rejection:
     """Estimates the pose of the rig that took the photographs, given in order."""
-    options = RigOptions(coverage=queries[0].options.coverage)
-    found = solve_rig(_images(queries, results), rig_from_camera, options)
+    found = solve_rig(_images(queries, results), rig_from_camera, queries[0].options.coverage)
     if not isinstance(found, Rejection):
         found = check_mounting(found, [result.answer for result in results])
     if isinstance(found, Rejection):
@@ -35,9 +33,9 @@ def pose_sequence(
     estimate_scale: bool,
 ) -> SequenceEstimate | Rejection:
     """Estimates the poses of a sequence's frames, in order, in OpenCV's axes."""
-    options = SequenceOptions(coverage=queries[0].options.coverage)
     unit = "units" if any(it.attributes.arbitrary_unit for it in results) else "m"
-    found = solve_sequence(_images(queries, results), session_from_camera, estimate_scale, options)
+    coverage = queries[0].options.coverage
+    found = solve_sequence(_images(queries, results), session_from_camera, estimate_scale, coverage)
     if not isinstance(found, Rejection):
         found = check_tracking(found, session_from_camera, unit)
     if not isinstance(found, Rejection) and not estimate_scale:

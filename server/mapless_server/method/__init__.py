@@ -4,25 +4,24 @@ Begin with `localize`, the stages in order. A module imports only modules above 
 
 choices                      names of backends and features, for settings
 options                      how options check themselves; cancelling and timing of a computation
-arrays, perturbation         NumPy or torch; small motions of poses, coordinates of their errors
-optimize                     robust losses; Levenberg-Marquardt, the only one
+perturbation                 small motions of poses, coordinates of their errors
+optimize                     robust losses; Levenberg-Marquardt, the only one; many small matrices
 views                        photographs with features and poses; the result of the coarse stage
 rejection                    "no pose" is a result
 features/                    local features of a photograph
 cache                        results that are kept within a bound, here and by the server
-tracks                       observations of the same point
+observations                 observations of the same point; metric points
 nearest                      nearest neighbours of two photographs' descriptors, and their epipolar lines
 lightglue, correspond        matches among references, and of the query with them (lightglue: by a network)
 priors/                      what is known of the query's pose beforehand
 intrinsics                   errors of the query's intrinsics, and the evidence of them
 results                      scale, structure, matches, pose estimate and its support: data between stages
-scale_equations, scale       metric scale, initial pose
-observations, structure      metric points
+scale                        metric scale, initial pose
+structure                    metric points of the references
 match                        2D-3D matches of the query
 kept_depth                   (ours) points from depths that are kept with the references
 pnp                          pose and inliers
 resection                    pose and focal length from fixed points
-pose_errors                  (ours) errors of the references' given poses: how large, and how alike for neighbours
 bundle                       (ours) everything adjusted together
 uncertainty/                 the covariance of a pose
 pose_problem                 (ours) the problem of one pose, and the estimate at its optimum
@@ -33,7 +32,6 @@ trust/                       whether a pose is accepted, and its trust
 one_reference                (ours) pose from one reference, by a network's depths and metres
 answer, hints                the answer of the method; what would help after a rejection
 coarse/                      query and references reconstructed together, up to scale
-on_device/                   scale, structure and match where a network left its output
 pipeline, alternatives       a query between the stages; poses where the stages have no points
 localize                     the stages in order
 groups/                      several photographs posed together

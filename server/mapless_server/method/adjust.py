@@ -22,6 +22,7 @@ import numpy as np
 
 from mapless.geometry import Array
 
+from .observations import Tracks
 from .options import IntrinsicsSigma
 from .perturbation import reprojection_errors_px
 from .pose_problem import AdjustOptions, adjusted_estimate, errors_of_pose, optimum, pose_problem, shares_camera
@@ -29,8 +30,7 @@ from .priors.known import NO_PRIORS, Priors
 from .recalibrate import Solved, is_suspicious, recalibrated
 from .results import MetricScale, PointMatches, PoseEstimate, PoseStage, Structure, Support
 from .structure import query_tracks, with_query_points
-from .tracks import Tracks
-from .uncertainty.covariance import scale_covariance
+from .uncertainty.dispersion import scale_covariance
 from .views import Matches, PosedView, View
 
 SHARED_CAMERA = 0.03

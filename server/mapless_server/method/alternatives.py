@@ -37,7 +37,7 @@ def from_one_reference(coarse: Coarse, scale: MetricScale) -> Answer:
     estimate = replace(estimate, prior_checks=tuple(replace(it, used=False) for it in checks))
     support = replace(found.support, estimate=estimate)
     trust = trust_of_score(found.score, options.one_reference)
-    failure = one_reference_failure(found, trust, prepared.options.coverage, options.gate)
+    failure = one_reference_failure(found, trust, prepared.options.coverage)
     if failure:
         return coarse.answer(Rejection(RejectionReason.GATE, failure), support)
     return coarse.answer(replace(Localization.of(estimate, trust), scale_source=scale.source), support)
@@ -52,15 +52,12 @@ def from_two_views(coarse: Coarse, answer: Answer) -> Answer:
     prepared, options = coarse.prepared, coarse.prepared.pipeline.options
     query_matches, estimate = prepared.correspondences.query_matches, support.estimate
     with prepared.context.stage("judge"):
-        evidence = two_view_evidence(support, query_matches, options.two_view_gate)
-        doubt, trust = (
-            two_view_failure(evidence, options.two_view_gate),
-            two_view_trust(evidence, options.two_view_gate),
-        )
+        evidence = two_view_evidence(support, query_matches)
+        doubt, trust = two_view_failure(evidence), two_view_trust(evidence)
         rejection = None if doubt else contradiction(support, votes_of(support, query_matches), options.judge)
     if rejection:
         return coarse.answer(rejection, support)
-    if doubt and lacks_distance(evidence, options.two_view_gate):
+    if doubt and lacks_distance(evidence):
         assert isinstance(answer.outcome, Rejection)
         return replace(answer, outcome=one_reference_rejection(answer.outcome.reason, doubt, support))
     if doubt or trust < 1 - prepared.options.coverage:
@@ -81,7 +78,7 @@ def _two_view_support(coarse: Coarse, found: Support | None) -> Support | None:
         in_world = prepared.references_in_world
         wide = matcher.correspond(query, in_world, True, context.check, query_matches)
         stages = prepared.structure_options, prepared.match_options, options.adjust
-        result = solve_two_view(query, references, wide, known, prepared.origin, *stages, options.two_view)
+        result = solve_two_view(query, references, wide, known, prepared.origin, *stages)
     if result is None or result.estimate is None:
         return None
     checks = prepared.priors.check(result.estimate.world_from_camera, result.estimate.covariance)

@@ -23,14 +23,12 @@ from scipy.sparse import csc_array
 
 from mapless.geometry import Array, RigidTransform
 
-from .arrays import apply_columns, columns, symmetric_products, take
-from .observations import Observations
-from .optimize import cauchy_cost, cauchy_weight, solve_step
-from .perturbation import pose_columns
+from .observations import Observations, Tracks, summed
+from .optimize import apply_columns, cauchy_cost, cauchy_weight, columns, solve_step, symmetric_products, take
+from .perturbation import pose_columns, world_jacobian
 from .priors.known import NO_PRIORS, Priors
 from .results import DepthPlanes, Structure
 from .structure import observe
-from .tracks import Tracks, summed
 from .views import PosedView
 
 
@@ -181,9 +179,11 @@ class BundleProblem:
             equations.pose_block[intrinsics, intrinsics] += np.diag(self.intrinsics_information)
             equations.pose_gradient[intrinsics] += self.intrinsics_information * errors
         if self.priors:
-            gradient, information = self._query_terms(bundle.world_from_query)
-            equations.pose_gradient[query] += gradient
-            equations.pose_block[query, query] += information
+            pose = bundle.world_from_query
+            gradient, information = self.priors.gradient_and_information(pose)
+            to_world = world_jacobian(pose)
+            equations.pose_gradient[query] += self.prior_weight * to_world.T @ gradient
+            equations.pose_block[query, query] += self.prior_weight * to_world.T @ information @ to_world
         return equations
 
     def step(self, bundle: Bundle, equations: NormalEquations, damping: float) -> Bundle | None:
@@ -205,24 +205,15 @@ class BundleProblem:
         unknowns = slice(self.query_rows.start, None)
         return math.sqrt(step @ equations.pose_block[unknowns, unknowns] @ step)
 
-    def _query_terms(self, world_from_query: RigidTransform) -> tuple[Array, Array]:
-        """Gradient (6,) and information (6, 6) of the query's priors, by a left perturbation of camera_from_world.
-
-        That moves the centre by -R v and turns the camera by -R w about fixed axes (see `world_covariance`).
-        """
-        gradient, information = self.priors.gradient_and_information(world_from_query)
-        turn = -np.kron(np.eye(2), world_from_query.rotation)
-        return self.prior_weight * turn.T @ gradient, self.prior_weight * turn.T @ information @ turn
-
 
 @dataclass(frozen=True, eq=False)
 class ViewColumns:
-    """Observations sorted by view, one row for each component; column o is one observation (see `arrays.columns`).
+    """Observations sorted by view, one row for each component; column o is one observation (see `optimize`).
 
     Attributes:
         point, view: (O,) indices of each observation's point and view.
         parts: range of the columns of each view.
-        focal, offset: (2, O) as in `observations.Columns`.
+        focal, offset: (2, O) as in `Observations`.
         sums: (P, O): a product with it sums over the observations of each point.
         by_intrinsics: (2, I, O_q) derivative of the last view's residuals by errors of its intrinsics.
         planes: planes of the points, if any have stored depths.
@@ -247,12 +238,11 @@ class ViewColumns:
     ) -> ViewColumns:
         """Makes the columns from rows and the view (O,) of each; `keypoint_motion` and `planes` as in BundleProblem."""
         order = np.argsort(view, kind="stable")
-        sigma_px = observations.sigma_px[order, None]
         return ViewColumns._sorted(
             observations.point[order],
             view[order],
-            columns(observations.focal_px[order] / sigma_px),
-            columns((observations.principal_px - observations.pixel)[order] / sigma_px),
+            take(observations.focal, order),
+            take(observations.offset, order),
             _by_intrinsics(keypoint_motion),
             view_count,
             planes,
@@ -367,7 +357,7 @@ class NormalEquations:
         columns: the observations.
         pose_block: B, (6 V + I, 6 V + I).
         pose_gradient: g, (6 V + I,).
-        point_block: C, (6, P) as in `arrays.SYMMETRIC`.
+        point_block: C, (6, P) as in `optimize.SYMMETRIC`.
         point_gradient: h, (3, P).
         by_point: A, (2, 3, O), derivatives of the residuals by the points.
         weighted_pose: w J, (2, 6, O), weighted derivatives by the poses. J^T w A is the block of E of an observation.
@@ -414,7 +404,7 @@ class EliminatedPoints:
     """What is needed to compute the points once the cameras are known.
 
     Attributes:
-        factor: L (6, P), as in `arrays.SYMMETRIC`.
+        factor: L (6, P), as in `optimize.SYMMETRIC`.
         gradient: L^-1 h, (3, P).
         cross: E L^-T, (U, 3 P).
         by_point: A L^-T, (2, 3, O), each with the factor of its point.
@@ -460,7 +450,7 @@ def _block_diagonal(blocks: Sequence[Array]) -> Array:
 
 
 def _cholesky(matrices: Array) -> Array:
-    """Cholesky factors L (6, P) of positive matrices (6, P), both as in `arrays.SYMMETRIC`; NaN where singular."""
+    """Cholesky factors L (6, P) of positive matrices (6, P), both as in `optimize.SYMMETRIC`; NaN where singular."""
     xx, yy, zz, xy, xz, yz = matrices
     with np.errstate(divide="ignore", invalid="ignore"):
         first = np.sqrt(xx)
@@ -490,4 +480,4 @@ def bundle_of(
     """
     observations = observe(tracks, views, structure.noise)
     bundle = Bundle(Poses.of(view.world_from_camera for view in views), structure.x_in_world[chosen])
-    return observations, bundle, float(np.median(observations.in_camera(bundle.points)[:, 2]))
+    return observations, bundle, float(np.median(observations.in_camera(bundle.points)[2]))

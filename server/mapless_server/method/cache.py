@@ -52,15 +52,26 @@ class LruCache(Generic[Value]):
                 self.used -= size
         return gone
 
-    def put(self, key: Hashable, value: Value, size: int = 1) -> None:
-        """Stores a value, unless it is larger than the whole cache."""
+    def put(self, key: Hashable, value: Value, size: int = 1) -> list[tuple[Any, Value]]:
+        """Stores a value; returns what is evicted for it, or the value itself if it is larger than the whole cache."""
         if size > self._capacity and not self._keeps_latest:
-            return
+            return [(key, value)]
+        evicted = []
         with self._lock:
             _, replaced = self._entries.pop(key, (None, 0))
             self._entries[key] = (value, size)
             self.used += size - replaced
             while self.used > self._capacity and len(self._entries) > self._keeps_latest:
-                _, (_, dropped) = self._entries.popitem(last=False)
-                self.used -= dropped
+                oldest, (dropped, dropped_size) = self._entries.popitem(last=False)
+                self.used -= dropped_size
                 self.evictions += 1
+                evicted.append((oldest, dropped))
+        return evicted
+
+    def clear(self) -> list[tuple[Any, Value]]:
+        """Drops everything and returns it, the least recently used first; not counted as evictions."""
+        with self._lock:
+            dropped = [(key, value) for key, (value, _) in self._entries.items()]
+            self._entries.clear()
+            self.used = 0
+        return dropped

@@ -25,8 +25,8 @@ import numpy as np
 from .cache import LruCache
 from .choices import EDGEPOINT2
 from .nearest import best_of_both, epipolar_distance_px, epipolar_distances_px, mutual_matches
+from .observations import Tracks, build_tracks
 from .options import check_bounds
-from .tracks import Tracks, build_tracks
 from .views import Matches, PosedView, View
 
 ItemT = TypeVar("ItemT")

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .answer import Answer
-from .options import check_bounds
 from .rejection import Advice, Hint, Rejection, RejectionReason
 from .views import PosedView, View
 
@@ -27,24 +26,14 @@ _STAGES = {
 }
 
 
-@dataclass(frozen=True)
-class HintOptions:
-    """Options of the hints.
+FEW_FEATURES = 200
+"""A photograph with fewer is dark, blurred or shows nothing; sharp ones have 500 to 2048."""
 
-    Attributes:
-        few_features: a photograph with fewer is dark, blurred or shows nothing; sharp ones have 500 to 2048.
-        few_matches: references of another place have fewer matches with a photograph by chance.
-        many_matches: so many with one reference are not chance; if they have no common pose, intrinsics or poses are
-            wrong.
-    """
+FEW_MATCHES = 30
+"""References of another place have fewer matches with a photograph by chance."""
 
-    few_features: int = 200
-    few_matches: int = 30
-    many_matches: int = 100
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "few_features", at_least=0)
-        check_bounds(self, "few_matches", above=0, at_most=self.many_matches)
+MANY_MATCHES = 100
+"""So many with one reference are not chance; if they have no common pose, intrinsics or poses are wrong."""
 
 
 @dataclass(frozen=True)
@@ -74,13 +63,7 @@ class _Case:
     has_prior: bool
 
 
-def hinted(
-    answer: Answer,
-    query: View,
-    references: Sequence[PosedView],
-    has_prior: bool = False,
-    options: HintOptions | None = None,
-) -> Answer:
+def hinted(answer: Answer, query: View, references: Sequence[PosedView], has_prior: bool = False) -> Answer:
     """Adds a hint to a rejection without one; the references are in the order of the answer's counts.
 
     `has_prior` is whether the request has a prior on position or heading.
@@ -103,16 +86,12 @@ def hinted(
         len(references),
         has_prior,
     )
-    advice, message = _advice(case, options or HintOptions())
-    hint = Hint(_stage(case), advice, message, case.best)
+    advice, message = _advice(case)
+    hint = Hint(_STAGES[rejection.reason] if references else "", advice, message, case.best)
     return replace(answer, outcome=replace(rejection, hint=hint))
 
 
-def _stage(case: _Case) -> str:
-    return _STAGES[case.rejection.reason] if case.reference_count else ""
-
-
-def _advice(case: _Case, options: HintOptions) -> tuple[Advice, str]:
+def _advice(case: _Case) -> tuple[Advice, str]:
     reason = case.rejection.reason
     if reason is RejectionReason.PRIOR_CONFLICT:
         return Advice.CHECK_PRIOR, "Check the prior: the matches place the camera elsewhere."
@@ -137,13 +116,13 @@ def _advice(case: _Case, options: HintOptions) -> tuple[Advice, str]:
             f"There {'is one reference' if case.reference_count else 'are no references'}: two at least are needed, "
             "taken from different places.",
         )
-    return _of_overlap(case, options)
+    return _of_overlap(case)
 
 
-def _of_overlap(case: _Case, options: HintOptions) -> tuple[Advice, str]:
+def _of_overlap(case: _Case) -> tuple[Advice, str]:
     """The hint if photograph and references are usable, but have too little in common."""
     shared = f"the best reference shares {case.matches} of the photograph's {case.features} features"
-    if case.features < options.few_features:
+    if case.features < FEW_FEATURES:
         return Advice.RETAKE_PHOTOGRAPH, _retake(case)
     if case.rejection.reason in (RejectionReason.NO_USABLE_REFERENCES, RejectionReason.SCALE_UNRELIABLE):
         return (
@@ -151,14 +130,14 @@ def _of_overlap(case: _Case, options: HintOptions) -> tuple[Advice, str]:
             f"The {case.reference_count} references do not give depth together: use some that show the same things "
             "from different places, and check their poses.",
         )
-    if case.matches < options.few_matches:
+    if case.matches < FEW_MATCHES:
         return (
             Advice.CHOOSE_OTHER_REFERENCES,
             f"Use references that show what the photograph shows: {shared}, no more than chance gives.",
         )
-    if case.matches >= options.many_matches and case.tried is not None and case.tried < case.matches / 4:
+    if case.matches >= MANY_MATCHES and case.tried is not None and case.tried < case.matches / 4:
         # Even if what two references show were independent, they would have so many of the features in common.
-        if case.tried < case.matches * case.second / case.features / 4 and case.second >= options.many_matches:
+        if case.tried < case.matches * case.second / case.features / 4 and case.second >= MANY_MATCHES:
             return (
                 Advice.CHECK_CALIBRATION,
                 f"Check the references' poses, for which `mapless-server audit` helps: world_from_camera (not its "
@@ -171,7 +150,7 @@ def _of_overlap(case: _Case, options: HintOptions) -> tuple[Advice, str]:
             f"Add references that show the same as {case.best} from a step aside: {shared}, but of the photograph's "
             f"matches only {case.tried} have a point that a second reference shows as well, as depth requires.",
         )
-    if case.matches >= options.many_matches and case.inliers < case.matches / 4:
+    if case.matches >= MANY_MATCHES and case.inliers < case.matches / 4:
         agreeing = f"{case.inliers} of {case.tried} matches with points agree on a pose" if case.tried else "few agree"
         return (
             Advice.CHECK_CALIBRATION,

@@ -23,52 +23,39 @@ from mapless.geometry import Array
 
 from .correspond import Correspondences
 from .match import vote
-from .options import check_bounds
+from .observations import Tracks, keypoint_offsets, keypoint_rays
 from .results import DepthPlanes, Structure
 from .structure import observe
-from .tracks import Tracks, keypoint_offsets, keypoint_rays
 from .views import PosedView
 
+MAX_CONTRADICTION = 3.0
+"""A depth that is farther from its triangulated point, in standard deviations of both, is wrong: it is at an edge, or
+the keypoint shows a reflection."""
 
-@dataclass(frozen=True)
-class KeptDepthOptions:
-    """Options of using stored depths.
-
-    Attributes:
-        max_contradiction: a depth that is farther from its triangulated point, in standard deviations of both, is
-            wrong: it is at an edge, or the keypoint shows a reflection.
-        enough_matches: with so many matches with triangulated points depths are not used. In `euroc-v101-drone`, with
-            five references and over a thousand, depths with shared errors of some per cent cost 5 cm; in the kitchen,
-            where most photographs have fewer, 100 instead of 200 costs a tenth of the gain.
-    """
-
-    max_contradiction: float = 3.0
-    enough_matches: int = 200
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "max_contradiction", above=0)
-        check_bounds(self, "enough_matches", at_least=1)
+ENOUGH_MATCHES = 200
+"""With so many matches with triangulated points depths are not used. In `euroc-v101-drone`, with five references and
+over a thousand, depths with shared errors of some per cent cost 5 cm; in the kitchen, where most photographs have less,
+100 instead of 200 costs a tenth of the gain."""
 
 
 def with_kept_depths(
     structure: Structure,
     references: Sequence[PosedView],
     correspondences: Correspondences,
-    options: KeptDepthOptions | None = None,
+    enough_matches: int = ENOUGH_MATCHES,
 ) -> Structure:
     """Adds the points that stored depths give to a structure, after the triangulated ones, with its `planes`.
 
     The references are in the order of the structure's tracks; the correspondences are those of the query with each. The
     structure, possibly without points, is unchanged if no reference has depths, or they are not needed.
     """
-    options = options or KeptDepthOptions()
     if all(reference.depths is None for reference in references):
         return structure
     counts = [len(reference.view.features) for reference in references]
-    if len(vote(structure, counts, correspondences)) >= options.enough_matches:
+    if len(vote(structure, counts, correspondences)) >= enough_matches:
         return structure
     known = _KnownDepths.of(references)
-    triangulated = _combined(structure, references, known, options)
+    triangulated = _combined(structure, references, known)
     return _with_single(triangulated, references, correspondences, known)
 
 
@@ -108,9 +95,7 @@ class _KnownDepths:
         return DepthPlanes(normal, offset, self.sigma[rows] ** -2.0)
 
 
-def _combined(
-    structure: Structure, references: Sequence[PosedView], known: _KnownDepths, options: KeptDepthOptions
-) -> Structure:
+def _combined(structure: Structure, references: Sequence[PosedView], known: _KnownDepths) -> Structure:
     """Moves each triangulated point that a depth determines better, and does not contradict, by that depth."""
     tracks, count = structure.tracks, len(structure.x_in_world)
     none = DepthPlanes(np.zeros((count, 3)), np.zeros(count), np.zeros(count))
@@ -123,14 +108,12 @@ def _combined(
     chosen, planes = np.flatnonzero(has_depth), known.planes(best[has_depth])
     kept = tracks.select(has_depth)
     x = structure.x_in_world[chosen]
-    _, by_point = observe(kept, references, structure.noise).linearized(x)
-    information = kept.sum_by_point(np.einsum("oai,oaj->oij", by_point, by_point))
-    covariance = np.linalg.pinv(information, hermitian=True)
+    covariance = observe(kept, references, structure.noise).point_covariances(x)
     across = np.einsum("pij,pj->pi", covariance, planes.normal)
     variance = (across * planes.normal).sum(axis=1) + 1 / planes.information
     off = planes.offset - (planes.normal * x).sum(axis=1)
     is_better = variance > 2 / planes.information
-    agrees = is_better & (off**2 <= options.max_contradiction**2 * variance)
+    agrees = is_better & (off**2 <= MAX_CONTRADICTION**2 * variance)
     moved = structure.x_in_world.copy()
     moved[chosen[agrees]] += (across * (off / variance)[:, None])[agrees]
     for name in ("normal", "offset", "information"):

@@ -140,7 +140,7 @@ def solve(coarse: Coarse, counts_agreement: bool = False) -> Answer:
         return coarse.answer(estimate, support)
     pose, inliers = estimate.world_from_camera, estimate.inliers
     chance = priors.log10_chance(pose) if counts_agreement else 0.0
-    failure = gate_failure(query.camera, matches, inliers, options.pnp.inlier_px, options.gate, chance)
+    failure = gate_failure(query.camera, matches, inliers, options.pnp.inlier_px, chance)
     if failure:
         return coarse.answer(Rejection(RejectionReason.GATE, failure), replace(support, estimate=estimate))
     sigma = prepared.options.intrinsics

@@ -21,16 +21,15 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian
 
-from .observations import FIRST_GUESS
+from .observations import FIRST_GUESS, Tracks
 from .options import check_bounds
 from .perturbation import motion_jacobian, perturbed, world_covariance
 from .pnp import PnpOptions, ransac
 from .rejection import Rejection, RejectionReason
 from .results import MetricScale, PointMatches, PoseEstimate, PoseStage, Structure, Support
-from .tracks import Tracks
-from .trust.gate import GateOptions, false_alarms, format_false_alarms
+from .trust.gate import MAX_LOG10_FALSE_ALARMS, false_alarms, format_false_alarms
 from .trust.judge import LEVELS
-from .uncertainty.covariance import scale_covariance
+from .uncertainty.dispersion import scale_covariance
 from .views import Matches, PosedView, Reconstruction, View
 
 MAD_TO_SIGMA = 1.4826
@@ -146,13 +145,13 @@ def trust_of_score(score: float, options: OneReferenceOptions) -> float:
     return float(np.interp(score, options.scores, LEVELS))
 
 
-def one_reference_failure(found: Found, trust: float, coverage: float, gate: GateOptions) -> str | None:
+def one_reference_failure(found: Found, trust: float, coverage: float) -> str | None:
     """Says in one sentence why a pose is not accepted; None if it is."""
     assert found.support.estimate is not None
     inliers = found.support.estimate.inliers
     count = f"{inliers.sum()} of {len(inliers)} matches agree on a pose"
-    if -found.score > gate.max_log10_false_alarms:
-        return f"{count}, which chance could do ({format_false_alarms(-found.score, gate.max_log10_false_alarms)})"
+    if -found.score > MAX_LOG10_FALSE_ALARMS:
+        return f"{count}, which chance could do ({format_false_alarms(-found.score, MAX_LOG10_FALSE_ALARMS)})"
     if trust < 1 - coverage:
         required = f"the {round(1 - coverage, 6):g} that a coverage of {coverage:g} requires"
         return f"its trust of {np.floor(1000 * trust) / 1000:g} is below {required}: {count} with a single reference"

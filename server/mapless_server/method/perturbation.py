@@ -52,15 +52,20 @@ def world_jacobian(world_from_camera: RigidTransform) -> Array:
     return jacobian
 
 
-def world_covariance(information: Array, world_from_camera: RigidTransform) -> Array:
-    """Covariance (6, 6) of world_from_camera, order x y z rx ry rz, about fixed world axes.
-
-    The information (6, 6) is the inverse covariance of a left perturbation (v, w) of camera_from_world. Directions
-    without information are left out (pseudo-inverse).
-    """
+def covariance_in_world(covariance: Array, world_from_camera: RigidTransform) -> Array:
+    """Covariance (6, 6) of world_from_camera, order x y z rx ry rz, from that of a left perturbation (v, w)."""
     jacobian = world_jacobian(world_from_camera)
-    covariance = jacobian @ np.linalg.pinv(information, hermitian=True) @ jacobian.T
-    return np.asarray((covariance + covariance.T) / 2)
+    turned = jacobian @ covariance @ jacobian.T
+    return np.asarray((turned + turned.T) / 2)
+
+
+def world_covariance(information: Array, world_from_camera: RigidTransform) -> Array:
+    """The same from the information (6, 6), the inverse covariance, of a left perturbation (v, w) of camera_from_world.
+
+    Directions without information are left out (pseudo-inverse).
+    """
+    covariance = np.asarray(np.linalg.pinv(information, hermitian=True), np.float64)
+    return covariance_in_world(covariance, world_from_camera)
 
 
 def motion_jacobian(x_in_camera: Array) -> Array:

@@ -1,13 +1,11 @@
 """A query between the parts of the method, and the part that computes batches: coarse and scale.
 
-A network reconstructs several queries together, so the stages up to the metric scale are computed here for a batch, on
-the device if the network's output is on one.
+A network reconstructs several queries together, so the stages up to the metric scale are computed here for a batch.
 """
 
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any, TypeVar
 
 from mapless.geometry import Array
@@ -25,13 +23,9 @@ from .pose_problem import AdjustOptions
 from .priors.known import NO_PRIORS, Priors
 from .rejection import Rejection, RejectionReason
 from .results import MetricScale, PointMatches, PoseStage, Structure, Support
-from .scale import estimate_scale, known_scale, network_scale
-from .scale_equations import ScaleOptions
+from .scale import ScaleOptions, estimate_scale, known_scale, network_scale
 from .structure import PAPER_STRUCTURE, StructureOptions, build_structure
-from .trust.gate import GateOptions
 from .trust.judge import JudgeOptions
-from .trust.two_view import TwoViewGateOptions
-from .two_view.solve import TwoViewOptions
 from .views import PosedView, Reconstruction, View
 
 T = TypeVar("T")
@@ -48,22 +42,16 @@ class StageOptions:
             better, its radius was at most 1.7 times as large; where repeated floor tiles had given it inliers, and
             centimetres of error, 40 to 80 times.
         pnp: options of the pose solver.
-        gate: options of the gate.
         adjust: options of the final adjustment.
         judge: options of the judge.
-        two_view: options of the pose from two-view matches, for queries that fail otherwise.
-        two_view_gate: options of accepting such a pose.
         one_reference: options of the pose from a single reference, with a network that predicts metres.
     """
 
     weak_inliers: int = 100
     max_radius_ratio: float = 3.0
     pnp: PnpOptions = field(default_factory=PnpOptions)
-    gate: GateOptions = field(default_factory=GateOptions)
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
     judge: JudgeOptions = field(default_factory=JudgeOptions)
-    two_view: TwoViewOptions = field(default_factory=TwoViewOptions)
-    two_view_gate: TwoViewGateOptions = field(default_factory=TwoViewGateOptions)
     one_reference: OneReferenceOptions = field(default_factory=OneReferenceOptions)
 
     @staticmethod
@@ -176,15 +164,11 @@ class Coarse:
         reconstruction: up to scale, or a rejection.
         scale: the metric scale with the initial pose, in the world of `prepared`; or a rejection, if wide
             correspondences are still to be tried.
-        structure, matches: None unless they were computed on a device together with the scale; the structure alone, if
-            the coarse stage triangulated it.
     """
 
     prepared: Prepared
     reconstruction: Outcome
     scale: MetricScale | Rejection
-    structure: Structure | None = None
-    matches: PointMatches | None = None
 
     @property
     def rests_on_priors(self) -> bool:
@@ -195,7 +179,7 @@ class Coarse:
         """What the coarse stage gives without priors."""
         free = replace(self, prepared=replace(self.prepared, priors=NO_PRIORS))
         if isinstance(self.reconstruction, Triangulation) and (alone := self.reconstruction.without_priors):
-            return replace(free, reconstruction=alone, scale=alone, structure=None)
+            return replace(free, reconstruction=alone, scale=alone)
         return free
 
     def answer(self, outcome: Localization | Rejection, support: Support | None = None) -> Answer:
@@ -210,8 +194,7 @@ class Coarse:
 def reconstruct(batch: Sequence[Prepared]) -> list[Coarse | Answer | Exception]:
     """Computes the coarse stage of a batch of queries of one reconstructor, then the metric scale of each.
 
-    Those of one bucket are reconstructed together. For a reconstruction on a device, scale, structure and matches are
-    computed there too; the device has finished with these queries when this returns.
+    Those of one bucket are reconstructed together.
 
     Returns for each query, in order, its reconstruction and scale; or its answer, if nothing remains to be computed; or
     its own exception, unchanged: raised by its check, or while it alone was computed, such as a torch.OutOfMemoryError
@@ -229,9 +212,7 @@ def reconstruct(batch: Sequence[Prepared]) -> list[Coarse | Answer | Exception]:
     spent_s = time.perf_counter() - start_s
     for prepared in batch:
         prepared.context.add("coarse", spent_s)
-    # All are launched before waiting for the first, so that the device does not wait for the host.
-    launched = _each(_launch_scale, batch, outcomes)
-    return _each(lambda finish: _answered_if_final(finish()), launched)
+    return _each(lambda prepared, outcome: _answered_if_final(_scaled(prepared, outcome)), batch, outcomes)
 
 
 def coarse_answer(coarse: Coarse) -> Answer | None:
@@ -254,7 +235,7 @@ def with_wide_correspondences(coarse: Coarse) -> Coarse:
             reconstruction = reconstruct_one(
                 pipeline.reconstructor, query, references, correspondences, prepared.priors
             )
-    return _launch_scale(replace(prepared, correspondences=correspondences), reconstruction)()
+    return _scaled(replace(prepared, correspondences=correspondences), reconstruction)
 
 
 def _each(work: Callable[..., T], *columns: Sequence[Any]) -> list[T | Exception]:
@@ -269,43 +250,21 @@ def _each(work: Callable[..., T], *columns: Sequence[Any]) -> list[T | Exception
     return results
 
 
-def _launch_scale(prepared: Prepared, reconstruction: Outcome) -> Callable[[], Coarse]:
-    """Launches the metric scale on the device of the reconstruction; the returned function waits for the result."""
-    references, correspondences, context = prepared.references, prepared.correspondences, prepared.context
-    options = ScaleOptions(prepared.options.scale_strategy)
-    if isinstance(reconstruction, Triangulation):
-        if prepared.options.variant in (Variant.BEST, Variant.COARSE):
-            with context.stage("scale"):
-                scale = known_scale(reconstruction.structure, reconstruction.world_from_query, references, options)
-            return partial(Coarse, prepared, reconstruction, scale, reconstruction.structure)
-        with context.stage("scale"):
-            reconstruction = point_maps(reconstruction, prepared.query, references)
-    coarse = partial(Coarse, prepared, reconstruction)
+def _scaled(prepared: Prepared, reconstruction: Outcome) -> Coarse:
+    """The metric scale of a reconstruction."""
     if isinstance(reconstruction, Rejection):
-        return partial(coarse, reconstruction)
-    if len(references) == 1 and reconstruction.metre_sigma is not None:
-        with context.stage("scale"):
-            fetched = reconstruction if isinstance(reconstruction, Reconstruction) else reconstruction.fetch()
-            return partial(Coarse, prepared, fetched, network_scale(fetched, references[0]))
-    options = replace(options, metre_sigma=reconstruction.metre_sigma)
-    if isinstance(reconstruction, Reconstruction):
-        with context.stage("scale"):
-            return partial(coarse, estimate_scale(reconstruction, references, correspondences, options))
-    from .on_device import launch_on_device
-    from .on_device.compute import Options
-
-    is_coarse = prepared.options.variant is Variant.COARSE
-    further = (None, None) if is_coarse else (prepared.structure_options, prepared.match_options)
-    context.check()
-    start_s = time.perf_counter()
-    launched = launch_on_device(reconstruction, prepared.query, references, correspondences, Options(options, *further))
-
-    def wait() -> Coarse:
-        found = launched()
-        context.add("refine", time.perf_counter() - start_s)  # each query waits for the whole batch
-        return coarse(found) if isinstance(found, Rejection) else coarse(found.scale, found.structure, found.matches)
-
-    return wait
+        return Coarse(prepared, reconstruction, reconstruction)
+    references, options = prepared.references, ScaleOptions(prepared.options.scale_strategy)
+    with prepared.context.stage("scale"):
+        if isinstance(reconstruction, Triangulation):
+            if prepared.options.variant in (Variant.BEST, Variant.COARSE):
+                structure, pose = reconstruction.structure, reconstruction.world_from_query
+                return Coarse(prepared, reconstruction, known_scale(structure, pose, references, options))
+            reconstruction = point_maps(reconstruction, prepared.query, references)
+        if len(references) == 1 and reconstruction.metre_sigma is not None:
+            return Coarse(prepared, reconstruction, network_scale(reconstruction, references[0]))
+        scale = estimate_scale(reconstruction, references, prepared.correspondences, options)
+        return Coarse(prepared, reconstruction, scale)
 
 
 def _answered_if_final(coarse: Coarse) -> Coarse | Answer:
@@ -324,13 +283,13 @@ def _unverified(scale: MetricScale, stage: PoseStage) -> Localization:
 
 
 def structure_and_matches(coarse: Coarse, scale: MetricScale) -> tuple[Structure, PointMatches]:
-    """Structure and matches: those that were computed together with the coarse stage or the scale, else new ones."""
-    if coarse.structure is not None and coarse.matches is not None:
-        return coarse.structure, coarse.matches
-    prepared, reconstruction, structure = coarse.prepared, coarse.reconstruction, coarse.structure
+    """The structure, which the coarse stage may have triangulated, and the query's matches with it."""
+    prepared, reconstruction = coarse.prepared, coarse.reconstruction
     references, correspondences = prepared.references, prepared.correspondences
     with prepared.context.stage("structure"):
-        if structure is None:
+        if isinstance(reconstruction, Triangulation):
+            structure = reconstruction.structure
+        else:
             assert isinstance(reconstruction, Reconstruction)
             structure = build_structure(reconstruction, scale, references, correspondences, prepared.structure_options)
             if prepared.options.variant is Variant.BEST:

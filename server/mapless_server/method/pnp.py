@@ -14,9 +14,8 @@ from mapless.geometry import Array, Camera, RigidTransform
 
 from .options import check_bounds
 from .perturbation import pose_hessian, reprojection_errors_px, world_covariance
-from .priors.informed import InformedOptions, informed_pose
+from .priors.informed import informed_pose
 from .priors.known import NO_PRIORS, Priors
-from .priors.pose_only import PoseOnlyOptions
 from .rejection import Rejection, RejectionReason
 from .results import PointMatches, PoseEstimate, PoseStage, Structure
 from .views import View
@@ -40,8 +39,6 @@ class PnpOptions:
         max_iterations: largest number of RANSAC iterations, reached with 5 % inliers.
         max_matches: largest number of matches, evenly thinned; more are not more accurate, and scoring is linear in it.
         min_matches: fewer give no pose.
-        error_inflation: factor on the standard deviations of a pose from matches, before it is compared or combined
-            with priors; as in the adjustment.
     """
 
     inlier_px: float = 4.0
@@ -50,18 +47,11 @@ class PnpOptions:
     max_iterations: int = 20_000
     max_matches: int = 2000
     min_matches: int = 6
-    error_inflation: float = 2.0
 
     def __post_init__(self) -> None:
-        check_bounds(self, "inlier_px loss_scale_px error_inflation", above=0)
+        check_bounds(self, "inlier_px loss_scale_px", above=0)
         check_bounds(self, "min_iterations", above=0, at_most=self.max_iterations)
         check_bounds(self, "min_matches", at_least=4)
-
-    @property
-    def informed(self) -> InformedOptions:
-        """Options of pose estimation with priors."""
-        refine = PoseOnlyOptions(sigma_px=self.loss_scale_px, prior_weight=self.error_inflation**2)
-        return InformedOptions(self.inlier_px, refine)
 
 
 def solve_pose(
@@ -90,7 +80,7 @@ def solve_pose(
     stage, pose = candidates[int(np.argmax([(e < options.inlier_px).sum() for e in errors]))]
     if not priors:
         return _estimate(camera, x_in_world, pixels, stage, pose, options)
-    informed = informed_pose(camera, x_in_world, pixels, pose, priors, options.informed)
+    informed = informed_pose(camera, x_in_world, pixels, pose, priors, options.inlier_px)
     assert informed  # `pose` at the least
     if informed.without_priors is not pose:
         stage = PoseStage.REFINED

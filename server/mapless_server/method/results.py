@@ -11,12 +11,9 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, Similarity
 
-from .arrays import (
-    AnyArray,
-)
 from .intrinsics import IntrinsicsEvidence
+from .observations import KeypointNoise, Tracks
 from .priors.known import PriorCheck
-from .tracks import Tracks
 from .views import Matches, PosedView, View
 
 
@@ -64,25 +61,6 @@ class MetricScale:
     def source(self) -> ScaleSource:
         """What the scale rests on."""
         return ScaleSource.NETWORK if self.stage is ScaleStage.NETWORK else ScaleSource.REFERENCES
-
-
-@dataclass(frozen=True)
-class KeypointNoise:
-    """Localization noise of keypoints: sigma^2 = level^2 + (slope * size)^2.
-
-    Attributes:
-        level_px: noise common to all keypoints: detection, and the effect of pose and lens errors in pixels. An array
-            of one number while it is being estimated.
-        slope: noise per diameter of the patch; a blob of 20 px is localized to a pixel, one of 3 px to a fifth.
-            Measured on photographs with surveyed poses.
-    """
-
-    level_px: float
-    slope: float
-
-    def sigma_px(self, sizes_px: AnyArray) -> AnyArray:
-        """Standard deviation (N,) of each coordinate of keypoints of these sizes (N,)."""
-        return (self.level_px**2 + (self.slope * sizes_px) ** 2) ** 0.5
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ The paper's structure-only bundle adjustment: with fixed poses every point is it
 so all points take Levenberg-Marquardt steps at once, each with its own damping. Residuals are divided by the standard
 deviation of their keypoint; in the paper's form this is one pixel for all.
 
-The equations are in `observations`, for NumPy arrays and torch tensors.
+The equations are in `observations`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,21 +19,25 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
-from .arrays import AnyArray, columns, length, namespace, take
 from .correspond import Correspondences
 from .observations import (
     FIRST_GUESS,
     ONE_PIXEL,
+    KeypointNoise,
     Observations,
+    Tracks,
     adjust_points,
-    back_project,
     better_start,
+    build_tracks,
     estimate_noise,
+    keypoint_depths,
+    keypoint_offsets,
+    keypoint_rays,
     triangulate,
 )
+from .optimize import columns, length, take
 from .options import check_bounds
-from .results import KeypointNoise, MetricScale, PointMatches, Structure
-from .tracks import Tracks, build_tracks, keypoint_depths, keypoint_offsets, keypoint_rays
+from .results import MetricScale, PointMatches, Structure
 from .views import Matches, PosedView, Reconstruction, View
 
 ENTRY_BYTES = 2048
@@ -98,10 +102,12 @@ def build_structure(
     The reconstruction's references are in the order of `references`; the correspondences are those between them. Every
     point is finite and in front of the references that observe it. `PAPER_STRUCTURE` is the paper's form.
     """
-    tracks = tracks_of(references, correspondences, options)
+    tracks = correspondences.tracks(references, None if options.all_references else 0)
     observations = observe(tracks, references, options.first_noise)
     start = predicted_points(reconstruction, scale, references, tracks)
-    return _refined(observations, first_points(observations, start, options), options)
+    if options.optimize and options.all_references:
+        start = better_start(observations, start, triangulate(observations), options.loss_scale_sigma)
+    return _refined(observations, start, options)
 
 
 def triangulated_structure(
@@ -146,15 +152,8 @@ def _triangulated(
 
 def _refined(observations: Observations, start: Array, options: StructureOptions) -> Structure:
     refined = refine_points(observations, start, options)
-    noise = replace(refined.noise, level_px=float(refined.noise.level_px))
-    left = refined.observations.tracks
-    assert isinstance(left, Tracks)
-    return Structure(refined.x_in_world[refined.trusted], left.select(refined.trusted), noise)
-
-
-def tracks_of(references: Sequence[PosedView], correspondences: Correspondences, options: StructureOptions) -> Tracks:
-    """Builds the tracks to triangulate."""
-    return correspondences.tracks(references, None if options.all_references else 0)
+    tracks = refined.observations.tracks.select(refined.trusted)
+    return Structure(refined.x_in_world[refined.trusted], tracks, refined.noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,20 +167,13 @@ class RefinedPoints:
         noise: noise of the keypoints.
     """
 
-    x_in_world: AnyArray
+    x_in_world: Array
     observations: Observations
-    trusted: AnyArray
+    trusted: NDArray[np.bool_]
     noise: KeypointNoise
 
 
-def first_points(observations: Observations, predicted: AnyArray, options: StructureOptions) -> AnyArray:
-    """Initial values (P, 3) of the points: the predicted ones, or the triangulated ones where these are better."""
-    if not (options.optimize and options.all_references):
-        return predicted
-    return better_start(observations, predicted, triangulate(observations), options.loss_scale_sigma)
-
-
-def refine_points(observations: Observations, x_in_world: AnyArray, options: StructureOptions) -> RefinedPoints:
+def refine_points(observations: Observations, x_in_world: Array, options: StructureOptions) -> RefinedPoints:
     """Adjusts points from their initial values (P, 3); `observations` must have the noise `options.first_noise`."""
     points, noise = x_in_world, options.first_noise
     if options.optimize:
@@ -191,45 +183,42 @@ def refine_points(observations: Observations, x_in_world: AnyArray, options: Str
             observations = observations.weighted(noise)
         if options.max_residual_sigma is not None:
             # A track with one wrong match has right observations too.
-            explained = length(observations.residuals(points)) < options.max_residual_sigma
+            explained = length(observations.residuals(points).T) < options.max_residual_sigma
             observations, points = observations.prune(explained, points)
         points = adjust_points(observations, points, options.loss_scale_sigma, options.iterations)
     return RefinedPoints(points, observations, trustworthy(observations, points, options), noise)
 
 
-def trustworthy(observations: Observations, x_in_world: AnyArray, options: StructureOptions) -> AnyArray:
+def trustworthy(observations: Observations, x_in_world: Array, options: StructureOptions) -> NDArray[np.bool_]:
     """Which points (P,) are finite, fit all their observations and have enough parallax."""
-    xp = namespace(x_in_world)
     limit = options.max_residual_sigma
-    explained = observations.max_by_point(length(observations.residuals(x_in_world))) < (limit or np.inf)
-    centre, _ = observations.columns.rays()
-    direction = take(columns(x_in_world), observations.point) - centre
+    explained = observations.max_by_point(length(observations.residuals(x_in_world).T)) < (limit or np.inf)
+    direction = take(columns(x_in_world), observations.point) - observations.rays()[0]
     direction = direction / (direction**2).sum(0) ** 0.5
     cosine = (direction * take(direction, observations.tracks.starts[observations.point])).sum(0)
-    parallax_deg = xp.rad2deg(xp.arccos(xp.clip(cosine, -1, 1)))
-    return explained & (observations.max_by_point(parallax_deg) >= options.min_parallax_deg)
+    parallax_deg = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
+    return np.asarray(explained & (observations.max_by_point(parallax_deg) >= options.min_parallax_deg))
 
 
 def observe(tracks: Tracks, references: Sequence[PosedView], noise: KeypointNoise) -> Observations:
     """Makes the observations of tracks over these references."""
-    camera_from_world = [r.world_from_camera.inverse() for r in references]
-    rotations = np.stack([c.rotation for c in camera_from_world])
-    translations = np.stack([c.translation for c in camera_from_world])
-    cameras = [r.view.camera for r in references]
-    focals = np.array([(c.focal_x_px, c.focal_y_px) for c in cameras])
-    principals = np.array([(c.principal_x_px, c.principal_y_px) for c in cameras])
+    poses, cameras = [r.world_from_camera.inverse() for r in references], [r.view.camera for r in references]
     keypoints = np.concatenate([r.view.features.keypoints for r in references]).astype(np.float64)
     rows = keypoint_offsets(references)[tracks.view] + tracks.keypoint
     sizes_px = np.concatenate([r.view.features.sizes_px for r in references]).astype(np.float64)[rows]
+
+    def of_view(values: Sequence[object]) -> Array:
+        return take(columns(np.array(values)), tracks.view)
+
     return Observations(
         tracks,
-        keypoints[rows],
+        columns(keypoints[rows]),
         sizes_px,
         noise.sigma_px(sizes_px),
-        rotations[tracks.view],
-        translations[tracks.view],
-        focals[tracks.view],
-        principals[tracks.view],
+        of_view([it.rotation for it in poses]),
+        of_view([it.translation for it in poses]),
+        of_view([(it.focal_x_px, it.focal_y_px) for it in cameras]),
+        of_view([(it.principal_x_px, it.principal_y_px) for it in cameras]),
     )
 
 
@@ -243,8 +232,7 @@ def predicted_points(
     first = keypoint_offsets(references)[tracks.view[tracks.starts]] + tracks.keypoint[tracks.starts]
     centre, ray = keypoint_rays(references)
     depth = keypoint_depths(reconstruction, references)
-    points: Array = back_project(centre[first], ray[first], scale.metres_per_unit * depth[first])
-    return points
+    return np.asarray(centre[first] + ray[first] * (scale.metres_per_unit * depth[first])[:, None])
 
 
 def query_tracks(
@@ -289,7 +277,6 @@ def with_query_points(
     observations = observe(tracks, [*references, PosedView("", "", query, world_from_query)], structure.noise)
     refined = refine_points(observations, triangulate(observations), replace(options, model_noise=False))
     found = refined.observations.tracks
-    assert isinstance(found, Tracks)
     chosen = np.zeros(found.point_count, bool)
     chosen[found.point[found.view == len(references)]] = True
     chosen &= refined.trusted

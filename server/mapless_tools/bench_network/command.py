@@ -107,8 +107,7 @@ class _Bench:
         tier, note = query.make_tier(query.FEATURES, self.device)
         bench = query.Bench(query.photographs(2 if self.quick else 8), tier)
         runner = self._runner(name, self.device)
-        for on_device in (True, False):
-            yield from self._tried(query.measure_queries(runner, bench, note, on_device), f"query-{name}")
+        yield from self._tried(query.measure_queries(runner, bench, note), f"query-{name}")
         runner.close()
 
     def _tried(self, figures: Iterator[Figure], part: str) -> Iterator[Figure]:

@@ -8,12 +8,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless_server.method.coarse import Bucket, Outcome, Request
-from mapless_server.method.coarse.device import DeviceReconstruction
 from mapless_server.method.coarse.grids import GridOptions, common_grid, lay_out
 from mapless_server.method.coarse.network import NetworkReconstructor
 from mapless_server.method.rejection import Rejection
@@ -38,11 +36,11 @@ class PlantedReconstructor:
     uses_correspondences = False
     is_batched = True
 
-    def __init__(self, network: NetworkReconstructor, truths: Mapping[str, Truth], device: torch.device) -> None:
-        """The `truths` are by the SHA-256 of the views' images; they are copied to the device beforehand."""
+    def __init__(self, network: NetworkReconstructor, truths: Mapping[str, Truth]) -> None:
+        """The `truths` are by the SHA-256 of the views' images."""
         self.network = network
         self._truths = truths
-        self._maps = {sha256: torch.from_numpy(true_points(truth)).to(device) for sha256, truth in truths.items()}
+        self._maps = {sha256: true_points(truth) for sha256, truth in truths.items()}
 
     @property
     def name(self) -> str:
@@ -73,11 +71,9 @@ class PlantedReconstructor:
         query, references = request.query, request.references
         keys = [_sha256(view) for view in (*(reference.view for reference in references), query)]
         poses = np.stack([self._local_pose(key, keys[0]) for key in keys])
-        if isinstance(outcome, DeviceReconstruction):
-            return self._on_device(outcome, keys[:-1], poses)
         assert isinstance(outcome, Reconstruction)
         views = [
-            replace(view, point_map=self._maps[key].numpy(), confidence=np.ones_like(view.confidence))
+            replace(view, point_map=self._maps[key], confidence=np.ones_like(view.confidence))
             for view, key in zip(outcome.references, keys, strict=False)
         ]
         parts = zip((*views, outcome.query), poses, strict=True)
@@ -85,13 +81,6 @@ class PlantedReconstructor:
             replace(view, local_from_camera=RigidTransform(pose[:3, :3], pose[:3, 3])) for view, pose in parts
         ]
         return Reconstruction(posed[-1], tuple(posed[:-1]))
-
-    def _on_device(self, outcome: DeviceReconstruction, keys: Sequence[str], poses: Array) -> DeviceReconstruction:
-        # Launched after the network on the same stream, so that to wait for this is to wait for the network.
-        maps = torch.stack([self._maps[key] for key in keys])
-        confidence = torch.ones_like(outcome.confidence)
-        on_device = torch.from_numpy(poses.astype(np.float32)).to(maps.device, non_blocking=True)
-        return replace(outcome, point_maps=maps, confidence=confidence, local_from_camera=on_device)
 
     def _local_pose(self, key: str, anchor: str) -> Array:
         """Pose (4, 4) in the planted frame, which is the first reference's camera."""

@@ -18,7 +18,7 @@ import torch
 from mapless_server.engine.query import Tier
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.answer import Answer, Localization
-from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
+from mapless_server.method.coarse.network import NetworkReconstructor
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions
@@ -112,17 +112,16 @@ class Bench:
         return answer, {**stages, **answer.stage_seconds, "total": time.perf_counter() - start_s}
 
 
-def measure_queries(runner: NetworkRunner, bench: Bench, note: str, keep_on_device: bool) -> Iterator[Figure]:
+def measure_queries(runner: NetworkRunner, bench: Bench, note: str) -> Iterator[Figure]:
     """Measures latency, stages and throughput on a planted reconstruction, and with the random network's own output."""
-    where = "device" if keep_on_device else "host"
     features = bench.tier.extractor.name.split("-")[0]
-    part = f"{runner.name} query, {features}, K = {REFERENCES}, stages after the network on the {where}"
-    network = NetworkReconstructor(runner, NetworkOptions(keep_on_device=keep_on_device))
+    part = f"{runner.name} query, {features}, K = {REFERENCES}"
+    network = NetworkReconstructor(runner)
     truths = {
         key: Truth(photo.camera, photo.world_from_camera, depth_map_m(photo.name))
         for key, photo in (bench.room.references | bench.room.queries).items()
     }
-    planted = Pipeline(PlantedReconstructor(network, truths, runner.device), bench.tier.pipeline.matcher)
+    planted = Pipeline(PlantedReconstructor(network, truths), bench.tier.pipeline.matcher)
     _runs(bench, planted, 1)  # fills caches
     graphs = compiled_graphs()
     runs, again = (_runs(bench, planted, ROUNDS) for _ in range(2))

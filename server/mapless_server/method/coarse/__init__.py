@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,6 @@ from ..priors.known import NO_PRIORS, Priors
 from ..rejection import Rejection
 from ..results import Structure
 from ..views import PosedView, Reconstruction, View
-
-if TYPE_CHECKING:  # it needs torch
-    from .device import DeviceReconstruction
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +40,7 @@ class Triangulation:
     without_priors: Rejection | None = None
 
 
-Outcome: TypeAlias = "Reconstruction | DeviceReconstruction | Triangulation | Rejection"
+Outcome: TypeAlias = Reconstruction | Triangulation | Rejection
 """The result of a backend for one query: its reconstruction, or a rejection."""
 
 

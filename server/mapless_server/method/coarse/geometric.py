@@ -6,7 +6,7 @@ variants the sparse points are scattered into point maps, in a local frame with 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,6 @@ from mapless.geometry import Array, RigidTransform, Similarity
 from ..correspond import Correspondences
 from ..kept_depth import with_kept_depths
 from ..match import vote
-from ..options import check_bounds
 from ..perturbation import reprojection_errors_px
 from ..pnp import PnpOptions, ransac
 from ..priors.informed import informed_pose
@@ -25,7 +24,7 @@ from ..rejection import Rejection, RejectionReason
 from ..results import PointMatches, Structure
 from ..scale import unit_frame
 from ..structure import StructureOptions, triangulated_structure
-from ..trust.gate import GateOptions, format_false_alarms, log10_false_alarms
+from ..trust.gate import MAX_LOG10_FALSE_ALARMS, format_false_alarms, log10_false_alarms
 from ..views import PosedView, ReconstructedView, Reconstruction, View
 from . import Bucket, Outcome, Request, Triangulation
 
@@ -33,32 +32,17 @@ CELL_PX = 2
 """Side of a cell of the point maps, pixels of the view; so small that two keypoints seldom share a cell."""
 
 
-@dataclass(frozen=True)
-class GeometricOptions:
-    """Options of the geometric backend.
+MIN_BASELINE_M = 0.02
+"""Least distance of the farthest reference from the mean of all; below it, nothing is triangulated."""
 
-    Attributes:
-        structure: options of the triangulation, those of the structure stage.
-        pnp: options of the query's pose.
-        gate: a pose is rejected if chance could have produced its inliers.
-        min_baseline_m: least distance of the farthest reference from the mean of all; below it, nothing is
-            triangulated.
-    """
-
-    structure: StructureOptions = field(default_factory=StructureOptions)
-    pnp: PnpOptions = field(default_factory=PnpOptions)
-    gate: GateOptions = field(default_factory=GateOptions)
-    min_baseline_m: float = 0.02
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "min_baseline_m", above=0)
+STRUCTURE, PNP = StructureOptions(), PnpOptions()
+"""Options as of the later stages."""
 
 
 @dataclass(frozen=True)
 class GeometricReconstructor:
     """A `Reconstructor` by triangulation and PnP; see the module."""
 
-    options: GeometricOptions = field(default_factory=GeometricOptions)
     name: str = "geometric"
     weights_sha256: str = ""
     uses_correspondences: bool = True
@@ -88,7 +72,7 @@ class GeometricReconstructor:
         rejection = self._check(references)
         if rejection:
             return rejection
-        structure = triangulated_structure(references, correspondences, self.options.structure)
+        structure = triangulated_structure(references, correspondences, STRUCTURE)
         structure = with_kept_depths(structure, references, correspondences)
         if not len(structure.x_in_world):
             return Rejection(
@@ -103,13 +87,13 @@ class GeometricReconstructor:
         matches = vote(structure, [len(r.view.features) for r in references], correspondences)
         x_in_world = structure.x_in_world[matches.point]
         pixels = query.features.keypoints[matches.keypoint].astype(np.float64)
-        options, priors = self.options.pnp, request.priors
-        enough = len(matches) >= options.min_matches
-        pose = ransac(query.camera, x_in_world, pixels, None, options) if enough else None
+        priors = request.priors
+        enough = len(matches) >= PNP.min_matches
+        pose = ransac(query.camera, x_in_world, pixels, None, PNP) if enough else None
         rejection, inliers = self._judge(query, structure, matches, pose, NO_PRIORS)
         without_priors = rejection
         if rejection and enough and priors:
-            informed = informed_pose(query.camera, x_in_world, pixels, pose, priors, options.informed)
+            informed = informed_pose(query.camera, x_in_world, pixels, pose, priors, PNP.inlier_px)
             pose = informed.world_from_camera if informed else None
             rejection, inliers = self._judge(query, structure, matches, pose, priors)
         if rejection:
@@ -125,18 +109,18 @@ class GeometricReconstructor:
         self, query: View, structure: Structure, matches: PointMatches, pose: RigidTransform | None, priors: Priors
     ) -> tuple[Rejection | None, NDArray[np.bool_]]:
         """Returns the reason to reject the pose, if any, and which of the matches (M,) are its inliers."""
-        inlier_px = self.options.pnp.inlier_px
+        inlier_px = PNP.inlier_px
         if pose is None:
             message = f"the photograph matches {len(matches)} of {len(structure.x_in_world)} points of the references"
             return _no_overlap(message, matches), np.zeros(len(matches), bool)
         x_in_world, pixels = structure.x_in_world[matches.point], query.features.keypoints[matches.keypoint]
         inliers = reprojection_errors_px(query.camera, pose, x_in_world, pixels.astype(np.float64)) < inlier_px
         expected = log10_false_alarms(query.camera, matches, inliers, inlier_px) + priors.log10_chance(pose)
-        if expected <= self.options.gate.max_log10_false_alarms:
+        if expected <= MAX_LOG10_FALSE_ALARMS:
             return None, inliers
         message = (
             f"{inliers.sum()} of {len(matches)} matches with the references' points agree on a pose, which chance"
-            f" could do ({format_false_alarms(expected, self.options.gate.max_log10_false_alarms)})"
+            f" could do ({format_false_alarms(expected, MAX_LOG10_FALSE_ALARMS)})"
         )
         return _no_overlap(message, matches), inliers
 
@@ -147,7 +131,7 @@ class GeometricReconstructor:
             )
         centres = np.stack([r.world_from_camera.translation for r in references])
         extent_m = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
-        if extent_m < self.options.min_baseline_m:
+        if extent_m < MIN_BASELINE_M:
             return Rejection(
                 RejectionReason.DEGENERATE_REFERENCES,
                 f"all {len(references)} references stand within {extent_m:.3f} m: without a baseline there is no scale",

@@ -1,8 +1,8 @@
 """The coarse stage by a network: pi^3, the paper's, or Pi3X or MapAnything, which take intrinsics and known poses, too.
 
-    photographs > pictures > tokens > network > DeviceReconstruction
-      (views)    (grids)  (cached for           (on the device,
-                           references)           or fetched)
+    photographs > pictures > tokens > network > Reconstruction
+      (views)    (grids)  (cached for           (copied to
+                           references)           the host)
 
 The output of a network is known up to a similarity, also if it was given poses: the scale stage aligns it.
 """
@@ -25,9 +25,8 @@ from mapless_server.networks.network import NetworkOutput
 from mapless_server.networks.runner import NetworkRunner
 
 from ..rejection import Rejection, RejectionReason
-from ..views import Photograph, PosedView, View
+from ..views import Photograph, PosedView, ReconstructedView, Reconstruction, View
 from . import Bucket, Outcome, Request
-from .device import DeviceReconstruction
 from .grids import Grid, GridOptions, Layout, common_grid, lay_out
 from .token_cache import TokenCache, TokenCacheOptions, TokenKey
 
@@ -43,7 +42,6 @@ class NetworkOptions:
     Attributes:
         grids: of the pictures.
         cache: of references' tokens.
-        keep_on_device: whether a reconstruction stays on the network's device; None keeps it on CUDA.
         query_rays: whether a network that takes intrinsics gets the query's. MapAnything saw hardly any view with
             intrinsics and without a pose among posed ones when it was trained, and few views with neither: which is
             better has to be measured with its weights.
@@ -51,7 +49,6 @@ class NetworkOptions:
 
     grids: GridOptions = field(default_factory=GridOptions)
     cache: TokenCacheOptions = field(default_factory=TokenCacheOptions)
-    keep_on_device: bool | None = None
     query_rays: bool = True
 
 
@@ -68,8 +65,6 @@ class NetworkReconstructor:
     def __init__(self, runner: NetworkRunner, options: NetworkOptions | None = None) -> None:
         self._runner = runner
         self._options = options or NetworkOptions()
-        keep = self._options.keep_on_device
-        self._keeps = runner.device.type == "cuda" if keep is None else keep
         on_host = runner.device.type == "cpu"
         cache = self._options.cache
         self.cache = TokenCache(runner.device, replace(cache, host_bytes=0) if on_host else cache)
@@ -202,21 +197,27 @@ class NetworkReconstructor:
         )
 
     def _outcome(self, scene: _Scene, output: NetworkOutput, index: int) -> Outcome:
-        points, logits, poses = (tensor[index] for tensor in vars(output).values())
-        if not self._keeps and not all(bool(tensor.isfinite().all()) for tensor in (points, logits, poses)):
+        points, logits, poses = (tensor[index].float() for tensor in vars(output).values())
+        *layouts, of_query = (view.layout for view in scene.views)
+        parts = points, _without_filling(logits.sigmoid(), layouts), poses
+        flat = torch.cat([part.reshape(-1) for part in parts]).cpu().numpy()  # in one transfer
+        if not np.isfinite(flat).all():
             log.warning("%s: the network's output is not finite", self.name)
             return Rejection(RejectionReason.SCALE_UNRELIABLE, f"the output of the network {self.name} is not finite")
-        *layouts, of_query = (view.layout for view in scene.views)
-        reconstruction = DeviceReconstruction(
-            tuple(layout.camera for layout in layouts),
-            of_query.camera,
-            points,
-            _without_filling(logits.sigmoid(), layouts),
-            poses,
-            self.name,
+        ends = np.cumsum([part.numel() for part in parts])
+        point_maps, confidence, matrices = (
+            values.reshape(part.shape) for values, part in zip(np.split(flat, ends[:-1]), parts, strict=True)
+        )
+        local_from_camera = [RigidTransform(pose[:3, :3], pose[:3, 3]) for pose in matrices.astype(np.float64)]
+        size = of_query.grid.height_px, of_query.grid.width_px
+        unknown = np.full((*size, 3), np.nan, np.float32), np.zeros(size, np.float32)  # the query's maps
+        cameras = (layout.camera for layout in layouts)
+        views = zip(cameras, point_maps, confidence, local_from_camera[:-1], strict=True)
+        return Reconstruction(
+            ReconstructedView(of_query.camera, *unknown, local_from_camera[-1]),
+            tuple(ReconstructedView(*view) for view in views),
             self._runner.metre_sigma if scene.is_metric else None,
         )
-        return reconstruction if self._keeps else reconstruction.fetch()
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,6 @@ depend on, so an entry is never stale.
 """
 
 import threading
-from collections import OrderedDict
 from dataclasses import dataclass, replace
 
 import torch
@@ -13,6 +12,7 @@ from torch import Tensor
 
 from mapless.geometry import Camera
 
+from ..cache import LruCache
 from ..options import check_bounds
 from .grids import Grid
 
@@ -76,8 +76,9 @@ class TokenCache:
         options = options or TokenCacheOptions()
         self._device = device
         self._pins = device.type == "cuda"
-        self._on_device = _Level(options.device_bytes)
-        self._on_host = _Level(options.host_bytes)
+        self._on_device: LruCache[Tensor] = LruCache(options.device_bytes)
+        self._on_host: LruCache[Tensor] = LruCache(options.host_bytes)
+        self._host_bytes = options.host_bytes
         self._counters = TokenCacheCounters()
         self._lock = threading.Lock()
 
@@ -85,7 +86,7 @@ class TokenCache:
     def counters(self) -> TokenCacheCounters:
         """Returns a snapshot of the counters."""
         with self._lock:
-            return replace(self._counters, device_bytes=self._on_device.used_bytes, host_bytes=self._on_host.used_bytes)
+            return replace(self._counters, device_bytes=self._on_device.used, host_bytes=self._on_host.used)
 
     def get(self, key: TokenKey) -> Tensor | None:
         """Returns the tokens (T, C) on the device, or None if they are not cached; they must not be modified."""
@@ -115,54 +116,16 @@ class TokenCache:
                 self._spill(key, tokens)
 
     def _hold(self, key: TokenKey, tokens: Tensor) -> None:
-        for old_key, old_tokens in self._on_device.put(key, tokens):
+        for old_key, old_tokens in self._on_device.put(key, tokens, tokens.nbytes):
             self._spill(old_key, old_tokens)
 
     def _spill(self, key: TokenKey, tokens: Tensor) -> None:
         dropped = 1
         if self._on_host.get(key) is not None:
             dropped = 0  # tokens that came from the host are still there
-        elif self._on_host.takes(tokens):
+        elif tokens.nbytes <= self._host_bytes:
             spilled = torch.empty(tokens.shape, dtype=tokens.dtype, pin_memory=self._pins)
             # Not waited for: it is only read by a copy to the device, which the device does after this one.
-            dropped = len(self._on_host.put(key, spilled.copy_(tokens, non_blocking=self._pins)))
+            copied = spilled.copy_(tokens, non_blocking=self._pins)
+            dropped = len(self._on_host.put(key, copied, copied.nbytes))
         self._counters = replace(self._counters, evictions=self._counters.evictions + dropped)
-
-
-class _Level:
-    """Tensors of at most `capacity_bytes` together; the least recently used ones are evicted."""
-
-    def __init__(self, capacity_bytes: int) -> None:
-        self.used_bytes = 0
-        self._capacity_bytes = capacity_bytes
-        self._entries: OrderedDict[TokenKey, Tensor] = OrderedDict()
-
-    def takes(self, tokens: Tensor) -> bool:
-        """Whether the tokens fit if everything else is evicted."""
-        return tokens.nbytes <= self._capacity_bytes
-
-    def get(self, key: TokenKey) -> Tensor | None:
-        if key not in self._entries:
-            return None
-        self._entries.move_to_end(key)
-        return self._entries[key]
-
-    def put(self, key: TokenKey, tokens: Tensor) -> list[tuple[TokenKey, Tensor]]:
-        """Stores tokens; returns the evicted entries, or the new one if it does not fit."""
-        if not self.takes(tokens):
-            return [(key, tokens)]
-        replaced = self._entries.pop(key, None)
-        self.used_bytes += tokens.nbytes - (replaced.nbytes if replaced is not None else 0)
-        self._entries[key] = tokens
-        evicted = []
-        while self.used_bytes > self._capacity_bytes:
-            evicted.append(self._entries.popitem(last=False))
-            self.used_bytes -= evicted[-1][1].nbytes
-        return evicted
-
-    def clear(self) -> list[tuple[TokenKey, Tensor]]:
-        """Evicts all entries and returns them, the least recently used first."""
-        evicted = list(self._entries.items())
-        self._entries.clear()
-        self.used_bytes = 0
-        return evicted

@@ -14,7 +14,7 @@ import numpy as np
 from mapless.geometry import RigidTransform
 
 from ..answer import Answer, Localization
-from ..hints import HintOptions
+from ..hints import FEW_MATCHES, MANY_MATCHES
 from ..rejection import Advice, Hint, Rejection, RejectionReason
 from ..views import PosedView
 from .rig import RigEstimate
@@ -122,7 +122,7 @@ def hinted_group(
     # Intrinsics and references are right where photographs are localized alone.
     if is_sequence and alone > 1 and rejection.reason in (RejectionReason.PNP_FAILED, RejectionReason.GATE):
         return replace(rejection, hint=replace(CHECK_TRACKING, best_reference=best))
-    advice, message = _advice(rejection.reason, matches, len(images), HintOptions())
+    advice, message = _advice(rejection.reason, matches, len(images))
     return replace(rejection, hint=Hint(STAGE, advice, message, best))
 
 
@@ -137,7 +137,7 @@ def _best(images: Sequence[tuple[Answer, Sequence[PosedView]]]) -> tuple[int, st
     return count, name if count else None
 
 
-def _advice(reason: RejectionReason, matches: int, image_count: int, options: HintOptions) -> tuple[Advice, str]:
+def _advice(reason: RejectionReason, matches: int, image_count: int) -> tuple[Advice, str]:
     shared = f"the best reference shares {matches} features with one of the {image_count} photographs"
     if reason is RejectionReason.SCALE_UNRELIABLE:
         return (
@@ -145,12 +145,12 @@ def _advice(reason: RejectionReason, matches: int, image_count: int, options: Hi
             "Take the photographs from further apart, so that the session's motion determines its unit; or say that "
             "the session is metric, if it is.",
         )
-    if matches < options.few_matches:
+    if matches < FEW_MATCHES:
         return (
             Advice.CHOOSE_OTHER_REFERENCES,
             f"Use references that show what the photographs show: {shared}, no more than chance gives.",
         )
-    if matches >= options.many_matches:
+    if matches >= MANY_MATCHES:
         return (
             Advice.CHECK_CALIBRATION,
             "Check the photographs' intrinsics, the poses of the cameras to one another, and the references' poses: "

@@ -11,52 +11,34 @@ If the unit of the session is unknown (monocular tracking), all steps share one 
 import itertools
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mapless.geometry import Array, RigidTransform, Similarity, cross_matrix
 
 from ..optimize import switched_cost, switched_weight
-from ..options import check_bounds
 from ..perturbation import perturbed, rotation_vector
 
 _MEDIAN_SQUARE = 5.35
 """Median of a chi-square of six degrees of freedom."""
 
 
-@dataclass(frozen=True)
-class DriftOptions:
-    """Noise of the steps of a session, as standard deviations of each axis.
+SHARE, FLOOR_M = 0.012, 0.002
+"""Noise of a step's position along each axis, as a share of the distance travelled, and what is added without motion.
+Visual-inertial tracking of phones and headsets drifts by about 1 %; this is 2 %, all axes together. With twice as much,
+jumps of 0.3 m are not found in steps of 5 m."""
 
-    Attributes:
-        share: noise of the position, as a share of the distance travelled. Visual-inertial tracking of phones and
-            headsets drifts by about 1 %; this is 2 %, all axes together. With twice as much, jumps of 0.3 m are not
-            found in steps of 5 m.
-        floor_m: noise of the position that is added, also without motion.
-        deg_per_m: noise of the direction per metre travelled.
-        turn_share: noise of the direction, as a share of the angle turned.
-        floor_deg: noise of the direction that is added, also without motion.
-        loss_scale: scale of the switched loss, in standard deviations of a step of six numbers.
-    """
+DEG_PER_M, TURN_SHARE, FLOOR_DEG = 0.3, 0.01, 0.05
+"""Noise of its direction about each axis: per metre travelled, as a share of the angle turned, and what is added."""
 
-    share: float = 0.012
-    floor_m: float = 0.002
-    deg_per_m: float = 0.3
-    turn_share: float = 0.01
-    floor_deg: float = 0.05
-    loss_scale: float = 2.0
+LOSS_SCALE = math.sqrt(6) * 2.0
+"""Scale of the switched loss, for the squared norm of a step's six numbers, in standard deviations."""
 
-    def __post_init__(self) -> None:
-        check_bounds(self, "share floor_m floor_deg loss_scale", above=0)
-        check_bounds(self, "deg_per_m turn_share", at_least=0)
 
-    def sigma(self, step: RigidTransform) -> Array:
-        """Standard deviations (6,) of a metric step: metres, then radians."""
-        length_m = float(np.linalg.norm(step.translation))
-        turn_deg = math.degrees(float(np.linalg.norm(rotation_vector(step.rotation))))
-        angle = math.radians(self.floor_deg + self.deg_per_m * length_m + self.turn_share * turn_deg)
-        return np.repeat([self.floor_m + self.share * length_m, angle], 3)
+def step_sigma(length_m: Array, turn_deg: Array) -> tuple[Array, Array]:
+    """Standard deviations (N,) of steps of these lengths and angles along, and about, each axis: metres and radians."""
+    return FLOOR_M + SHARE * length_m, np.radians(FLOOR_DEG + DEG_PER_M * length_m + TURN_SHARE * turn_deg)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +54,6 @@ class SequenceState:
         scale: metres per unit of the session.
         scale_is_free: whether it is estimated.
         sigma: (F - 1, 6) standard deviations of the steps; infinite for steps that are cut.
-        options: noise of the steps.
     """
 
     frames: tuple[RigidTransform, ...]
@@ -80,7 +61,6 @@ class SequenceState:
     scale: float
     scale_is_free: bool
     sigma: Array
-    options: DriftOptions = field(default_factory=DriftOptions)
 
     @staticmethod
     def of(
@@ -88,17 +68,17 @@ class SequenceState:
         session_from_camera: Sequence[RigidTransform],
         scale: float,
         scale_is_free: bool,
-        options: DriftOptions,
         cut: Collection[int] = (),
     ) -> "SequenceState":
         """Makes the state of frames at these poses, without the steps `cut`; step i is from frame i to frame i + 1."""
         neighbours = itertools.pairwise(session_from_camera)
         steps = tuple(first.inverse().compose(second) for first, second in neighbours)
-        metric = (replace(step, translation=scale * step.translation) for step in steps)
-        sigma = np.array([options.sigma(step) for step in metric]).reshape(-1, 6)
+        length_m = np.array([scale * np.linalg.norm(step.translation) for step in steps])
+        turn_deg = np.array([math.degrees(float(np.linalg.norm(rotation_vector(step.rotation)))) for step in steps])
+        sigma = np.repeat(np.stack(step_sigma(length_m, turn_deg), axis=1), 3, axis=1)
         sigma[list(cut)] = np.inf
         frames = tuple(pose.inverse() for pose in world_from_camera)
-        return SequenceState(frames, steps, scale, scale_is_free, sigma, options)
+        return SequenceState(frames, steps, scale, scale_is_free, sigma)
 
     @property
     def size(self) -> int:
@@ -135,7 +115,7 @@ class SequenceState:
 
     def cost(self) -> float:
         """See GroupState."""
-        return switched_cost((self.residuals() ** 2).sum(axis=1), self._loss_scale)
+        return switched_cost((self.residuals() ** 2).sum(axis=1), LOSS_SCALE)
 
     def residuals(self) -> Array:
         """Difference (F - 1, 6) of each step from the session's, in standard deviations."""
@@ -143,7 +123,7 @@ class SequenceState:
 
     def weights(self) -> Array:
         """Robust weight (F - 1,) of each step, 0 to 1."""
-        return switched_weight((self.residuals() ** 2).sum(axis=1), self._loss_scale)
+        return switched_weight((self.residuals() ** 2).sum(axis=1), LOSS_SCALE)
 
     def equations(self) -> tuple[Array, Array]:
         """See GroupState."""
@@ -154,11 +134,6 @@ class SequenceState:
             matrix += weight * jacobian.T @ jacobian
             gradient += weight * jacobian.T @ residual
         return matrix, gradient
-
-    @property
-    def _loss_scale(self) -> float:
-        """Scale of the loss, for the squared norm of six numbers."""
-        return math.sqrt(6) * self.options.loss_scale
 
     def _step(self, i: int) -> RigidTransform:
         """Pose of camera i + 1 in camera i, from the frames' poses."""

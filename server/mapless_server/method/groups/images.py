@@ -13,39 +13,31 @@ from mapless.geometry import Array, RigidTransform
 
 from ..answer import Answer, Localization
 from ..match import MatchOptions, search, vote
-from ..options import check_bounds
 from ..pipeline import Prepared
+from ..pnp import PnpOptions
 from ..priors.known import NO_PRIORS, Priors
 from ..rejection import Rejection, RejectionReason
 from ..results import PointMatches, ScaleSource, Structure, Support
 from ..structure import StructureOptions, triangulated_structure
 from ..trust.evidence import findable_count, hull_share
-from ..trust.gate import GateOptions, false_alarms, format_false_alarms
+from ..trust.gate import MAX_LOG10_FALSE_ALARMS, false_alarms, format_false_alarms
 from ..views import Matches, PosedView, View
 from .generalized import CameraMatches
 
+INLIER_PX = PnpOptions().inlier_px
+"""Largest reprojection error of an inlier, as for one photograph."""
 
-@dataclass(frozen=True)
-class GroupGateOptions(GateOptions):
-    """Options of the gate of a group.
+MIN_FOUND_SHARE = 0.08
+"""Least share of inliers among the points inside the images, or among the photographs' features if they are fewer. Of
+200 photographs with right poses the lowest was 0.10; wrong poses by chance or repetition mostly had 0.01."""
 
-    Attributes:
-        min_found_share: least share of inliers among the points inside the images, or among the photographs' features
-            if they are fewer. Of 200 photographs with right poses the lowest was 0.10; wrong poses by chance or
-            repetition mostly had 0.01.
-        enough_inliers: so many inliers are enough for any share: with many references the structure extends far beyond
-            one photograph. Repetition has supported wrong poses with at most 23.
-        min_hull_share: least share of an image covered by the convex hulls of the inliers. On the same photographs the
-            lowest of right poses was 0.08; a repeated floor tile with 16 inliers had 0.03.
-    """
+ENOUGH_INLIERS = 100
+"""So many inliers are enough for any share: with many references the structure extends far beyond one photograph.
+Repetition has supported wrong poses with at most 23."""
 
-    min_found_share: float = 0.08
-    enough_inliers: int = 100
-    min_hull_share: float = 0.04
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_bounds(self, "min_found_share min_hull_share", at_least=0, below=1)
+MIN_HULL_SHARE = 0.04
+"""Least share of an image covered by the convex hulls of the inliers. On the same photographs the lowest of right poses
+was 0.08; a repeated floor tile with 16 inliers had 0.03."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +172,7 @@ def rejection_without_matches(images: Sequence[GroupImage]) -> Rejection:
     return Rejection(furthest.reason, f"no image has 2D-3D matches; image {i}: {furthest.message}", furthest.hint)
 
 
-def group_gate_failure(matched: Sequence[PosedImage], inlier_px: float, options: GroupGateOptions) -> str | None:
+def group_gate_failure(matched: Sequence[PosedImage]) -> str | None:
     """Returns why the pose of a group fails the gate; None if it passes.
 
     `gate.gate_failure` with sums over the photographs; besides, a share of the points must be found, over more than a
@@ -190,24 +182,24 @@ def group_gate_failure(matched: Sequence[PosedImage], inlier_px: float, options:
     count = (
         f"{inlier_total} of {sum(len(it.matches) for it in matched)} matches in {len(matched)} images agree on a pose"
     )
-    expected = group_log10_false_alarms(matched, inlier_px)
-    if expected > options.max_log10_false_alarms:
-        return f"{count}, which chance could do ({format_false_alarms(expected, options.max_log10_false_alarms)})"
+    expected = group_log10_false_alarms(matched)
+    if expected > MAX_LOG10_FALSE_ALARMS:
+        return f"{count}, which chance could do ({format_false_alarms(expected, MAX_LOG10_FALSE_ALARMS)})"
     visible = sum(
         findable_count(it.source.query, it.source.structure.x_in_world, it.world_from_camera) for it in matched
     )
-    if inlier_total < min(options.min_found_share * visible, options.enough_inliers):
+    if inlier_total < min(MIN_FOUND_SHARE * visible, ENOUGH_INLIERS):
         return f"{count}, but they should show {visible} points: repeated structure somewhere else, most likely"
     shares = (hull_share(it.source.query, it.matches, it.inliers) for it in matched if it.inliers.sum() >= 3)
     covered = sum(shares)
-    if covered < options.min_hull_share:
+    if covered < MIN_HULL_SHARE:
         return f"{count}, but they cover only {100 * covered:.1f} % of an image"
     return None
 
 
-def group_log10_false_alarms(matched: Sequence[PosedImage], inlier_px: float) -> float:
+def group_log10_false_alarms(matched: Sequence[PosedImage]) -> float:
     """`gate.log10_false_alarms` of all matches, with the largest chance of an inlier of any photograph."""
-    disc = inlier_px**2
+    disc = INLIER_PX**2
     expected = []
     for guided in (False, True):
         total = sum(int((it.matches.guided == guided).sum()) for it in matched)

@@ -24,10 +24,9 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, cross_matrix
 
-from ..options import check_bounds
 from ..perturbation import rotation_vector
 from ..priors.known import conflict_threshold
-from .drift import DriftOptions
+from .drift import step_sigma
 
 
 @dataclass(frozen=True)
@@ -54,25 +53,15 @@ class Jump:
         )
 
 
-@dataclass(frozen=True)
-class JumpOptions:
-    """Options of the search for jumps.
+OWN_INFLATION = 2.0
+"""Factor on the standard deviations of the photographs' own poses. In places that no constant was fitted on, errors are
+up to this many times as large as their standard deviations say."""
 
-    Attributes:
-        own_inflation: factor on the standard deviations of the photographs' own poses. In places that no constant was
-            fitted on, errors are up to this many times as large as their standard deviations say.
-        left_out_cost: cost of leaving out a pose, in thresholds; more than one jump and less than two.
-        units: largest number of pairs that an unknown unit is tried from, those with the longest steps.
-    """
+LEFT_OUT_COST = 1.5
+"""Cost of leaving out a pose, in thresholds; more than one jump and less than two."""
 
-    own_inflation: float = 2.0
-    left_out_cost: float = 1.5
-    units: int = 20
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "own_inflation", above=0)
-        check_bounds(self, "left_out_cost", above=1, below=2)
-        check_bounds(self, "units", at_least=1)
+UNITS = 20
+"""Largest number of pairs that an unknown unit is tried from, those with the longest steps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,23 +88,21 @@ def find_jumps(
     own: Mapping[int, tuple[RigidTransform, Array]],
     session_from_camera: Sequence[RigidTransform],
     scale: float | None,
-    drift: DriftOptions,
-    options: JumpOptions,
 ) -> Chain | None:
     """Finds the chain of least cost; None if there is no pose, or no unit of the session.
 
     `own` has world_from_camera and its covariance (6, 6) of each photograph that is localized alone, by its index;
     `session_from_camera` the tracked pose of every photograph. The scale is metres per unit of the session, None if
-    unknown; `drift` the noise of the steps.
+    unknown.
     """
     if not own:
         return None
-    links = _Links.of(own, session_from_camera, drift, options)
-    scales = links.scales(options.units) if scale is None else [scale]
+    links = _Links.of(own, session_from_camera)
+    scales = links.scales() if scale is None else [scale]
     if not scales:
         return None
     threshold = conflict_threshold(6)
-    chains = [_cheapest(links.squared(it), threshold, options.left_out_cost * threshold) for it in scales]
+    chains = [_cheapest(links.squared(it), threshold, LEFT_OUT_COST * threshold) for it in scales]
     best = min(range(len(scales)), key=lambda i: chains[i][0])
     _, positions = chains[best]
     squared = links.squared(scales[best])
@@ -152,7 +139,6 @@ class _Links:
         steps: (F - 1, 2) length, in the session's unit, and angle, in degrees, of each step of the session.
         levers: (P, F - 1) tracked distance from the end of each step to the second camera; NaN for steps outside the
             pair.
-        drift: noise of the steps.
     """
 
     frames: NDArray[np.intp]
@@ -164,15 +150,9 @@ class _Links:
     own: Array
     steps: Array
     levers: Array
-    drift: DriftOptions
 
     @staticmethod
-    def of(
-        own: Mapping[int, tuple[RigidTransform, Array]],
-        session: Sequence[RigidTransform],
-        drift: DriftOptions,
-        options: JumpOptions,
-    ) -> "_Links":
+    def of(own: Mapping[int, tuple[RigidTransform, Array]], session: Sequence[RigidTransform]) -> "_Links":
         frames = sorted(own)
         pairs = list(combinations(range(len(frames)), 2))
         shift, tracked, turn, covariances = [], [], [], []
@@ -198,19 +178,18 @@ class _Links:
             np.array(shift).reshape(-1, 3),
             np.array(tracked).reshape(-1, 3),
             np.array(turn).reshape(-1, 3),
-            options.own_inflation**2 * np.array(covariances).reshape(-1, 6, 6),
+            OWN_INFLATION**2 * np.array(covariances).reshape(-1, 6, 6),
             np.array(lengths).reshape(-1, 2),
             levers,
-            drift,
         )
 
-    def scales(self, most: int) -> list[float]:
-        """Metres per unit that the pairs with the longest steps give, at most `most` values."""
+    def scales(self) -> list[float]:
+        """Metres per unit that the pairs with the longest steps give, at most `UNITS` values."""
         travelled, moved_m = np.linalg.norm(self.tracked, axis=1), np.linalg.norm(self.shift, axis=1)
         usable = np.flatnonzero((travelled > 0) & (moved_m > 0))
         neighbours_first = np.argsort(self.second[usable] - self.first[usable], kind="stable")
         order = usable[neighbours_first][np.argsort(-moved_m[usable[neighbours_first]], kind="stable")]
-        return [float(moved_m[i] / travelled[i]) for i in order[:most]]
+        return [float(moved_m[i] / travelled[i]) for i in order[:UNITS]]
 
     def squared(self, scale: float) -> Array:
         """The matrix (N, N) of each pair's m^2, above the diagonal."""
@@ -218,11 +197,10 @@ class _Links:
         if not len(self.first):
             return result
         length_m, turn_deg = scale * self.steps[:, 0], self.steps[:, 1]
-        options = self.drift
-        angle = np.radians(options.floor_deg + options.deg_per_m * length_m + options.turn_share * turn_deg)
+        sigma_m, angle = step_sigma(length_m, turn_deg)
         inside = np.isfinite(self.levers)
         levers_m = scale * np.where(inside, self.levers, 0.0)
-        shift = inside @ (options.floor_m + options.share * length_m) ** 2 + levers_m**2 @ angle**2
+        shift = inside @ sigma_m**2 + levers_m**2 @ angle**2
         covariance = self.own.copy()
         covariance[:, range(3), range(3)] += shift[:, None]
         covariance[:, range(3, 6), range(3, 6)] += (inside @ angle**2)[:, None]

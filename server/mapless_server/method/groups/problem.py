@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -11,19 +11,23 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform
 
 from ..bundle import Bundle, BundleProblem, NormalEquations, Poses, bundle_of
+from ..observations import Tracks
 from ..optimize import solve_step
-from ..options import check_bounds
 from ..perturbation import reprojection_errors_px, world_jacobian
-from ..pose_errors import most_probable, pose_errors
-from ..pose_problem import LEAST_DAMPING, AdjustOptions
+from ..pose_problem import LEAST_DAMPING, AdjustOptions, most_probable, pose_errors
 from ..priors.known import Priors
 from ..results import PointMatches
 from ..structure import tracks_with_query
-from ..tracks import Tracks
 from ..views import PosedView
 from .images import MatchedImage
 
 S = TypeVar("S", bound="GroupState")
+
+ADJUST = AdjustOptions()
+"""Options as for one photograph."""
+
+MAX_MATCHES = 300
+"""Of a photograph, evenly thinned; several photographs have enough together."""
 
 
 class GroupState(Protocol):
@@ -80,15 +84,13 @@ class Part:
     tracks: Tracks
 
 
-def part_of(
-    source: MatchedImage, matches: PointMatches, state: GroupState, max_error_px: float, max_matches: int
-) -> Part:
+def part_of(source: MatchedImage, matches: PointMatches, state: GroupState) -> Part:
     """Selects the part of a photograph from its matches with small errors, evenly thinned."""
     structure, pose = source.structure, state.camera_from_world(source.image).inverse()
     pixels = source.query.features.keypoints[matches.keypoint].astype(np.float64)
     errors_px = reprojection_errors_px(source.query.camera, pose, structure.x_in_world[matches.point], pixels)
-    used = np.flatnonzero(errors_px < max_error_px)
-    used = used[:: max(1, -(-len(used) // max_matches))]
+    used = np.flatnonzero(errors_px < ADJUST.max_error_px)
+    used = used[:: max(1, -(-len(used) // MAX_MATCHES))]
     tracks, chosen = tracks_with_query(structure, matches.point[used], matches.keypoint[used], len(source.references))
     return Part(source, pose, np.flatnonzero(chosen), tracks)
 
@@ -115,26 +117,6 @@ def _measurements(part: Part) -> list[object]:
     keypoints = [it.features.keypoints for it in (*views, part.source.query)]
     rows = zip(part.tracks.view.tolist(), part.tracks.keypoint.tolist(), strict=True)
     return [(names[v], *keypoints[v][k].tolist()) for v, k in rows]
-
-
-@dataclass(frozen=True)
-class JointOptions:
-    """Options of the joint adjustment.
-
-    Attributes:
-        adjust: options as for one photograph.
-        max_matches: largest number of matches of a photograph, evenly thinned; several photographs have enough
-            together.
-        iterations: largest number of Levenberg-Marquardt steps; drift needs more than one photograph's pose.
-    """
-
-    adjust: AdjustOptions = field(default_factory=AdjustOptions)
-    max_matches: int = 300
-    iterations: int = 15
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "max_matches", at_least=3)
-        check_bounds(self, "iterations", at_least=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,18 +176,15 @@ class GroupProblem(Generic[S]):
         matched_images: Sequence[MatchedImage],
         matches: Sequence[PointMatches],
         state: S,
-        options: JointOptions,
         priors: Mapping[int, Priors] | None = None,
     ) -> None:
-        self.options = options
         self.priors = priors or {}
         self._references: dict[str, tuple[int, PosedView]] = {}
         self.blocks: list[ImageBlock] = []
         self.chosen: list[NDArray[np.intp]] = []
         points: list[Array] = []
         parts = [
-            part_of(source, its_matches, state, options.adjust.max_error_px, options.max_matches)
-            for source, its_matches in zip(matched_images, matches, strict=True)
+            part_of(source, its_matches, state) for source, its_matches in zip(matched_images, matches, strict=True)
         ]
         used = [part for part in parts if len(part.chosen)]
         shared = Shared(used)
@@ -230,16 +209,17 @@ class GroupProblem(Generic[S]):
         references = np.array([self._index(it) for it in source.references])
         free = np.zeros((6 * len(references),) * 2)
         planes = None if structure.planes is None else structure.planes[part.chosen]
-        scale_sigma = self.options.adjust.loss_scale_sigma
-        problem = BundleProblem(observations, part.tracks.view, start.poses[:-1], free, scale_sigma, planes=planes)
-        return ImageBlock(source.image, problem, references, float(structure.noise.level_px), depth_m)
+        problem = BundleProblem(
+            observations, part.tracks.view, start.poses[:-1], free, ADJUST.loss_scale_sigma, planes=planes
+        )
+        return ImageBlock(source.image, problem, references, structure.noise.level_px, depth_m)
 
     def _index(self, reference: PosedView) -> int:
         """Index of a reference in the group."""
         return self._references.setdefault(reference.key, (len(self._references), reference))[0]
 
     def _reference_information(self) -> Array:
-        """Inverse covariance (6 R, 6 R) of the priors on the references' poses (see `pose_errors`).
+        """Inverse covariance (6 R, 6 R) of the priors on the references' poses (see `pose_problem`).
 
         The size of the errors is estimated from the photograph with the most observations; they are relative to the
         place of the last photograph.
@@ -255,7 +235,7 @@ class GroupProblem(Generic[S]):
         its = given[block.references]
         errors = pose_errors(its.centres, its.rotation, centre, *size, observing)
         matrix, gradient, _ = block.problem.linearize(bundle).reduced(LEAST_DAMPING)
-        own, drift = most_probable(errors, matrix, gradient, self.options.adjust.pose_errors)
+        own, drift = most_probable(errors, matrix, gradient)
         last = self.start.state.camera_from_world(self.blocks[-1].image).inverse().translation
         errors = pose_errors(given.centres, given.rotation, last, *size, block.references[observing])
         return np.asarray(np.linalg.inv(errors.covariance(own, drift)), np.float64)
@@ -266,12 +246,7 @@ class GroupProblem(Generic[S]):
         poses = {image: point.state.camera_from_world(image).inverse() for image in self.priors}
         prior = sum(self.priors[image].cost(pose) for image, pose in poses.items())
         motion = self._reference_motion(point)
-        return (
-            data
-            + float(motion @ self.information @ motion)
-            + point.state.cost()
-            + self.options.adjust.error_inflation**2 * prior
-        )
+        return data + float(motion @ self.information @ motion) + point.state.cost() + ADJUST.error_inflation**2 * prior
 
     def _reference_motion(self, point: Point[S]) -> Array:
         """Motion (6 R,) of each reference from its given pose."""
@@ -288,7 +263,7 @@ class GroupProblem(Generic[S]):
         """See `optimize.Problem`."""
         columns = self._columns(point)
         reduced = [it.reduced(damping) for it in equations]
-        matrix, gradient = self._prior_equations(point, self.options.adjust.error_inflation**2)
+        matrix, gradient = self._prior_equations(point, ADJUST.error_inflation**2)
         matrix += damping * np.diag(np.diag(matrix))
         for (its_matrix, its_gradient, _), its_columns in zip(reduced, columns, strict=True):
             matrix += its_columns.T @ its_matrix @ its_columns
@@ -328,7 +303,7 @@ class GroupProblem(Generic[S]):
         The standard deviations of the observations are inflated (see AdjustOptions.error_inflation), those of the
         priors and of the parameters' cost are not.
         """
-        inflation = self.options.adjust.error_inflation
+        inflation = ADJUST.error_inflation
         matrix, _ = self._prior_equations(point, data_inflation=inflation)
         for it, its_columns in zip(self.linearize(point), self._columns(point), strict=True):
             its_matrix, _, _ = it.reduced(0.0)

@@ -11,15 +11,12 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform, cross_matrix
 
-from ..options import check_bounds
-from ..perturbation import perturbed
+from ..perturbation import covariance_in_world, perturbed
 from ..pnp import PnpOptions
 from ..priors.known import PriorCheck
 from ..rejection import Rejection, RejectionReason
-from ..trust.judge import JudgeOptions
 from .generalized import inlier_count, rig_ransac
 from .images import (
-    GroupGateOptions,
     GroupImage,
     MatchedImage,
     PosedImage,
@@ -28,33 +25,11 @@ from .images import (
     priors_of,
     rejection_without_matches,
 )
-from .joint import JointOptions, adjust_in_rounds, covariance_in_world
+from .joint import adjust_in_rounds
 from .trust import trust_of_group
 
-
-@dataclass(frozen=True)
-class RigOptions:
-    """Options of posing a rig.
-
-    Attributes:
-        pnp: options of the pose solver; `min_matches` holds for all cameras together.
-        gate: options of the gate, which tests sums over the cameras.
-        joint: options of the adjustment.
-        judge: options of the trust.
-        coverage: share of right answers that are accepted.
-        rounds: number of rounds of searching matches and adjusting; the second starts from a better pose.
-    """
-
-    pnp: PnpOptions = field(default_factory=PnpOptions)
-    gate: GroupGateOptions = field(default_factory=GroupGateOptions)
-    joint: JointOptions = field(default_factory=JointOptions)
-    judge: JudgeOptions = field(default_factory=JudgeOptions)
-    coverage: float = 0.95
-    rounds: int = 2
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "rounds", at_least=1)
-        check_bounds(self, "coverage", above=0, at_most=1)
+PNP = PnpOptions()
+"""Options of the pose solver; `min_matches` holds for all cameras together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,9 +91,11 @@ class RigState:
 
 
 def solve_rig(
-    images: Sequence[GroupImage], rig_from_camera: Sequence[RigidTransform], options: RigOptions
+    images: Sequence[GroupImage], rig_from_camera: Sequence[RigidTransform], coverage: float = 0.95
 ) -> RigEstimate | Rejection:
     """Estimates the pose of a rig from the photograph of each camera, with its own answer and metric pose in the rig.
+
+    The coverage is the share of right answers that are accepted.
 
     A rejection is that of the image that reached the latest stage, if none has matches; TOO_FEW_MATCHES; PNP_FAILED if
     no pose has four inliers; or GATE.
@@ -126,17 +103,17 @@ def solve_rig(
     origin, matched_images = matched_images_of(images)
     if not matched_images:
         return rejection_without_matches(images)
-    start = _start(matched_images, rig_from_camera, options)
+    start = _start(matched_images, rig_from_camera)
     if isinstance(start, Rejection):
         return start
     state = RigState(start.inverse(), tuple(rig_from_camera))
-    estimate = adjust_in_rounds(matched_images, state, options.joint, options.rounds, priors_of(images, origin))
+    estimate = adjust_in_rounds(matched_images, state, priors_of(images, origin))
     if estimate.inlier_count < 4:
         return Rejection(RejectionReason.PNP_FAILED, "no pose of the rig explains four matches")
-    failure = group_gate_failure(estimate.matched, options.pnp.inlier_px, options.gate)
+    failure = group_gate_failure(estimate.matched)
     if failure:
         return Rejection(RejectionReason.GATE, failure)
-    trust, doubt = trust_of_group(estimate.matched, options.judge, options.coverage)
+    trust, doubt = trust_of_group(estimate.matched, coverage)
     if doubt:
         return doubt
     world_from_rig = estimate.state.rig_from_world.inverse()
@@ -147,20 +124,20 @@ def solve_rig(
 
 
 def _start(
-    matched_images: Sequence[MatchedImage], rig_from_camera: Sequence[RigidTransform], options: RigOptions
+    matched_images: Sequence[MatchedImage], rig_from_camera: Sequence[RigidTransform]
 ) -> RigidTransform | Rejection:
     """Returns the pose with most inliers, from generalized PnP or from the own pose of an image."""
     cameras = [it.camera_matches(rig_from_camera[it.image]) for it in matched_images]
     total = sum(len(camera.pixels) for camera in cameras)
-    if total < options.pnp.min_matches:
-        message = f"{total} 2D-3D matches in {len(cameras)} images, {options.pnp.min_matches} needed"
+    if total < PNP.min_matches:
+        message = f"{total} 2D-3D matches in {len(cameras)} images, {PNP.min_matches} needed"
         return Rejection(RejectionReason.TOO_FEW_MATCHES, message)
-    found = rig_ransac(cameras, options.pnp)
+    found = rig_ransac(cameras, PNP)
     candidates = [] if found is None else [found]
     candidates += [
         it.own_pose.compose(rig_from_camera[it.image].inverse()) for it in matched_images if it.own_pose is not None
     ]
-    counts = [inlier_count(cameras, pose, options.pnp.inlier_px) for pose in candidates]
+    counts = [inlier_count(cameras, pose, PNP.inlier_px) for pose in candidates]
     if max(counts, default=0) < 4:
         message = f"no pose of the rig explains more than {max(counts, default=0)} of {total} matches"
         return Rejection(RejectionReason.PNP_FAILED, message)

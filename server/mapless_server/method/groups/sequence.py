@@ -19,6 +19,7 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform, Similarity
 
+from ..perturbation import covariance_in_world
 from ..priors.known import PriorCheck
 from ..rejection import Rejection, RejectionReason
 from ..trust.evidence import findable_count
@@ -32,10 +33,18 @@ from .images import (
     priors_of,
     rejection_without_matches,
 )
-from .joint import JointEstimate, adjust_in_rounds, covariance_in_world
+from .joint import JointEstimate, adjust_in_rounds
 from .jumps import Jump
-from .start import SequenceOptions, Session, Start
+from .start import LOOSE_PX, PNP, Session, Start
 from .trust import trust_of_group
+
+SHOULD_SHOW, LEAST_NEAR = 15, 3
+"""The last photograph, not localized alone, contradicts the pose that it is tracked to if so many points should be
+visible, or are matched, and fewer of its matches are near them, within `LOOSE_PX` and three standard deviations of the
+pose. Of 14 such photographs 13 had three and more at their true poses; by chance a hundred matches have 0.2."""
+
+MAX_SCALE_SIGMA = 0.15
+"""Largest relative standard deviation of an accepted scale."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +78,12 @@ def solve_sequence(
     images: Sequence[GroupImage],
     session_from_camera: Sequence[RigidTransform],
     estimate_scale: bool,
-    options: SequenceOptions,
+    coverage: float = 0.95,
 ) -> SequenceEstimate | Rejection:
     """Estimates the poses of a sequence: frames in the order they were taken, with their own answers and tracked poses.
 
-    If the scale is not to be estimated, the session's unit is the metre. A rejection is that of the frame that reached
+    If the scale is not to be estimated, the session's unit is the metre. The coverage is the share of right answers
+    that are accepted. A rejection is that of the frame that reached
     the latest stage, if none has matches; TOO_FEW_MATCHES; PNP_FAILED if no poses have four inliers; SCALE_UNRELIABLE
     if the scale is unknown and the session moves too little to determine it, or jumps; or GATE, also if the tracking
     jumps and the frames after it are not localized.
@@ -81,30 +91,30 @@ def solve_sequence(
     origin, matched_images = matched_images_of(images)
     if not matched_images:
         return rejection_without_matches(images)
-    session = Session(tuple(session_from_camera), estimate_scale, options, priors_of(images, origin))
+    session = Session(tuple(session_from_camera), estimate_scale, priors_of(images, origin))
     if estimate_scale and not session.moves:
         return Rejection(RejectionReason.SCALE_UNRELIABLE, "the session does not move: its unit cannot be determined")
     total = sum(len(it.tracked) for it in matched_images)
-    if total < options.pnp.min_matches:
-        message = f"{total} 2D-3D matches in {len(matched_images)} frames, {options.pnp.min_matches} needed"
+    if total < PNP.min_matches:
+        message = f"{total} 2D-3D matches in {len(matched_images)} frames, {PNP.min_matches} needed"
         return Rejection(RejectionReason.TOO_FEW_MATCHES, message)
     found = _estimated(matched_images, session)
     if isinstance(found, Rejection):
         return found
     start, estimate = found
-    if last := _last_contradicted(estimate, len(images), options):
-        posed = _posed_by_themselves(images, matched_images, session, last)
+    if last := _last_contradicted(estimate, len(images)):
+        posed = _posed_by_themselves(images, matched_images, session, last, coverage)
         if isinstance(posed, Rejection):
             return posed
         found = _estimated(posed, session)
         if isinstance(found, Rejection):
             return found
         start, estimate = found
-    rejection = _rejection(estimate, start, options)
+    rejection = _rejection(estimate, start)
     if rejection:
         return rejection
     last_part = [it for it in estimate.matched if it.source.image in start.last_part]
-    trust, doubt = trust_of_group(last_part, options.judge, options.coverage)
+    trust, doubt = trust_of_group(last_part, coverage)
     if doubt:
         cut = "".join(f"{it}; " for it in start.jumps)
         return replace(doubt, message=f"{cut}{doubt.message}")
@@ -118,41 +128,38 @@ def _estimated(
     start = session.start(matched_images)
     if isinstance(start, Rejection):
         return start
-    options = session.options
-    state = SequenceState.of(start.poses, session.frames, start.scale, session.scale_is_free, options.drift, start.cut)
-    return start, adjust_in_rounds(matched_images, state, options.joint, options.rounds, session.priors)
+    state = SequenceState.of(start.poses, session.frames, start.scale, session.scale_is_free, start.cut)
+    return start, adjust_in_rounds(matched_images, state, session.priors)
 
 
-def _rejection(estimate: JointEstimate[SequenceState], start: Start, options: SequenceOptions) -> Rejection | None:
+def _rejection(estimate: JointEstimate[SequenceState], start: Start) -> Rejection | None:
     matched = [it for it in estimate.matched if it.source.image in start.last_part]
     cut = "".join(f"{it}; " for it in start.jumps)
     if sum(int(it.inliers.sum()) for it in matched) < 4:
         return Rejection(RejectionReason.PNP_FAILED, f"{cut}no poses of the sequence explain four matches")
-    failure = group_gate_failure(matched, options.pnp.inlier_px, options.gate)
+    failure = group_gate_failure(matched)
     if failure:
         return Rejection(RejectionReason.GATE, f"{cut}{failure}")
     sigma = _scale_sigma(estimate)
-    if not sigma <= options.max_scale_sigma:
+    if not sigma <= MAX_SCALE_SIGMA:
         message = f"{cut}the session moves too little for its unit: the scale is known to {100 * sigma:.0f} % only"
         return Rejection(RejectionReason.SCALE_UNRELIABLE, message)
     return None
 
 
-def _last_contradicted(
-    estimate: JointEstimate[SequenceState], frame_count: int, options: SequenceOptions
-) -> PosedImage | None:
+def _last_contradicted(estimate: JointEstimate[SequenceState], frame_count: int) -> PosedImage | None:
     """Returns the last frame if its matches, though enough, do not support the pose that it is tracked to."""
     last = estimate.matched[-1]
     if last.source.image != frame_count - 1 or last.source.own_pose is not None:
         return None
-    if max(_visible(last), len(last.source.tracked)) < options.should_show:
+    if max(_visible(last), len(last.source.tracked)) < SHOULD_SHOW:
         return None
     sigma = np.sqrt(np.diag(estimate.covariance)[6 * (frame_count - 1) :][:6])
     source, focal_px = last.source, last.source.query.camera.focal_x_px
     depth_m = np.median(last.world_from_camera.inverse().apply(source.structure.x_in_world[last.matches.point])[:, 2])
-    bound_px = options.loose_px + 3 * focal_px * (max(sigma[:3]) / max(depth_m, 1e-9) + max(sigma[3:]))
+    bound_px = LOOSE_PX + 3 * focal_px * (max(sigma[:3]) / max(depth_m, 1e-9) + max(sigma[3:]))
     near = int((last.errors_px[~last.matches.guided] < bound_px).sum())
-    return last if near < options.least_near else None
+    return last if near < LEAST_NEAR else None
 
 
 def _visible(matched: PosedImage) -> int:
@@ -161,14 +168,18 @@ def _visible(matched: PosedImage) -> int:
 
 
 def _posed_by_themselves(
-    images: Sequence[GroupImage], matched_images: Sequence[MatchedImage], session: Session, last: PosedImage
+    images: Sequence[GroupImage],
+    matched_images: Sequence[MatchedImage],
+    session: Session,
+    last: PosedImage,
+    coverage: float,
 ) -> list[MatchedImage] | Rejection:
     """Poses the last images by their own matches, together; a rejection if no pose is found."""
     posed = [it.image for it in matched_images if it.own_pose is not None]
     # Of frames in an unknown unit only the last is posed.
     first = len(images) - 1 if session.scale_is_free else max(posed, default=-1) + 1
     if first == 0 or isinstance(
-        alone := solve_sequence(images[first:], session.frames[first:], False, session.options), Rejection
+        alone := solve_sequence(images[first:], session.frames[first:], False, coverage), Rejection
     ):
         message = (
             f"the last photograph contradicts its tracked pose: {int(last.inliers.sum())} of its {len(last.matches)} "

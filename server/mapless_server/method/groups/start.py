@@ -5,22 +5,19 @@ the whole sequence as one camera).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mapless.geometry import Array, RigidTransform, Similarity
 
-from ..options import check_bounds
 from ..pnp import PnpOptions
 from ..priors.known import Priors
 from ..rejection import Advice, Hint, Rejection, RejectionReason
-from ..trust.judge import JudgeOptions
-from .drift import DriftOptions, world_from_session_at
+from .drift import world_from_session_at
 from .generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
-from .images import GroupGateOptions, MatchedImage
-from .joint import JointOptions
-from .jumps import Chain, Jump, JumpOptions, find_jumps
+from .images import MatchedImage
+from .jumps import Chain, Jump, find_jumps
 
 STAGE = "join"
 """Name of the stage in which photographs are posed together."""
@@ -33,52 +30,17 @@ CHECK_TRACKING = Hint(
 )
 
 
-@dataclass(frozen=True)
-class SequenceOptions:
-    """Options of posing a sequence.
+PNP = PnpOptions()
+"""Options of the pose solvers; `min_matches` holds for all frames together."""
 
-    Attributes:
-        pnp: options of the pose solvers; `min_matches` holds for all frames together.
-        gate: options of the gate, which tests sums over the frames.
-        joint: options of the adjustment.
-        judge: options of the trust.
-        coverage: share of right answers that are accepted.
-        drift: noise of the session's steps.
-        jumps: options of the search for jumps of the tracking.
-        rounds: number of rounds of searching matches and adjusting; the second starts from better poses.
-        loose_px: inlier bound for initial guesses, which drift.
-        should_show, least_near: the last photograph, not localized alone, contradicts the pose that it is tracked to if
-            so many points should be visible, or are matched, and fewer of its matches are near them, within `loose_px`
-            and three standard deviations of the pose. Of 14 such photographs 13 had three and more at their true poses;
-            by chance a hundred matches have 0.2.
-        min_motion: least extent of a session of unknown unit, as a share of its distance from its own origin; less is
-            rounding.
-        max_scale_sigma: largest relative standard deviation of an accepted scale.
-        scale_iterations: number of samples of the RANSAC for pose and scale.
-        scale_matches: number of matches on which samples are scored.
-    """
+LOOSE_PX = 12.0
+"""Inlier bound for initial guesses, which drift."""
 
-    pnp: PnpOptions = field(default_factory=PnpOptions)
-    gate: GroupGateOptions = field(default_factory=GroupGateOptions)
-    joint: JointOptions = field(default_factory=JointOptions)
-    judge: JudgeOptions = field(default_factory=JudgeOptions)
-    coverage: float = 0.95
-    drift: DriftOptions = field(default_factory=DriftOptions)
-    jumps: JumpOptions = field(default_factory=JumpOptions)
-    rounds: int = 2
-    loose_px: float = 12.0
-    should_show: int = 15
-    least_near: int = 3
-    min_motion: float = 1e-6
-    max_scale_sigma: float = 0.15
-    scale_iterations: int = 1000
-    scale_matches: int = 600
+MIN_MOTION = 1e-6
+"""Least extent of a session of unknown unit, as a share of its distance from its own origin; less is rounding."""
 
-    def __post_init__(self) -> None:
-        check_bounds(self, "rounds should_show least_near scale_iterations scale_matches", at_least=1)
-        check_bounds(self, "loose_px", above=0)
-        check_bounds(self, "coverage", above=0, at_most=1)
-        check_bounds(self, "min_motion max_scale_sigma", above=0)
+SCALE_ITERATIONS, SCALE_MATCHES = 1000, 600
+"""Samples of the RANSAC for pose and scale, and matches on which they are scored."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,13 +72,11 @@ class Session:
     Attributes:
         frames: `session_from_camera` of each frame.
         scale_is_free: whether its unit is unknown.
-        options: options of the sequence.
         priors: priors on the frames' poses, by index.
     """
 
     frames: tuple[RigidTransform, ...]
     scale_is_free: bool
-    options: SequenceOptions
     priors: Mapping[int, Priors]
 
     @property
@@ -124,7 +84,7 @@ class Session:
         """Whether there is enough motion to determine the session's unit."""
         centres = np.array([frame.translation for frame in self.frames])
         extent = float(np.ptp(centres, axis=0).max())
-        return extent > self.options.min_motion * float(np.abs(centres).max())
+        return extent > MIN_MOTION * float(np.abs(centres).max())
 
     def start(self, matched_images: Sequence[MatchedImage]) -> Start | Rejection:
         """Initial poses of all frames: from their own poses and the tracking, or from the matches of all together."""
@@ -154,7 +114,7 @@ class Session:
 
     def _chain(self, own: Mapping[int, tuple[RigidTransform, Array]]) -> Chain | None:
         scale = None if self.scale_is_free else 1.0
-        return find_jumps(own, self.frames, scale, self.options.drift, self.options.jumps)
+        return find_jumps(own, self.frames, scale)
 
     def _is_outvoted(
         self, matched: MatchedImage, jump: Jump, chain: Chain, own: Mapping[int, tuple[RigidTransform, Array]]
@@ -172,17 +132,16 @@ class Session:
 
     def _inliers(self, matched: MatchedImage, pose: RigidTransform) -> int:
         camera = matched.camera_matches(RigidTransform.identity())
-        return int(camera.inliers(pose, self.options.loose_px).sum())
+        return int(camera.inliers(pose, LOOSE_PX).sum())
 
     def _of_all_matches(self, cameras: Sequence[CameraMatches]) -> Similarity | None:
         """Estimates `world_from_session` of the whole sequence as one camera; None if no pose explains four matches."""
-        options = self.options
         if self.scale_is_free:
-            guess = scaled_ransac(cameras, options.pnp, options.scale_iterations, options.scale_matches)
+            guess = scaled_ransac(cameras, PNP, SCALE_ITERATIONS, SCALE_MATCHES)
         else:
-            rigid = rig_ransac(cameras, options.pnp)
+            rigid = rig_ransac(cameras, PNP)
             guess = None if rigid is None else Similarity(1.0, rigid.rotation, rigid.translation)
-        if guess is None or inlier_count(cameras, guess, options.loose_px) < 4:
+        if guess is None or inlier_count(cameras, guess, LOOSE_PX) < 4:
             return None
         return guess
 

@@ -17,12 +17,14 @@ from mapless.geometry import Array, RigidTransform
 from ..rejection import Rejection
 from ..trust.evidence import (
     NO_AGREEMENT,
-    AgreementOptions,
+    PNP,
+    SPLITS,
     Evidence,
     Votes,
     epipolar_share,
     expected_share,
     findable_count,
+    half_of_references,
     hull_share,
     votes_on,
 )
@@ -31,9 +33,7 @@ from .generalized import CameraMatches, rig_ransac
 from .images import PosedImage
 
 
-def trust_of_group(
-    matched: Sequence[PosedImage], options: JudgeOptions, coverage: float
-) -> tuple[float, Rejection | None]:
+def trust_of_group(matched: Sequence[PosedImage], coverage: float) -> tuple[float, Rejection | None]:
     """Computes the trust, 0 to 1, and a rejection GATE if it is less than 1 - coverage.
 
     The photographs have joint poses, and together at least four inliers. The coverage is the share of right answers to
@@ -56,10 +56,10 @@ def trust_of_group(
         float(np.average(expected, weights=np.maximum(findable, 1))),
         min(1.0, sum(hulls)),
         float(np.average([_epipolar_share(it) for it in matched], weights=np.maximum(inliers, 1))),
-        _matches_apart(matched, distance_m, options.agreement),
-        _references_apart(matched, distance_m, options.agreement),
+        _matches_apart(matched, distance_m),
+        _references_apart(matched, distance_m),
     )
-    trust = trust_of(evidence, options)
+    trust = trust_of(evidence, JudgeOptions())
     return trust, low_trust(evidence, trust, coverage)
 
 
@@ -72,7 +72,7 @@ def _distance_m(matched: Sequence[PosedImage]) -> float:
     return max(float(np.median(np.concatenate(depths))), np.finfo(float).tiny)
 
 
-def _matches_apart(matched: Sequence[PosedImage], distance_m: float, options: AgreementOptions) -> float:
+def _matches_apart(matched: Sequence[PosedImage], distance_m: float) -> float:
     """`agreement.disagreement_of_matches` for all photographs together."""
     cameras = []
     for it, mounting in zip(matched, _mounting(matched), strict=True):
@@ -85,10 +85,10 @@ def _matches_apart(matched: Sequence[PosedImage], distance_m: float, options: Ag
     def half(random: np.random.Generator) -> list[NDArray[np.bool_]]:
         return [np.asarray(random.permutation(len(it.pixels)) % 2 == 0) for it in cameras]
 
-    return _median_disagreement(cameras, half, distance_m, options, None)
+    return _median_disagreement(cameras, half, distance_m, None)
 
 
-def _references_apart(matched: Sequence[PosedImage], distance_m: float, options: AgreementOptions) -> float:
+def _references_apart(matched: Sequence[PosedImage], distance_m: float) -> float:
     """`agreement.disagreement_of_references` for all photographs; a reference is in the same half for all of them."""
     cameras, owners, keypoints = [], [], []
     names: dict[str, int] = {}
@@ -102,14 +102,10 @@ def _references_apart(matched: Sequence[PosedImage], distance_m: float, options:
     counts = np.bincount(np.concatenate(owners), minlength=len(names))
 
     def half(random: np.random.Generator) -> list[NDArray[np.bool_]]:
-        order = np.argsort(-counts * (1 + options.shuffling * random.random(len(counts))), kind="stable")
-        in_first, totals = np.zeros(len(counts), bool), [0, 0]
-        for reference in order:
-            in_first[reference] = totals[0] <= totals[1]
-            totals[0 if in_first[reference] else 1] += counts[reference]
+        in_first = half_of_references(counts, random)
         return [np.asarray(in_first[it]) for it in owners]
 
-    return _median_disagreement(cameras, half, distance_m, options, keypoints)
+    return _median_disagreement(cameras, half, distance_m, keypoints)
 
 
 def _epipolar_share(matched: PosedImage) -> float:
@@ -133,12 +129,11 @@ def _median_disagreement(
     cameras: Sequence[CameraMatches],
     draw_half: Callable[[np.random.Generator], list[NDArray[np.bool_]]],
     distance_m: float,
-    options: AgreementOptions,
     keypoints: Sequence[NDArray[np.intp]] | None,
 ) -> float:
     """Median over the splits of the distance between the two halves' poses, as a share of `distance_m`; at most 1."""
     random, apart = np.random.default_rng(0), []
-    for _ in range(options.splits):
+    for _ in range(SPLITS):
         in_first = draw_half(random)
         centres: list[Array | None] = []
         for halves in (in_first, [~it for it in in_first]):
@@ -150,7 +145,7 @@ def _median_disagreement(
                 for it, r in zip(cameras, rows, strict=True)
                 if len(r)
             ]
-            pose = rig_ransac(some, options.pnp) if sum(map(len, rows)) >= 4 else None
+            pose = rig_ransac(some, PNP) if sum(map(len, rows)) >= 4 else None
             centres.append(None if pose is None else pose.translation)
         first, second = centres
         apart.append(NO_AGREEMENT if first is None or second is None else math.dist(first, second) / distance_m)

@@ -1,1 +1,1 @@
-"""Priors on a pose (`known`), and pose estimation with them: `gravity`, `informed`, `pose_only`."""
+"""Priors on a pose (`known`), and pose estimation with them (`informed`)."""

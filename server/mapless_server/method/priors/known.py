@@ -4,7 +4,7 @@ Each prior gives, for a pose, a residual r, its covariance C, and the derivative
 (x, y, z) and a rotation (rx, ry, rz) about fixed world axes, as in the covariances of poses (ROS's order). From these:
 
     distance        m^2 = r^T (C + J Sigma J^T)^-1 r,    Sigma the covariance of a pose estimated without the prior
-    cost            r^T C^-1 r,                          which `adjust` and `pose_only` add to the reprojection errors
+    cost            r^T C^-1 r,                          which `adjust` and `informed` add to the reprojection errors
     information     J^T C^-1 J,                          which reduces the covariance of the answer.
 
 m^2 of a consistent prior follows a chi-square distribution. A prior beyond the quantile of `CONFLICT_PROBABILITY` is in

@@ -13,7 +13,7 @@ RANSAC could not find another one that more of them agree with, only the same a 
 import math
 import statistics
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,6 @@ from scipy.spatial import ConvexHull
 from mapless.geometry import Array, Camera, RigidTransform
 
 from ..optimize import cauchy_weight
-from ..options import check_bounds
 from ..perturbation import pose_jacobian, reprojection_errors_px
 from ..pnp import PnpOptions, ransac
 from ..results import PointMatches, Structure, Support
@@ -46,6 +45,17 @@ LINEAR_SHARE, LINEAR_STEPS = 0.02, 5
 
 LEAST_DAMPING = 1e-9
 """Relative: a pose that matches do not determine has a large standard deviation, not none."""
+
+SPLITS = 3
+"""Splits into halves, of which the median counts; one split may put all good matches into one half."""
+
+SHUFFLING = 0.3
+"""References are assigned to halves in the order of their numbers of matches, each raised by up to this share at
+random, so that the splits differ and the halves remain balanced."""
+
+PNP = PnpOptions(min_iterations=30, max_iterations=1000, max_matches=600)
+"""Of the halves' poses. With good matches, 30 iterations give the same poses as 100; 1000 find a pose with a third of
+the matches as inliers."""
 
 NO_AGREEMENT = 1.0
 """The disagreement of halves that give no pose: as far apart as what they see is away."""
@@ -101,29 +111,7 @@ def votes_on(
     return Votes(reference[known], keypoint, structure.x_in_world[point[known]], pixels)
 
 
-@dataclass(frozen=True)
-class AgreementOptions:
-    """Options of the comparison.
-
-    Attributes:
-        splits: largest number of splits into halves, of which the median counts; one split may put all good matches
-            into one half.
-        shuffling: references are assigned to halves in the order of their numbers of matches, each raised by up to this
-            share at random, so that the splits differ and the halves remain balanced.
-        pnp: options of the halves' poses. With good matches, 30 iterations give the same poses as 100; 1000 find a pose
-            with a third of the matches as inliers.
-    """
-
-    splits: int = 3
-    shuffling: float = 0.3
-    pnp: PnpOptions = field(default_factory=lambda: PnpOptions(min_iterations=30, max_iterations=1000, max_matches=600))
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "splits", at_least=1)
-        check_bounds(self, "shuffling", at_least=0)
-
-
-def disagreement_of_matches(support: Support, distance_m: float, options: AgreementOptions) -> float:
+def disagreement_of_matches(support: Support, distance_m: float) -> float:
     """Distance between the cameras that random halves of the matches give, as a share of `distance_m`; at most 1."""
     matches, structure = support.matches, support.structure
     rows = np.flatnonzero(~matches.guided)
@@ -136,28 +124,31 @@ def disagreement_of_matches(support: Support, distance_m: float, options: Agreem
         return np.asarray(random.permutation(len(rows)) % 2 == 0)
 
     camera, pose = support.query.camera, _pose(support)
-    return _median_disagreement(camera, x_in_world, pixels, random_half, distance_m, options, pose)
+    return _median_disagreement(camera, x_in_world, pixels, random_half, distance_m, pose)
 
 
-def disagreement_of_references(support: Support, votes: Votes, distance_m: float, options: AgreementOptions) -> float:
+def disagreement_of_references(support: Support, votes: Votes, distance_m: float) -> float:
     """The same distance for matches with one half of the references and with the other half.
 
     The halves have about as many matches each; of several matches of a keypoint within a half the first counts.
     """
     counts = np.bincount(votes.reference, minlength=len(support.references))
 
-    def half_of_the_references(random: np.random.Generator) -> NDArray[np.bool_]:
-        order = np.argsort(-counts * (1 + options.shuffling * random.random(len(counts))), kind="stable")
-        in_first, totals = np.zeros(len(counts), bool), [0, 0]
-        for reference in order:
-            in_first[reference] = totals[0] <= totals[1]
-            totals[0 if in_first[reference] else 1] += counts[reference]
-        return np.asarray(in_first[votes.reference])
+    def half_of_votes(random: np.random.Generator) -> NDArray[np.bool_]:
+        return np.asarray(half_of_references(counts, random)[votes.reference])
 
     camera, key = support.query.camera, votes.keypoint
-    return _median_disagreement(
-        camera, votes.x_in_world, votes.pixels, half_of_the_references, distance_m, options, _pose(support), key
-    )
+    return _median_disagreement(camera, votes.x_in_world, votes.pixels, half_of_votes, distance_m, _pose(support), key)
+
+
+def half_of_references(counts: NDArray[np.intp], random: np.random.Generator) -> NDArray[np.bool_]:
+    """Which references are in the first half, that both have about as many of their numbers of matches (K,)."""
+    order = np.argsort(-counts * (1 + SHUFFLING * random.random(len(counts))), kind="stable")
+    in_first, totals = np.zeros(len(counts), bool), [0, 0]
+    for reference in order:
+        in_first[reference] = totals[0] <= totals[1]
+        totals[0 if in_first[reference] else 1] += counts[reference]
+    return in_first
 
 
 def _pose(support: Support) -> RigidTransform:
@@ -171,21 +162,20 @@ def _median_disagreement(
     pixels: Array,
     draw_half: Callable[[np.random.Generator], NDArray[np.bool_]],
     distance_m: float,
-    options: AgreementOptions,
     pose: RigidTransform,
     keypoint: NDArray[np.intp] | None = None,
 ) -> float:
     """Median over the splits of the distance of the two halves' cameras, as a share of `distance_m`; at most 1."""
     random = np.random.default_rng(0)
-    firsts = np.array([draw_half(random) for _ in range(options.splits)])
-    halves = np.stack([firsts, ~firsts], axis=1).reshape(2 * options.splits, -1)
+    firsts = np.array([draw_half(random) for _ in range(SPLITS)])
+    halves = np.stack([firsts, ~firsts], axis=1).reshape(2 * SPLITS, -1)
     if keypoint is not None:
         rows, halves = _first_of_each(keypoint, x_in_world, halves)
         x_in_world, pixels = x_in_world[rows], pixels[rows]
-    shifts = _shifts_nearby(camera, x_in_world, pixels, halves, pose, distance_m, options.pnp)
+    shifts = _shifts_nearby(camera, x_in_world, pixels, halves, pose, distance_m)
     for half, shift in zip(halves, shifts, strict=True):
         if np.isnan(shift[0]) and half.sum() >= 4:
-            found = ransac(camera, x_in_world[half], pixels[half], None, options.pnp)
+            found = ransac(camera, x_in_world[half], pixels[half], None, PNP)
             shift[:] = np.nan if found is None else found.translation - pose.translation
     apart = np.linalg.norm(shifts[::2] - shifts[1::2], axis=1) / distance_m
     return float(min(NO_AGREEMENT, statistics.median(np.nan_to_num(apart, nan=NO_AGREEMENT).tolist())))
@@ -214,7 +204,6 @@ def _shifts_nearby(
     halves: NDArray[np.bool_],
     pose: RigidTransform,
     distance_m: float,
-    options: PnpOptions,
 ) -> Array:
     """Shifts (H, 3) from a pose's centre to those of halves (H, M) of the matches; NaN where the pose is not theirs.
 
@@ -223,7 +212,7 @@ def _shifts_nearby(
     shifts = np.full((len(halves), 3), np.nan)
     x_in_camera = pose.inverse().apply(x_in_world)
     residual = camera.project(x_in_camera) - pixels
-    agrees: NDArray[np.bool_] = np.linalg.norm(residual, axis=1) < options.inlier_px
+    agrees: NDArray[np.bool_] = np.linalg.norm(residual, axis=1) < PNP.inlier_px
     in_half = halves[:, agrees]
     agreeing = in_half.sum(axis=1)
     chosen: NDArray[np.bool_] = (agreeing >= LEAST_AGREEING) & (agreeing > MAJORITY * halves.sum(axis=1))
@@ -235,7 +224,7 @@ def _shifts_nearby(
     largest = LINEAR_SHARE * np.repeat([distance_m, 1.0], 3)
     for _ in range(LINEAR_STEPS):
         moved = residual + motion @ by_pose
-        weight = in_half[chosen] * cauchy_weight(moved[0] ** 2 + moved[1] ** 2, options.loss_scale_px)
+        weight = in_half[chosen] * cauchy_weight(moved[0] ** 2 + moved[1] ** 2, PNP.loss_scale_px)
         gradient = (weight * moved[0]) @ by_pose[0].T + (weight * moved[1]) @ by_pose[1].T
         hessian = (weight @ products.T).reshape(-1, 6, 6)
         hessian += LEAST_DAMPING * np.eye(6) * (hessian + 1)
@@ -296,16 +285,13 @@ class Evidence:
         return math.log(found * hull * epipolar / max(LEAST_DISAGREEMENT, self.disagreement))
 
 
-def evidence_of(
-    support: Support, votes: Votes, query_matches: Sequence[Matches], options: AgreementOptions
-) -> Evidence:
+def evidence_of(support: Support, votes: Votes, query_matches: Sequence[Matches]) -> Evidence:
     """Computes the evidence for the estimate of a support.
 
     Args:
         support: the support, whose estimate has at least four inliers.
         votes: the query's matches, carried to points.
         query_matches: matches of the query with each reference.
-        options: options of the comparison of halves.
 
     Raises:
         ValueError: there is no such estimate.
@@ -322,8 +308,8 @@ def evidence_of(
         expected_share(structure, support.references),
         hull_share(query, matches, inliers),
         epipolar_share(query, support.references, query_matches, support.inliers_by_reference(), pose),
-        disagreement_of_matches(support, distance_m, options),
-        disagreement_of_references(support, votes, distance_m, options),
+        disagreement_of_matches(support, distance_m),
+        disagreement_of_references(support, votes, distance_m),
     )
 
 

@@ -5,31 +5,16 @@ Stival 2004). This is a cheap first test, which means the same for every scene; 
 with one another and pass it. `judge` computes the trust of poses that pass.
 """
 
-import math
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from mapless.geometry import Camera
 
-from ..options import check_bounds
 from ..results import PointMatches
 
-
-@dataclass(frozen=True)
-class GateOptions:
-    """Options of the gate.
-
-    Attributes:
-        max_log10_false_alarms: largest log10 of the expected number of poses with as many inliers among wrong matches.
-    """
-
-    max_log10_false_alarms: float = -3.0
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "max_log10_false_alarms", at_least=-math.inf)
+MAX_LOG10_FALSE_ALARMS = -3.0
+"""Largest log10 of the expected number of poses with as many inliers among wrong matches."""
 
 
 def gate_failure(
@@ -37,7 +22,6 @@ def gate_failure(
     matches: PointMatches,
     inliers: NDArray[np.bool_],
     inlier_px: float,
-    options: GateOptions,
     log10_chance: float = 0.0,
 ) -> str | None:
     """Says in one sentence why a pose fails the gate; None if it passes.
@@ -47,14 +31,13 @@ def gate_failure(
         matches: matches of the photograph with the points of a structure.
         inliers: (M,) which of them are inliers of the pose; at least four.
         inlier_px: largest reprojection error of an inlier.
-        options: options of the gate.
         log10_chance: see `Priors.log10_chance`.
     """
     expected = log10_false_alarms(camera, matches, inliers, inlier_px) + log10_chance
-    if expected <= options.max_log10_false_alarms:
+    if expected <= MAX_LOG10_FALSE_ALARMS:
         return None
     count = f"{inliers.sum()} of {len(matches)} matches agree on a pose"
-    return f"{count}, which chance could do ({format_false_alarms(expected, options.max_log10_false_alarms)})"
+    return f"{count}, which chance could do ({format_false_alarms(expected, MAX_LOG10_FALSE_ALARMS)})"
 
 
 def log10_false_alarms(camera: Camera, matches: PointMatches, inliers: NDArray[np.bool_], inlier_px: float) -> float:

@@ -13,6 +13,19 @@ The quantiles come from `research.trust`: answers to photographs with many and f
 places where right answers have the least evidence, so that the coverage holds in a place like these; elsewhere more are
 accepted. A right answer is off by at most 5 % of the distance to what the photograph shows, 5 degrees and, in
 scenes in metres, 25 cm.
+
+A second pose, at another place, that other references support about as well, makes a pose ambiguous. With repeated
+corridors and floors, identical furniture, or some references with wrong poses, the matches of the references form two
+clusters, and the pose with a few more inliers is found. So a second pose is searched among the matches that are
+outliers of the first. It is a rival if
+
+    its inliers are not chance (the a-contrario test of `gate`, over these matches),
+    it explains at least a given share of the number of keypoints that the first pose explains,
+    it is further from the first pose than the 95 % radii of both, and
+    most of its inliers come from references that support it more than the first pose.
+
+Keypoints are counted over the matches with each reference, before the majority vote for a keypoint's point, which
+removes the matches of the weaker place.
 """
 
 import itertools
@@ -21,16 +34,42 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Camera, RigidTransform, rotation_angle_deg
 
 from ..intrinsics import ContradictionOptions
 from ..options import check_bounds
+from ..perturbation import pose_hessian, world_covariance
+from ..pnp import PnpOptions, ransac
 from ..rejection import Advice, Hint, Hypothesis, Rejection, RejectionReason
 from ..results import Support
-from ..uncertainty.radii import accuracy_from_covariance
+from ..uncertainty.radii import Accuracy, accuracy_from_covariance
 from ..views import Matches
-from .ambiguity import AmbiguityOptions, find_rival
-from .evidence import AgreementOptions, Evidence, Votes, evidence_of, votes_of
+from .evidence import Evidence, Votes, evidence_of, votes_of
+from .gate import false_alarms
 from .intrinsics import WrongCameraOptions, wrong_camera, wrong_intrinsics
+
+RIVAL_MIN_SHARE, RIVAL_MIN_KEYPOINTS = 0.5, 10
+"""Least number of keypoints of a rival, as a share of those of the first pose, and in all. A place with less than half
+the keypoints of another is distinguished from it."""
+
+RIVAL_MAX_LOG10_FALSE_ALARMS = -6.0
+"""As in `gate`, but stricter, because a rival is searched for every answer."""
+
+RIVAL_MIN_OWN_SHARE = 0.5
+"""Least share of a rival's inliers from references that support it more than the first pose. A few references that show
+both places support both."""
+
+MIN_APART_M, MIN_APART_DEG = 0.1, 5.0
+"""Poses nearer than this are one place, independent of their radii."""
+
+AGREEING_PX = 12.0
+"""Matches within this distance belong to the first pose; larger than the inlier bound, since a point with an error is
+not a second place."""
+
+RIVAL_PNP = PnpOptions(min_iterations=50, max_iterations=200, max_matches=300)
+"""Of the rival's pose. The few iterations find a pose with a third of the matches as inliers."""
 
 _RARE = (0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075)
 LEVELS = (*_RARE, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
@@ -46,8 +85,6 @@ class JudgeOptions:
         agreement_weight: weight of ln(1 / chance) if gravity or heading agrees with a pose. It would be 1 if poses were
             wrong only by chance; but poses from repeated structure and wrong references agree too, and so do slightly
             wrong ones.
-        agreement: options of the comparison of halves.
-        ambiguity: options of the search for a second pose.
         intrinsics: options of the check of the photograph's intrinsics.
         camera: options of the comparison with other cameras.
         max_radius_share: largest 68 % radius of the position, as a share of the distance to what the photograph shows:
@@ -60,8 +97,6 @@ class JudgeOptions:
         -0.623, 0.323, 1.854, 2.719, 3.518, 4.185, 4.882, 5.504, 6.015, 6.717,
     )  # fmt: skip
     agreement_weight: float = 0.3
-    agreement: AgreementOptions = field(default_factory=AgreementOptions)
-    ambiguity: AmbiguityOptions = field(default_factory=AmbiguityOptions)
     intrinsics: ContradictionOptions = field(default_factory=ContradictionOptions)
     camera: WrongCameraOptions = field(default_factory=WrongCameraOptions)
     max_radius_share: float = 0.08
@@ -117,7 +152,7 @@ def judge(
         less than 1 - coverage.
     """
     votes = votes_of(support, query_matches)
-    evidence = evidence_of(support, votes, query_matches, options.agreement)
+    evidence = evidence_of(support, votes, query_matches)
     trust = trust_of(evidence, options, log10_chance)
     rejection = contradiction(support, votes, options)
     if rejection is None:
@@ -133,7 +168,7 @@ def contradiction(support: Support, votes: Votes, options: JudgeOptions) -> Reje
         wrong = wrong_intrinsics(evidence, best, options.intrinsics)
         if wrong := wrong or wrong_camera(support, evidence, best, options.camera):
             return wrong
-    hypotheses = find_rival(support, votes, options.ambiguity)
+    hypotheses = find_rival(support, votes)
     return _ambiguous(hypotheses) if hypotheses else _too_uncertain(support, options)
 
 
@@ -195,3 +230,77 @@ def _ambiguous(hypotheses: tuple[Hypothesis, Hypothesis]) -> Rejection:
         f"{len(first.references)} references, {second.inlier_count} with the other by {len(second.references)}"
     )
     return Rejection(RejectionReason.AMBIGUOUS, message, hypotheses=(first, second))
+
+
+def find_rival(support: Support, votes: Votes) -> tuple[Hypothesis, Hypothesis] | None:
+    """Finds the first pose and its rival, as hypotheses in the support's world; None without a rival.
+
+    Projects all matches, and searches only if enough of them are outliers.
+
+    Args:
+        support: the first pose's support, with its estimate.
+        votes: the query's matches with each reference.
+    """
+    estimate, camera = support.estimate, support.query.camera
+    if estimate is None:
+        return None
+    errors_px = votes.errors_px(camera, estimate.world_from_camera)
+    own = errors_px < RIVAL_PNP.inlier_px
+    wanted = max(RIVAL_MIN_KEYPOINTS, int(np.ceil(RIVAL_MIN_SHARE * votes.keypoint_count(own))))
+    candidates = _outliers(votes, own, ~(errors_px < AGREEING_PX), len(support.references))
+    if votes.keypoint_count(candidates) < wanted:
+        return None
+    rival = _second_pose(camera, votes[candidates], wanted)
+    if rival is None:
+        return None
+    pose, radii = rival
+    own_radii = accuracy_from_covariance(estimate.covariance)
+    if not _are_apart(estimate.world_from_camera, own_radii, pose, radii):
+        return None
+    theirs = votes.errors_px(camera, pose) < RIVAL_PNP.inlier_px
+    counts = [np.bincount(votes.reference[rows], minlength=len(support.references)) for rows in (own, theirs)]
+    if counts[1][counts[1] > counts[0]].sum() < RIVAL_MIN_OWN_SHARE * counts[1].sum():
+        return None
+    names = [reference.name for reference in support.references]
+    return (
+        Hypothesis(estimate.world_from_camera, votes.keypoint_count(own), _supporters(names, counts[0], counts[1])),
+        Hypothesis(pose, votes.keypoint_count(theirs), _supporters(names, counts[1], counts[0])),
+    )
+
+
+def _second_pose(camera: Camera, votes: Votes, wanted: int) -> tuple[RigidTransform, Accuracy] | None:
+    """Finds a pose with enough inliers that are not chance, and its radii."""
+    pose = ransac(camera, votes.x_in_world, votes.pixels, None, RIVAL_PNP)
+    if pose is None:
+        return None
+    inliers = votes.errors_px(camera, pose) < RIVAL_PNP.inlier_px
+    keypoint_count, count = len(np.unique(votes.keypoint)), votes.keypoint_count(inliers)
+    # The chance of an inlier is proportional to the number of matches of a keypoint.
+    disc_share = np.pi * RIVAL_PNP.inlier_px**2 / (camera.width_px * camera.height_px)
+    chance = float(disc_share * len(votes.keypoint) / keypoint_count)
+    if count < wanted or false_alarms(keypoint_count, count, chance) > RIVAL_MAX_LOG10_FALSE_ALARMS:
+        return None
+    # With a keypoint noise of one pixel.
+    covariance = world_covariance(pose_hessian(camera, pose, votes.x_in_world[inliers]), pose)
+    return pose, accuracy_from_covariance(covariance)
+
+
+def _supporters(names: Sequence[str], own: NDArray[np.intp], other: NDArray[np.intp]) -> tuple[str, ...]:
+    """Names of the references with more inliers of one pose than of the other, those with the most first."""
+    return tuple(names[i] for i in np.argsort(-own, kind="stable") if own[i] > other[i])
+
+
+def _outliers(
+    votes: Votes, own: NDArray[np.bool_], apart: NDArray[np.bool_], reference_count: int
+) -> NDArray[np.bool_]:
+    """Mask (V,) of the matches far from the first pose, of references with more such matches than inliers."""
+    against, favour = (np.bincount(votes.reference[rows], minlength=reference_count) for rows in (apart, own))
+    return np.asarray(apart & (against > favour)[votes.reference])
+
+
+def _are_apart(first: RigidTransform, radii: Accuracy, second: RigidTransform, other: Accuracy) -> bool:
+    apart_m = float(np.linalg.norm(second.translation - first.translation))
+    apart_deg = rotation_angle_deg(first.rotation.T @ second.rotation)
+    reach_m = max(MIN_APART_M, radii.position_95_m + other.position_95_m)
+    reach_deg = max(MIN_APART_DEG, radii.rotation_95_deg + other.rotation_95_deg)
+    return apart_m > reach_m or apart_deg > reach_deg

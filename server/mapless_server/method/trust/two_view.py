@@ -22,7 +22,6 @@ from scipy.spatial import ConvexHull
 
 from mapless.geometry import Array
 
-from ..options import check_bounds
 from ..rejection import Advice, Hint, Rejection, RejectionReason
 from ..results import Support
 from ..two_view.matches import TwoViewMatches
@@ -30,41 +29,27 @@ from ..two_view.pose import band_chance, disc_chance
 from ..views import Matches
 from .gate import false_alarms, format_false_alarms, log10_tail
 
+MAX_LOG10_POSE = -15.0
+"""Largest log10 of the expected number of such poses among wrong matches. Of 220 photographs with references of other
+places none was below -3."""
+
+MAX_LOG10_DISTANCE = -5.0
+"""The same limit for distances."""
+
+MIN_SECOND_SHARE = 0.35
+"""Least share of inliers among the matches of the reference with the second most inliers. On a statue that looks alike
+from several sides, wrong poses had up to 0.26, and one with a wrong focal length, off by 6 degrees, 0.32; of 31 right
+answers to photographs that failed otherwise 22 have more."""
+
+SHARES = (0.253, 0.256, 0.274, 0.288, 0.331, 0.432, 0.476, 0.636)
 LEVELS = (0.0, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 1.0)
-"""Shares of the right answers at which `TwoViewGateOptions.shares` are the quantiles."""
+"""Quantiles of the second reference's share of those right answers, and the shares of the answers that have less."""
 
+MIN_HULL_SHARE = 0.04
+"""Least share of the image covered by the convex hull of the inliers; see `groups.images`."""
 
-@dataclass(frozen=True)
-class TwoViewGateOptions:
-    """Options of the test.
-
-    Attributes:
-        max_log10_pose: largest log10 of the expected number of such poses among wrong matches. Of 220 photographs with
-            references of other places none was below -3.
-        max_log10_distance: the same limit for distances.
-        min_second_share: least share of inliers among the matches of the reference with the second most inliers. On
-            a statue that looks alike from several sides, wrong poses had up to 0.26, and one with a wrong focal length,
-            off by 6 degrees, 0.32; of 31 right answers to photographs that failed otherwise 22 have more.
-        min_hull_share: least share of the image covered by the convex hull of the inliers; see `GateOptions`.
-        shares: quantiles of the second reference's share of those right answers at `LEVELS`.
-        inlier_px: largest reprojection error of an inlier.
-        epipolar_px: largest Sampson distance of an inlier.
-    """
-
-    max_log10_pose: float = -15.0
-    max_log10_distance: float = -5.0
-    min_second_share: float = 0.35
-    min_hull_share: float = 0.04
-    shares: tuple[float, ...] = (0.253, 0.256, 0.274, 0.288, 0.331, 0.432, 0.476, 0.636)
-    inlier_px: float = 4.0
-    epipolar_px: float = 2.0
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "max_log10_pose max_log10_distance", at_most=0)
-        check_bounds(self, "min_second_share min_hull_share shares", at_least=0, at_most=1)
-        check_bounds(self, "inlier_px epipolar_px", above=0)
-        if len(self.shares) != len(LEVELS) or list(self.shares) != sorted(self.shares):
-            raise ValueError(f"TwoViewGateOptions.shares must be {len(LEVELS)} rising numbers, is {self.shares}")
+INLIER_PX, EPIPOLAR_PX = 4.0, 2.0
+"""Largest reprojection error, and largest Sampson distance, of an inlier."""
 
 
 @dataclass(frozen=True)
@@ -90,15 +75,12 @@ class TwoViewEvidence:
     hull_share: float
 
 
-def two_view_evidence(
-    support: Support, query_matches: Sequence[Matches], options: TwoViewGateOptions
-) -> TwoViewEvidence:
+def two_view_evidence(support: Support, query_matches: Sequence[Matches]) -> TwoViewEvidence:
     """Computes the evidence for the estimate of a support with two-view matches.
 
     Args:
         support: the support, with an estimate and two-view matches.
         query_matches: matches of the query with each reference.
-        options: options of the test.
 
     Raises:
         ValueError: there is no estimate, or there are no two-view matches.
@@ -106,7 +88,7 @@ def two_view_evidence(
     estimate, lines, matches, camera = support.estimate, support.two_view, support.matches, support.query.camera
     if estimate is None or lines is None:
         raise ValueError("support.estimate and support.two_view must not be None")
-    disc, band = disc_chance(camera, options.inlier_px), band_chance(camera, options.epipolar_px)
+    disc, band = disc_chance(camera, INLIER_PX), band_chance(camera, EPIPOLAR_PX)
     # Matches searched near a pose agree with it by construction.
     points = int((~matches.guided).sum()), int((estimate.inliers & ~matches.guided).sum())
     all_lines = len(lines.inliers), int(lines.inliers.sum())
@@ -115,7 +97,7 @@ def two_view_evidence(
         false_alarms(*all_lines, band, sample=6) + log10_tail(*points, disc),
     )
     every = TwoViewMatches.of(support.query, support.references, query_matches)
-    agreeing = every.sampson_px(estimate.world_from_camera) < options.epipolar_px
+    agreeing = every.sampson_px(estimate.world_from_camera) < EPIPOLAR_PX
     counts = np.bincount(every.reference[agreeing], minlength=len(support.references))
     strongest, second = np.argsort(-counts, kind="stable")[:2]
     others = lines.reference != strongest
@@ -133,27 +115,27 @@ def two_view_evidence(
     )
 
 
-def lacks_distance(evidence: TwoViewEvidence, options: TwoViewGateOptions) -> bool:
+def lacks_distance(evidence: TwoViewEvidence) -> bool:
     """Whether only one reference supports the pose, and too few other matches do."""
-    return evidence.log10_pose <= options.max_log10_pose and evidence.log10_distance > options.max_log10_distance
+    return evidence.log10_pose <= MAX_LOG10_POSE and evidence.log10_distance > MAX_LOG10_DISTANCE
 
 
-def two_view_failure(evidence: TwoViewEvidence, options: TwoViewGateOptions) -> str | None:
+def two_view_failure(evidence: TwoViewEvidence) -> str | None:
     """Says in one sentence why a pose fails; None if it passes."""
     count = f"{evidence.inlier_count} of {evidence.match_count} matches with references and points agree on a pose"
-    if evidence.log10_pose > options.max_log10_pose:
-        return f"{count}, which chance could do ({format_false_alarms(evidence.log10_pose, options.max_log10_pose)})"
-    if lacks_distance(evidence, options):
+    if evidence.log10_pose > MAX_LOG10_POSE:
+        return f"{count}, which chance could do ({format_false_alarms(evidence.log10_pose, MAX_LOG10_POSE)})"
+    if lacks_distance(evidence):
         return (
             f"{count}, but all except {evidence.other_inliers} of them are with one reference, which determines "
             "the direction but not the distance"
         )
-    if evidence.second_share < options.min_second_share:
+    if evidence.second_share < MIN_SECOND_SHARE:
         return (
             f"{count}, but of the matches with the second reference only {100 * evidence.second_share:.0f} %: repeated "
             "structure somewhere else, most likely"
         )
-    if evidence.hull_share < options.min_hull_share:
+    if evidence.hull_share < MIN_HULL_SHARE:
         return f"{count}, but they cover only {100 * evidence.hull_share:.1f} % of the image"
     return None
 
@@ -168,9 +150,9 @@ def one_reference_rejection(reason: RejectionReason, message: str, support: Supp
     return Rejection(reason, message, Hint("two_view", Advice.ADD_REFERENCES, advice, best))
 
 
-def two_view_trust(evidence: TwoViewEvidence, options: TwoViewGateOptions) -> float:
+def two_view_trust(evidence: TwoViewEvidence) -> float:
     """Trust, 0 to 1: the share of right answers whose second reference has at most this share of inliers."""
-    return float(np.interp(evidence.second_share, options.shares, LEVELS))
+    return float(np.interp(evidence.second_share, SHARES, LEVELS))
 
 
 def _hull_px2(pixels: Array) -> float:

@@ -24,10 +24,8 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
-from ..observations import triangulate
-from ..results import KeypointNoise
+from ..observations import KeypointNoise, Tracks, triangulate
 from ..structure import observe
-from ..tracks import Tracks
 from ..views import Matches, PosedView, View
 
 
@@ -127,7 +125,7 @@ class TwoViewMatches:
         )
         observations = observe(tracks, [*references, PosedView("", "", query, world_from_query)], noise)
         points = triangulate(observations)
-        in_front = (observations.in_camera(points)[:, 2] > 0).reshape(-1, 2).all(axis=1)
+        in_front = (observations.in_camera(points)[2] > 0).reshape(-1, 2).all(axis=1)
         _, direction = observations.rays()
-        cosine = (direction[::2] * direction[1::2]).sum(axis=1).clip(-1, 1)
+        cosine = (direction[:, ::2] * direction[:, 1::2]).sum(axis=0).clip(-1, 1)
         return np.where(in_front[:, None], points, np.nan), np.rad2deg(np.arccos(cosine))

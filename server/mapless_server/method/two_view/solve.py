@@ -7,7 +7,7 @@ point without its only reference has no information.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,37 +17,26 @@ from mapless.geometry import Array, RigidTransform
 from ..adjust import adjust_pose
 from ..correspond import Correspondences
 from ..match import MatchOptions, match_points, vote
-from ..options import check_bounds
+from ..observations import Tracks
 from ..perturbation import reprojection_errors_px
 from ..pose_problem import AdjustOptions
 from ..results import PointMatches, PoseEstimate, PoseStage, Structure, Support, TwoViewSupport
 from ..structure import StructureOptions, triangulated_structure
-from ..tracks import Tracks
 from ..views import PosedView, View
 from .matches import TwoViewMatches
 from .pose import Evidence, RelativePoseOptions, find_pose, score
 
+POSE = RelativePoseOptions()
+"""Of the search for the initial pose, and of its inliers."""
 
-@dataclass(frozen=True)
-class TwoViewOptions:
-    """Options of the stage.
+MIN_PARALLAX_DEG = 0.5
+"""Matches with a smaller parallax are not adjusted: their points have no depth."""
 
-    Attributes:
-        pose: options of the search for the initial pose, and of its inliers.
-        min_parallax_deg: matches with a smaller parallax are not adjusted: their points have no depth.
-        rounds: number of rounds of choosing inliers and adjusting.
-        min_inliers: fewer matches do not determine a pose with any redundancy.
-    """
+ROUNDS = 3
+"""Of choosing inliers and adjusting."""
 
-    pose: RelativePoseOptions = field(default_factory=RelativePoseOptions)
-    min_parallax_deg: float = 0.5
-    rounds: int = 3
-    min_inliers: int = 8
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "min_parallax_deg", above=0, below=90)
-        check_bounds(self, "rounds", above=0)
-        check_bounds(self, "min_inliers", at_least=7)
+MIN_INLIERS = 8
+"""Fewer matches do not determine a pose with any redundancy."""
 
 
 def solve_two_view(
@@ -59,7 +48,6 @@ def solve_two_view(
     structure_options: StructureOptions,
     match_options: MatchOptions,
     adjust_options: AdjustOptions,
-    options: TwoViewOptions,
 ) -> Support | None:
     """Finds the pose that most matches of both kinds support, with these matches; None if there is none.
 
@@ -70,18 +58,18 @@ def solve_two_view(
     matches = vote(structure, [len(it.view.features) for it in references], correspondences)
     two_view = TwoViewMatches.of(query, references, correspondences.query_matches)
     evidence = Evidence(query, references, two_view, structure.x_in_world[matches.point], matches.keypoint)
-    pose = find_pose(evidence, options.pose, known)
+    pose = find_pose(evidence, POSE, known)
     if pose is None:
         return None
     searched = match_points(query, references, structure, correspondences, pose, match_options)
-    problem = _Problem(evidence, structure, searched, adjust_options, options)
+    problem = _Problem(evidence, structure, searched, adjust_options)
     best = problem.at(pose)
-    for _ in range(options.rounds):
+    for _ in range(ROUNDS):
         adjusted = problem.adjusted(best)
         if adjusted is None or (best.estimate is not None and adjusted.score <= best.score):
             break
         best = adjusted
-    if best.estimate is None or best.inlier_count < options.min_inliers:
+    if best.estimate is None or best.inlier_count < MIN_INLIERS:
         return None
     query_matches = tuple(correspondences.query_matches)
     return Support(query, tuple(references), structure, searched, best.estimate, origin, best.support, query_matches)
@@ -119,7 +107,6 @@ class _Problem:
     structure: Structure
     matches: PointMatches
     adjust: AdjustOptions
-    options: TwoViewOptions
 
     def at(self, pose: RigidTransform, estimate: PoseEstimate | None = None) -> _Solution:
         """Finds the inliers of a pose."""
@@ -131,14 +118,14 @@ class _Problem:
         rest = evidence.two_view[~np.isin(evidence.two_view.keypoint, matches.keypoint[inliers])]
         points, parallax_deg = rest.triangulated(query, evidence.references, pose, self.structure.noise)
         sampson_px = rest.sampson_px(pose)
-        agreeing = (sampson_px < self.options.pose.epipolar_px) & np.isfinite(points).all(axis=1)
+        agreeing = (sampson_px < POSE.epipolar_px) & np.isfinite(points).all(axis=1)
         support = TwoViewSupport(rest.reference, rest.keypoint, rest.reference_keypoint, points, sampson_px, agreeing)
-        value = score(evidence, pose, self.options.pose)
+        value = score(evidence, pose, POSE)
         return _Solution(pose, value, errors_px, inliers, support, parallax_deg, estimate)
 
     def adjusted(self, start: _Solution) -> _Solution | None:
         """Adjusts over the inliers of both kinds; None if that fails."""
-        used = start.support.inliers & (start.parallax_deg >= self.options.min_parallax_deg)
+        used = start.support.inliers & (start.parallax_deg >= MIN_PARALLAX_DEG)
         support, rows = start.support, np.arange(used.sum(), dtype=np.intp)
         single = Tracks(rows, support.reference[used], support.reference_keypoint[used])
         structure = self.structure.and_last(support.x_in_world[used], single)

@@ -1,1 +1,1 @@
-"""The covariance of a pose (`covariance`), from its changes without parts of the data (`dispersion`); its `radii`."""
+"""The covariance of a pose, from its changes without parts of the data (`dispersion`); its `radii`."""

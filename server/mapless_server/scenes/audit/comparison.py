@@ -48,7 +48,7 @@ GPS poses, no single one is at fault."""
 _MIN_INLIERS = 25
 """With fewer there is no verdict. Repeated texture has given up to 23 wrong ones."""
 _MAX_LOG10_FALSE_ALARMS = -6.0
-"""As in `GateOptions`, with a reserve, since an audit makes thousands of decisions."""
+"""As in `gate`, with a reserve, since an audit makes thousands of decisions."""
 _BOTH_EXCESS = 2.0
 """If a changed pose alone and a changed focal length alone leave more robust cost per match than this, both are wrong.
 One true cause leaves up to 0.75, two leave 4."""

@@ -17,14 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform
-from mapless_server.method.arrays import invert_symmetric
 from mapless_server.method.correspond import Correspondences
 from mapless_server.method.match import vote
 from mapless_server.method.nearest import epipolar_distance_px, mutual_matches
-from mapless_server.method.observations import Observations, triangulate
+from mapless_server.method.observations import Tracks, build_tracks, triangulate
 from mapless_server.method.results import PointMatches, Structure
 from mapless_server.method.structure import StructureOptions, observe, refine_points
-from mapless_server.method.tracks import Tracks, build_tracks
 from mapless_server.method.views import Matches, PosedView
 from mapless_server.store import LruCache
 
@@ -85,11 +83,9 @@ def build_neighbourhood(references: Sequence[PosedView], pairs: PairMatches) -> 
     tracks = build_tracks(matches, [len(r.view.features) for r in references])
     observations = observe(tracks, references, options.first_noise)
     refined = refine_points(observations, triangulate(observations), options)
-    left = refined.observations.tracks
-    assert isinstance(left, Tracks)
-    covariance = _point_covariance(refined.observations, refined.x_in_world)
+    covariance = refined.observations.point_covariances(refined.x_in_world)
     trusted = refined.trusted & np.isfinite(covariance).all(axis=(1, 2))
-    structure = Structure(refined.x_in_world[trusted], left.select(trusted), refined.noise)
+    structure = Structure(refined.x_in_world[trusted], refined.observations.tracks.select(trusted), refined.noise)
     return Neighbourhood(tuple(references), structure, covariance[trusted])
 
 
@@ -117,11 +113,6 @@ def observed_points(subject: PosedView, neighbourhood: Neighbourhood, found: Poi
         neighbourhood.point_covariance[found.point],
         np.asarray(neighbourhood.structure.noise.sigma_px(features.sizes_px[found.keypoint].astype(np.float64))),
     )
-
-
-def _point_covariance(observations: Observations, x_in_world: Array) -> Array:
-    _, jacobians = observations.linearized(x_in_world)
-    return np.asarray(invert_symmetric(observations.sum_by_point(np.swapaxes(jacobians, 1, 2) @ jacobians)))
 
 
 @dataclass(frozen=True)

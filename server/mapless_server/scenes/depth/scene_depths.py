@@ -13,7 +13,7 @@ from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import StageContext
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.scale import estimate_scale
-from mapless_server.method.views import KeptDepth, PosedView, Reconstruction
+from mapless_server.method.views import KeptDepth, PosedView
 from mapless_server.security import SceneKey
 from mapless_server.store import Store
 from mapless_server.store.depths import depth_kind, discard_depths, keep_depths, list_kinds, list_without
@@ -75,12 +75,11 @@ class DepthMaker:
         nothing = dict.fromkeys(it.key for it in given)
         if isinstance(outcome, Rejection | Triangulation):  # only a network predicts depths
             return nothing
-        reconstruction = outcome if isinstance(outcome, Reconstruction) else outcome.fetch()
-        scale = estimate_scale(reconstruction, given, correspondences)
+        scale = estimate_scale(outcome, given, correspondences)
         if isinstance(scale, Rejection):
             return nothing
         true_pose = query.world_from_camera.shifted(-origin)
-        depths = checked_depths(reconstruction, scale, given, true_pose, correspondences)
+        depths = checked_depths(outcome, scale, given, true_pose, correspondences)
         return dict(zip(nothing, depths, strict=True))
 
     def _neighbours(

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapless.geometry import Array, Quaternion, RigidTransform
-from mapless_server.method.scale_equations import triangulate_depths
+from mapless_server.method.scale import triangulate_depths
 from mapless_server.method.views import PosedView
 
 from .errors import THRESHOLD_PX, MatchedPair, PairError, Views, errors_of, summary, summary_with
