@@ -72,19 +72,15 @@ def cases_of(scene: str, frame_count: int) -> Iterator[Case]:
     yield Case(scene, dense)
     for count in (*reversed(SPARSE), *FEWEST.get(scene, ())):
         if count < frame_count - MIN_QUERIES:
-            split = split_frames(frame_count, EvaluationOptions(count))
-            if len(split.queries) >= MIN_QUERIES:
+            _, queries = split_frames(range(frame_count), EvaluationOptions(count))
+            if len(queries) >= MIN_QUERIES:
                 yield Case(scene, count)
 
 
 def queries_of(dataset: Dataset, case: Case) -> list[PlannedQuery]:
     """Those of `mapless-server evaluate`."""
-    split = split_frames(len(dataset.frames), EvaluationOptions(case.references))
-    references = [dataset.frames[i] for i in split.references]
-    return [
-        PlannedQuery(query, tuple(frame for frame in references if frame is not query))
-        for query in (dataset.frames[i] for i in split.queries)
-    ]
+    references, queries = split_frames(dataset.frames, EvaluationOptions(case.references))
+    return [PlannedQuery(query, tuple(frame for frame in references if frame is not query)) for query in queries]
 
 
 class SceneDatabase:

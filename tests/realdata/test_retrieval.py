@@ -52,11 +52,11 @@ def sees_the_same(frame: Frame, found: list[RankedReference]) -> bool:
 def test_kitchen_queries_find_a_near_reference(photographs: Photographs) -> None:
     """100 references spread over the sequence, 100 other frames: 95 % of them, thinned or not."""
     frames = photographs("7scenes-redkitchen-seq01-first600").frames
-    split = split_frames(len(frames), EvaluationOptions(reference_count=100, query_count=125))
-    assert len(split.references) == 100
-    assert len(split.queries) >= 100
-    entries = index_of([frames[i] for i in split.references]).entries()
-    queries = list(zip([frames[i] for i in split.queries], described([frames[i] for i in split.queries]), strict=True))
+    references, asked = split_frames(frames, EvaluationOptions(reference_count=100, query_count=125))
+    assert len(references) == 100
+    assert len(asked) >= 100
+    entries = index_of([*references]).entries()
+    queries = list(zip(asked, described([*asked]), strict=True))
     for options in (RankOptions(), RankOptions(nearby_weight=1.0)):
         found = [rank_references(entries, vector, Selection(10, options=options)) for _, vector in queries]
         shares = np.mean([sees_the_same(frame, it) for (frame, _), it in zip(queries, found, strict=True)])

@@ -19,7 +19,7 @@ from mapless_tools.charts import INK, figure_of, inline_svg, new_axes, plot, use
 from mapless_tools.child import Memory
 from mapless_tools.dataset import Dataset
 from mapless_tools.evaluate.metrics import QueryResult, pose_error, quantile, summarize
-from mapless_tools.evaluate.plan import EvaluationOptions, Split, split_frames
+from mapless_tools.evaluate.plan import EvaluationOptions, split_frames
 from mapless_tools.evaluate.report import print_report, to_json
 from mapless_tools.evaluate.run import Evaluation
 
@@ -40,27 +40,26 @@ MISSED = result(math.inf)
 class TestSplit:
     def test_small_ones_are_as_derived_by_hand(self) -> None:
         """Half is rounded to even; each frame is left out once, or some; without room for a margin there is none."""
-        assert split_frames(10, EvaluationOptions(reference_count=3, query_count=2)).references == (0, 4, 9)
-        assert split_frames(11, EvaluationOptions()) == Split(tuple(range(11)), tuple(range(11)))
-        assert split_frames(11, EvaluationOptions(query_count=3)).queries == (0, 5, 10)
-        assert split_frames(5, EvaluationOptions(2)) == Split((0, 4), (1, 2, 3))
+        assert split_frames(range(10), EvaluationOptions(reference_count=3, query_count=2))[0] == (0, 4, 9)
+        assert split_frames(range(11), EvaluationOptions()) == (tuple(range(11)), tuple(range(11)))
+        assert split_frames(range(11), EvaluationOptions(query_count=3))[1] == (0, 5, 10)
+        assert split_frames(range(5), EvaluationOptions(2)) == ((0, 4), (1, 2, 3))
 
     @given(frames=st.integers(2, 700), references=st.integers(2, 60), queries=st.integers(1, 80))
     def test_gives_existing_frames_and_no_query_among_references(
         self, frames: int, references: int, queries: int
     ) -> None:
         try:
-            split = split_frames(frames, EvaluationOptions(references, queries))
+            chosen, asked = split_frames(range(frames), EvaluationOptions(references, queries))
         except ValueError:
             margin = 3 if frames >= 8 else 0
             places = {round(x) for x in np.linspace(margin, frames - 1 - margin, queries)}
             assert references > frames or places <= {round(x) for x in np.linspace(0, frames - 1, references)}
             return
-        assert len(split.references) == references
-        assert 1 <= len(split.queries) <= queries
-        assert not set(split.references) & set(split.queries)
-        assert all(0 <= i < frames for i in split.references + split.queries)
-        assert list(split.queries) == sorted(set(split.queries))
+        assert len(chosen) == references
+        assert 1 <= len(asked) <= queries
+        assert not set(chosen) & set(asked)
+        assert list(asked) == sorted(set(asked))
 
     @pytest.mark.parametrize(
         ("frames", "options", "words"),
@@ -73,7 +72,7 @@ class TestSplit:
     )
     def test_refuses_what_cannot_be_split(self, frames: int, options: EvaluationOptions, words: str) -> None:
         with pytest.raises(ValueError, match=words):
-            split_frames(frames, options)
+            split_frames(range(frames), options)
 
 
 class TestMetrics:

@@ -89,14 +89,14 @@ def measure(
     servers: Sequence[ChildServer], dataset: Dataset, options: EvaluationOptions, rounds: int, tracking: bool = False
 ) -> list[Measured]:
     """Localizes photographs on two servers by turns, after once each on both; the servers choose the references."""
-    split = split_frames(len(dataset.frames), options)
+    references, queries = split_frames(dataset.frames, options)
     with ExitStack() as stack:
         clients = [stack.enter_context(Client(server.address, CONNECT)) for server in servers]
         for client in clients:
-            store_references(client, SCENE, [dataset.frames[i] for i in split.references], lambda *_: None)
+            store_references(client, SCENE, references, lambda *_: None)
         measured = []
         random = np.random.default_rng(0)
-        for frame in (dataset.frames[i] for i in split.queries):
+        for frame in queries:
             priors = Priors(pose=_prior_of(frame, random)) if tracking else None
             sides = zip(clients, servers, strict=True)
             positions = [_call(client, server, frame, priors)[2] for client, server in sides]

@@ -129,14 +129,6 @@ class Method:
         return self.variant if self.scale == "two_stage" else f"{self.variant}, {self.scale}"
 
 
-@dataclass(frozen=True)
-class Split:
-    """Indices of references and of queries, each ascending and without repetition."""
-
-    references: tuple[int, ...]
-    queries: tuple[int, ...]
-
-
 @dataclass(frozen=True, eq=False)
 class SceneSplit:
     """References and queries of a scene; the setting is the number of references, DENSE for all.
@@ -155,30 +147,30 @@ def setting_name(setting: int) -> str:
     return "dense" if setting == DENSE else f"N={setting}"
 
 
-def split_frames(frame_count: int, options: EvaluationOptions) -> Split:
-    """Splits F frames into references and queries; UsageError if there are too few.
+def split_frames(frames: Sequence[T], options: EvaluationOptions) -> tuple[tuple[T, ...], tuple[T, ...]]:
+    """References and queries of F frames, each in their order and without repetition; UsageError if there are too few.
 
     With N references: those at round(linspace(0, F - 1, N)), and those of round(linspace(3, F - 4, M)) that are not
     references as queries; fewer than 8 frames have no room for that margin, there it is round(linspace(0, F - 1, M)).
     Without N, every frame is a reference of all others.
     """
+    count = len(frames)
     if options.reference_count is None:
-        if frame_count < 3:
-            raise UsageError(f"leaving one out needs at least 3 frames, the folder has {frame_count}")
-        wanted = frame_count if options.query_count is None else options.query_count
-        return Split(tuple(range(frame_count)), tuple(_spread(0, frame_count - 1, wanted)))
-    if options.reference_count > frame_count:
-        raise UsageError(f"{options.reference_count} references are wanted, the folder has {frame_count} frames")
-    references = _spread(0, frame_count - 1, options.reference_count)
-    margin = QUERY_MARGIN if frame_count >= 8 else 0
+        if count < 3:
+            raise UsageError(f"leaving one out needs at least 3 frames, the folder has {count}")
+        return tuple(frames), tuple(evenly_spread(frames, options.query_count))
+    if options.reference_count > count:
+        raise UsageError(f"{options.reference_count} references are wanted, the folder has {count} frames")
+    references = _spread(0, count - 1, options.reference_count)
+    margin = QUERY_MARGIN if count >= 8 else 0
     wanted = DEFAULT_QUERY_COUNT if options.query_count is None else options.query_count
-    queries = tuple(sorted(set(_spread(margin, frame_count - 1 - margin, wanted)) - set(references)))
+    queries = [i for i in _spread(margin, count - 1 - margin, wanted) if i not in references]
     if not queries:
         raise UsageError(
-            f"with {options.reference_count} references among {frame_count} frames no frame is left as a query; take "
-            "fewer references, more queries, or leave one out"
+            f"with {options.reference_count} references among {count} frames no frame is left as a query; take fewer "
+            "references, more queries, or leave one out"
         )
-    return Split(tuple(references), queries)
+    return tuple(frames[i] for i in references), tuple(frames[i] for i in queries)
 
 
 def split_scene(dataset: Dataset, setting: int, options: SuiteOptions) -> SceneSplit:
@@ -190,9 +182,8 @@ def split_scene(dataset: Dataset, setting: int, options: SuiteOptions) -> SceneS
     train = [frame for frame in dataset.frames if frame.split == "train"]
     test = [frame for frame in dataset.frames if frame.split == "test"]
     if setting != DENSE and not train and not test and dataset.format == "cameras":
-        split = split_frames(len(dataset.frames), EvaluationOptions(setting, options.max_queries))
-        references, queries = ([dataset.frames[i] for i in part] for part in (split.references, split.queries))
-        return SceneSplit(setting, tuple(references), tuple(queries), len(dataset.frames) - len(references))
+        split = split_frames(dataset.frames, EvaluationOptions(setting, options.max_queries))
+        return SceneSplit(setting, *split, len(dataset.frames) - setting)
     for name, frames in (("train", train), ("test", test)):
         if not frames:
             raise UsageError(f"{dataset.name} has no frame of the {name} split: is its file of the split there?")

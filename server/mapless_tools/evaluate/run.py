@@ -61,8 +61,7 @@ def plan_for(dataset: Dataset, options: EvaluationOptions, settings: Settings, p
     settings ask for features that are not there.
     """
     matcher = Matcher.of(settings)
-    split = split_frames(len(dataset.frames), options)
-    references, queries = (tuple(dataset.frames[i] for i in part) for part in (split.references, split.queries))
+    references, queries = split_frames(dataset.frames, options)
     check_images(dict.fromkeys((*references, *queries)), matcher.limits)
     return Plan(dataset, references, rank_by_matches(queries, references, options.k, matcher, progress))
 
