@@ -60,7 +60,7 @@ from mapless_tools.load.driving import free_port
 from mapless_tools.load.watch import Scrape, read_metrics
 
 ONCE = ConnectOptions(max_attempts=1)
-PATIENT = ConnectOptions(max_attempts=5, initial_backoff_s=1.0, max_backoff_s=5.0)
+PATIENT = ConnectOptions(max_attempts=50, initial_backoff_s=1.0, max_backoff_s=2.0)
 SERVING, NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
 
 

@@ -91,7 +91,7 @@ def mirrored(pose: RigidTransform) -> RigidTransform:
 
 def test_each_usual_mistake_is_noticed_and_named() -> None:
     """One set of matches, since matches do not depend on poses."""
-    views = planted("mistakes", count=6)
+    views = planted("mistakes", count=5)
     pairs = matched(views)
     w_first, w_last = quaternion_reordered((3, 0, 1, 2)), quaternion_reordered((1, 2, 3, 0))
     faults: dict[str, Fault] = {
