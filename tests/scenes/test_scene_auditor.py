@@ -146,3 +146,17 @@ def test_a_scene_that_never_holds_still_is_unavailable(store: Store, monkeypatch
         auditor.audit("r0", go_on)
     assert caught.value.reason == "SCENE_CHANGED"
     assert len(readings) == 3
+
+
+def test_neighbours_among_rows_with_holes_are_the_nearest(store: Store) -> None:
+    store.delete_reference(KEY, "r1")
+    auditor = SceneAuditor(tools_of(store), KEY)
+    finder = auditor._finder(auditor._read().rows())
+    left = {f"scenes/s/references/r{i}": REFERENCES[i].world_from_camera for i in range(len(REFERENCES)) if i != 1}
+    np.testing.assert_array_equal(finder.origin, REFERENCES[0].world_from_camera.translation)
+    for name, pose in left.items():
+        np.testing.assert_allclose(finder.pose(name).matrix(), pose.shifted(-finder.origin).matrix(), atol=1e-12)
+        assert set(finder.near(name, 4)) == left.keys() - {name}
+        (nearest,) = finder.near(name, 1)
+        away_m = {it: np.linalg.norm(left[it].translation - pose.translation) for it in left if it != name}
+        assert away_m[nearest] <= 1.5 * min(away_m.values())
