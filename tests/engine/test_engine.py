@@ -369,6 +369,23 @@ class TestRematching:
         assert planted.calls == calls
 
 
+class TestMemory:
+    def test_a_group_photo_is_counted_with_its_group_only(
+        self, setting: Setting, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        setting.replies["cheap"] = localized(SURE_INLIERS)
+        run, sizes = setting.engine.queue.run, list[int]()
+
+        def noted(job: Job) -> Any:
+            sizes.append(job.size_bytes)
+            return run(job)
+
+        monkeypatch.setattr(setting.engine.queue, "run", noted)
+        setting.localize()
+        setting.localize(is_part=True)
+        assert sizes == [len(PHOTO), 0]
+
+
 class TestPhotograph:
     def test_reaches_the_method_with_the_query_and_every_reference(self, setting: Setting) -> None:
         setting.replies["cheap"] = localized(SURE_INLIERS)

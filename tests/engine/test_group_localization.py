@@ -158,6 +158,17 @@ def test_one_caller_s_groups_leave_room_for_another_s() -> None:
     run(engine, work())
 
 
+def test_a_group_above_the_limit_is_refused_without_retry() -> None:
+    engine = Toy()
+
+    async def work() -> None:
+        with pytest.raises(Overloaded) as refused, engine.hold([PART] * 11, caller("rig")):
+            pass
+        assert (refused.value.reason, refused.value.retry_after_s) == ("TOO_LARGE", None)
+
+    run(engine, work())
+
+
 def test_computed_photos_are_posed_together_in_a_full_queue() -> None:
     engine = Toy(max_queued_s=0.3)
     is_released = threading.Event()

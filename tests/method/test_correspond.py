@@ -362,6 +362,20 @@ def test_what_determines_matches_is_in_their_name() -> None:
     assert Matcher(replace(usual, query_ratio=0.5)).matching() == Matcher(usual).matching()
 
 
+def test_the_cache_is_bounded_and_drops_the_least_recently_used(matched_pairs: list[tuple[Features, Features]]) -> None:
+    scene = make_scene(random_for("bounded"), SceneOptions(reference_count=4, point_count=50))
+    a, b, c, d = scene.references
+    matcher = Matcher(CorrespondOptions(remembered_pairs=2))
+    for first, second in ((a, b), (a, c), (a, b), (a, d)):  # forgets (a, c), since (a, b) was used after it
+        matcher.match_references(first, second)
+    assert len(matched_pairs) == 3
+    matcher.match_references(a, b)
+    matcher.match_references(a, d)
+    assert len(matched_pairs) == 3
+    matcher.match_references(a, c)
+    assert len(matched_pairs) == 4
+
+
 def test_pairs_of_a_deleted_reference_leave_the_cache(matched_pairs: list[tuple[Features, Features]]) -> None:
     scene = make_scene(random_for("deleted"), SceneOptions(reference_count=3, point_count=50))
     a, b, c = scene.references

@@ -281,6 +281,14 @@ def test_tokens_released_from_the_device_stay_on_the_host() -> None:
     assert cache.counters.host_hits == 2
 
 
+def test_storing_a_key_again_replaces_its_tokens() -> None:
+    cache = cache_of(2, 0)
+    cache.put(key(0), tokens(0))
+    cache.put(key(0), tokens(5))
+    assert_holds(cache, key(0), tokens(5))
+    assert cache.counters.device_bytes == SIZE
+
+
 def test_threads_get_the_tokens_of_their_keys() -> None:
     cache = cache_of(5, 5)
     wrong: list[int] = []

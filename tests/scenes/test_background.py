@@ -301,6 +301,14 @@ class TestUnused:
             let_pass(monkeypatch, 0.6 * pairs.KEPT_S)
         assert [len(servers[0].stored(wide)) for wide in (False, True)] == [10, 0]
 
+    def test_a_server_that_makes_none_keeps_what_it_uses(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+        Server(store, widths=[False]).background.match_waiting()
+        let_pass(monkeypatch, 1.1 * pairs.KEPT_S)
+        reader, other = Server(store, widths=[False]), Server(store, widths=[True])
+        reader.background.maintain()
+        other.background.match_waiting()
+        assert [len(reader.stored(wide)) for wide in (False, True)] == [10, 10]
+
 
 class TestFailures:
     def test_a_failure_is_counted_and_tried_again_with_back_off(

@@ -66,6 +66,10 @@ class TestFit:
         n0 = (options.scatter / options.factor_log) ** 2
         assert np.log(found.position_factor) == pytest.approx(count / (count + n0) * np.log(factor), abs=0.05)
 
+    def test_a_larger_gap_explains_larger_errors(self) -> None:
+        near, far = (fit(spread(30, 2.0, gap), KIND, 1) for gap in (0.05, 0.4))
+        assert near.position_factor == pytest.approx(far.position_factor, rel=0.03)
+
     def test_errors_that_do_not_shrink_are_of_the_references(self) -> None:
         """The radii of some answers are a tenth of those of others, their errors are not."""
         options, random = FitOptions(noise_share=1.0), random_for("noise")

@@ -214,6 +214,17 @@ class TestAdmission:
         toy.now_s = 31.0
         toy.admit(deadline_s=34.0)
 
+    def test_stages_that_jobs_do_not_reach_cost_them_nothing(self) -> None:
+        toy = Toy()
+        for _ in range(30):
+            toy.admit(client="tracked")
+            toy.finish(toy.take("host"), Done("result"))
+        job = toy.admit(client="tracked")
+        assert job.booked_s["host"] == pytest.approx(COST_S["prepare"], rel=0.1)
+        assert job.booked_s["device"] == pytest.approx(0.0, abs=0.02)
+        certain = toy.admit(stage="refine", client="tracked")
+        assert certain.booked_s["host"] == pytest.approx(COST_S["refine"], rel=0.1)
+
     def test_no_job_is_admitted_while_draining(self) -> None:
         toy = Toy()
         before = toy.admit()
@@ -265,6 +276,16 @@ class TestOrder:
         toy.now_s = 10.0  # none has come for as long as it takes
         assert toy.take("host").jobs == (second,)
         assert not first.is_over
+
+    def test_steps_of_a_quantum_leave_no_thread_idle(self) -> None:
+        toy = Toy()
+        toy.scheduler.costs.forget()
+        toy.learn("describe", "toy", 0.001, "short")
+        for client in ("long", "long too"):
+            toy.learn("prepare", "toy", OPTIONS.quantum_s, client)
+            toy.admit(client=client)
+        toy.admit(client="short", stage="describe")
+        assert [toy.take("host").stage.name for _ in range(2)] == ["prepare", "prepare"]
 
     def test_a_batch_is_of_one_bucket_and_as_large_as_what_waits(self) -> None:
         toy = Toy(WorkQueueOptions(max_queued_s=1000))
@@ -379,6 +400,15 @@ class TestTime:
             toy.now_s += 1.0
         assert refined > 50
         assert toy.ending_of(job) is Ending.OK
+
+    def test_a_job_cancelled_while_computed_is_charged(self) -> None:
+        quota = PlantedQuota()
+        toy = Toy(quota=quota)
+        toy.admit(deadline_s=5.0)
+        toy.take("host")
+        toy.scheduler.expire(5.0)
+        ((predicted_s, actual_s),) = quota.settled
+        assert actual_s == predicted_s > 0
 
     @pytest.mark.parametrize(
         ("kind", "others", "expected"),

@@ -215,6 +215,16 @@ class TestResults:
         async with Toy(compute) as toy:
             assert await toy.together(range(2)) == [0, 1]
 
+    async def test_a_step_held_back_for_shorter_ones_starts_when_none_come(self) -> None:
+        async with Toy() as toy:
+            for client, cost_s in (("short", 0.0), ("plug", 1.0), ("long", 1.0)):
+                for stage in ("first", "then"):
+                    costs, flow = toy.queue._scheduler.costs, Flow("t", client)
+                    costs.observe(stage, "toy", flow, cost_s, time.monotonic())
+            await toy.plug("first")
+            assert await outcomes([toy.submit("short", "first", client="short")]) == ["short"]
+            assert await outcomes([toy.submit("long", "first", client="long")]) == ["long"]
+
 
 class TestFailure:
     @settings(max_examples=25, deadline=None)

@@ -4,12 +4,12 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from support.stores import Place, faults_of, make_reference
+from support.stores import Place, faults_of, let_pass, make_reference
 
 from mapless.geometry import Camera
 from mapless_server.method.views import KeptDepth
 from mapless_server.security import SceneKey
-from mapless_server.store import Store, codec, depths
+from mapless_server.store import Store, codec, depths, pairs
 from mapless_server.store.depths import (
     depth_kind,
     discard_depths,
@@ -18,7 +18,7 @@ from mapless_server.store.depths import (
     list_without,
     load_depths,
 )
-from mapless_server.store.pairs import PairStore, Progress
+from mapless_server.store.pairs import PairStore, Progress, delete_unused, record_use
 
 SCENE = SceneKey("office")
 KIND = depth_kind("mapanything", "a" * 64)
@@ -149,3 +149,18 @@ def test_they_are_deleted_with_the_reference_and_the_scene(store: Store, place: 
     assert place.fetch("SELECT count(*) FROM reference_depth") == [(2,)]
     store.delete_scene(SCENE)
     assert place.fetch("SELECT count(*) FROM reference_depth") == [(0,)]
+
+
+def test_those_without_use_are_deleted(store: Store, place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also of a reference that no server has claimed."""
+    keep_depths(store.database, OTHER, {key_of(store, name): kept() for name in "ab"})
+    claims = PairStore(store.database)
+    claim = claims.claim(OTHER, Progress())
+    assert claim is not None
+    claims.add(OTHER, claim, {}, is_complete=True)
+    record_use(store.database, [OTHER])
+    let_pass(monkeypatch, pairs.KEPT_S + 1)
+    keep_depths(store.database, KIND, {key_of(store, "c"): kept()})
+    record_use(store.database, [KIND])
+    delete_unused(store.database, lambda: None)
+    assert place.fetch("SELECT kind FROM reference_depth") == [(KIND,)]
