@@ -64,15 +64,6 @@ WORLD_FROM_RIGHT_HANDED = {axes: _constant(np.diag([1, 1, -1 if axes is Axes.UNI
 """From the scene's world, or any other right-handed one, to the same in these axes. Its own inverse."""
 
 
-def _covariance_signs(world: Array) -> Array:
-    both = np.concatenate([np.diag(world), np.linalg.det(world) * np.diag(world)])
-    return _constant(np.outer(both, both))
-
-
-_COVARIANCE_SIGNS = {axes: _covariance_signs(world) for axes, world in WORLD_FROM_RIGHT_HANDED.items()}
-"""(6, 6) by which `covariance_to` multiplies: products of the signs of two directions."""
-
-
 def pose_to(axes: Axes, world_from_camera: RigidTransform) -> RigidTransform:
     """Converts a camera's pose from OpenCV's axes and a right-handed world to other axes.
 
@@ -133,7 +124,9 @@ def covariance_to(axes: Axes, covariance: ArrayLike) -> Array:
     A rotation by the vector w, R' = Exp(w) R, is in a mirrored world M R' = Exp(det(M) M w) M R: a mirror also reverses
     the sense of a rotation vector. The conversion is its own inverse.
     """
-    changed: Array = _COVARIANCE_SIGNS[axes] * np.asarray(covariance, float)
+    signs = np.diag(WORLD_FROM_RIGHT_HANDED[axes])
+    both = np.concatenate([signs, signs.prod() * signs])
+    changed: Array = np.outer(both, both) * np.asarray(covariance, float)
     return changed
 
 

@@ -171,6 +171,17 @@ def host_and_port(address: str) -> tuple[str, int]:
     return (host.strip("[]"), int(port)) if is_plain and port.isdecimal() else ("", 0)
 
 
+def connection_fault(family: int, endpoint: tuple[Any, ...]) -> OSError | None:
+    """Why no connection can be made to an endpoint of `socket.getaddrinfo`; None if one can."""
+    try:
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.settimeout(_CONNECT_LIMIT_S)
+            probe.connect(endpoint)
+    except OSError as error:
+        return error
+    return None
+
+
 def is_unreached(error: MaplessError) -> bool:
     """Whether the error says that no server was reached at an address; `explained` may then find a better reason."""
     return error.message.startswith("cannot connect") and _UNREACHED.search(error.message) is not None
@@ -194,14 +205,10 @@ def explained(error: MaplessError, address: str, options: ConnectOptions) -> Map
         one = f"[{ip}]:{port}" if family == socket.AF_INET6 else f"{ip}:{port}"
         if f" {one}: " in error.message:
             continue
-        try:
-            with socket.socket(family, socket.SOCK_STREAM) as probe:
-                probe.settimeout(_CONNECT_LIMIT_S)
-                probe.connect(endpoint)
-        except ConnectionRefusedError:
+        fault = connection_fault(family, endpoint)
+        if isinstance(fault, ConnectionRefusedError):
             refused = refused or Unavailable("UNAVAILABLE", f"cannot connect to {one}: {REFUSED} (connection refused)")
-            continue
-        except OSError:
+        if fault is not None:
             continue
         other = _failure(one, host, options)
         if other is not None and other.message.startswith("cannot connect") and not is_unreached(other):

@@ -5,7 +5,6 @@ import socket
 import ssl
 import time
 from collections.abc import Callable
-from contextlib import closing
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 
@@ -15,7 +14,7 @@ import numpy as np
 from ..answers import Rejected
 from ..client import Client
 from ..errors import DeadlineExceeded, MaplessError, from_rpc_error
-from ..options import explained, host_and_port
+from ..options import connection_fault, explained, host_and_port
 from ..results import Reference
 from ..v1 import reference_service_pb2 as pb
 from ..v1.reference_service_pb2_grpc import ReferenceServiceStub
@@ -95,23 +94,13 @@ def _check_address(session: _Session) -> _Result:
     except (OSError, UnicodeError) as error:
         advice = "check the spelling of --address (or MAPLESS_ADDRESS), and the network's name server"
         return WRONG, f"the name {host} cannot be resolved: {getattr(error, 'strerror', None) or error}", advice
-    answers = [_connected(family, endpoint) for family, *_, endpoint in found]
-    if "" in answers:
-        return OK, f"{found[answers.index('')][4][0]} port {port} accepts connections", ""
-    refused = "; ".join(f"{it[4][0]}: {answer}" for it, answer in zip(found, answers, strict=True))
+    faults = {str(endpoint[0]): connection_fault(family, endpoint) for family, *_, endpoint in found}
+    if None in faults.values():
+        reached = next(ip for ip, fault in faults.items() if fault is None)
+        return OK, f"{reached} port {port} accepts connections", ""
+    refused = "; ".join(f"{ip}: {fault.strerror or 'no answer'}" for ip, fault in faults.items() if fault)
     advice = f"start the server (mapless-server serve), or correct --address (host:port); is port {port} open?"
     return WRONG, f"nothing answers at {session.client.address} ({refused})", advice
-
-
-def _connected(family: int, endpoint: tuple[object, ...]) -> str:
-    """Returns why no connection can be made; empty if one can."""
-    try:
-        with closing(socket.socket(family, socket.SOCK_STREAM)) as probe:
-            probe.settimeout(_CONNECT_LIMIT_S)
-            probe.connect(endpoint)
-    except OSError as error:
-        return error.strerror or "no answer"
-    return ""
 
 
 def _check_protocol(session: _Session) -> _Result:
