@@ -8,7 +8,7 @@ import itertools
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn
@@ -71,16 +71,18 @@ class _Parser(argparse.ArgumentParser):
         for flag in itertools.takewhile(lambda it: it not in ends, args):
             name = flag.partition("=")[0]
             if re.match("--[a-z]", name) and not any(it.startswith(name) for it in self._option_string_actions):
-                nearest = difflib.get_close_matches(name, self._option_string_actions, 1)
-                super().error(f"unknown flag {name}{f'; did you mean {nearest[0]!r}?' if nearest else ''}")
+                self._exit_for(f"unknown flag {name}", name, self._option_string_actions)
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
-        """Prints the message and exits."""
+        """Prints the message, without the usage of many lines, and exits."""
         wrong = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
-        choices = re.findall(r"[\w-]+", wrong[2]) if wrong else []
-        nearest = difflib.get_close_matches(wrong[1], choices, 1) if wrong else []
-        super().error(f"{message}; did you mean {nearest[0]!r}?" if nearest else message)
+        self._exit_for(message, *(wrong[1], re.findall(r"[\w-]+", wrong[2])) if wrong else ("", ()))
+
+    def _exit_for(self, message: str, given: str, known: Iterable[str]) -> NoReturn:
+        nearest = difflib.get_close_matches(given, list(known), 1)
+        meant = f"; did you mean {nearest[0]!r}?" if nearest else ""
+        self.exit(2, f"{self.prog}: error: {message}{meant}\n`{self.prog} --help` shows what it takes\n")
 
 
 class _Command(_Parser):
