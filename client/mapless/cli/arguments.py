@@ -81,8 +81,8 @@ class _Parser(argparse.ArgumentParser):
 
     def _exit_for(self, message: str, given: str, known: Iterable[str]) -> NoReturn:
         nearest = difflib.get_close_matches(given, list(known), 1)
-        meant = f"; did you mean {nearest[0]!r}?" if nearest else ""
-        self.exit(2, f"{self.prog}: error: {message}{meant}\n`{self.prog} --help` shows what it takes\n")
+        help_text = f"; did you mean {nearest[0]!r}?" if nearest else f"\n`{self.prog} --help` shows what it takes"
+        self.exit(2, f"{self.prog}: error: {message}{help_text}\n")
 
 
 class _Command(_Parser):
