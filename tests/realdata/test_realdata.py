@@ -105,7 +105,7 @@ def test_no_photograph_of_another_place_is_localized(
 ) -> None:
     """So many photographs of each other place against ten references of this one."""
     dataset = photographs(place)
-    plan = Plan(dataset, spread(dataset, 10), ())
+    plan = Plan(spread(dataset, 10), ())
     others = [frame for folder in elsewhere for frame in spread(photographs(folder), count)]
     with child_server(tmp_path) as server, Client(server.address, CONNECT) as client:
         store_references(client, SCENE, plan.references, ignore)

@@ -25,7 +25,6 @@ SCENE = "evaluation"
 class Plan:
     """References to upload and queries to localize."""
 
-    dataset: Dataset
     references: tuple[Frame, ...]
     queries: tuple[PlannedQuery, ...]
 
@@ -63,7 +62,7 @@ def plan_for(dataset: Dataset, options: EvaluationOptions, settings: Settings, p
     matcher = Matcher.of(settings)
     references, queries = split_frames(dataset.frames, options)
     check_images(dict.fromkeys((*references, *queries)), matcher.limits)
-    return Plan(dataset, references, rank_by_matches(queries, references, options.k, matcher, progress))
+    return Plan(references, rank_by_matches(queries, references, options.k, matcher, progress))
 
 
 def store_references(client: Client, scene: str, references: Sequence[Frame], progress: Progress) -> None:
