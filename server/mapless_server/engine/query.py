@@ -13,6 +13,7 @@ import numpy as np
 
 from mapless_server import __version__
 from mapless_server.images import ImageLimits, decode_image
+from mapless_server.method.features.turned import extract_turned
 from mapless_server.method.options import StageContext, Variant
 from mapless_server.method.priors.known import NO_PRIORS, Priors
 from mapless_server.method.views import Photograph, reduce_image
@@ -42,6 +43,9 @@ POSE_PRIOR = "pose-prior"
 TRACK = "track"
 """The stage of choosing references by the prior and comparing others; or the whole attempt, if it did not suffice."""
 
+TURN = "turn"
+"""The stage of comparing a photograph that was not localized with its references turned, too."""
+
 UNFINISHED = "/unfinished"
 """Ends the name of a stage: its tier came to no answer, see `Result`."""
 
@@ -64,12 +68,14 @@ class Tier:
     """Features, with the extractor and the pipeline that use them.
 
     The pipeline's matcher caches matches of these features, so no other tier may have the same one; tiers may share a
-    reconstructor. References of a tier that `uses_depths` are loaded with the depths stored with them.
+    reconstructor. References of a tier that `uses_depths` are loaded with the depths stored with them. Features that
+    are `upright_only` match nothing in a photograph that is turned by 90 or 180 degrees against the references.
     """
 
     extractor: FeatureExtractor
     pipeline: Pipeline
     uses_depths: bool = False
+    upright_only: bool = False
 
     @property
     def features(self) -> str:
@@ -202,7 +208,11 @@ class Description:
 
 
 class QueryViews:
-    """Decodes a photograph once, and describes it once with each extractor, when first needed."""
+    """Decodes a photograph once, and describes it once with each extractor, when first needed.
+
+    Attributes:
+        quarter_turns: clockwise, of the raster in which its features are found.
+    """
 
     def __init__(self, photo: Photo, limits: ImageLimits) -> None:
         self._photo = photo
@@ -210,6 +220,7 @@ class QueryViews:
         self._photograph: Photograph | None = None
         self._views: dict[str, View] = {}
         self._max_pixels: int | None = None
+        self.quarter_turns = 0
 
     def view(self, extractor: FeatureExtractor, context: StageContext) -> View:
         """The photograph's view with this extractor's features; InvalidArgument if the image is bad."""
@@ -220,7 +231,10 @@ class QueryViews:
                 if self._max_pixels is not None:
                     share = min(1.0, math.sqrt(self._max_pixels / (camera.width_px * camera.height_px)))
                     pixels, camera = reduce_image(pixels, camera, round(share * max(camera.width_px, camera.height_px)))
-                view = extractor.extract(pixels, camera)
+                if self.quarter_turns:
+                    view = extract_turned(extractor, pixels, camera, self.quarter_turns)
+                else:
+                    view = extractor.extract(pixels, camera)
             self._views[extractor.name] = replace(view, photograph=photograph)
         return self._views[extractor.name]
 
@@ -228,6 +242,15 @@ class QueryViews:
         """The same photograph, decoded once, whose features are found in a reduced image with about so many pixels."""
         views = QueryViews(self._photo, self._limits)
         views._photograph, views._max_pixels = self._decoded(context), max_pixels
+        return views
+
+    def turned(self, quarter_turns: int, context: StageContext) -> QueryViews:
+        """The same photograph, decoded once, whose features are found in its raster turned clockwise.
+
+        Their pixels are of the photograph as it is, and so is its pose.
+        """
+        views = QueryViews(self._photo, self._limits)
+        views._photograph, views.quarter_turns = self._decoded(context), quarter_turns
         return views
 
     def _decoded(self, context: StageContext) -> Photograph:
@@ -282,6 +305,7 @@ class QueryRun:
         start_s: when this tier began, by `time.monotonic`.
         give_up_s: time after which `best` is the answer, if this tier has none by then.
         narrowed: the query with the soft priors' choice of references, if references elsewhere are now searched.
+        tries_turns: whether the photograph is to be turned as it matches most, because it was not localized as it is.
         ambiguous: the rejection as ambiguous, if the references of the place that the priors decided for are now used.
         listings: how often the scene was listed in this tier.
         context: cancels and times this tier's stages; from here on set by the stage `prepare`.
@@ -307,6 +331,7 @@ class QueryRun:
     start_s: float = field(default_factory=time.monotonic)
     give_up_s: float = math.inf
     narrowed: Query | None = None
+    tries_turns: bool = False
     ambiguous: Result | None = None
     listings: int = 1
     context: StageContext = field(default_factory=StageContext)
@@ -333,7 +358,8 @@ class QueryRun:
             return "tracked"
         ids = self.query.reference_ids
         count = next((count for count in _COUNTS if len(ids) <= count), _COUNTS[-1])
-        return f"tier {self.tier}, {'chosen' if self.query.chooses else f'up to {count}'}"
+        turned = ", turned" if self.tries_turns else ""
+        return f"tier {self.tier}{turned}, {'chosen' if self.query.chooses else f'up to {count}'}"
 
     @property
     def tracks(self) -> bool:

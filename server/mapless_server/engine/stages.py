@@ -31,8 +31,8 @@ from mapless_server.scheduling import Abandoned, Done, Ending, Failure, Fallback
 from . import tracking
 from .failures import failure_of
 from .options import EscalationOptions
-from .query import COARSE, PREPARE, REFINE, TRACK, UNFINISHED, Query, QueryRun, Result, Tier
-from .tiers import better_of, inlier_count, is_doubtful, of_two_places, place_of_priors
+from .query import COARSE, PREPARE, REFINE, TRACK, TURN, UNFINISHED, Query, QueryRun, QueryViews, Result, Tier
+from .tiers import CLEARLY_MORE, better_of, inlier_count, is_doubtful, of_two_places, place_of_priors
 
 log = logging.getLogger(__name__)
 
@@ -46,6 +46,9 @@ answer is better than none; the rest of the time suffices to send it."""
 REMATCH_SHARE = 0.7
 """Of a tier's time, after which it stops matching the photograph again by a slow network (see `Matcher.rematch`); the
 rest is for the pose, which takes a second if matches are few."""
+
+TURN_REFERENCES = 10
+"""A photograph that was not localized is compared with so many references each way round, the most similar first."""
 
 ANSWER_MARGIN_S = 0.05
 """Before the deadline, for an answer that exists to reach its caller."""
@@ -121,6 +124,14 @@ class QueryStages:
             if query.is_generic:
                 attributes = replace(attributes, calibration=None, self_calibrations=())
             run = run.but(attributes=attributes)
+            if run.tries_turns and not run.views.quarter_turns:
+                assert run.best is not None
+                views = self._turned(run, tier)
+                if not views.quarter_turns:
+                    spent_s = {f"{tier.features}/{name}": it for name, it in run.context.stage_seconds.items()}
+                    best = replace(run.best, stage_seconds=run.best.stage_seconds | spent_s)
+                    return self._stronger(run, query, best)
+                run = run.but(views=views)
             tracked = self._tracked(run, tier) if run.tracks else None
             if tracked is not None:
                 return tracked
@@ -141,7 +152,9 @@ class QueryStages:
                     matches = matcher.match_quickly(run.view, run.references, run.context.check)
                 run = run.but(query_matches=tuple(matches))
             assert run.query_matches is not None
-            run = run.but(unmatched=tuple(matcher.to_rematch(run.query_matches)))
+            # The network of a slow matching takes places in the photograph for those in an upright one.
+            if not run.views.quarter_turns:
+                run = run.but(unmatched=tuple(matcher.to_rematch(run.query_matches)))
         return self._matched_further(run)
 
     def _rematched(self, run: QueryRun) -> QueryRun:
@@ -288,10 +301,42 @@ class QueryStages:
         elif run.best is not None:
             result = replace(better_of(run.best, result), stage_seconds=result.stage_seconds)
         elif self._searches_elsewhere(run, answer):
-            return self._again(run, replace(query, narrowing=query.narrowing.limits), run.tier, result)
+            elsewhere = replace(query, narrowing=query.narrowing.limits)
+            return self._search(replace(self._further(run, elsewhere, run.tier, result), narrowed=query))
+        is_lost = isinstance(result.answer.outcome, Rejection) and is_doubtful(result.answer, self._doubt_in(run))
+        if is_lost and run.tier == 0 and not run.tries_turns and self._tiers[0].upright_only:
+            return self._search(replace(self._further(run, query, 0, result), tries_turns=True))
+        return self._stronger(run, query, result)
+
+    def _stronger(self, run: QueryRun, query: Query, result: Result) -> StageResult:
+        """Searches with stronger features if a result is doubtful and there are any, and otherwise returns it."""
         if run.tier + 1 < len(self._tiers) and is_doubtful(result.answer, self._doubt_in(run)):
-            return self._again(run, query, run.tier + 1, result)
+            return self._search(self._further(run, query, run.tier + 1, result))
         return Done(result, _ending(result))
+
+    def _turned(self, run: QueryRun, tier: Tier) -> QueryViews:
+        """The photograph turned such that clearly more of it matches references than as it is; else as it is.
+
+        The best of its references counts: others may not show the same.
+        """
+        with run.context.stage(TURN):
+            found = [run.views, *(run.views.turned(turns, run.context) for turns in (1, 2, 3))]
+        counts = [self._most_matches(run.but(views=views), tier) for views in found]
+        best = max(range(4), key=counts.__getitem__)
+        return found[best if counts[best] >= CLEARLY_MORE * counts[0] else 0]
+
+    def _most_matches(self, run: QueryRun, tier: Tier) -> int:
+        """Most matches of the photograph with one of the references that it resembles, or of those named."""
+        query = run.query
+        if query.chooses:
+            chosen = run.choose(query.narrowing).references[:TURN_REFERENCES]
+            references = _load_chosen(run, [it.reference_id for it in chosen], tier)[1]
+        else:
+            references = run.load(query.reference_ids[:TURN_REFERENCES], tier)[1]
+        view = run.views.view(tier.extractor, run.context)
+        with run.context.stage(TURN):
+            matches = tier.pipeline.matcher.match_quickly(view, references, run.context.check)
+        return max(map(len, matches), default=0)
 
     def _at_place(self, run: QueryRun, place: Hypothesis, ambiguous: Result) -> StageResult:
         """Computes the pose from the references of one place alone."""
@@ -306,11 +351,13 @@ class QueryStages:
         now_s = time.monotonic()
         return now_s + TIME_SHARE * (run.deadline_s - now_s)
 
-    def _again(self, run: QueryRun, query: Query, tier: int, best: Result) -> StageResult:
-        """Starts another search; if it finds nothing better in time, the best result so far is returned."""
-        limits = time.monotonic(), self._give_up_s(run), run.query if tier == run.tier else None
-        again = QueryRun(query, run.source, run.views, run.deadline_s, run.on_coarse, tier, best, *limits)
-        return self._next(again, again.first_step)
+    def _further(self, run: QueryRun, query: Query, tier: int, best: Result) -> QueryRun:
+        """Another search; if it finds nothing better in time, the best result so far is returned."""
+        limits = time.monotonic(), self._give_up_s(run)
+        return QueryRun(query, run.source, run.views, run.deadline_s, run.on_coarse, tier, best, *limits)
+
+    def _search(self, run: QueryRun) -> StageResult:
+        return self._next(run, run.first_step)
 
     def _searches_elsewhere(self, run: QueryRun, answer: Answer) -> bool:
         """`_may_be_elsewhere`, except that its failure does not cost the answer that there is."""

@@ -306,7 +306,7 @@ def seen_share(camera: Camera) -> float:
 def view_of(
     camera: Camera,
     pixels: Array,
-    descriptors: NDArray[np.float32] | NDArray[np.uint8],
+    descriptors: NDArray[np.float32] | NDArray[np.int8] | NDArray[np.uint8],
     sizes_px: NDArray[np.float32],
 ) -> View:
     """Makes the view of keypoints found in an image: undistorted, without those that have no undistorted pixel.
@@ -314,7 +314,7 @@ def view_of(
     The camera is the image's, with its lens distortion; pixels (N, 2), descriptors and sizes are as in Features, but
     descriptors that are float32 are rounded to 8 bits, for queries as for stored references.
     """
-    is_exact = descriptors.dtype == np.uint8
+    is_exact = descriptors.dtype in (np.uint8, np.int8)
     rounded = descriptors if is_exact else rounded_descriptors(np.asarray(descriptors, np.float32))
     if not len(pixels):
         nothing = Features(np.empty((0, 2), np.float32), rounded, sizes_px)

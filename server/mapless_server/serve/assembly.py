@@ -231,7 +231,8 @@ def make_tiers(settings: Settings) -> tuple[Tier, ...]:
     )
     uses_depths = settings.reference_depth != OFF and reconstructor.uses_correspondences
     return tuple(
-        Tier(extractor, Pipeline(reconstructor, matchers[name]), uses_depths) for name, extractor in extractors.items()
+        Tier(extractor, Pipeline(reconstructor, matchers[name]), uses_depths, upright_only=name != "sift")
+        for name, extractor in extractors.items()
     )
 
 

@@ -1,0 +1,108 @@
+"""A photograph whose raster is turned against the references, with features that match only what is upright."""
+
+import asyncio
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.compare import pose_error
+from support.corner import CAMERA, photograph, pose
+from support.images import encode, textured
+
+from mapless.axes import turned_raster
+from mapless.geometry import Camera
+from mapless_server.engine.options import EngineOptions
+from mapless_server.engine.query import TURN, Caller, Photo, Query, Result, Tier
+from mapless_server.images import ImageLimits, decode_image
+from mapless_server.method.answer import Localization
+from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.pipeline import Pipeline
+from mapless_server.method.rejection import Rejection
+from mapless_server.method.views import View, view_of
+from mapless_server.scenes import Narrowing
+from mapless_server.scheduling import Flow
+from mapless_server.security import SceneKey
+from mapless_server.serve.assembly import engine_over
+from mapless_server.store import NewReference, Store
+
+SCENE = SceneKey("corner")
+TRUE = pose(2.0, -1.5)
+REFERENCE_POSES = [pose(angle, height) for angle in (-10, -3, 5, 12) for height in (-1.8, -1.2)]
+NAMED = tuple(f"r{i}" for i in range(len(REFERENCE_POSES)))
+Localize = Callable[..., Result]
+
+
+@dataclass
+class UprightSift:
+    """SIFT whose descriptors do not turn with the image."""
+
+    name: str = "upright-sift"
+
+    def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
+        sift = cv2.SIFT.create(nfeatures=1024, contrastThreshold=0.02, enable_precise_upscale=True)
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        upright = [cv2.KeyPoint(it.pt[0], it.pt[1], it.size, 0.0, it.response, it.octave) for it in sift.detect(grey)]
+        found, descriptors = sift.compute(grey, upright)
+        sizes_px = np.array([it.size for it in found], np.float32)
+        return view_of(camera, np.array([it.pt for it in found]), descriptors.astype(np.uint8), sizes_px)
+
+
+@pytest.fixture(scope="module")
+def localize(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Localize]:
+    caller, loop = Caller(Flow("tenant", "client"), time.monotonic() + 600), asyncio.new_event_loop()
+    folder: Path = tmp_path_factory.mktemp("store")
+    with Store.open(folder) as store:
+        engine = engine_over(store, [Tier(UprightSift(), Pipeline(), upright_only=True)], EngineOptions())
+        photos = [Photo(photograph(it), CAMERA, "image") for it in REFERENCE_POSES]
+        described = loop.run_until_complete(engine.describe(photos, caller))
+        store.create_scene(SCENE)
+        shown = zip(NAMED, photos, REFERENCE_POSES, described, strict=True)
+        references = [NewReference(i, p.image, CAMERA, at, it.views, it.descriptors) for i, p, at, it in shown]
+        store.add_references(SCENE, references)
+
+        def answer(image: bytes, camera: Camera, named: tuple[str, ...]) -> Result:
+            asked = Query(SCENE, named, Photo(image, camera, "image"), Narrowing(), 8, LocalizeOptions())
+            return loop.run_until_complete(engine.run(engine.query_job(asked, caller)))
+
+        yield answer
+        loop.run_until_complete(engine.close())
+    loop.close()
+
+
+def turned_camera(quarter_turns: int) -> Camera:
+    camera = CAMERA
+    for _ in range(quarter_turns):
+        width, height, x, y = camera.width_px, camera.height_px, camera.principal_x_px, camera.principal_y_px
+        camera = Camera(height, width, camera.focal_y_px, camera.focal_x_px, height - 1 - y, x)
+    return camera
+
+
+@pytest.mark.parametrize(("quarter_turns", "named"), [(1, NAMED), (2, ()), (3, ())], ids=str)
+def test_a_turned_photograph_gets_the_pose_of_its_raster(
+    localize: Localize, quarter_turns: int, named: tuple[str, ...]
+) -> None:
+    image = decode_image(photograph(TRUE), ImageLimits())
+    turned = encode(".png", np.ascontiguousarray(np.rot90(image, -quarter_turns)))
+    outcome = localize(turned, turned_camera(quarter_turns), named).answer.outcome
+    assert isinstance(outcome, Localization)
+    off_m, off_deg = pose_error(outcome.world_from_camera, turned_raster(TRUE, quarter_turns))
+    assert off_m < 0.01
+    assert off_deg < 0.2
+
+
+def test_an_upright_photograph_is_not_tried_turned(localize: Localize) -> None:
+    result = localize(photograph(TRUE), CAMERA, ())
+    assert isinstance(result.answer.outcome, Localization)
+    assert not any(stage.endswith(TURN) for stage in result.stage_seconds)
+
+
+def test_a_photograph_of_elsewhere_stays_rejected(localize: Localize) -> None:
+    image = encode(".png", textured(CAMERA.width_px, CAMERA.height_px, seed=5))
+    result = localize(image, CAMERA, ())
+    assert isinstance(result.answer.outcome, Rejection)
+    assert f"upright-sift/{TURN}" in result.stage_seconds
