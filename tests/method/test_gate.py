@@ -21,15 +21,17 @@ from mapless_server.method.features import make_extractor
 from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.pnp import PnpOptions, ransac, solve_pose
-from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.results import PointMatches, PoseEstimate
-from mapless_server.method.trust.gate import (
+from mapless_server.method.pnp import (
+    PnpOptions,
     false_alarms,
     format_false_alarms,
     gate_failure,
     log10_false_alarms,
+    ransac,
+    solve_pose,
 )
+from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.results import PointMatches, PoseEstimate
 from mapless_server.method.views import PosedView, View
 
 INLIER_PX = PnpOptions().inlier_px

@@ -17,7 +17,7 @@ import mapless_server.method.localize as method
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg, rotation_from_vector
 from mapless_server.method import alternatives, pnp
 from mapless_server.method.answer import Answer, Localization
-from mapless_server.method.coarse import Bucket, Outcome, Request
+from mapless_server.method.coarse import Outcome, Request
 from mapless_server.method.coarse.geometric import GeometricReconstructor
 from mapless_server.method.correspond import Correspondences, Matcher
 from mapless_server.method.localize import MIN_FEATURES, localize, prepare, refine
@@ -48,8 +48,8 @@ class ChangedNetwork:
     def close(self) -> None:
         self.network.close()
 
-    def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
-        return self.network.bucket(query, references)
+    def bucket(self, query: View, references: Sequence[PosedView]) -> str:
+        return str(self.network.bucket(query, references))
 
     def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
         return [self.change(self.network.reconstruct(request.query, request.references)) for request in requests]

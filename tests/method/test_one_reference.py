@@ -11,7 +11,7 @@ from support.scenes import random_for
 
 from mapless.geometry import Array, Camera, RigidTransform, rotation_from_vector
 from mapless_server.method.answer import Answer, Localization
-from mapless_server.method.coarse import Bucket, Outcome, Request
+from mapless_server.method.coarse import Outcome, Request
 from mapless_server.method.correspond import Correspondences, Matcher
 from mapless_server.method.localize import localize
 from mapless_server.method.one_reference import OneReferenceOptions
@@ -108,8 +108,8 @@ class PlantedNetwork:
     def close(self) -> None:
         """Nothing to release."""
 
-    def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
-        return Bucket(self.name, len(references))
+    def bucket(self, query: View, references: Sequence[PosedView]) -> str:
+        return f"{self.name}-{len(references)}"
 
     def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
         return [self._reconstruction] * len(requests)

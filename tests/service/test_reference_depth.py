@@ -21,7 +21,7 @@ from mapless import Client, LocalizationResult, NewReference
 from mapless.geometry import RigidTransform
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.method import kept_depth
-from mapless_server.method.coarse import Bucket, Outcome, Reconstructor, Request
+from mapless_server.method.coarse import Outcome, Reconstructor, Request
 from mapless_server.method.views import PosedView, ReconstructedView, Reconstruction, View
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security import RateLimiter
@@ -62,8 +62,8 @@ class PlantedNetwork:
     def close(self) -> None:
         pass
 
-    def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
-        return Bucket(self.name, len(references))
+    def bucket(self, query: View, references: Sequence[PosedView]) -> str:
+        return f"{self.name}-{len(references)}"
 
     def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
         self.runs += 1

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, Similarity, resized_pixel, rotation_from_vector
-from mapless_server.method.coarse import Bucket, Outcome, Request
+from mapless_server.method.coarse import Outcome, Request
 from mapless_server.method.views import PosedView, ReconstructedView, Reconstruction, View
 from support.scenes import SyntheticScene, random_for
 
@@ -67,9 +67,9 @@ class FakeNetwork:
     def close(self) -> None:
         """Nothing to give back."""
 
-    def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
+    def bucket(self, query: View, references: Sequence[PosedView]) -> str:
         """By the number of references alone."""
-        return Bucket(self.name, len(references))
+        return f"{self.name}-{len(references)}"
 
     def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
         """See Reconstructor.reconstruct_many."""

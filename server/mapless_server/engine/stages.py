@@ -182,7 +182,7 @@ class QueryStages:
         part = self._method.prepare(*given, not run.attributes.arbitrary_unit)
         if isinstance(part, Answer):
             return self._conclude(run, part)
-        return self._next(run, Step(COARSE, run.kind, str(part.bucket), run.but(part=part)))
+        return self._next(run, Step(COARSE, run.kind, part.bucket, run.but(part=part)))
 
     def _has_time_to_rematch(self, run: QueryRun, tier: Tier) -> bool:
         """Whether another reference is left to be matched, and time for it before the tier must compute the pose."""

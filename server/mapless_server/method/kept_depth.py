@@ -47,10 +47,8 @@ def with_kept_depths(
     """Adds the points that stored depths give to a structure, after the triangulated ones, with its `planes`.
 
     The references are in the order of the structure's tracks; the correspondences are those of the query with each. The
-    structure, possibly without points, is unchanged if no reference has depths, or they are not needed.
+    structure, possibly without points, is unchanged if depths are not needed. A reference at least has some.
     """
-    if all(reference.depths is None for reference in references):
-        return structure
     counts = [len(reference.view.features) for reference in references]
     if len(vote(structure, counts, correspondences)) >= enough_matches:
         return structure

@@ -14,11 +14,10 @@ from .alternatives import from_one_reference, from_two_views
 from .answer import Answer, Localization, is_better
 from .options import LocalizeOptions, StageContext, Variant
 from .pipeline import Coarse, Pipeline, Prepared, reconstruct, structure_and_matches, with_wide_correspondences
-from .pnp import solve_pose
+from .pnp import gate_failure, solve_pose
 from .priors.known import NO_PRIORS, Priors
 from .rejection import Rejection, RejectionReason
 from .results import ScaleStage, Support
-from .trust.gate import gate_failure
 from .trust.intrinsics import intrinsics_checks
 from .trust.judge import judge
 from .views import Matches, PosedView, View

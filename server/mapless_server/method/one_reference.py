@@ -24,10 +24,9 @@ from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian
 from .observations import FIRST_GUESS, Tracks
 from .options import check_bounds
 from .perturbation import motion_jacobian, perturbed, world_covariance
-from .pnp import PnpOptions, ransac
+from .pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, false_alarms, format_false_alarms, ransac
 from .rejection import Rejection, RejectionReason
 from .results import MetricScale, PointMatches, PoseEstimate, PoseStage, Structure, Support
-from .trust.gate import MAX_LOG10_FALSE_ALARMS, false_alarms, format_false_alarms
 from .trust.judge import LEVELS
 from .uncertainty.dispersion import scale_covariance
 from .views import Matches, PosedView, Reconstruction, View

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from mapless.geometry import Array
 
 from .answer import Answer, Localization, shifted
-from .coarse import Bucket, Outcome, Reconstructor, Request, Triangulation, reconstruct_one
+from .coarse import Outcome, Reconstructor, Request, Triangulation, reconstruct_one
 from .coarse.geometric import GeometricReconstructor, point_maps
 from .correspond import Correspondences, Matcher
 from .kept_depth import with_kept_depths
@@ -116,7 +116,7 @@ class Prepared:
     pipeline: Pipeline
     options: LocalizeOptions
     correspondences: Correspondences
-    bucket: Bucket
+    bucket: str
     context: StageContext
     priors: Priors = NO_PRIORS
     is_metric: bool = True
@@ -292,7 +292,7 @@ def structure_and_matches(coarse: Coarse, scale: MetricScale) -> tuple[Structure
         else:
             assert isinstance(reconstruction, Reconstruction)
             structure = build_structure(reconstruction, scale, references, correspondences, prepared.structure_options)
-            if prepared.options.variant is Variant.BEST:
+            if prepared.options.variant is Variant.BEST and any(it.depths is not None for it in references):
                 structure = with_kept_depths(structure, references, correspondences)
     with prepared.context.stage("match"):
         initial, options = scale.world_from_query, prepared.match_options

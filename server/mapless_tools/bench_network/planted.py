@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform
-from mapless_server.method.coarse import Bucket, Outcome, Request
+from mapless_server.method.coarse import Outcome, Request
 from mapless_server.method.coarse.grids import GridOptions, common_grid, lay_out
 from mapless_server.method.coarse.network import NetworkReconstructor
 from mapless_server.method.rejection import Rejection
@@ -56,7 +56,7 @@ class PlantedReconstructor:
         """Ends the network's thread."""
         self.network.close()
 
-    def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
+    def bucket(self, query: View, references: Sequence[PosedView]) -> str:
         """See the network's `bucket`."""
         return self.network.bucket(query, references)
 

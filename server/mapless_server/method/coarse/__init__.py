@@ -44,25 +44,6 @@ Outcome: TypeAlias = Reconstruction | Triangulation | Rejection
 """The result of a backend for one query: its reconstruction, or a rejection."""
 
 
-@dataclass(frozen=True)
-class Bucket:
-    """The shape of a query's input: queries of one bucket may be reconstructed together. `str` gives its short name.
-
-    Attributes:
-        backend: name of the backend.
-        reference_count: number of references of each query.
-        grid: rows and columns of the pictures' patches; None for a backend without pictures.
-    """
-
-    backend: str
-    reference_count: int
-    grid: tuple[int, int] | None = None
-
-    def __str__(self) -> str:
-        grid = [] if self.grid is None else ["x".join(map(str, self.grid))]
-        return "-".join([self.backend, *grid, str(self.reference_count)])
-
-
 @dataclass(frozen=True, eq=False)
 class Request:
     """A query and its references, to be reconstructed together.
@@ -118,10 +99,10 @@ class Reconstructor(Protocol):
         """Releases threads and devices; the backend cannot be used afterwards."""
         ...
 
-    def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
-        """Returns the bucket of a query, which has at least one reference.
+    def bucket(self, query: View, references: Sequence[PosedView]) -> str:
+        """Names the shape of a query's input, which has at least one reference.
 
-        ValueError if a view lacks input of the backend.
+        Queries of one bucket may be reconstructed together. ValueError if a view lacks input of the backend.
         """
         ...
 

@@ -17,16 +17,15 @@ from ..correspond import Correspondences
 from ..kept_depth import with_kept_depths
 from ..match import vote
 from ..perturbation import reprojection_errors_px
-from ..pnp import PnpOptions, ransac
+from ..pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, format_false_alarms, log10_false_alarms, ransac
 from ..priors.informed import informed_pose
 from ..priors.known import NO_PRIORS, Priors
 from ..rejection import Rejection, RejectionReason
 from ..results import PointMatches, Structure
 from ..scale import unit_frame
 from ..structure import StructureOptions, triangulated_structure
-from ..trust.gate import MAX_LOG10_FALSE_ALARMS, format_false_alarms, log10_false_alarms
 from ..views import PosedView, ReconstructedView, Reconstruction, View
-from . import Bucket, Outcome, Request, Triangulation
+from . import Outcome, Request, Triangulation
 
 CELL_PX = 2
 """Side of a cell of the point maps, pixels of the view; so small that two keypoints seldom share a cell."""
@@ -51,9 +50,9 @@ class GeometricReconstructor:
     def close(self) -> None:
         """Nothing to release."""
 
-    def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
+    def bucket(self, query: View, references: Sequence[PosedView]) -> str:
         """See Reconstructor.bucket."""
-        return Bucket(self.name, len(references))
+        return f"{self.name}-{len(references)}"
 
     def reconstruct_many(self, requests: Sequence[Request]) -> "list[Outcome | Exception]":
         """See Reconstructor.reconstruct_many; requests are computed one after the other."""
@@ -73,7 +72,8 @@ class GeometricReconstructor:
         if rejection:
             return rejection
         structure = triangulated_structure(references, correspondences, STRUCTURE)
-        structure = with_kept_depths(structure, references, correspondences)
+        if any(it.depths is not None for it in references):
+            structure = with_kept_depths(structure, references, correspondences)
         if not len(structure.x_in_world):
             return Rejection(
                 RejectionReason.NO_USABLE_REFERENCES, "the references share no points that could be triangulated"

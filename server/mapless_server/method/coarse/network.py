@@ -26,7 +26,7 @@ from mapless_server.networks.runner import NetworkRunner
 
 from ..rejection import Rejection, RejectionReason
 from ..views import Photograph, PosedView, ReconstructedView, Reconstruction, View
-from . import Bucket, Outcome, Request
+from . import Outcome, Request
 from .grids import Grid, GridOptions, Layout, common_grid, lay_out
 from .token_cache import TokenCache, TokenCacheOptions, TokenKey
 
@@ -83,10 +83,10 @@ class NetworkReconstructor:
         """Ends the network's thread."""
         self._runner.close()
 
-    def bucket(self, query: View, references: Sequence[PosedView]) -> Bucket:
+    def bucket(self, query: View, references: Sequence[PosedView]) -> str:
         """See Reconstructor.bucket."""
         grid = _Scene.of(Request(query, references), self._options).grid
-        return Bucket(self.name, len(references), (grid.rows, grid.columns))
+        return f"{self.name}-{grid.rows}x{grid.columns}-{len(references)}"
 
     def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
         """See Reconstructor.reconstruct_many: requests of the same grid and number of references are computed together.

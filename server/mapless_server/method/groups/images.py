@@ -14,13 +14,12 @@ from mapless.geometry import Array, RigidTransform
 from ..answer import Answer, Localization
 from ..match import MatchOptions, search, vote
 from ..pipeline import Prepared
-from ..pnp import PnpOptions
+from ..pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, false_alarms, format_false_alarms
 from ..priors.known import NO_PRIORS, Priors
 from ..rejection import Rejection, RejectionReason
 from ..results import PointMatches, ScaleSource, Structure, Support
 from ..structure import StructureOptions, triangulated_structure
 from ..trust.evidence import findable_count, hull_share
-from ..trust.gate import MAX_LOG10_FALSE_ALARMS, false_alarms, format_false_alarms
 from ..views import Matches, PosedView, View
 from .generalized import CameraMatches
 

@@ -41,13 +41,12 @@ from mapless.geometry import Camera, RigidTransform, rotation_angle_deg
 from ..intrinsics import ContradictionOptions
 from ..options import check_bounds
 from ..perturbation import pose_hessian, world_covariance
-from ..pnp import PnpOptions, ransac
+from ..pnp import PnpOptions, false_alarms, ransac
 from ..rejection import Advice, Hint, Hypothesis, Rejection, RejectionReason
 from ..results import Support
 from ..uncertainty.radii import Accuracy, accuracy_from_covariance
 from ..views import Matches
 from .evidence import Evidence, Votes, evidence_of, votes_of
-from .gate import false_alarms
 from .intrinsics import WrongCameraOptions, wrong_camera, wrong_intrinsics
 
 RIVAL_MIN_SHARE, RIVAL_MIN_KEYPOINTS = 0.5, 10

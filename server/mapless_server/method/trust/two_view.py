@@ -1,6 +1,6 @@
 """Whether a pose from two-view matches and 2D-3D matches is right, or chance and repetition could have produced it.
 
-Two a-contrario tests (see `gate`):
+Two a-contrario tests (see `pnp`):
 
     pose        as many inliers among wrong matches, at a pose through three 2D-3D matches or six two-view matches. Each
                 kind has its own chance of an inlier, a disc or a band in the image, and the numbers of inliers of the
@@ -22,12 +22,12 @@ from scipy.spatial import ConvexHull
 
 from mapless.geometry import Array
 
+from ..pnp import false_alarms, format_false_alarms, log10_tail
 from ..rejection import Advice, Hint, Rejection, RejectionReason
 from ..results import Support
 from ..two_view.matches import TwoViewMatches
 from ..two_view.pose import band_chance, disc_chance
 from ..views import Matches
-from .gate import false_alarms, format_false_alarms, log10_tail
 
 MAX_LOG10_POSE = -15.0
 """Largest log10 of the expected number of such poses among wrong matches. Of 220 photographs with references of other

@@ -13,9 +13,8 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.perturbation import world_covariance
-from mapless_server.method.pnp import PnpOptions, ransac
+from mapless_server.method.pnp import PnpOptions, false_alarms, ransac
 from mapless_server.method.results import PointMatches, PoseEstimate, PoseStage, Support
-from mapless_server.method.trust.gate import false_alarms
 from mapless_server.method.trust.judge import JudgeOptions, judge
 from mapless_server.method.views import Matches, PosedView
 
