@@ -21,7 +21,7 @@ from mapless_server.method.options import IntrinsicsSigma
 from mapless_server.method.pose_problem import AdjustOptions, pose_problem, with_intrinsics
 from mapless_server.method.rejection import Advice, IntrinsicsParameter, Rejection, RejectionReason
 from mapless_server.method.results import PoseEstimate, Support
-from mapless_server.method.trust.intrinsics import WrongCameraOptions, intrinsics_checks, wrong_camera, wrong_intrinsics
+from mapless_server.method.trust.intrinsics import intrinsics_checks, wrong_camera, wrong_intrinsics
 from mapless_server.method.views import undistort_pixels
 
 LENSES = {
@@ -268,8 +268,7 @@ def rejection_of(
     focal_x: float = 1.0,
     outliers: float = 0.0,
     sigma: float | None = None,
-    doubted: float = 0.0,
-    max_inlier_share: float = 0.6,
+    doubted: float = 3.1,
 ) -> tuple[Rejection | None, Camera]:
     """Of a photograph with intrinsics that are wrong by these factors, and seem so by `doubted` standard deviations."""
     scene = make_scene(random_for("wrong camera"))
@@ -287,12 +286,14 @@ def rejection_of(
     )
     query = replace(scene.query, camera=given, features=replace(scene.query.features, keypoints=keypoints))
     structure, matches, estimate = stages(replace(scene, query=query), scene.references)
-    support = Support(query, scene.references, structure, matches, estimate, np.zeros(3))
     usual = (IntrinsicsSigma() if sigma is None else IntrinsicsSigma(focal_share=sigma)).of(given)
     zero = np.zeros(4)
     value = np.array([doubted * np.hypot(usual[0], usual[0]), 0, 0, 0])
     evidence = IntrinsicsEvidence(given, given, value, usual, usual, np.zeros((4, 4)), np.zeros((6, 4)), zero)
-    return wrong_camera(support, evidence, "a", WrongCameraOptions(max_inlier_share)), true
+    nothing = tuple(np.empty((0, 2), np.int32) for _ in scene.references)
+    estimate = replace(estimate, intrinsics=evidence)
+    support = Support(query, scene.references, structure, matches, estimate, np.zeros(3), query_matches=nothing)
+    return wrong_camera(support, "a"), true
 
 
 @pytest.mark.parametrize(
@@ -317,9 +318,8 @@ def test_a_planted_gross_error_is_named_with_its_value(
     assert f"focal_x_px {focal.estimated:.0f} instead of {focal.given:.0f}" in rejection.message
 
 
-@pytest.mark.parametrize(("doubted", "is_named"), [(2.9, False), (3.1, True)])
-def test_many_inliers_do_not_clear_a_doubted_camera(doubted: float, is_named: bool) -> None:
-    assert (rejection_of(focal=2.0, doubted=doubted, max_inlier_share=0.01)[0] is not None) == is_named
+def test_a_camera_that_nothing_doubts_is_not_compared() -> None:
+    assert rejection_of(focal=2.0, doubted=2.9)[0] is None
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.5, 0.8])

@@ -17,7 +17,7 @@ from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.correspond import Correspondences, Matcher
 from mapless_server.method.localize import localize
 from mapless_server.method.match import MatchOptions
-from mapless_server.method.options import IntrinsicsSigma, LocalizeOptions
+from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.perturbation import moved, rotation_vector
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.pose_problem import AdjustOptions
@@ -25,7 +25,7 @@ from mapless_server.method.priors.known import PosePrior, Priors
 from mapless_server.method.rejection import Advice, IntrinsicsParameter, Rejection, RejectionReason
 from mapless_server.method.results import Support
 from mapless_server.method.structure import StructureOptions
-from mapless_server.method.trust.intrinsics import WrongCameraOptions, wrong_camera_by_lines
+from mapless_server.method.trust.intrinsics import wrong_camera
 from mapless_server.method.trust.two_view import (
     TwoViewEvidence,
     lacks_distance,
@@ -254,8 +254,7 @@ def test_intrinsics_of_another_image_size_are_named(factor: float) -> None:
     problem = replace(problem, query=replace(problem.query, camera=camera))
     support = problem.solved()
     assert support is not None
-    matches = problem.correspondences.query_matches
-    rejection = wrong_camera_by_lines(support, matches, IntrinsicsSigma(), WrongCameraOptions())
+    rejection = wrong_camera(support, "a")
     if factor == 1:
         assert rejection is None
         return

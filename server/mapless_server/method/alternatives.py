@@ -4,12 +4,10 @@ from dataclasses import replace
 
 from .answer import Answer, Localization
 from .one_reference import one_reference_failure, solve_one_reference, trust_of_score
-from .options import IntrinsicsSigma
 from .pipeline import Coarse
 from .rejection import Rejection, RejectionReason
 from .results import MetricScale, Support
 from .trust.evidence import votes_of
-from .trust.intrinsics import wrong_camera_by_lines
 from .trust.judge import contradiction
 from .trust.two_view import (
     lacks_distance,
@@ -62,10 +60,7 @@ def from_two_views(coarse: Coarse, answer: Answer) -> Answer:
         return replace(answer, outcome=one_reference_rejection(answer.outcome.reason, doubt, support))
     if doubt or trust < 1 - prepared.options.coverage:
         return answer
-    with prepared.context.stage("judge"):
-        sigma = prepared.options.intrinsics or IntrinsicsSigma()
-        rejection = wrong_camera_by_lines(support, query_matches, sigma, options.judge.camera)
-    return coarse.answer(rejection or Localization.of(estimate, trust, support.two_view), support)
+    return coarse.answer(Localization.of(estimate, trust, support.two_view), support)
 
 
 def _two_view_support(coarse: Coarse, found: Support | None) -> Support | None:

@@ -47,7 +47,7 @@ from ..results import Support
 from ..uncertainty.radii import Accuracy, accuracy_from_covariance
 from ..views import Matches
 from .evidence import Evidence, Votes, evidence_of, votes_of
-from .intrinsics import WrongCameraOptions, wrong_camera, wrong_intrinsics
+from .intrinsics import wrong_camera, wrong_intrinsics
 
 RIVAL_MIN_SHARE, RIVAL_MIN_KEYPOINTS = 0.5, 10
 """Least number of keypoints of a rival, as a share of those of the first pose, and in all. A place with less than half
@@ -85,7 +85,6 @@ class JudgeOptions:
             wrong only by chance; but poses from repeated structure and wrong references agree too, and so do slightly
             wrong ones.
         intrinsics: options of the check of the photograph's intrinsics.
-        camera: options of the comparison with other cameras.
         max_radius_share: largest 68 % radius of the position, as a share of the distance to what the photograph shows:
             of the poses with a larger one too many are wrong. Of 2,416 right answers 7 have it, of 116 wrong ones 18.
             Each of twelve places left out, the others choose this limit.
@@ -97,7 +96,6 @@ class JudgeOptions:
     )  # fmt: skip
     agreement_weight: float = 0.3
     intrinsics: ContradictionOptions = field(default_factory=ContradictionOptions)
-    camera: WrongCameraOptions = field(default_factory=WrongCameraOptions)
     max_radius_share: float = 0.08
 
     def __post_init__(self) -> None:
@@ -161,12 +159,14 @@ def judge(
 
 def contradiction(support: Support, votes: Votes, options: JudgeOptions) -> Rejection | None:
     """Rejects a pose whose matches contradict the intrinsics or support a second pose, or whose radius is too large."""
-    if support.estimate is not None and support.estimate.intrinsics is not None:
-        best = support.references[int(np.argmax(support.inliers_by_reference()))].name
-        evidence = support.estimate.intrinsics
-        wrong = wrong_intrinsics(evidence, best, options.intrinsics)
-        if wrong := wrong or wrong_camera(support, evidence, best, options.camera):
-            return wrong
+    assert support.estimate is not None
+    best, evidence = (
+        support.references[int(np.argmax(support.inliers_by_reference()))].name,
+        support.estimate.intrinsics,
+    )
+    wrong = wrong_intrinsics(evidence, best, options.intrinsics) if evidence else None
+    if wrong := wrong or wrong_camera(support, best):
+        return wrong
     hypotheses = find_rival(support, votes)
     return _ambiguous(hypotheses) if hypotheses else _too_uncertain(support, options)
 
