@@ -1,16 +1,17 @@
-"""Depths stored with the references: points where nothing can be triangulated, and better ones where little can.
+"""Depths stored with the references: points where nothing can be triangulated.
 
 A network has predicted the depth of each reference once, when it was added (see `scenes.depth`). A keypoint with depth
 d and relative standard deviation s, of a camera at C with the viewing direction z, then has its point near the plane
 
     z . (x - C) = d,    with the standard deviation    s d.
 
-Where the photograph matches many triangulated points, depths are not used: a network's errors are shared by all points
-of a surface, so that they do not average out, and the references' own poses follow them. Otherwise a point that its
-plane determines better than its rays is moved by what both say, each weighted by its information, unless they
-contradict each other. A reference's keypoint that only the query matches becomes a point at its depth, which one
-reference observes. Its error is along the ray, so it moves the photograph's keypoint along the epipolar line; the final
-adjustment knows that, since it keeps the planes (see `bundle`).
+A reference's keypoint that only the query matches becomes a point at its depth, which one reference observes. Its error
+is along the ray, so it moves the photograph's keypoint along the epipolar line; the final adjustment knows that, since
+it keeps the planes (see `bundle`). Where the photograph matches mostly triangulated points, these alone are used.
+
+A network's errors are shared by all depths of a photograph, so that they do not average out. What they share is seen at
+the keypoints of triangulated points: the most probable common factor is removed, by the variances of depths and points,
+with Cauchy's loss and a prior of standard deviation s. Points that are triangulated stay where they are.
 """
 
 from collections.abc import Sequence
@@ -24,37 +25,41 @@ from mapless.geometry import Array
 from .correspond import Correspondences
 from .match import vote
 from .observations import Tracks, keypoint_offsets, keypoint_rays
+from .optimize import cauchy_weight
 from .results import DepthPlanes, Structure
 from .structure import observe
 from .views import PosedView
 
-MAX_CONTRADICTION = 3.0
-"""A depth that is farther from its triangulated point, in standard deviations of both, is wrong: it is at an edge, or
-the keypoint shows a reflection."""
+MIN_ADDED_SHARE = 0.4
+"""Points at stored depths are added where there are so many for each match with a triangulated point; as
+`AdjustOptions.min_added_share`. In `euroc-v101-drone` with five references and over a thousand matches, they would make
+errors a fifth larger."""
 
-ENOUGH_MATCHES = 200
-"""With so many matches with triangulated points depths are not used. In `euroc-v101-drone`, with five references and
-over a thousand, depths with shared errors of some per cent cost 5 cm; in the kitchen, where most photographs have less,
-100 instead of 200 costs a tenth of the gain."""
+LOSS_SCALE_SIGMA = 2.0
+"""Of the Cauchy loss for common factors: depths are wrong at edges, and of what is reflected."""
+
+ITERATIONS = 6
+"""Steps to a common factor, by reweighted least squares."""
 
 
 def with_kept_depths(
     structure: Structure,
     references: Sequence[PosedView],
     correspondences: Correspondences,
-    enough_matches: int = ENOUGH_MATCHES,
+    min_added_share: float = MIN_ADDED_SHARE,
 ) -> Structure:
     """Adds the points that stored depths give to a structure, after the triangulated ones, with its `planes`.
 
-    The references are in the order of the structure's tracks; the correspondences are those of the query with each. The
-    structure, possibly without points, is unchanged if depths are not needed. A reference at least has some.
+    Each is of a reference's keypoint that the query matches and that observes no triangulated point. The references
+    are in the order of the structure's tracks; the correspondences are those of the query with each. The structure,
+    possibly without points, is unchanged if depths are not needed. A reference at least has some.
     """
-    counts = [len(reference.view.features) for reference in references]
-    if len(vote(structure, counts, correspondences)) >= enough_matches:
-        return structure
     known = _KnownDepths.of(references)
-    triangulated = _combined(structure, references, known)
-    return _with_single(triangulated, references, correspondences, known)
+    rows = _single_rows(structure, correspondences, known)
+    counts = [len(reference.view.features) for reference in references]
+    if not len(rows) or len(rows) < min_added_share * len(vote(structure, counts, correspondences)):
+        return structure
+    return _with_single(structure, _without_common_factors(structure, references, known), rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,43 +98,47 @@ class _KnownDepths:
         return DepthPlanes(normal, offset, self.sigma[rows] ** -2.0)
 
 
-def _combined(structure: Structure, references: Sequence[PosedView], known: _KnownDepths) -> Structure:
-    """Moves each triangulated point that a depth determines better, and does not contradict, by that depth."""
-    tracks, count = structure.tracks, len(structure.x_in_world)
-    none = DepthPlanes(np.zeros((count, 3)), np.zeros(count), np.zeros(count))
+def _without_common_factors(structure: Structure, references: Sequence[PosedView], known: _KnownDepths) -> _KnownDepths:
+    """Divides the depths of each reference by the factor that triangulated points say they share."""
+    tracks, depth, sigma = structure.tracks, known.depth.copy(), known.sigma.copy()
     row = known.offsets[tracks.view] + tracks.keypoint
-    order = np.lexsort((known.sigma[row], tracks.point))  # NaN is last
-    best = row[order[np.unique(tracks.point[order], return_index=True)[1]]] if count else row
-    has_depth = np.isfinite(known.depth[best])
+    has_depth = np.isfinite(known.depth[row])
     if not has_depth.any():
-        return replace(structure, planes=none)
-    chosen, planes = np.flatnonzero(has_depth), known.planes(best[has_depth])
-    kept = tracks.select(has_depth)
-    x = structure.x_in_world[chosen]
-    covariance = observe(kept, references, structure.noise).point_covariances(x)
-    across = np.einsum("pij,pj->pi", covariance, planes.normal)
-    variance = (across * planes.normal).sum(axis=1) + 1 / planes.information
-    off = planes.offset - (planes.normal * x).sum(axis=1)
-    is_better = variance > 2 / planes.information
-    agrees = is_better & (off**2 <= MAX_CONTRADICTION**2 * variance)
-    moved = structure.x_in_world.copy()
-    moved[chosen[agrees]] += (across * (off / variance)[:, None])[agrees]
-    for name in ("normal", "offset", "information"):
-        getattr(none, name)[chosen[agrees]] = getattr(planes, name)[agrees]
-    return replace(structure, x_in_world=moved, planes=none)
+        return known
+    observations = observe(tracks, references, structure.noise)
+    covariance = observations.point_covariances(structure.x_in_world)[tracks.point]
+    axis = known.axis[row]
+    triangulated = (axis * (structure.x_in_world[tracks.point] - known.centre[row])).sum(axis=1)
+    log_factor = np.log(known.depth[row] / triangulated)
+    relative_variance = np.einsum("oi,oij,oj->o", axis, covariance, axis) / triangulated**2
+    for view, reference in enumerate(references):
+        seen = has_depth & (tracks.view == view)
+        if reference.depths is None or not seen.any():
+            continue
+        own_variance = reference.depths.relative_sigma**2
+        values, variance, common = log_factor[seen], own_variance + relative_variance[seen], 0.0
+        for _ in range(ITERATIONS):
+            weight = cauchy_weight((values - common) ** 2 / variance, LOSS_SCALE_SIGMA) / variance
+            common = float(weight @ values) / (float(weight.sum()) + 1 / own_variance)
+        its_rows = slice(known.offsets[view], known.offsets[view + 1])
+        depth[its_rows] /= np.exp(common)
+        sigma[its_rows] /= np.exp(common)
+    return replace(known, depth=depth, sigma=sigma)
 
 
-def _with_single(
-    structure: Structure, references: Sequence[PosedView], correspondences: Correspondences, known: _KnownDepths
-) -> Structure:
-    """Adds a point for each matched keypoint that has a depth and observes no point."""
+def _single_rows(structure: Structure, correspondences: Correspondences, known: _KnownDepths) -> NDArray[np.intp]:
+    """Rows of the references' keypoints that the query matches, and that have a depth and observe no point."""
     tracks = structure.tracks
     matched = zip(correspondences.query_matches, known.offsets[:-1], strict=True)
     rows = np.unique(np.concatenate([pairs[:, 1] + start for pairs, start in matched]))
-    rows = np.setdiff1d(rows[np.isfinite(known.depth[rows])], known.offsets[tracks.view] + tracks.keypoint)
-    if not len(rows):
-        return structure
+    return np.setdiff1d(rows[np.isfinite(known.depth[rows])], known.offsets[tracks.view] + tracks.keypoint)
+
+
+def _with_single(structure: Structure, known: _KnownDepths, rows: NDArray[np.intp]) -> Structure:
+    """Adds a point at its depth for each of these keypoints."""
     view = np.searchsorted(known.offsets, rows, side="right") - 1
     points = known.centre[rows] + known.ray[rows] * known.depth[rows, None]
     single = Tracks(np.arange(len(rows)), view, rows - known.offsets[view])
-    return structure.and_last(points, single, known.planes(rows))
+    count = len(structure.x_in_world)
+    none = DepthPlanes(np.zeros((count, 3)), np.zeros(count), np.zeros(count))
+    return replace(structure, planes=none).and_last(points, single, known.planes(rows))
