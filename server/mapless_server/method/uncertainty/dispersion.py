@@ -326,15 +326,13 @@ def _by_region(
     lost = (rows @ points.cross).reshape(len(rows), *points.gradient.shape)
     of_match = summed(seen.sums, (of_observation * (weight * residual)[:, None]).sum(axis=0))
     of_match -= (lost * points.gradient).sum(axis=1)
-    region = np.empty(lost.shape[2], np.intp)
+    member = np.zeros((lost.shape[2], len(regions)))  # 1 where a point is of a region
     for i, it in enumerate(regions):
-        region[it] = i
-    of_observation, lost = np.swapaxes(of_observation[:, 6:] * np.sqrt(weight), 0, 1), lost[6:]
-    of_view = region[seen.point]
-    parts = [(of_observation[:, :, of_view == i], lost[:, :, it]) for i, it in enumerate(regions)]
-    squares = [[np.tensordot(it, it, ((1, 2), (1, 2))) for it in part] for part in parts]
-    influences = np.stack([of_match[:, it].sum(axis=1) for it in regions])
-    return influences, np.stack([kept - gone for kept, gone in squares])
+        member[it, i] = 1
+    of_observation, lost = of_observation[:, 6:] * np.sqrt(weight), lost[6:]
+    kept, gone = np.einsum("aio,ajo->ijo", of_observation, of_observation), np.einsum("iap,jap->ijp", lost, lost)
+    squares = np.tensordot(kept, member[seen.point], 1) - np.tensordot(gone, member, 1)
+    return (of_match @ member).T, np.moveaxis(squares, 2, 0)
 
 
 def _whitened(seen: ViewColumns, residual: Array, weight: Array, points: EliminatedPoints) -> tuple[Array, Array]:
