@@ -195,6 +195,16 @@ def test_queries_use_what_is_kept_without_the_network(kept: Path) -> None:
     assert network.runs == 0
 
 
+def test_radii_follow_the_calibration_with_depths(kept: Path) -> None:
+    query = room().queries[0]
+    with serving(kept, **(STORED | {"background_matching": True})) as server, Client(server.address) as client:
+        wait_until(lambda: server.value("mapless_calibrations_total") > 0)
+        answer = client.localize(query.data, query.camera, "room")
+    assert isinstance(answer, LocalizationResult)
+    assert answer.accuracy is not None
+    assert answer.accuracy.calibration == "SELF"
+
+
 @pytest.mark.parametrize("factor", [1.6, float("nan")], ids=["another scale", "NaN"])
 def test_a_network_that_is_wrong_keeps_nothing(data_dir: Path, factor: float) -> None:
     """All depths 1.6 times as large as its own poses say: triangulated points contradict them."""

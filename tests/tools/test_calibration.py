@@ -42,6 +42,7 @@ from mapless_tools.calibrate.report import CalibrationReport, page, to_json, wor
 from mapless_tools.dataset import Dataset
 
 SIFT = Conditions("sift", "geometric", "BEST", "1")
+KIND = calibration_kind(SIFT.features, SIFT.backend, SIFT.server_version)
 SIGMA_M, SIGMA_DEG = 0.02, 0.1
 
 
@@ -146,22 +147,21 @@ class TestApplying:
     MEASURED = Calibration(2.0, 3.0, 0.5, 0.75, 20, "sift", "geometric", "BEST", server_version="1")
 
     def own(self, count: int = 30) -> SelfCalibration:
-        kind = calibration_kind(SIFT.features, SIFT.backend, SIFT.server_version)
-        return SelfCalibration(kind, 7, count, 2.0, 0.5)
+        return SelfCalibration(KIND, 7, count, 2.0, 0.5)
 
     def test_of_references_hold_at_the_usual_gap(self) -> None:
         before, attributes = Accuracy(1.0, 2.0, 3.0, 4.0), SceneAttributes(self_calibrations=(self.own(),))
-        after = reported_radii(before, self.COVARIANCE, SIFT, attributes, USUAL_GAP)
+        after = reported_radii(before, self.COVARIANCE, SIFT, KIND, attributes, USUAL_GAP)
         assert (after.accuracy.position_68_m, after.accuracy.rotation_68_deg) == (2.0, 1.5)
         assert (after.calibration, after.count) == ("SELF", 30)
-        near, far = (reported_radii(before, self.COVARIANCE, SIFT, attributes, it).accuracy for it in (0.05, 0.2))
+        near, far = (reported_radii(before, self.COVARIANCE, SIFT, KIND, attributes, it).accuracy for it in (0.05, 0.2))
         assert near.position_68_m < after.accuracy.position_68_m < far.position_68_m
 
     def test_many_references_leave_less_to_the_tails(self) -> None:
         before, tails = Accuracy(1.0, 2.0, 3.0, 6.0), []
         for count in (3, 30, 3000):
             attributes = SceneAttributes(self_calibrations=(self.own(count=count),))
-            after = reported_radii(before, self.COVARIANCE, SIFT, attributes, USUAL_GAP).accuracy
+            after = reported_radii(before, self.COVARIANCE, SIFT, KIND, attributes, USUAL_GAP).accuracy
             tails.append(after.position_95_m / after.position_68_m)
             assert after.rotation_95_deg / after.rotation_68_deg == pytest.approx(tails[-1])
         assert 2.0 > tails[0] > tails[1] > tails[2] == pytest.approx(2.0 * SELF_TAIL_95 / TAIL_95, rel=1e-2)
@@ -170,12 +170,12 @@ class TestApplying:
         noisy = SceneAttributes(self_calibrations=(replace(self.own(), reference_noise_m=0.01),))
         for radius_m in (1e-4, 1e-2, 1.0):
             before = Accuracy(radius_m, 2 * radius_m, 3.0, 4.0)
-            after = reported_radii(before, self.COVARIANCE, SIFT, noisy, USUAL_GAP).accuracy
+            after = reported_radii(before, self.COVARIANCE, SIFT, KIND, noisy, USUAL_GAP).accuracy
             assert after.position_68_m == pytest.approx(math.hypot(2 * radius_m, 0.01), rel=1e-2)
 
     def test_measured_ones_win_over_those_of_references(self) -> None:
         both = SceneAttributes(calibration=self.MEASURED, self_calibrations=(self.own(),))
-        after = reported_radii(Accuracy(1.0, 2.0, 3.0, 4.0), self.COVARIANCE, SIFT, both, 0.3)
+        after = reported_radii(Accuracy(1.0, 2.0, 3.0, 4.0), self.COVARIANCE, SIFT, KIND, both, 0.3)
         assert (after.calibration, after.count, after.accuracy) == ("MEASURED", 20, Accuracy(2.0, 6.0, 1.5, 3.0))
         np.testing.assert_array_equal(after.covariance, scaled_covariance(self.COVARIANCE, self.FACTORS))
 
@@ -190,14 +190,16 @@ class TestApplying:
     @pytest.mark.parametrize("field", ["features", "backend", "variant", "server_version"])
     def test_what_something_else_computed_stays_uncalibrated(self, field: str) -> None:
         before, other = Accuracy(1.0, 2.0, 3.0, 4.0), replace(SIFT, **{field: "other"})
-        for conditions, calibration, calibrations in (
-            (SIFT, None, ()),
-            (SIFT, None, (self.own(count=0),)),
-            (other, self.MEASURED, ()),
-            (other, None, (self.own(),)),
+        others = calibration_kind(other.features, other.backend, other.server_version)
+        for conditions, kind, calibration, calibrations in (
+            (SIFT, KIND, None, ()),
+            (SIFT, KIND, None, (self.own(count=0),)),
+            (SIFT, calibration_kind("sift", "geometric+depth", "1"), None, (self.own(),)),
+            (other, others, self.MEASURED, ()),
+            (other, others, None, (self.own(),)),
         ):
             attributes = SceneAttributes(calibration=calibration, self_calibrations=calibrations)
-            after = reported_radii(before, self.COVARIANCE, conditions, attributes, 0.1)
+            after = reported_radii(before, self.COVARIANCE, conditions, kind, attributes, 0.1)
             assert after.accuracy == before
             assert after.calibration == "GENERIC"
             np.testing.assert_array_equal(after.covariance, self.COVARIANCE)

@@ -27,7 +27,7 @@ from mapless_server.method.uncertainty.radii import (
     self_tail,
     viewpoint_gap,
 )
-from mapless_server.store import SceneAttributes, SelfCalibration, calibration_kind
+from mapless_server.store import SceneAttributes, SelfCalibration
 
 from .queries import enum_from_message, enum_to_message
 
@@ -96,7 +96,12 @@ class ReportedRadii:
 
 
 def reported_radii(
-    accuracy: Accuracy, covariance: Array, conditions: Conditions, attributes: SceneAttributes, gap: float | None
+    accuracy: Accuracy,
+    covariance: Array,
+    conditions: Conditions,
+    kind: str,
+    attributes: SceneAttributes,
+    gap: float | None,
 ) -> ReportedRadii:
     """Radii by the scene's measured calibration, else by its self-calibration, if made under the same conditions.
 
@@ -104,6 +109,7 @@ def reported_radii(
         accuracy: radii of the method.
         covariance: (6, 6) of the method.
         conditions: what computed the answer.
+        kind: kind of the answer, see `store.calibration_kind`; with depths kept with references another one.
         attributes: attributes of the scene.
         gap: gap of the answer, see `method.uncertainty.radii.viewpoint_gap`; None if unknown.
     """
@@ -111,7 +117,6 @@ def reported_radii(
     if measured is not None and measured.is_of(*astuple(conditions)):
         factors, calibration, count = Factors.of(measured), "MEASURED", measured.query_count
     else:
-        kind = calibration_kind(conditions.features, conditions.backend, conditions.server_version)
         own = attributes.self_calibration(kind)
         if own is None or not own.answer_count or conditions.variant != _SELF_CALIBRATED or gap is None:
             return ReportedRadii(accuracy, covariance)
@@ -174,7 +179,7 @@ def outcome_to_message(result: Result, options: LocalizeOptions, frames: AnswerF
         conditions = Conditions(result.tier.features, result.tier.backend, options.variant.name, __version__)
         support = result.answer.support
         gap = viewpoint_gap(support)[0] if support is not None and support.estimate is not None else None
-        radii = reported_radii(accuracy, outcome.covariance, conditions, result.attributes, gap)
+        radii = reported_radii(accuracy, outcome.covariance, conditions, result.tier.kind, result.attributes, gap)
     return pb.LocalizeResponse(localization=_localization_to_message(outcome, radii, result.attributes, frames))
 
 
