@@ -111,7 +111,7 @@ length more uncertain (standard deviation, as a share): with K of an image of tw
 
 MIN_GAIN = 1.2
 """The camera is wrong if a pose of another one scores this many times as high. With half, 1.5 times or twice the focal
-length 86 of 89 accepted poses of five places have more, and 82 by the number of inliers alone; of 153 right answers of
+length 86 of 89 accepted poses of seven places have more, and 82 by the number of inliers alone; of 153 right answers of
 twelve places one has 1.5, whose focal length is given for all photographs of a statue, and the others up to 1.04."""
 
 MIN_MATCHES = 40
