@@ -17,7 +17,7 @@ from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.correspond import Correspondences, Matcher
 from mapless_server.method.localize import localize
 from mapless_server.method.match import MatchOptions
-from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.options import IntrinsicsSigma, LocalizeOptions
 from mapless_server.method.perturbation import moved, rotation_vector
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.pose_problem import AdjustOptions
@@ -259,9 +259,22 @@ def test_intrinsics_of_another_image_size_are_named(factor: float) -> None:
         assert rejection is None
         return
     assert rejection is not None
+    assert rejection.message.startswith("its matches agree as well with a pose of focal_x_px")
     found = {it.parameter: it.estimated for it in rejection.intrinsics_checks}
     assert found[IntrinsicsParameter.FOCAL_LENGTH] == pytest.approx(CAMERA.focal_x_px, rel=0.01)
     assert found[IntrinsicsParameter.PRINCIPAL_X] == pytest.approx((CAMERA.width_px - 1) / 2)
+    tried = wrong_camera(support, "a", IntrinsicsSigma(focal_share=0.2))
+    assert tried is not None
+    assert tried.intrinsics_checks[0].given_sigma == pytest.approx(0.2 * camera.focal_x_px)
+
+
+def test_cameras_that_the_caller_allows_are_not_compared() -> None:
+    problem = planted((70, 60, 50), 0.5, 0.3)
+    camera = replace(CAMERA, focal_x_px=2 * CAMERA.focal_x_px, focal_y_px=2 * CAMERA.focal_y_px)
+    support = replace(problem, query=replace(problem.query, camera=camera)).solved()
+    assert support is not None
+    assert wrong_camera(support, "a") is not None
+    assert wrong_camera(support, "a", IntrinsicsSigma(focal_share=0.5)) is None
 
 
 def test_references_are_always_matched_at_their_given_poses() -> None:

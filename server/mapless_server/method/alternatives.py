@@ -52,7 +52,8 @@ def from_two_views(coarse: Coarse, answer: Answer) -> Answer:
     with prepared.context.stage("judge"):
         evidence = two_view_evidence(support, query_matches)
         doubt, trust = two_view_failure(evidence), two_view_trust(evidence)
-        rejection = None if doubt else contradiction(support, votes_of(support, query_matches), options.judge)
+        votes, sigma = votes_of(support, query_matches), prepared.options.intrinsics
+        rejection = None if doubt else contradiction(support, votes, options.judge, sigma)
     if rejection:
         return coarse.answer(rejection, support)
     if doubt and lacks_distance(evidence):

@@ -131,12 +131,13 @@ LINES = RelativePoseOptions(min_iterations=50, max_iterations=150, pair_iteratio
 """Of the poses where the given one rests on matches without points; brief, 20 to 40 ms a camera."""
 
 
-def wrong_camera(support: Support, best_reference: str) -> Rejection | None:
+def wrong_camera(support: Support, best_reference: str, intrinsics: IntrinsicsSigma | None = None) -> Rejection | None:
     """A rejection that names what is wrong and the better value, if a pose of another camera scores clearly higher.
 
     A pose that rests on matches without points is compared whatever the linear check says, with four cameras by a brief
     search: these score 0.67 to 0.90 of the pose where the given camera is right, and 1.07 to 1.44 where its intrinsics
-    are those of an image of half or twice the size.
+    are those of an image of half or twice the size. Its linear check knows the defaults alone; `intrinsics` are the
+    caller's standard deviations, within three of which no camera is tried.
     """
     assert support.estimate is not None
     query, evidence, by_lines = support.query, support.estimate.intrinsics, support.two_view is not None
@@ -157,7 +158,8 @@ def wrong_camera(support: Support, best_reference: str) -> Rejection | None:
         return 0.0 if pose is None else score(all_matches, pose, LINES), camera
 
     steps, steps_per_octave = (2, 2) if by_lines else (STEPS, STEPS_PER_OCTAVE)
-    prior_sigma = evidence.prior_sigma if evidence else IntrinsicsSigma().of(query.camera)
+    usual = (intrinsics or IntrinsicsSigma()).of(query.camera)
+    prior_sigma = usual if by_lines or evidence is None else evidence.prior_sigma
     others = list(_other_cameras(query.camera, float(prior_sigma[0]), steps, steps_per_octave))
     if not others:
         return None
@@ -174,6 +176,8 @@ def wrong_camera(support: Support, best_reference: str) -> Rejection | None:
     named = ", ".join(f"{it.parameter.field} {it.estimated:.0f} instead of {it.given:.0f}" for it in checks)
     inliers = support.estimate.inliers
     message = f"{inliers.sum()} of {len(inliers)} matches agree with the pose; all together fit one of {named} better"
+    if by_lines:  # the matches with points may be none
+        message = f"its matches agree as well with a pose of {named}"
     text = (
         "Check the photograph's intrinsics: they belong to one image size, change with it when a photograph is "
         "resized, and have another principal point when it is cropped."

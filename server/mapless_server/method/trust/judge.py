@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Camera, RigidTransform, rotation_angle_deg
 
 from ..intrinsics import ContradictionOptions
-from ..options import check_bounds
+from ..options import IntrinsicsSigma, check_bounds
 from ..perturbation import pose_hessian, world_covariance
 from ..pnp import PnpOptions, false_alarms, ransac
 from ..rejection import Advice, Hint, Hypothesis, Rejection, RejectionReason
@@ -157,15 +157,18 @@ def judge(
     return Judgement(trust, evidence, rejection)
 
 
-def contradiction(support: Support, votes: Votes, options: JudgeOptions) -> Rejection | None:
-    """Rejects a pose whose matches contradict the intrinsics or support a second pose, or whose radius is too large."""
+def contradiction(
+    support: Support, votes: Votes, options: JudgeOptions, intrinsics: IntrinsicsSigma | None = None
+) -> Rejection | None:
+    """Rejects a pose whose matches contradict the intrinsics or support a second pose, or whose radius is too large.
+
+    `intrinsics` are the caller's standard deviations, see `wrong_camera`.
+    """
     assert support.estimate is not None
-    best, evidence = (
-        support.references[int(np.argmax(support.inliers_by_reference()))].name,
-        support.estimate.intrinsics,
-    )
+    evidence = support.estimate.intrinsics
+    best = support.references[int(np.argmax(support.inliers_by_reference()))].name
     wrong = wrong_intrinsics(evidence, best, options.intrinsics) if evidence else None
-    if wrong := wrong or wrong_camera(support, best):
+    if wrong := wrong or wrong_camera(support, best, intrinsics):
         return wrong
     hypotheses = find_rival(support, votes)
     return _ambiguous(hypotheses) if hypotheses else _too_uncertain(support, options)
