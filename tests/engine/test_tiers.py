@@ -145,6 +145,13 @@ class TestBetter:
         else:
             assert isinstance(outcome, Localization)
 
+    def test_a_photograph_that_fits_two_places_turned_says_so(self) -> None:
+        as_it_is, turned = found(rejected(RejectionReason.GATE), 0.0, 30), found(localized(3.0, inliers=40), 3.0, 40)
+        results = [Result(it, CHEAP, (), 1, CAMERA) for it in (as_it_is, turned)]
+        outcome = better_of(results[0], results[1]).answer.outcome
+        assert isinstance(outcome, Rejection)
+        assert outcome.message.startswith("the photograph fits two places: the pose as it is (30 inliers)")
+
     @pytest.mark.parametrize("reason", [RejectionReason.GATE, RejectionReason.AMBIGUOUS])
     @pytest.mark.parametrize(("inliers", "is_answered"), [(44, False), (45, True)])
     def test_a_rejected_pose_elsewhere_contradicts_unless_weaker(

@@ -2,8 +2,9 @@
 
 import asyncio
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -17,12 +18,13 @@ from support.images import encode, textured
 from mapless.axes import turned_raster
 from mapless.geometry import Camera
 from mapless_server.engine.options import EngineOptions
-from mapless_server.engine.query import TURN, Caller, Photo, Query, Result, Tier
+from mapless_server.engine.query import TURN, Caller, Photo, Query, QueryRun, QueryViews, Result, Tier
+from mapless_server.engine.stages import QueryStages
 from mapless_server.images import ImageLimits, decode_image
-from mapless_server.method.answer import Localization
+from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.rejection import Rejection
+from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.views import View, view_of
 from mapless_server.scenes import Narrowing
 from mapless_server.scheduling import Flow
@@ -52,12 +54,33 @@ class UprightSift:
         return view_of(camera, np.array([it.pt for it in found]), descriptors.astype(np.uint8), sizes_px)
 
 
+@dataclass
+class Blind(UprightSift):
+    """Features of which those of further photographs match only by chance, once `is_blind`."""
+
+    name: str = "blind"
+    is_blind: bool = False
+
+    def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
+        view = super().extract(image, camera)
+        if not self.is_blind:
+            return view
+        chance = np.random.default_rng(int(image.sum(dtype=np.int64)))
+        descriptors = chance.permuted(view.features.descriptors, axis=1)
+        return replace(view, features=replace(view.features, descriptors=descriptors))
+
+
 @pytest.fixture(scope="module")
 def localize(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Localize]:
+    with localizing(tmp_path_factory.mktemp("store"), [Tier(UprightSift(), Pipeline(), upright_only=True)]) as answer:
+        yield answer
+
+
+@contextmanager
+def localizing(folder: Path, tiers: Sequence[Tier]) -> Iterator[Localize]:
     caller, loop = Caller(Flow("tenant", "client"), time.monotonic() + 600), asyncio.new_event_loop()
-    folder: Path = tmp_path_factory.mktemp("store")
     with Store.open(folder) as store:
-        engine = engine_over(store, [Tier(UprightSift(), Pipeline(), upright_only=True)], EngineOptions())
+        engine = engine_over(store, tiers, EngineOptions())
         photos = [Photo(photograph(it), CAMERA, "image") for it in REFERENCE_POSES]
         described = loop.run_until_complete(engine.describe(photos, caller))
         store.create_scene(SCENE)
@@ -65,7 +88,7 @@ def localize(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Localize]:
         references = [NewReference(i, p.image, CAMERA, at, it.views, it.descriptors) for i, p, at, it in shown]
         store.add_references(SCENE, references)
 
-        def answer(image: bytes, camera: Camera, named: tuple[str, ...]) -> Result:
+        def answer(image: bytes, camera: Camera, named: tuple[str, ...] = ()) -> Result:
             asked = Query(SCENE, named, Photo(image, camera, "image"), Narrowing(), 8, LocalizeOptions())
             return loop.run_until_complete(engine.run(engine.query_job(asked, caller)))
 
@@ -106,3 +129,31 @@ def test_a_photograph_of_elsewhere_stays_rejected(localize: Localize) -> None:
     result = localize(image, CAMERA, ())
     assert isinstance(result.answer.outcome, Rejection)
     assert f"upright-sift/{TURN}" in result.stage_seconds
+
+
+def test_a_turn_that_shows_no_more_is_not_searched_further(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Matches by chance may be clearly more in a turned raster; stronger features still get the photograph as it is."""
+
+    def turned(stages: QueryStages, run: QueryRun, tier: Tier) -> QueryViews:
+        return run.views.turned(1, run.context)
+
+    monkeypatch.setattr(QueryStages, "_turned", turned)
+    first = Blind()
+    tiers = [Tier(first, Pipeline(), upright_only=True), Tier(UprightSift(), Pipeline(), upright_only=True)]
+    with localizing(tmp_path, tiers) as answer:
+        first.is_blind = True
+        result = answer(photograph(TRUE), CAMERA)
+    assert isinstance(result.answer.outcome, Localization)
+    assert result.tier.features == "upright-sift"
+
+
+def test_time_of_several_searches_with_one_tier_adds_up() -> None:
+    result = Result(
+        Answer(Rejection(RejectionReason.LOW_OVERLAP, "planted")), Tier(UprightSift(), Pipeline()), (), 1, CAMERA
+    )
+    searched = replace(result, stage_seconds={"features": 1.0, "sift/features": 2.0})
+    assert searched.seconds_with({"sift/features": 0.5, "sift/turn": 0.25}) == {
+        "features": 1.0,
+        "sift/features": 2.5,
+        "sift/turn": 0.25,
+    }

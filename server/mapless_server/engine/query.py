@@ -190,6 +190,13 @@ class Result:
     attributes: SceneAttributes = field(default_factory=SceneAttributes)
     stage_seconds: dict[str, float] = field(default_factory=dict)
 
+    def seconds_with(self, stage_seconds: Mapping[str, float]) -> dict[str, float]:
+        """Time of its stages and of those of a further search with a tier; a tier may search several times."""
+        seconds = dict(self.stage_seconds)
+        for name, spent_s in stage_seconds.items():
+            seconds[name] = seconds.get(name, 0.0) + spent_s
+        return seconds
+
     @property
     def is_tracked(self) -> bool:
         """Whether its references were chosen by a pose prior, see `tracking`."""
@@ -221,6 +228,7 @@ class QueryViews:
         self._views: dict[str, View] = {}
         self._max_pixels: int | None = None
         self.quarter_turns = 0
+        self._not_turned: QueryViews | None = None
 
     def view(self, extractor: FeatureExtractor, context: StageContext) -> View:
         """The photograph's view with this extractor's features; InvalidArgument if the image is bad."""
@@ -251,7 +259,13 @@ class QueryViews:
         """
         views = QueryViews(self._photo, self._limits)
         views._photograph, views.quarter_turns = self._decoded(context), quarter_turns
+        views._not_turned = self.not_turned
         return views
+
+    @property
+    def not_turned(self) -> QueryViews:
+        """The same photograph, whose features are found in its raster as it is."""
+        return self._not_turned or self
 
     def _decoded(self, context: StageContext) -> Photograph:
         if self._photograph is None:

@@ -129,7 +129,7 @@ class QueryStages:
                 views = self._turned(run, tier)
                 if not views.quarter_turns:
                     spent_s = {f"{tier.features}/{name}": it for name, it in run.context.stage_seconds.items()}
-                    best = replace(run.best, stage_seconds=run.best.stage_seconds | spent_s)
+                    best = replace(run.best, stage_seconds=run.best.seconds_with(spent_s))
                     return self._stronger(run, query, best)
                 run = run.but(views=views)
             tracked = self._tracked(run, tier) if run.tracks else None
@@ -299,7 +299,10 @@ class QueryStages:
             query = run.narrowed if better is run.best and is_near else query
             result = replace(better, stage_seconds=result.stage_seconds)
         elif run.best is not None:
-            result = replace(better_of(run.best, result), stage_seconds=result.stage_seconds)
+            better = better_of(run.best, result)
+            if run.tries_turns and better is result and _shows_no_more(run.best, result):
+                better, run = run.best, run.but(views=run.views.not_turned)
+            result = replace(better, stage_seconds=result.stage_seconds)
         elif self._searches_elsewhere(run, answer):
             elsewhere = replace(query, narrowing=query.narrowing.limits)
             return self._search(replace(self._further(run, elsewhere, run.tier, result), narrowed=query))
@@ -426,10 +429,9 @@ class QueryStages:
                 answer = replace(answer, outcome=Rejection(RejectionReason.PRIOR_CONFLICT, beyond))
         if isinstance(answer.outcome, Rejection):
             answer = hinted(answer, run.view, run.references, _is_searched(run) and not narrowing.is_empty)
-        prefix = "" if run.best is None else f"{tier.features}/"
-        seconds = {} if run.best is None else dict(run.best.stage_seconds)
-        for stage, spent_s in (run.context.stage_seconds | answer.stage_seconds).items():
-            seconds[f"{prefix}{stage}"] = spent_s
+        seconds = run.context.stage_seconds | answer.stage_seconds
+        if run.best is not None:
+            seconds = run.best.seconds_with({f"{tier.features}/{name}": it for name, it in seconds.items()})
         used = run.references, run.generation, run.view.camera, run.choice, run.attributes
         return Result(answer, tier, *used, seconds)
 
@@ -450,6 +452,11 @@ def _pipeline_in(run: QueryRun, tier: Tier) -> Pipeline:
 def _is_searched(run: QueryRun) -> bool:
     """Whether the scene has references to choose from."""
     return run.choice is not None and bool(run.choice.descriptor)
+
+
+def _shows_no_more(best: Result, turned: Result) -> bool:
+    """Whether a photograph was not localized turned either, and no more of it agrees with a pose than as it is."""
+    return isinstance(turned.answer.outcome, Rejection) and inlier_count(turned) <= inlier_count(best)
 
 
 def _ending(result: Result) -> Ending:

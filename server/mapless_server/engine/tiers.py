@@ -85,10 +85,16 @@ def better_of(cheaper: Result, stronger: Result) -> Result:
         return cheaper if is_first_better else stronger
     if second.inlier_count >= CLEARLY_MORE * inlier_count:
         return stronger
-    message = (
+    poses = (
         f"the features disagree: the pose of {cheaper.tier.features} ({inlier_count} inliers) and that of "
-        f"{stronger.tier.features} ({second.inlier_count}) are {apart_m:.2f} m and {apart_deg:.1f} degrees apart"
+        f"{stronger.tier.features} ({second.inlier_count})"
     )
+    if cheaper.tier is stronger.tier:
+        poses = (
+            f"the photograph fits two places: the pose as it is ({inlier_count} inliers) and that of the photograph "
+            f"turned ({second.inlier_count})"
+        )
+    message = f"{poses} are {apart_m:.2f} m and {apart_deg:.1f} degrees apart"
     rejection = Rejection(RejectionReason.GATE, message, _places_apart(stronger))
     return replace(stronger, answer=replace(stronger.answer, outcome=rejection))
 
@@ -187,12 +193,12 @@ def _rejected_pose(answer: Answer) -> tuple[RigidTransform, int, float] | None:
 
 
 def _places_apart(result: Result) -> Hint:
-    """The hint for two kinds of features that find two places."""
+    """The hint for two searches, with other features or of the photograph turned, that find two places."""
     matches = result.answer.reference_match_counts
     best = result.references[int(np.argmax(matches))].name if result.references and any(matches) else None
     message = (
-        "Say where the camera is, or take a photograph that shows more of what the references show: two kinds of "
-        "features find two places."
+        "Say where the camera is, or take a photograph that shows more of what the references show: two searches find "
+        "two places."
     )
     return Hint("judge", Advice.TELL_PLACES_APART, message, best)
 
