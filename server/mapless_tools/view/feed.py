@@ -103,7 +103,7 @@ class Feed:
         self._stub = LocalizationServiceStub(self._channel)
         self._show, self._report = show, report
         self.own: set[bytes] = set()
-        """SHA-256 of photographs that the viewer localizes itself, which are not shown."""
+        """SHA-256 of photographs that the viewer localizes itself; the next query of each is not shown."""
         self._count = 0
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
@@ -138,7 +138,9 @@ class Feed:
         if call.is_active():
             self._report("live", True)
         for message in call:
-            if hashlib.sha256(message.image).digest() in self.own:
+            digest = hashlib.sha256(message.image).digest()
+            if digest in self.own:  # another client may localize the same photograph later
+                self.own.remove(digest)
                 continue
             self._count += 1 + message.missed_count
             if not message.image:  # too large to be shown
