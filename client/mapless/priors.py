@@ -141,6 +141,6 @@ def _set(message: Any, name: str, value: Any) -> None:
     elif isinstance(value, RigidTransform):
         getattr(message, name).CopyFrom(wire.transform_to_message(value))
     elif np.ndim(value):
-        getattr(message, name).CopyFrom(wire.vector_to_message(value))
+        getattr(message, name).CopyFrom(wire.vector_to_message(value, name))
     else:
         setattr(message, name, value)

@@ -154,9 +154,12 @@ def transform_from_message(
     return RigidTransform(rotation, translation)
 
 
-def vector_to_message(xyz: ArrayLike) -> pb.Vector3:
-    """Message of a vector (3,)."""
-    x, y, z = map(float, np.asarray(xyz, float))
+def vector_to_message(xyz: ArrayLike, name: str = "vector") -> pb.Vector3:
+    """Message of a vector (3,); ValueError with its name if it is none."""
+    vector = np.asarray(xyz, float)
+    if vector.shape != (3,):
+        raise ValueError(f"{name} must have three numbers, x, y and z, is {vector.tolist()}")
+    x, y, z = vector.tolist()
     return pb.Vector3(x=x, y=y, z=z)
 
 

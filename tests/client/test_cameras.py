@@ -64,6 +64,7 @@ GOOD = {"width_px": 640, "height_px": 480, "focal_x_px": 9, "focal_y_px": 9, "pr
         ({"focal_x_px": -5}, "focal_x_px: must be 6.4 to 64000, is -5"),
         ({"focal_x_px": None}, "focal_x_px is missing"),
         ({"focal_z_px": 5}, "focal_z_px is no field, perhaps focal_y_px; known: width_px, "),
+        ({"focal_x": 5}, "focal_x is no field, perhaps focal_x_px; known: width_px, "),
         ({"spherical": {"k1": 1}}, "spherical is no field; known: .* fisheye"),
         ({"fisheye": {"k9": 1}}, "fisheye.k9 is no field; known: k1, k2, k3, k4"),
         ({"fisheye": {"k1": 1000}}, "fisheye.k1: must be at most 100 in magnitude, is 1000"),

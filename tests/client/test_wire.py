@@ -10,9 +10,10 @@ import pytest
 
 from mapless import Client, names, wire
 from mapless.geometry import MAX_COORDINATE_M, Camera, RigidTransform
-from mapless.priors import PositionPrior, set_priors
+from mapless.priors import PositionPrior, Priors, set_priors
 from mapless.requests import NewReference, create_request
 from mapless.v1 import geometry_pb2 as pb
+from mapless.v1.localization_service_pb2 import LocalizeRequest
 
 CAMERA = Camera(640, 480, 500.0, 501.5, 319.5, 239.25)
 
@@ -46,6 +47,16 @@ def changed(**values: Any) -> Camera:
 def test_a_value_of_another_type_is_named(convert: Callable[[Any], Any], value: Any, error_text: str) -> None:
     with pytest.raises(TypeError, match=error_text):
         convert(value)
+
+
+def test_a_prior_with_too_few_coordinates_is_named() -> None:
+    with pytest.raises(ValueError, match=r"position_m must have three numbers, x, y and z, is \[1.0, 2.0\]"):
+        set_priors(LocalizeRequest(), Priors(position=PositionPrior(np.array([1.0, 2.0]), 1.0)))
+
+
+def test_a_missing_argument_is_reported_by_the_call_s_own_name() -> None:
+    with pytest.raises(TypeError, match=r"^localize\(\) missing 1 required positional argument: 'scene'"):
+        Client("localhost").localize(b"x", CAMERA)  # type: ignore[call-arg]
 
 
 def test_a_reference_whose_rotation_is_none_is_not_sent() -> None:

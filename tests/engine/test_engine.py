@@ -261,6 +261,19 @@ class TestTiers:
         assert "strong failed" in caplog.text
         assert "out of memory, say" in caplog.text
 
+    def test_a_rejection_says_what_was_not_tried(self, setting: Setting) -> None:
+        """A caller who is told to check the intrinsics would, though asking again is what helps."""
+        setting.replies = {"cheap": rejected(), "strong": rejected()}
+        told = hint_of(setting.localize()).message
+
+        def unavailable(*_: object) -> Answer:
+            raise RuntimeError("out of memory, say")
+
+        setting.replies["strong"] = unavailable
+        assert hint_of(setting.localize()).message == (
+            f"{told} Trying it with strong features was not finished: asking again, when less is asked, may help."
+        )
+
     def test_a_better_answer_never_waits_for_feature_extraction(self, setting: Setting) -> None:
         """It is done after the call, once, and the next doubtful query has the better answer."""
         setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": localized(SURE_INLIERS)}

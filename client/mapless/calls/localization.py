@@ -109,6 +109,9 @@ async def _localize_request(
     return request
 
 
+_localize_request.__qualname__ = "localize"  # by which Python names it where an argument is missing or unknown
+
+
 def _asked_like(
     model: Callable[Concatenate[Connection, P], Coroutine[Any, Any, Any]],
 ) -> Callable[[Callable[..., T]], Callable[Concatenate[Any, P], T]]:
