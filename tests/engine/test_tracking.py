@@ -13,9 +13,9 @@ from support.corner import CAMERA, photograph, pose
 from support.images import encode, textured
 
 from mapless.geometry import RigidTransform, rotation_from_vector
+from mapless_server.engine import stages
 from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.query import TRACK, Caller, Photo, Query, Result, Tier
-from mapless_server.engine.stages import QueryStages
 from mapless_server.errors import DataLoss
 from mapless_server.method.answer import Localization
 from mapless_server.method.features import SiftExtractor
@@ -190,7 +190,7 @@ def test_a_search_elsewhere_that_fails_costs_no_answer(localize: Localize, monke
     def fails(*_: object) -> bool:
         raise DataLoss("damaged")
 
-    monkeypatch.setattr(QueryStages, "_may_be_elsewhere", fails)
+    monkeypatch.setattr(stages, "may_be_elsewhere", fails)
     assert isinstance(localize(prior(TRUE.shifted(AWAY_M)), TWO_PLACES).answer.outcome, Rejection)
     localized(localize(Priors(position=PositionPrior(TRUE.translation, np.eye(3)))))
 

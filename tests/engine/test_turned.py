@@ -17,9 +17,9 @@ from support.images import encode, textured
 
 from mapless.axes import turned_raster
 from mapless.geometry import Camera
+from mapless_server.engine import stages
 from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.query import TURN, Caller, Photo, Query, QueryRun, QueryViews, Result, Tier
-from mapless_server.engine.stages import QueryStages
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.options import LocalizeOptions
@@ -134,10 +134,10 @@ def test_a_photograph_of_elsewhere_stays_rejected(localize: Localize) -> None:
 def test_a_turn_that_shows_no_more_is_not_searched_further(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Matches by chance may be clearly more in a turned raster; stronger features still get the photograph as it is."""
 
-    def turned(stages: QueryStages, run: QueryRun, tier: Tier) -> QueryViews:
+    def turned(run: QueryRun, tier: Tier) -> QueryViews:
         return run.views.turned(1, run.context)
 
-    monkeypatch.setattr(QueryStages, "_turned", turned)
+    monkeypatch.setattr(stages, "turned_to_match", turned)
     first = Blind()
     tiers = [Tier(first, Pipeline(), upright_only=True), Tier(UprightSift(), Pipeline(), upright_only=True)]
     with localizing(tmp_path, tiers) as answer:

@@ -1,7 +1,7 @@
 """The stages of a query in the work queue: prepare, coarse, refine; and again with stronger features if doubtful.
 
-The method computes the pose. This module loads the references, finds the photograph's features, checks the pose against
-hard priors, chooses between the answers of two tiers, and gives an answer when time runs out.
+The method computes the pose, `choosing` finds references and the photograph's features. This module checks the pose
+against hard priors, chooses between the answers of two searches, and gives an answer when time runs out.
 """
 
 import logging
@@ -9,10 +9,9 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
-from mapless_server.errors import DataLoss, NotFound, Unavailable
+from mapless_server.errors import NotFound, Unavailable
 from mapless_server.method import localize as method
 from mapless_server.method import pipeline
 from mapless_server.method.answer import Answer, Localization
@@ -24,15 +23,15 @@ from mapless_server.method.rejection import Hint, Hypothesis, Rejection, Rejecti
 from mapless_server.method.results import Support
 from mapless_server.method.trust.judge import trust_in_scene
 from mapless_server.scenes import ANYWHERE, Selection
-from mapless_server.scenes.library import FeaturesMissing, Loaded, load_usable
-from mapless_server.scenes.retrieval.ranking import spread_choice
+from mapless_server.scenes.library import FeaturesMissing
 from mapless_server.scheduling import Abandoned, Done, Ending, Failure, Fallback, Job, Next, StageResult, Step
 
 from . import tracking
+from .choosing import is_searched, load_chosen, may_be_elsewhere, turned_to_match, with_chosen, with_named
 from .failures import failure_of
 from .options import EscalationOptions
-from .query import COARSE, PREPARE, REFINE, TRACK, TURN, UNFINISHED, Query, QueryRun, QueryViews, Result, Tier
-from .tiers import CLEARLY_MORE, better_of, inlier_count, is_doubtful, of_two_places, place_of_priors
+from .query import COARSE, PREPARE, REFINE, TRACK, UNFINISHED, Query, QueryRun, Result, Tier
+from .tiers import better_of, inlier_count, is_doubtful, of_two_places, place_of_priors
 
 log = logging.getLogger(__name__)
 
@@ -46,9 +45,6 @@ answer is better than none; the rest of the time suffices to send it."""
 REMATCH_SHARE = 0.7
 """Of a tier's time, after which it stops matching the photograph again by a slow network (see `Matcher.rematch`); the
 rest is for the pose, which takes a second if matches are few."""
-
-TURN_REFERENCES = 10
-"""A photograph that was not localized is compared with so many references each way round, the most similar first."""
 
 ANSWER_MARGIN_S = 0.05
 """Before the deadline, for an answer that exists to reach its caller."""
@@ -126,7 +122,7 @@ class QueryStages:
             run = run.but(attributes=attributes)
             if run.tries_turns and not run.views.quarter_turns:
                 assert run.best is not None
-                views = self._turned(run, tier)
+                views = turned_to_match(run, tier)
                 if not views.quarter_turns:
                     spent_s = {f"{tier.features}/{name}": it for name, it in run.context.stage_seconds.items()}
                     best = replace(run.best, stage_seconds=run.best.seconds_with(spent_s))
@@ -135,12 +131,12 @@ class QueryStages:
             tracked = self._tracked(run, tier) if run.tracks else None
             if tracked is not None:
                 return tracked
-            run = self._with_chosen(run, tier) if query.chooses else self._with_named(run, tier)
+            run = with_chosen(run, tier) if query.chooses else with_named(run, tier)
         finally:
             # Described once and for all: the next queries find the features stored.
             job.unusual_s = run.context.stage_seconds.get("describe", 0.0)
         if not run.references:
-            where = "no reference is where the prior says" if _is_searched(run) else "the scene has no references"
+            where = "no reference is where the prior says" if is_searched(run) else "the scene has no references"
             if run.choice is not None and run.choice.references:
                 where = "what is stored of the references that resemble the photograph is damaged"
             return self._conclude(run, Answer(Rejection(RejectionReason.NO_USABLE_REFERENCES, where)))
@@ -211,7 +207,7 @@ class QueryStages:
             near = run.source.choose(query.scene_key, run.views, selection, context)
         if len(near.references) < 2:
             return None
-        generation, references = _load_chosen(run, [it.reference_id for it in near.references], tier)
+        generation, references = load_chosen(run, [it.reference_id for it in near.references], tier)
         views = run.views.reduced(tracking.MAX_PIXELS, context)
         tier = tracking.tracking_tier(tier)
         view, pipeline = views.view(tier.extractor, context), _pipeline_in(run, tier)
@@ -222,36 +218,12 @@ class QueryStages:
         alike = run.source.choose(query.scene_key, views, selection, context)
         others = [it.reference_id for it in tracking.elsewhere(near, alike)]
         with context.stage(TRACK):
-            rivals = _load_chosen(run, others, tier)[1] if others else ()
+            rivals = load_chosen(run, others, tier)[1] if others else ()
             if tracking.is_contradicted(answer, view, rivals, pipeline.matcher):
                 return None
         tracked = run.but(generation=generation, references=references, view=view, choice=near)
         result = replace(self._result(tracked, answer), tier=tier)
         return result if isinstance(result.answer.outcome, Localization) else None
-
-    def _with_named(self, run: QueryRun, tier: Tier) -> QueryRun:
-        # References come first: a wrong name is found before the photograph is described.
-        generation, references = run.load(run.query.reference_ids, tier)
-        view = run.views.view(tier.extractor, run.context)
-        return run.but(generation=generation, references=references, view=view)
-
-    def _with_chosen(self, run: QueryRun, tier: Tier) -> QueryRun:
-        """Chooses, among the references that resemble the photograph most, those with the most matches."""
-        query, context = run.query, run.context
-        choice = run.choose(query.narrowing)
-        generation, shortlist = _load_chosen(run, [it.reference_id for it in choice.references], tier)
-        view = run.views.view(tier.extractor, context)
-
-        def choose(indices: Sequence[int], match_counts: Sequence[int]) -> list[int]:
-            centres = [shortlist[i].world_from_camera.translation for i in indices]
-            return [indices[i] for i in spread_choice(match_counts, centres, query.reference_count)]
-
-        with context.stage("shortlist"):
-            matcher = tier.pipeline.matcher
-            matches = matcher.match_best(view, shortlist, query.reference_count, choose, context.check)
-        chosen, query_matches = tuple(shortlist[i] for i in matches), tuple(matches.values())
-        found = run.but(generation=generation, references=chosen, view=view, choice=choice)
-        return found.but(query_matches=query_matches)
 
     def _after_coarse(self, run: QueryRun, part: Coarse | Answer | Exception) -> StageResult:
         if isinstance(part, Exception):
@@ -317,30 +289,6 @@ class QueryStages:
             return self._search(self._further(run, query, run.tier + 1, result))
         return Done(result, _ending(result))
 
-    def _turned(self, run: QueryRun, tier: Tier) -> QueryViews:
-        """The photograph turned such that clearly more of it matches references than as it is; else as it is.
-
-        The best of its references counts: others may not show the same.
-        """
-        with run.context.stage(TURN):
-            found = [run.views, *(run.views.turned(turns, run.context) for turns in (1, 2, 3))]
-        counts = [self._most_matches(run.but(views=views), tier) for views in found]
-        best = max(range(4), key=counts.__getitem__)
-        return found[best if counts[best] >= CLEARLY_MORE * counts[0] else 0]
-
-    def _most_matches(self, run: QueryRun, tier: Tier) -> int:
-        """Most matches of the photograph with one of the references that it resembles, or of those named."""
-        query = run.query
-        if query.chooses:
-            chosen = run.choose(query.narrowing).references[:TURN_REFERENCES]
-            references = _load_chosen(run, [it.reference_id for it in chosen], tier)[1]
-        else:
-            references = run.load(query.reference_ids[:TURN_REFERENCES], tier)[1]
-        view = run.views.view(tier.extractor, run.context)
-        with run.context.stage(TURN):
-            matches = tier.pipeline.matcher.match_quickly(view, references, run.context.check)
-        return max(map(len, matches), default=0)
-
     def _at_place(self, run: QueryRun, place: Hypothesis, ambiguous: Result) -> StageResult:
         """Computes the pose from the references of one place alone."""
         kept = [i for i, it in enumerate(run.references) if it.name in place.references]
@@ -363,38 +311,14 @@ class QueryStages:
         return self._next(run, run.first_step)
 
     def _searches_elsewhere(self, run: QueryRun, answer: Answer) -> bool:
-        """`_may_be_elsewhere`, except that its failure does not cost the answer that there is."""
+        """`may_be_elsewhere`, except that its failure does not cost the answer that there is."""
         try:
-            return self._may_be_elsewhere(run, answer)
+            return may_be_elsewhere(run, self._tiers[run.tier], answer)
         except Exception as error:
             if isinstance(error, Abandoned) or failure_of(error) is Failure.DEVICE_LOST:
                 raise
             log.warning("references elsewhere could not be compared; the first answer is given", exc_info=error)
             return False
-
-    def _may_be_elsewhere(self, run: QueryRun, answer: Answer) -> bool:
-        """Whether soft priors may have led to the wrong references.
-
-        That is if the photograph was not localized, and references elsewhere would be chosen without them; or if the
-        reference that resembles it most is not where they say, and references elsewhere contradict the pose.
-        """
-        outcome, query = answer.outcome, run.query
-        is_excluded = isinstance(outcome, Rejection) and bool(outcome.intrinsics_checks)
-        if run.choice is None or query.is_part or is_excluded or not query.narrowing.has_likely:
-            return False
-        with run.context.stage("retrieval"):
-            alike = run.choose(query.narrowing.limits).references
-        inside = {it.reference_id for it in run.choice.references}
-        if isinstance(outcome, Rejection):
-            return any(it.reference_id not in inside for it in alike)
-        if not alike or alike[0].reference_id in inside:
-            return False
-        assert run.view is not None
-        tier = self._tiers[run.tier]
-        others = [it.reference_id for it in alike if it.reference_id not in inside][: tracking.OTHERS]
-        with run.context.stage("correspond"):
-            rivals = _load_chosen(run, others, tier)[1]
-            return tracking.is_contradicted(answer, run.view, rivals, tier.pipeline.matcher)
 
     def _doubt_in(self, run: QueryRun) -> EscalationOptions:
         """Adapts the options to the scene's quantiles of trust, so that the same answers are doubtful in all scenes."""
@@ -429,20 +353,12 @@ class QueryStages:
             if beyond:
                 answer = replace(answer, outcome=Rejection(RejectionReason.PRIOR_CONFLICT, beyond))
         if isinstance(answer.outcome, Rejection):
-            answer = hinted(answer, run.view, run.references, _is_searched(run) and not narrowing.is_empty)
+            answer = hinted(answer, run.view, run.references, is_searched(run) and not narrowing.is_empty)
         seconds = run.context.stage_seconds | answer.stage_seconds
         if run.best is not None:
             seconds = run.best.seconds_with({f"{tier.features}/{name}": it for name, it in seconds.items()})
         used = run.references, run.generation, run.view.camera, run.choice, run.attributes
         return Result(answer, tier, *used, seconds)
-
-
-def _load_chosen(run: QueryRun, reference_ids: Sequence[str], tier: Tier) -> Loaded:
-    """Loads chosen references without damaged ones; a damaged reference that the caller named is an error."""
-    if run.query.reference_ids:
-        return run.load(reference_ids, tier)
-    report = partial(run.source.report_damaged, run.query.scene_key)
-    return load_usable(lambda some: run.load(some, tier), reference_ids, (DataLoss,), report)
 
 
 def _pipeline_in(run: QueryRun, tier: Tier) -> Pipeline:
@@ -465,11 +381,6 @@ def _told_unfinished(run: QueryRun, answer: Answer, tier: Tier) -> Answer:
         untried = "with references of one of the places"
     told = f"{outcome.hint.message} Trying it {untried} was not finished: asking again, when less is asked, may help."
     return replace(answer, outcome=replace(outcome, hint=replace(outcome.hint, message=told)))
-
-
-def _is_searched(run: QueryRun) -> bool:
-    """Whether the scene has references to choose from."""
-    return run.choice is not None and bool(run.choice.descriptor)
 
 
 def _shows_no_more(best: Result, turned: Result) -> bool:

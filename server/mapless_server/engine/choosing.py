@@ -1,0 +1,110 @@
+"""Which references a query uses: those that it names, or those that resemble the photograph and match it most.
+
+A photograph that was not localized is also compared with them turned, and with references elsewhere than priors say.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+
+from mapless_server.errors import DataLoss
+from mapless_server.method.answer import Answer
+from mapless_server.method.rejection import Rejection
+from mapless_server.scenes.library import Loaded, load_usable
+from mapless_server.scenes.retrieval.ranking import spread_choice
+
+from . import tracking
+from .query import TURN, QueryRun, QueryViews, Tier
+from .tiers import CLEARLY_MORE
+
+TURN_REFERENCES = 10
+"""A photograph that was not localized is compared with so many references each way round, the most similar first."""
+
+
+def with_named(run: QueryRun, tier: Tier) -> QueryRun:
+    """Loads the references that the query names, and finds the photograph's features."""
+    # References come first: a wrong name is found before the photograph is described.
+    generation, references = run.load(run.query.reference_ids, tier)
+    view = run.views.view(tier.extractor, run.context)
+    return run.but(generation=generation, references=references, view=view)
+
+
+def with_chosen(run: QueryRun, tier: Tier) -> QueryRun:
+    """Chooses, among the references that resemble the photograph most, those with the most matches."""
+    query, context = run.query, run.context
+    choice = run.choose(query.narrowing)
+    generation, shortlist = load_chosen(run, [it.reference_id for it in choice.references], tier)
+    view = run.views.view(tier.extractor, context)
+
+    def choose(indices: Sequence[int], match_counts: Sequence[int]) -> list[int]:
+        centres = [shortlist[i].world_from_camera.translation for i in indices]
+        return [indices[i] for i in spread_choice(match_counts, centres, query.reference_count)]
+
+    with context.stage("shortlist"):
+        matcher = tier.pipeline.matcher
+        matches = matcher.match_best(view, shortlist, query.reference_count, choose, context.check)
+    chosen, query_matches = tuple(shortlist[i] for i in matches), tuple(matches.values())
+    found = run.but(generation=generation, references=chosen, view=view, choice=choice)
+    return found.but(query_matches=query_matches)
+
+
+def load_chosen(run: QueryRun, reference_ids: Sequence[str], tier: Tier) -> Loaded:
+    """Loads chosen references without damaged ones; a damaged reference that the caller named is an error."""
+    if run.query.reference_ids:
+        return run.load(reference_ids, tier)
+    report = partial(run.source.report_damaged, run.query.scene_key)
+    return load_usable(lambda some: run.load(some, tier), reference_ids, (DataLoss,), report)
+
+
+def turned_to_match(run: QueryRun, tier: Tier) -> QueryViews:
+    """The photograph turned such that clearly more of it matches references than as it is; else as it is.
+
+    The best of its references counts: others may not show the same.
+    """
+    with run.context.stage(TURN):
+        found = [run.views, *(run.views.turned(turns, run.context) for turns in (1, 2, 3))]
+    counts = [_most_matches(run.but(views=views), tier) for views in found]
+    best = max(range(4), key=counts.__getitem__)
+    return found[best if counts[best] >= CLEARLY_MORE * counts[0] else 0]
+
+
+def _most_matches(run: QueryRun, tier: Tier) -> int:
+    """Most matches of the photograph with one of the references that it resembles, or of those named."""
+    query = run.query
+    if query.chooses:
+        chosen = run.choose(query.narrowing).references[:TURN_REFERENCES]
+        references = load_chosen(run, [it.reference_id for it in chosen], tier)[1]
+    else:
+        references = run.load(query.reference_ids[:TURN_REFERENCES], tier)[1]
+    view = run.views.view(tier.extractor, run.context)
+    with run.context.stage(TURN):
+        matches = tier.pipeline.matcher.match_quickly(view, references, run.context.check)
+    return max(map(len, matches), default=0)
+
+
+def may_be_elsewhere(run: QueryRun, tier: Tier, answer: Answer) -> bool:
+    """Whether soft priors may have led to the wrong references.
+
+    That is if the photograph was not localized, and references elsewhere would be chosen without them; or if the
+    reference that resembles it most is not where they say, and references elsewhere contradict the pose.
+    """
+    outcome, query = answer.outcome, run.query
+    is_excluded = isinstance(outcome, Rejection) and bool(outcome.intrinsics_checks)
+    if run.choice is None or query.is_part or is_excluded or not query.narrowing.has_likely:
+        return False
+    with run.context.stage("retrieval"):
+        alike = run.choose(query.narrowing.limits).references
+    inside = {it.reference_id for it in run.choice.references}
+    if isinstance(outcome, Rejection):
+        return any(it.reference_id not in inside for it in alike)
+    if not alike or alike[0].reference_id in inside:
+        return False
+    assert run.view is not None
+    others = [it.reference_id for it in alike if it.reference_id not in inside][: tracking.OTHERS]
+    with run.context.stage("correspond"):
+        rivals = load_chosen(run, others, tier)[1]
+        return tracking.is_contradicted(answer, run.view, rivals, tier.pipeline.matcher)
+
+
+def is_searched(run: QueryRun) -> bool:
+    """Whether the scene has references to choose from."""
+    return run.choice is not None and bool(run.choice.descriptor)
