@@ -1,6 +1,8 @@
 """When a call is tried again, and when not: decided without a server, by a planted clock."""
 
-from collections.abc import Callable, Coroutine
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from contextlib import aclosing
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -9,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.clients import Played
 
+from mapless.client import Client, _iterated
 from mapless.connection import Connection
 from mapless.errors import (
     AlreadyExists,
@@ -169,6 +172,46 @@ def test_a_look_up_has_the_deadline_of_any_call() -> None:
 def test_no_time_is_not_the_usual_time(timeout_s: float) -> None:
     with pytest.raises(ValueError, match="timeout_s must be above 0"):
         Played(asking(timeout_s=timeout_s), [Empty()], ConnectOptions())
+
+
+class Stream:
+    """A gRPC stream of an early answer, and then an interruption by the keyboard."""
+
+    def __init__(self) -> None:
+        self.cancelled = 0
+
+    def __iter__(self) -> Iterator[Any]:
+        yield SimpleNamespace(is_final=False)
+        raise KeyboardInterrupt
+
+    def cancel(self) -> None:
+        self.cancelled += 1
+
+
+@pytest.mark.parametrize("end", ["interrupted", "closed", "forgotten", "raised"])
+def test_a_blocking_stream_is_cancelled_however_it_ends(end: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = Stream()
+
+    async def call(connection: Connection) -> AsyncIterator[Any]:
+        async with aclosing(connection.streamed("M", Empty(), lambda it: it, None)) as answers:
+            async for answer in answers:
+                yield answer
+
+    monkeypatch.setattr(Client, "_start", lambda *_: stream)
+    with Client("localhost:1") as client:
+        answers: Any = _iterated(call)(client)
+        assert not next(answers).is_final
+        if end == "closed":
+            answers.close()
+        elif end == "forgotten":
+            del answers
+        elif end == "raised":
+            with pytest.raises(LookupError):
+                answers.throw(LookupError())
+        else:
+            with pytest.raises(KeyboardInterrupt):
+                next(answers)
+    assert stream.cancelled == 1
 
 
 def test_an_answer_that_cannot_be_read_is_the_servers_fault() -> None:
