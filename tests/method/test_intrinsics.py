@@ -269,8 +269,12 @@ def rejection_of(
     outliers: float = 0.0,
     sigma: float | None = None,
     doubted: float = 3.1,
+    is_estimated: bool = False,
 ) -> tuple[Rejection | None, Camera]:
-    """Of a photograph with intrinsics that are wrong by these factors, and seem so by `doubted` standard deviations."""
+    """Of a photograph with intrinsics that are wrong by these factors, and seem so by `doubted` standard deviations.
+
+    They may be estimated with the pose.
+    """
     scene = make_scene(random_for("wrong camera"))
     random, true = random_for("outliers"), scene.query.camera
     keypoints = scene.query.features.keypoints.copy()
@@ -286,6 +290,9 @@ def rejection_of(
     )
     query = replace(scene.query, camera=given, features=replace(scene.query.features, keypoints=keypoints))
     structure, matches, estimate = stages(replace(scene, query=query), scene.references)
+    if is_estimated:
+        structure, matches, estimate = stages(scene, scene.references)
+        estimate = replace(estimate, view=scene.query)
     usual = (IntrinsicsSigma() if sigma is None else IntrinsicsSigma(focal_share=sigma)).of(given)
     zero = np.zeros(4)
     value = np.array([doubted * np.hypot(usual[0], usual[0]), 0, 0, 0])
@@ -310,12 +317,19 @@ def rejection_of(
 def test_a_planted_gross_error_is_named_with_its_value(
     errors: dict[str, float], named: set[IntrinsicsParameter]
 ) -> None:
-    rejection, true = rejection_of(**errors)
+    rejection, true = rejection_of(**errors)  # type: ignore[arg-type]  # all are factors
     assert rejection
     assert {it.parameter for it in rejection.intrinsics_checks if it.conflict} == named
     (focal,) = (it for it in rejection.intrinsics_checks if it.parameter is FOCAL)
     assert focal.estimated == pytest.approx(true.focal_x_px, rel=0.1)
     assert f"focal_x_px {focal.estimated:.0f} instead of {focal.given:.0f}" in rejection.message
+
+
+@pytest.mark.parametrize(("is_estimated", "is_named"), [(False, True), (True, False)])
+def test_intrinsics_estimated_with_the_pose_are_its_own(is_estimated: bool, is_named: bool) -> None:
+    """A caller that allows them is not told that another camera fits better than those it gave."""
+    rejection, _ = rejection_of(focal=1.25, sigma=0.08, is_estimated=is_estimated)
+    assert (rejection is not None) == is_named
 
 
 def test_a_camera_that_nothing_doubts_is_not_compared() -> None:

@@ -189,7 +189,7 @@ def download_reference(client: Client, arguments: argparse.Namespace) -> int:
         sys.stdout.buffer.write(image)
         return 0
     ending = format_of_image(image).replace("jpeg", "jpg")
-    file = arguments.output or Path(f"{found.reference_id}.{ending}")
+    file = arguments.output or Path(found.reference_id + (ending and f".{ending}"))
     try:
         with file.open("wb" if arguments.force else "xb") as target:
             target.write(image)

@@ -164,7 +164,8 @@ def wrong_camera(support: Support, best_reference: str, intrinsics: IntrinsicsSi
     if not others:
         return None
     best = max(map(scored, others), key=lambda it: it[0])
-    own = scored(query.camera, support.estimate.world_from_camera)[0]
+    # The estimate's own intrinsics are those that were estimated with it, within what the caller allows.
+    own = scored((support.estimate.view or query).camera, support.estimate.world_from_camera)[0]
     if not by_lines:
         own = MIN_GAIN * max(own, scored(query.camera)[0])
         half_step = 2 ** (0.5 / steps_per_octave)
