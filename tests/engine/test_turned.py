@@ -26,7 +26,7 @@ from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.views import View, view_of
-from mapless_server.scenes import Narrowing
+from mapless_server.scenes import ANYWHERE, Narrowing, Sphere
 from mapless_server.scheduling import Flow
 from mapless_server.security import SceneKey
 from mapless_server.serve.assembly import engine_over
@@ -88,8 +88,10 @@ def localizing(folder: Path, tiers: Sequence[Tier]) -> Iterator[Localize]:
         references = [NewReference(i, p.image, CAMERA, at, it.views, it.descriptors) for i, p, at, it in shown]
         store.add_references(SCENE, references)
 
-        def answer(image: bytes, camera: Camera, named: tuple[str, ...] = ()) -> Result:
-            asked = Query(SCENE, named, Photo(image, camera, "image"), Narrowing(), 8, LocalizeOptions())
+        def answer(
+            image: bytes, camera: Camera, named: tuple[str, ...] = (), narrowing: Narrowing = ANYWHERE
+        ) -> Result:
+            asked = Query(SCENE, named, Photo(image, camera, "image"), narrowing, 8, LocalizeOptions())
             return loop.run_until_complete(engine.run(engine.query_job(asked, caller)))
 
         yield answer
@@ -121,6 +123,13 @@ def test_a_turned_photograph_gets_the_pose_of_its_raster(
 def test_an_upright_photograph_is_not_tried_turned(localize: Localize) -> None:
     result = localize(photograph(TRUE), CAMERA, ())
     assert isinstance(result.answer.outcome, Localization)
+    assert not any(stage.endswith(TURN) for stage in result.stage_seconds)
+
+
+def test_a_photograph_found_beyond_its_limits_is_not_tried_turned(localize: Localize) -> None:
+    result = localize(photograph(TRUE), CAMERA, NAMED, Narrowing(position=Sphere(TRUE.translation + 5.0, 1.0)))
+    assert isinstance(result.answer.outcome, Rejection)
+    assert result.answer.outcome.reason is RejectionReason.PRIOR_CONFLICT
     assert not any(stage.endswith(TURN) for stage in result.stage_seconds)
 
 

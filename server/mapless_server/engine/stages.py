@@ -278,8 +278,8 @@ class QueryStages:
         elif self._searches_elsewhere(run, answer):
             elsewhere = replace(query, narrowing=query.narrowing.limits)
             return self._search(replace(self._further(run, elsewhere, run.tier, result), narrowed=query))
-        is_lost = isinstance(result.answer.outcome, Rejection) and is_doubtful(result.answer, self._doubt_in(run))
-        if is_lost and run.tier == 0 and not run.tries_turns and self._tiers[0].upright_only:
+        is_first = run.tier == 0 and not run.tries_turns
+        if is_first and self._tiers[0].upright_only and _is_lost(result.answer, self._doubt_in(run)):
             return self._search(replace(self._further(run, query, 0, result), tries_turns=True))
         return self._stronger(run, query, result)
 
@@ -381,6 +381,13 @@ def _told_unfinished(run: QueryRun, answer: Answer, tier: Tier) -> Answer:
         untried = "with references of one of the places"
     told = f"{outcome.hint.message} Trying it {untried} was not finished: asking again, when less is asked, may help."
     return replace(answer, outcome=replace(outcome, hint=replace(outcome.hint, message=told)))
+
+
+def _is_lost(answer: Answer, options: EscalationOptions) -> bool:
+    """Whether a photograph was not localized and other matches may; one that fits two places was found as it is."""
+    found = RejectionReason.AMBIGUOUS, RejectionReason.PRIOR_CONFLICT
+    outcome = answer.outcome
+    return isinstance(outcome, Rejection) and outcome.reason not in found and is_doubtful(answer, options)
 
 
 def _shows_no_more(best: Result, turned: Result) -> bool:
