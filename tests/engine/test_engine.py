@@ -30,7 +30,7 @@ from mapless_server.method.results import PoseStage
 from mapless_server.method.trust.judge import LEVELS, JudgeOptions
 from mapless_server.method.views import Features, Matches, PosedView, View
 from mapless_server.scenes import Narrowing, Sphere
-from mapless_server.scheduling import CostModel, Flow, Job, Next
+from mapless_server.scheduling import CostModel, Done, Flow, Job, Next
 from mapless_server.security import SceneKey
 from mapless_server.serve.assembly import engine_over
 from mapless_server.store import NewReference, SelfCalibration, Store, calibrations
@@ -273,6 +273,19 @@ class TestTiers:
         assert hint_of(setting.localize()).message == (
             f"{told} Trying it with strong features was not finished: asking again, when less is asked, may help."
         )
+
+    def test_a_search_that_is_given_up_leaves_the_first_answer(self, setting: Setting) -> None:
+        tried = whole(lambda *_: rejected())
+        stages = QueryStages(setting.engine.tiers, ESCALATION, tried, lambda run: run.tier == 1)
+        job = setting.engine.query_job(query_of(("r0", "r1")), caller())
+        while True:
+            (result,) = getattr(stages, job.step.stage)([job])
+            if isinstance(result, Done):
+                break
+            job.step = result.step
+        assert result.value.tier.extractor.name == "cheap"
+        assert "strong features was not finished" in hint_of(result.value).message
+        assert list(result.value.stage_seconds)[-1] == "strong/unfinished"
 
     def test_a_better_answer_never_waits_for_feature_extraction(self, setting: Setting) -> None:
         """It is done after the call, once, and the next doubtful query has the better answer."""

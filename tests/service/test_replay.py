@@ -14,6 +14,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -41,7 +42,7 @@ from mapless_server.services.capture.files import blob_path, calls_of
 from mapless_server.settings import load_settings
 from mapless_tools.child import child_server
 from mapless_tools.replay import report as report_module
-from mapless_tools.replay.recompute import recompute
+from mapless_tools.replay.recompute import given_up, recompute
 from mapless_tools.replay.report import Report, Selection, select
 
 pytestmark = pytest.mark.nightly("replay")
@@ -306,6 +307,25 @@ def test_a_replay_that_is_not_possible_is_refused(captured: Path, arguments: lis
     assert done.returncode == 2
     assert message in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("stages", "tier", "before", "is_given_up"),
+    [
+        (("pnp", "strong/unfinished"), 1, ("pnp",), True),
+        (("pnp", "strong/unfinished"), 0, ("pnp",), False),
+        (("pnp", "cheap/unfinished"), 0, ("pnp",), True),
+        (("pnp", "cheap/pnp", "cheap/unfinished"), 0, ("pnp",), False),
+        (("pnp", "cheap/pnp", "cheap/unfinished"), 0, ("pnp", "cheap/pnp"), True),
+        (("pnp", "cheap/pnp"), 0, ("pnp",), False),
+    ],
+)
+def test_searches_that_had_no_time_are_given_up_again(
+    stages: tuple[str, ...], tier: int, before: tuple[str, ...], is_given_up: bool
+) -> None:
+    tiers: Any = [SimpleNamespace(features=it) for it in ("cheap", "strong")]
+    run: Any = SimpleNamespace(tier=tier, best=SimpleNamespace(stage_seconds=dict.fromkeys(before, 0.1)))
+    assert given_up(stages, tiers)(run) == is_given_up
 
 
 def test_a_folder_that_is_none_is_refused(tmp_path: Path) -> None:

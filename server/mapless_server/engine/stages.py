@@ -67,11 +67,21 @@ class Method:
 class QueryStages:
     """Computes the three stages; its methods run in the queue's threads."""
 
-    def __init__(self, tiers: Sequence[Tier], escalation: EscalationOptions, method: Method | None = None) -> None:
-        """Uses these tiers, the cheapest first; see `EngineOptions` for the options."""
+    def __init__(
+        self,
+        tiers: Sequence[Tier],
+        escalation: EscalationOptions,
+        method: Method | None = None,
+        gives_up: Callable[[QueryRun], bool] = lambda run: False,
+    ) -> None:
+        """Uses these tiers, the cheapest first; see `EngineOptions` for the options.
+
+        A further search that `gives_up` is not begun, as if there were no time: where a captured call is replayed.
+        """
         self._tiers = tiers
         self._escalation = escalation
         self._method = method or Method()
+        self._gives_up = gives_up
 
     def prepare(self, jobs: Sequence[Job]) -> list[StageResult]:
         """Loads references, finds features and computes correspondences."""
@@ -308,7 +318,7 @@ class QueryStages:
         return QueryRun(query, run.source, run.views, run.deadline_s, run.on_coarse, tier, best, *limits)
 
     def _search(self, run: QueryRun) -> StageResult:
-        return self._next(run, run.first_step)
+        return self._unfinished(run) if self._gives_up(run) else self._next(run, run.first_step)
 
     def _searches_elsewhere(self, run: QueryRun, answer: Answer) -> bool:
         """`may_be_elsewhere`, except that its failure does not cost the answer that there is."""

@@ -9,7 +9,7 @@ import asyncio
 import hashlib
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -231,7 +231,7 @@ class _Recomputing:
         self._parts = {part.field: part for part in call.parts}
         described = zip(self._parts, diagnostics_of(then), strict=True)
         stages = {field: [it.stage for it in about.stages] for field, about in described}
-        self._unfinished = {field: _unfinished(names) for field, names in stages.items()}
+        self._stages = stages
         self._described = {field for field, names in stages.items() if RETRIEVAL in names}
         unrefined = Method(refine=lambda coarse: coarse_answer(coarse) or refine(coarse))
         self._method = unrefined if _is_cut_short(request, then) else Method()
@@ -245,9 +245,8 @@ class _Recomputing:
 
     async def run(self, job: Job) -> Result:
         run: QueryRun = job.step.payload
-        given_up = self._unfinished[run.query.photo.field]
-        tried = [tier for tier in self._tiers if tier.extractor.name not in given_up]
-        stages = QueryStages(tried or self._tiers, self.options.escalation, self._method)
+        gives_up = given_up(self._stages[run.query.photo.field], self._tiers)
+        stages = QueryStages(self._tiers, self.options.escalation, self._method, gives_up)
         return await asyncio.to_thread(_compute, stages, job)
 
     @contextmanager
@@ -269,9 +268,26 @@ def _compute(stages: QueryStages, job: Job) -> Result:
         job.step = result.step
 
 
-def _unfinished(stages: Sequence[str]) -> frozenset[str]:
-    """Extractors that there was no time for."""
-    return frozenset(it.removesuffix(UNFINISHED) for it in stages if it.endswith(UNFINISHED))
+def given_up(stages: Sequence[str], tiers: Sequence[Tier]) -> Callable[[QueryRun], bool]:
+    """Which further searches had no time, of an answer with these stages.
+
+    The first tier may search twice more: the whole scene, and the photograph turned. The first of these was finished if
+    the answer has other stages of it.
+    """
+    unfinished = {it.removesuffix(UNFINISHED) for it in stages if it.endswith(UNFINISHED)}
+    finished = _searched_again([it for it in stages if not it.endswith(UNFINISHED)])
+
+    def is_given_up(run: QueryRun) -> bool:
+        features = tiers[run.tier].features
+        has_searched = run.best is not None and features in _searched_again(run.best.stage_seconds)
+        return features in unfinished and has_searched == (features in finished)
+
+    return is_given_up
+
+
+def _searched_again(stages: Iterable[str]) -> set[str]:
+    """Extractors of further searches that were finished."""
+    return {it.rpartition("/")[0] for it in stages} - {""}
 
 
 def _is_cut_short(request: Any, then: Response) -> bool:
