@@ -218,6 +218,20 @@ class TestReloading:
         assert source.refresh()
         assert source.value.find(token) == source.value.tokens[0]
 
+    def test_a_changed_file_is_read_again_after_a_failure(self, path: Path) -> None:
+        path.write_text("{}")
+        faults = [SecurityError("too many open files")]
+
+        def read() -> Tokens:
+            if path.read_text() != "{}" and faults:
+                raise faults.pop()
+            return read_tokens(path)
+
+        source = Reloading([path], read, "tokens")
+        token = create_token(path, "a", "t", "read", None)
+        assert [source.refresh() for _ in range(2)] == [False, True]
+        assert source.value.find(token) is not None
+
 
 class TestAccess:
     def test_the_table_has_every_method_and_no_other(self) -> None:

@@ -176,9 +176,9 @@ class Result:
         processed: the camera of the reduced image that features were found in.
         choice: how the references were chosen; None if the caller named them.
         attributes: attributes of the scene.
-        stage_seconds: time of every stage that was computed, in order, of all tiers. The name of a stage of a later
-            tier begins with its extractor's name and a slash. Such a tier has only "unfinished" if it failed, was ended
-            for lack of time, or has not described the references yet.
+        stage_seconds: time of every stage that was computed, in order, of all searches. The name of a stage of a
+            further search begins with its extractor's name and a slash. Such a search has only "unfinished" if it
+            failed, was ended for lack of time, or its tier has not described the references yet.
     """
 
     answer: Answer

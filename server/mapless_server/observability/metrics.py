@@ -208,7 +208,10 @@ class Metrics(Observer, BackgroundObserver):
     # Answers
 
     def stages(self, stage_seconds: Mapping[str, float]) -> None:
-        """Records the durations of an answer's stages; those of stronger features are named "extractor/stage"."""
+        """Records the durations of an answer's stages.
+
+        Those of a further search, with stronger features or of the photograph turned, are named "extractor/stage".
+        """
         for name, seconds in stage_seconds.items():
             extractor, _, stage = name.rpartition("/")
             self._stage_seconds(stage, "1" if extractor else "0").observe(seconds)
