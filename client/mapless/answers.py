@@ -48,11 +48,18 @@ class Accuracy:
 
     def text(self, kind: str, unit: str) -> str:
         """The radii of a `kind`, "position" or "rotation", as a phrase; `unit` is "m", "units" or "deg"."""
-        factor, shown = (100, "cm") if unit == "m" else (1, unit)
         suffix = "m" if kind == "position" else "deg"
-        radii = [factor * getattr(self, f"{kind}_{share}_{suffix}") for share in (68, 95)]
+        radii = [getattr(self, f"{kind}_{share}_{suffix}") for share in (68, 95)]
+        shown = unit
+        if unit == "m" and radii[0] < 1:
+            radii, shown = [100 * it for it in radii], "cm"
         note = f"calibrated {self.calibrated_by}" if self.calibrated_by else "uncalibrated"
-        return f"within {radii[0]:.2g} {shown} (68 %), {radii[1]:.2g} {shown} (95 %, {note})"
+        return f"within {_plain(radii[0])} {shown} (68 %), {_plain(radii[1])} {shown} (95 %, {note})"
+
+
+def _plain(number: float) -> str:
+    """Two digits, and all before the decimal point: 0.82, 1.4, 140."""
+    return f"{number:.0f}" if number >= 99.5 else f"{number:.2g}"
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,8 @@ _NOT_CONNECTED_BECAUSE = {
     "Hostname Verification Check failed": "the server's certificate is for another name",
     "unable to get local issuer certificate": "the server's certificate is not signed by a known authority; give its "
     "certificate with --ca FILE (Python: root_certificates)",
+    "self signed certificate": "the server's certificate is self-signed; give it with --ca FILE (Python: "
+    "root_certificates)",
     "Failed to create security handshaker": "the given certificates are unusable; they must be PEM",
     "Connection refused": f"{REFUSED} (connection refused)",
 }

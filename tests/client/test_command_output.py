@@ -10,7 +10,7 @@ import pytest
 from support.planted_answers import diagnostics, localized, rejected, truth
 
 from mapless import wire
-from mapless.answers import IntrinsicsCheck, LocalizationResult, PriorCheck, Rejected
+from mapless.answers import Accuracy, IntrinsicsCheck, LocalizationResult, PriorCheck, Rejected
 from mapless.axes import Axes, pose_to
 from mapless.cameras import read_camera
 from mapless.cli.arguments import make_parser
@@ -174,3 +174,13 @@ def test_pixels_are_to_be_encoded_first() -> None:
 def test_the_cameras_of_a_folder_are_not_one_camera(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="a single camera is needed"):
         read_camera(tmp_path / "cameras.json")
+
+
+@pytest.mark.parametrize(
+    ("radius_m", "unit", "shown"),
+    [(0.0082, "m", "within 0.82 cm (68 %), 1.6 cm"), (1.4, "m", "within 1.4 m (68 %), 2.8 m")]
+    + [(0.7, "m", "within 70 cm (68 %), 140 cm"), (612.0, "units", "within 612 units (68 %), 1224 units")],
+)
+def test_radii_have_a_unit_that_suits_their_size(radius_m: float, unit: str, shown: str) -> None:
+    accuracy = Accuracy(radius_m, 2 * radius_m, 0.1, 0.2, calibrated=False)
+    assert accuracy.text("position", unit) == f"{shown} (95 %, uncalibrated)"

@@ -39,6 +39,7 @@ from mapless_server.method.rejection import (
 from mapless_server.method.results import PointMatches, PoseEstimate, PoseStage, Structure, Support, TwoViewSupport
 from mapless_server.method.uncertainty.radii import accuracy_from_covariance, error_radii
 from mapless_server.scheduling import Failure
+from mapless_server.store import SceneAttributes
 
 OPTIONS = EscalationOptions()
 CAMERA = Camera(96, 64, 80.0, 81.0, 47.5, 31.5)
@@ -147,10 +148,12 @@ class TestBetter:
 
     def test_a_photograph_that_fits_two_places_turned_says_so(self) -> None:
         as_it_is, turned = found(rejected(RejectionReason.GATE), 0.0, 30), found(localized(3.0, inliers=40), 3.0, 40)
-        results = [Result(it, CHEAP, (), 1, CAMERA) for it in (as_it_is, turned)]
-        outcome = better_of(results[0], results[1]).answer.outcome
-        assert isinstance(outcome, Rejection)
-        assert outcome.message.startswith("the photograph fits two places: the pose as it is (30 inliers)")
+        for scene, unit in ((SceneAttributes(), "m"), (SceneAttributes(arbitrary_unit=True), "units")):
+            results = [Result(it, CHEAP, (), 1, CAMERA, attributes=scene) for it in (as_it_is, turned)]
+            outcome = better_of(results[0], results[1]).answer.outcome
+            assert isinstance(outcome, Rejection)
+            assert outcome.message.startswith("the photograph fits two places: the pose as it is (30 inliers)")
+            assert f" are 3.00 {unit} and " in outcome.message
 
     @pytest.mark.parametrize("reason", [RejectionReason.GATE, RejectionReason.AMBIGUOUS])
     @pytest.mark.parametrize(("inliers", "is_answered"), [(44, False), (45, True)])

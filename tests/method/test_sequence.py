@@ -10,6 +10,7 @@ from support.groups import NOTHING, caller_pose, drifting, error_m, images_of, r
 from support.scenes import SceneOptions, look_at, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg, rotation_from_vector
+from mapless_server.method.groups.checks import check_tracking
 from mapless_server.method.groups.drift import SequenceState, step_sigma
 from mapless_server.method.groups.jumps import find_jumps
 from mapless_server.method.groups.rig import solve_rig
@@ -168,6 +169,19 @@ def test_a_last_frame_not_localized_alone_is_cut_by_its_matches() -> None:
     found = estimate(solve_sequence(images, session, False))
     assert [(it.before, it.after) for it in found.jumps] == [(2, 3)]
     assert error_m(found.world_from_camera[-1], truth[-1]) < 0.01
+
+
+@pytest.mark.parametrize("unit_m", [0.001, 0.01, 0.3048, 1000.0])
+def test_a_session_in_another_unit_is_no_series_of_jumps(unit_m: float) -> None:
+    """Steps to and fro, whose stated noise in a unit that is far too small covers what they are together."""
+    random = random_for("other unit", unit_m)
+    truth = [walk(random, 6)[i] for i in (0, 3, 1, 4, 2, 5)]
+    images = images_of(random, truth, alone=True, own_noise_m=0.002)
+    session = rescaled(drifting(random, truth, 0.01), 1 / unit_m)
+    outcome = solve_sequence(images, session, False)
+    if not isinstance(outcome, Rejection):
+        outcome = check_tracking(outcome, session)
+    assert "contradict the photographs between all 6" in rejection(outcome).message
 
 
 def test_steps_that_fit_no_unit_are_rejected() -> None:

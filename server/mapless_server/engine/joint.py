@@ -23,7 +23,7 @@ def pose_rig(
     if isinstance(found, Rejection):
         return _hinted(found, results)
     poses = {i: found.world_from_rig.compose(it) for i, it in enumerate(rig_from_camera)}
-    return _beyond_limits(queries, poses, "images") or found
+    return _beyond_limits(queries, poses, "images", results[0].attributes.unit) or found
 
 
 def pose_sequence(
@@ -33,7 +33,7 @@ def pose_sequence(
     estimate_scale: bool,
 ) -> SequenceEstimate | Rejection:
     """Estimates the poses of a sequence's frames, in order, in OpenCV's axes."""
-    unit = "units" if any(it.attributes.arbitrary_unit for it in results) else "m"
+    unit = results[0].attributes.unit
     coverage = queries[0].options.coverage
     found = solve_sequence(_images(queries, results), session_from_camera, estimate_scale, coverage)
     if not isinstance(found, Rejection):
@@ -44,13 +44,15 @@ def pose_sequence(
         return _hinted(found, results, is_sequence=True)
     since = max((jump.after for jump in found.jumps), default=0)
     poses = {i: pose for i, pose in enumerate(found.world_from_camera) if i >= since}
-    return _beyond_limits(queries, poses, "frames") or found
+    return _beyond_limits(queries, poses, "frames", unit) or found
 
 
-def _beyond_limits(queries: Sequence[Query], poses: Mapping[int, RigidTransform], list_name: str) -> Rejection | None:
+def _beyond_limits(
+    queries: Sequence[Query], poses: Mapping[int, RigidTransform], list_name: str, unit: str
+) -> Rejection | None:
     """Rejects a group if a photograph's joint pose is beyond a hard limit of its priors."""
     for i, pose in poses.items():
-        if contradiction := queries[i].narrowing.contradiction(pose):
+        if contradiction := queries[i].narrowing.contradiction(pose, unit):
             return Rejection(RejectionReason.PRIOR_CONFLICT, f"{list_name}[{i}]: {contradiction}")
     return None
 

@@ -359,7 +359,7 @@ class QueryStages:
         tier, narrowing = self._tiers[run.tier], run.query.narrowing
         outcome = answer.outcome
         if isinstance(outcome, Localization) and narrowing is not ANYWHERE:
-            beyond = narrowing.contradiction(outcome.world_from_camera)
+            beyond = narrowing.contradiction(outcome.world_from_camera, run.attributes.unit)
             if beyond:
                 answer = replace(answer, outcome=Rejection(RejectionReason.PRIOR_CONFLICT, beyond))
         if isinstance(answer.outcome, Rejection):

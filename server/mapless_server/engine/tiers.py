@@ -94,7 +94,7 @@ def better_of(cheaper: Result, stronger: Result) -> Result:
             f"the photograph fits two places: the pose as it is ({inlier_count} inliers) and that of the photograph "
             f"turned ({second.inlier_count})"
         )
-    message = f"{poses} are {apart_m:.2f} m and {apart_deg:.1f} degrees apart"
+    message = f"{poses} are {apart_m:.2f} {stronger.attributes.unit} and {apart_deg:.1f} degrees apart"
     rejection = Rejection(RejectionReason.GATE, message, _places_apart(stronger))
     return replace(stronger, answer=replace(stronger.answer, outcome=rejection))
 
@@ -126,8 +126,9 @@ def of_two_places(narrowed: Result, elsewhere: Result) -> Result:
         for it, of in ((second, elsewhere), (first, narrowed))
     ]
     message = (
-        f"two poses {apart_m:.2f} m and {apart_deg:.0f} degrees apart explain the photograph: the one where the prior "
-        f"says with {first.inlier_count} inliers, the other with {second.inlier_count}"
+        f"two poses {apart_m:.2f} {elsewhere.attributes.unit} and {apart_deg:.0f} degrees apart explain the "
+        f"photograph: the one where the prior says with {first.inlier_count} inliers, the other with "
+        f"{second.inlier_count}"
     )
     hint = Hint("judge", Advice.CHECK_PRIOR, "Check the prior: references elsewhere show more of the photograph.", None)
     rejection = Rejection(RejectionReason.AMBIGUOUS, message, hint, hypotheses=(poses[0], poses[1]))

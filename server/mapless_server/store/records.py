@@ -88,6 +88,11 @@ class SceneAttributes:
     arbitrary_unit: bool = False
     self_calibrations: tuple[SelfCalibration, ...] = ()
 
+    @property
+    def unit(self) -> str:
+        """Its unit of length, in messages for a person."""
+        return "units" if self.arbitrary_unit else "m"
+
     def __post_init__(self) -> None:
         if self.datum is not None and self.arbitrary_unit:
             raise DatumWithoutMetres("needs a scene in metres: the unit of length of this one is arbitrary")

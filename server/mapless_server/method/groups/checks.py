@@ -17,6 +17,7 @@ from ..answer import Answer, Localization
 from ..hints import FEW_MATCHES, MANY_MATCHES
 from ..rejection import Advice, Hint, Rejection, RejectionReason
 from ..views import PosedView
+from .jumps import ALL_JUMPS
 from .rig import RigEstimate
 from .sequence import SequenceEstimate
 from .start import CHECK_TRACKING, STAGE
@@ -32,9 +33,6 @@ UNIT_TOLERANCE = 1.25
 
 SIGNIFICANT_SIGMAS = 4.0
 """Least difference of the path's lengths, in standard deviations."""
-
-ALL_JUMPS = 3
-"""Where so many steps or more are all jumps, the tracked poses are wrong; fewer may be jumps of a device."""
 
 
 def check_mounting(estimate: RigEstimate, alone: Sequence[Answer]) -> RigEstimate | Rejection:

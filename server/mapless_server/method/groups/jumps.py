@@ -60,6 +60,9 @@ up to this many times as large as their standard deviations say."""
 LEFT_OUT_COST = 1.5
 """Cost of leaving out a pose, in thresholds; more than one jump and less than two."""
 
+ALL_JUMPS = 3
+"""Where so many steps or more are all jumps, the tracked poses are wrong; fewer may be jumps of a device."""
+
 UNITS = 20
 """Largest number of pairs that an unknown unit is tried from, those with the longest steps."""
 
@@ -106,6 +109,10 @@ def find_jumps(
     best = min(range(len(scales)), key=lambda i: chains[i][0])
     _, positions = chains[best]
     squared = links.squared(scales[best])
+    neighbours = squared.diagonal(1)
+    if scale is not None and len(neighbours) >= ALL_JUMPS and (neighbours > threshold).all():
+        # Leaving poses out would explain some of it by the noise of long steps, as of a session in millimetres.
+        positions = list(range(len(squared)))
     jumps = [links.jump(i, j, scales[best]) for i, j in pairwise(positions) if squared[i, j] > threshold]
     return Chain(tuple(int(links.frames[i]) for i in positions), tuple(jumps), scales[best])
 

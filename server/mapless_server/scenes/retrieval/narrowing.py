@@ -140,12 +140,13 @@ class Narrowing:
             return self.position.position
         return self.likely_positions[0].position if self.likely_positions else None
 
-    def contradiction(self, world_from_camera: RigidTransform) -> str:
-        """Names the limit, without margins, that a pose of the camera violates; empty if none."""
+    def contradiction(self, world_from_camera: RigidTransform, unit: str = "m") -> str:
+        """Names the limit, without margins, that a pose violates; empty if none. `unit` is the scene's, in the text."""
         if self.position is not None:
             outside_m = self.position.distance_m(world_from_camera.translation)
             if outside_m > 0:
-                return f"the pose lies {outside_m:.2f} m outside the prior's radius of {self.position.radius_m:g} m"
+                radius = f"{self.position.radius_m:g} {unit}"
+                return f"the pose lies {outside_m:.2f} {unit} outside the prior's radius of {radius}"
         if self.heading is not None:
             outside_deg = self.heading.angle_deg(world_from_camera.rotation[:, 2])
             if outside_deg > 0:
