@@ -11,7 +11,7 @@ from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, ran
 from mapless.geometry import RigidTransform
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pnp import PnpOptions, solve_pose
-from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.rejection import IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason
 from mapless_server.method.results import PoseEstimate, Support
 from mapless_server.method.trust.evidence import (
     NO_AGREEMENT,
@@ -103,6 +103,17 @@ def test_poses_with_trust_below_1_minus_coverage_are_rejected() -> None:
         f"its trust of {np.floor(1000 * trust) / 1000:g} is below the {1 - too_little:.6g} "
     )
     assert "matches agree" in refused.message
+
+
+def test_a_doubted_pose_keeps_no_features_from_being_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another camera is named, but only a pose with enough evidence is evidence against its own."""
+    check = IntrinsicsCheck(IntrinsicsParameter.FOCAL_LENGTH, 500.0, 600.0, 10.0, 1.5, True, False)
+    named = Rejection(RejectionReason.GATE, "focal_x_px 600 instead of 500", intrinsics_checks=(check,))
+    monkeypatch.setattr("mapless_server.method.trust.judge.wrong_camera", lambda *_: named)
+    support = support_of()
+    trust, rejection = verdict(support, 1.0)
+    assert rejection == named
+    assert verdict(support, 1 - trust - 1e-6)[1] == replace(named, intrinsics_checks=())
 
 
 @pytest.mark.parametrize(("share", "is_accepted"), [(0.079, True), (0.081, False), (1.0, False)])

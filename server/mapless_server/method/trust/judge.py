@@ -151,25 +151,31 @@ def judge(
     votes = votes_of(support, query_matches)
     evidence = evidence_of(support, votes, query_matches)
     trust = trust_of(evidence, options, log10_chance)
-    rejection = contradiction(support, votes, options)
-    if rejection is None:
-        rejection = low_trust(evidence, trust, coverage)
-    return Judgement(trust, evidence, rejection)
+    doubt = low_trust(evidence, trust, coverage)
+    return Judgement(trust, evidence, contradiction(support, votes, options, is_doubted=doubt is not None) or doubt)
 
 
 def contradiction(
-    support: Support, votes: Votes, options: JudgeOptions, intrinsics: IntrinsicsSigma | None = None
+    support: Support,
+    votes: Votes,
+    options: JudgeOptions,
+    intrinsics: IntrinsicsSigma | None = None,
+    is_doubted: bool = False,
 ) -> Rejection | None:
     """Rejects a pose whose matches contradict the intrinsics or support a second pose, or whose radius is too large.
 
-    `intrinsics` are the caller's standard deviations, see `wrong_camera`.
+    `intrinsics` are the caller's standard deviations, see `wrong_camera`. A pose that is doubted for lack of evidence
+    is none against its camera: what other cameras say is then named, but without the checks that keep stronger
+    features from being tried.
     """
     assert support.estimate is not None
     evidence = support.estimate.intrinsics
     best = support.references[int(np.argmax(support.inliers_by_reference()))].name
     wrong = wrong_intrinsics(evidence, best, options.intrinsics) if evidence else None
-    if wrong := wrong or wrong_camera(support, best, intrinsics):
+    if wrong:
         return wrong
+    if wrong := wrong_camera(support, best, intrinsics):
+        return replace(wrong, intrinsics_checks=()) if is_doubted else wrong
     hypotheses = find_rival(support, votes)
     return _ambiguous(hypotheses) if hypotheses else _too_uncertain(support, options)
 
