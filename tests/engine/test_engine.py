@@ -262,16 +262,16 @@ class TestTiers:
         assert "out of memory, say" in caplog.text
 
     def test_a_rejection_says_what_was_not_tried(self, setting: Setting) -> None:
-        """A caller who is told to check the intrinsics would, though asking again is what helps."""
+        """A caller with a hint to check the intrinsics would, though asking again is what helps."""
         setting.replies = {"cheap": rejected(), "strong": rejected()}
-        told = hint_of(setting.localize()).message
+        advice = hint_of(setting.localize()).message
 
         def unavailable(*_: object) -> Answer:
             raise RuntimeError("out of memory, say")
 
         setting.replies["strong"] = unavailable
         assert hint_of(setting.localize()).message == (
-            f"{told} Trying it with strong features was not finished: asking again, when less is asked, may help."
+            f"{advice} Trying it with strong features was not finished: asking again, when less is asked, may help."
         )
 
     def test_a_search_that_is_given_up_leaves_the_first_answer(self, setting: Setting) -> None:

@@ -327,7 +327,7 @@ def test_a_planted_gross_error_is_named_with_its_value(
 
 @pytest.mark.parametrize(("is_estimated", "is_named"), [(False, True), (True, False)])
 def test_intrinsics_estimated_with_the_pose_are_its_own(is_estimated: bool, is_named: bool) -> None:
-    """A caller that allows them is not told that another camera fits better than those it gave."""
+    """No other camera is named against intrinsics within what the caller allows."""
     rejection, _ = rejection_of(focal=1.25, sigma=0.08, is_estimated=is_estimated)
     assert (rejection is not None) == is_named
 

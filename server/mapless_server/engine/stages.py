@@ -389,8 +389,8 @@ def _told_unfinished(run: QueryRun, answer: Answer, tier: Tier) -> Answer:
         untried = "with references of the whole scene"
     elif run.ambiguous is not None:
         untried = "with references of one of the places"
-    told = f"{outcome.hint.message} Trying it {untried} was not finished: asking again, when less is asked, may help."
-    return replace(answer, outcome=replace(outcome, hint=replace(outcome.hint, message=told)))
+    advice = f"{outcome.hint.message} Trying it {untried} was not finished: asking again, when less is asked, may help."
+    return replace(answer, outcome=replace(outcome, hint=replace(outcome.hint, message=advice)))
 
 
 def _is_lost(answer: Answer, options: EscalationOptions) -> bool:
