@@ -9,7 +9,8 @@ import pytest
 
 from mapless_tools.dataset import Dataset
 from mapless_tools.ingest.formats.cameras import read_folder
-from research.places import Place, read_place
+
+from .places import Place, read_place
 
 DATA = Path(os.environ.get("TEST_DATA") or Path(__file__).parents[3] / "shared" / "data")
 

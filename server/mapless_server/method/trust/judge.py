@@ -9,9 +9,9 @@ right, which depends on how many of a caller's photographs show the place at all
 Wrong intrinsics are checked separately (`intrinsics`), because the evidence of their answers is as good as that of
 right ones.
 
-The quantiles come from `research.trust`: answers to photographs with many and few references, of the third of twelve
-places where right answers have the least evidence, so that the coverage holds in a place like these; elsewhere more are
-accepted. A right answer is off by at most 5 % of the distance to what the photograph shows, 5 degrees and, in
+The quantiles were measured once (server/research): answers to photographs with many and few references, of the third of
+twelve places where right answers have the least evidence, so that the coverage holds in a place like these; elsewhere
+more are accepted. A right answer is off by at most 5 % of the distance to what the photograph shows, 5 degrees and, in
 scenes in metres, 25 cm.
 
 A second pose, at another place, that other references support about as well, makes a pose ambiguous. With repeated

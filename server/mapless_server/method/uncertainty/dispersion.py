@@ -27,7 +27,7 @@ same side. Within 11 of 12 scenes errors grow more than radii with the gap, the 
 depth.
 
 Three factors remain: on the standard deviations of positions and of angles, and on the radii of 95 %, because errors
-have heavier tails than the normal distribution. `research.radii` measures them on scenes with known poses, each tested
+have heavier tails than the normal distribution. They were measured on scenes with known poses, each tested
 on a scene that it was not measured on.
 
 The dispersion is how an adjusted pose changes without parts of its data.

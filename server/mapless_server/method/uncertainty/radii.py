@@ -12,7 +12,7 @@ from mapless.geometry import Array
 from ..results import Support
 
 TAIL_95 = 1.47
-"""Factor on the radius of 95 %, for heavy tails; the covariance is right at 68 %. From `research.radii`."""
+"""Factor on the radius of 95 %, for heavy tails; the covariance is right at 68 %. Measured once (server/research)."""
 
 
 SELF_TAIL_95 = 1.3
@@ -68,7 +68,7 @@ def error_radii(covariance: Array, probabilities: ArrayLike) -> Array:
 
 
 GROWTH = 0.2
-"""Exponent of the gap in the ratio of errors to radii, which contain 0.1 of it; from `research.self_calibration`."""
+"""Exponent of the gap in the ratio of errors to radii, which contain 0.1 of it; measured once (server/research)."""
 
 USUAL_GAP = 0.1
 """The gap at which factors are stated."""
