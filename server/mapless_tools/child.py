@@ -1,4 +1,4 @@
-"""The real server as a child process on the loopback interface."""
+"""The real server as a child process on the loopback interface. It ends with this process, however that ends."""
 
 import os
 import subprocess
@@ -104,8 +104,8 @@ def child_module(
     """Runs a module as a server that prints its address as `mapless-server serve` does; see `child_server`."""
     with nullcontext() if log is None else log.open("ab") as errors:
         process = subprocess.Popen(
-            [sys.executable, "-m", module, *arguments],
-            stdin=subprocess.DEVNULL,
+            [sys.executable, "-m", "mapless_tools.with_parent", module, *arguments],
+            stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,
             text=True,
@@ -120,8 +120,8 @@ def child_module(
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-        if process.stdout is not None:
-            process.stdout.close()
+        for pipe in filter(None, (process.stdin, process.stdout)):
+            pipe.close()
 
 
 def _read_address(process: subprocess.Popen[str], where: str) -> str:

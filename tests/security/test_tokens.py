@@ -377,6 +377,8 @@ class TestCommand:
             (("create", "--name", "a", "--role", "read", "--expires", "2001-01-01T00:00:00Z"), 2, "in the future"),
             (("create", "--name", "old", "--role", "read"), 1, "already"),
             (("revoke", "a"), 1, "no token"),
+            (("create", "--role", "read"), 2, "one name"),
+            (("revoke", "old", "--name", "old"), 2, "one name"),
         ],
     )
     def test_complaints_are_one_line(self, path: Path, arguments: tuple[str, ...], code: int, error_text: str) -> None:
@@ -384,6 +386,12 @@ class TestCommand:
         found_code, printed, said = self.run(*arguments, path=path)
         assert (found_code, printed, said.count("\n")) == (code, "", 1)
         assert error_text in said
+
+    def test_names_are_arguments_or_options(self, path: Path) -> None:
+        assert self.run("create", "a", "--role", "read", path=path)[0] == 0
+        assert self.run("create", "--name", "b", "--role", "read", path=path)[0] == 0
+        assert self.run("revoke", "--name", "a", path=path) == (0, "", "")
+        assert [it.name for it in read_tokens(path).tokens] == ["b"]
 
     def test_the_setting_names_the_file(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """The client's variable MAPLESS_TOKEN is no setting, and no error."""

@@ -1,5 +1,6 @@
 """The command `mapless` against a real server."""
 
+import io
 import json
 import os
 import signal
@@ -70,6 +71,30 @@ def test_from_an_empty_server_to_a_pose(run: Run, tmp_path: Path, camera_json: s
     assert run("scene", "get", "kitchen")[1]["reference_count"] == 0
     assert run("scene", "delete", "kitchen")[0] == 0
     assert run("scene", "list")[1] == []
+
+
+@pytest.mark.parametrize(("answer", "is_deleted"), [("y", True), ("n", False), ("", False)])
+def test_a_terminal_is_asked_before_deleting(
+    run: Run, client: Client, scene: str, answer: str, is_deleted: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is no terminal, as a script's input, is not asked; nor is anybody with --yes."""
+    typed = io.StringIO(f"{answer}\n" * 2)
+    monkeypatch.setattr(typed, "isatty", lambda: True)
+    monkeypatch.setattr("sys.stdin", typed)
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    code, _, asked = run("reference", "delete", scene, "r0")
+    assert (code, asked) == (int(not is_deleted), f"mapless: delete the reference r0 of {scene}? [y/N] ")
+    count = 3 - is_deleted
+    code, _, asked = run("scene", "delete", scene)
+    assert (code, asked) == (
+        int(not is_deleted),
+        f"mapless: delete the scene {scene} with its {count} references? [y/N] ",
+    )
+    assert (scene in {it.scene_id for it in client.list_scenes()}) is not is_deleted
+    if not is_deleted:
+        assert run("reference", "delete", scene, "r0", "--yes") == (0, "", "")
+        assert run("scene", "delete", scene, "--yes") == (0, "", "")
+    client.create_scene(scene)  # which the fixture deletes
 
 
 def test_a_reference_is_shown_and_its_photograph_downloaded(

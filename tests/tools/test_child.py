@@ -1,8 +1,11 @@
 """A server as a child process: one that does not start is an error, and every one ends."""
 
+import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +81,26 @@ def test_a_child_on_a_folder_does_not_reach_for_a_database(
     with started as server, Client(server.address) as client:
         client.create_scene("mine")
         assert (data_dir / DATABASE_FILE).is_file()
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="finds the server's end in /proc")
+def test_a_server_ends_with_a_tool_that_is_killed(tmp_path: Path) -> None:
+    program = (
+        "import os, signal, sys; from mapless_tools.child import child_module\n"
+        "with child_module('mapless_tools.load.no_op', sys.argv[1]) as server:\n"
+        "    print(server.process_id, flush=True); os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    tool = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE, text=True, check=False
+    )
+    assert tool.returncode == -signal.SIGKILL
+    state = Path(f"/proc/{int(tool.stdout)}/stat")
+    for _ in range(600):
+        if not state.exists() or state.read_text().rpartition(")")[2].split()[0] == "Z":
+            return
+        time.sleep(0.1)
+    os.kill(int(tool.stdout), signal.SIGKILL)
+    pytest.fail("the server of a killed tool still runs after a minute")
 
 
 def test_a_server_is_stopped_when_its_user_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -219,6 +219,8 @@ def _add_scene(scene: argparse.ArgumentParser) -> None:
     ):
         one = actions.add_parser(action, aliases=others, help=text)  # completion knows only those with a text
         one.add_argument("scene")
+        if action == "delete":
+            _add_yes(one)
         one.set_defaults(run=run)
     listing = actions.add_parser("list", help="all scenes")
     listing.set_defaults(run=commands.list_scenes)
@@ -269,6 +271,12 @@ def _add_reference(reference: argparse.ArgumentParser) -> None:
         if action == "download":
             one.add_argument("--output", type=Path, metavar="FILE", help="default: ID.jpg, .png or .webp; - for stdout")
             one.add_argument("--force", action="store_true", help="overwrite the file")
+        if action == "delete":
+            _add_yes(one)
+
+
+def _add_yes(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--yes", action="store_true", help="do not ask; only a terminal is asked")
 
 
 def _add_localize(command: argparse.ArgumentParser) -> None:

@@ -16,7 +16,7 @@ from ..requests import NewReference
 from ..results import Reference, Scene
 from .folder import EXIT_FAILED, EXIT_REJECTED
 from .localize import limits
-from .output import card, serving_states, show, table
+from .output import card, is_confirmed, serving_states, show, table
 
 _BLANK = "nothing can be matched with it; it is blank, dark or blurred"
 
@@ -109,7 +109,10 @@ def _minute(it: Scene | Reference) -> str:
 
 
 def delete_scene(client: Client, arguments: argparse.Namespace) -> int:
-    """Deletes a scene and its references."""
+    """Deletes a scene and its references; exit code 1 if the user, asked, does not want it."""
+    scene = client.get_scene(arguments.scene)
+    if not is_confirmed(arguments, f"delete the scene {scene.scene_id} with its {scene.reference_count} references"):
+        return 1
     client.delete_scene(arguments.scene)
     return 0
 
@@ -199,7 +202,9 @@ def download_reference(client: Client, arguments: argparse.Namespace) -> int:
 
 
 def delete_reference(client: Client, arguments: argparse.Namespace) -> int:
-    """Deletes a reference."""
+    """Deletes a reference; exit code 1 if the user, asked, does not want it."""
+    if not is_confirmed(arguments, f"delete the reference {arguments.reference} of {arguments.scene}"):
+        return 1
     client.delete_reference(arguments.scene, arguments.reference)
     return 0
 

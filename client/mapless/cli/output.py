@@ -39,6 +39,14 @@ def show(arguments: argparse.Namespace, value: object, text: Sequence[str]) -> i
     return 0
 
 
+def is_confirmed(arguments: argparse.Namespace, what: str) -> bool:
+    """Whether the user wants what cannot be undone: asked where there is a terminal, unless --yes is given."""
+    if arguments.yes or not (sys.stdin.isatty() and sys.stderr.isatty()):
+        return True
+    print(f"mapless: {what}? [y/N] ", end="", file=sys.stderr, flush=True)
+    return sys.stdin.readline().strip().lower() in ("y", "yes")
+
+
 def serving_states(client: Client, whole: str) -> dict[str, bool]:
     """Whether the server as a whole, under this name, and each of its services accept calls."""
     states = {whole: client.is_serving()}

@@ -19,10 +19,15 @@ DEFAULT_TENANT = "default"
 TokensFile = Annotated[Path | None, typer.Option(help="The file of tokens; default: the server's setting.")]
 
 
+Name = Annotated[str | None, typer.Argument(help="Name of the holder; unique, and the caller's name in the log.")]
+NameFlag = Annotated[str | None, typer.Option("--name", help="The same as NAME.")]
+
+
 @token_app.command("create")
 def create_command(
-    name: Annotated[str, typer.Option(help="Name of the holder; unique, and the caller's name in the log.")],
     role: Annotated[str, typer.Option(help="Rights of the holder: read, localize (and read), or write (everything).")],
+    name: Name = None,
+    name_flag: NameFlag = None,
     tenant: Annotated[str, typer.Option(help="Tenant whose scenes the holder can access.")] = DEFAULT_TENANT,
     expires: Annotated[str | None, typer.Option(help="When it ends, 2027-01-01T00:00:00Z; default: never.")] = None,
     tokens_file: TokensFile = None,
@@ -30,6 +35,7 @@ def create_command(
     """Create a token and print it, once: the file has only its hash."""
     from mapless_server.security import create_token
 
+    name = _one_name(name, name_flag)
     with _tokens_file(tokens_file) as path:
         token = create_token(path, name, tenant, role, _read_time(expires) if expires else None)
     typer.echo(f"the token {name!r} of tenant {tenant!r}; it is not shown again:", err=True)
@@ -55,14 +61,21 @@ def list_command(tokens_file: TokensFile = None, as_json: AsJson = None) -> None
 
 
 @token_app.command("revoke")
-def revoke_command(
-    name: Annotated[str, typer.Argument(help="The token's name, as listed.")], tokens_file: TokensFile = None
-) -> None:
+def revoke_command(name: Name = None, name_flag: NameFlag = None, tokens_file: TokensFile = None) -> None:
     """Remove a token; a running server rejects it about a second later."""
     from mapless_server.security import revoke_token
 
+    name = _one_name(name, name_flag)
     with _tokens_file(tokens_file) as path:
         revoke_token(path, name)
+
+
+def _one_name(name: str | None, flag: str | None) -> str:
+    """The token's name, as an argument or with --name."""
+    given = [it for it in (name, flag) if it]
+    if len(given) != 1:
+        fail("give the token one name, as an argument or with --name")
+    return given[0]
 
 
 @contextmanager

@@ -102,7 +102,7 @@ def add_command(
     file: Annotated[Path, typer.Argument(help="The file: safetensors, or the authors' own.")],
     link: Annotated[bool, typer.Option("--link", help="Link to the file instead of copying it.")] = False,
     unofficial: Annotated[
-        bool, typer.Option("--unofficial", help="Take a file that is not the official one, if the network takes it.")
+        bool, typer.Option("--unofficial", help="Also take a file that differs from the authors', if its tensors fit.")
     ] = False,
     weights_dir: WeightsDir = None,
 ) -> None:

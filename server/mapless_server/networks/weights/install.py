@@ -199,7 +199,7 @@ def add(
             with ready.open("wb") as copy:
                 found = _read_through(file, weights, progress, _writer(copy.write))
         if not unofficial:
-            _require_official(found, weights, str(file), "; --unofficial takes it all the same")
+            _require_official(found, weights, str(file), "; if you trust where it is from, add it with --unofficial")
         return replace(found, path=put_in_place(ready, weights, weights_dir, found.sha256))
 
 
