@@ -18,7 +18,9 @@ def check_id(value: str) -> str:
 
 
 def scene_name(scene: str) -> str:
-    """The name of a scene given by id or by name."""
+    """The name of a scene given by id or by name; TypeError for another type than text."""
+    if not isinstance(scene, str):
+        raise TypeError(f"scene must be its id or name, is {scene!r}")
     return scene if scene.startswith("scenes/") else f"scenes/{scene}"
 
 

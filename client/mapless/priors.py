@@ -113,13 +113,12 @@ class Priors:
     pose: PosePrior | None = None
 
 
-def set_priors(request: Any, priors: Priors) -> None:
+def set_priors(request: Any, priors: Priors, path: str = "priors") -> None:
     """Sets the priors of a request; the fields of a prior and of its message have the same names.
 
-    TypeError if a single prior was given, ValueError if the request has no field for a prior.
+    TypeError, with the path, if a single prior was given, ValueError if the request has no field for a prior.
     """
-    if not isinstance(priors, Priors):
-        raise TypeError(f"priors must be a Priors, such as Priors(position=...), is a {type(priors).__name__}")
+    wire.require(priors, Priors, path, "such as Priors(position=...)")
     for field in fields(priors):
         prior, name = getattr(priors, field.name), f"{field.name}_prior"
         if prior is None:

@@ -38,14 +38,19 @@ class IntrinsicsUncertainty:
     k1_sigma: float = 0.0
 
 
-def create_request(scene_name: str, reference: NewReference) -> reference_pb.CreateReferenceRequest:
+def create_request(
+    scene_name: str, reference: NewReference, field: str = "reference"
+) -> reference_pb.CreateReferenceRequest:
     """The request that stores a reference; reads the photograph's file.
 
-    TypeError names a value of another type; ValueError if the pose's rotation is not a rotation.
+    TypeError names a value of another type by its field; ValueError if the pose's rotation is not a rotation.
     """
+    wire.require(
+        reference, NewReference, field, "one is made by NewReference(reference_id, image, camera, world_from_camera)"
+    )
     if not isinstance(reference.reference_id, str):
-        raise TypeError(f"reference_id must be a text, is {reference.reference_id!r}")
-    world_from_camera = wire.transform_to_message(reference.world_from_camera)
+        raise TypeError(f"{field}.reference_id must be a text, is {reference.reference_id!r}")
+    world_from_camera = wire.transform_to_message(reference.world_from_camera, f"{field}.world_from_camera")
     try:
         nearest_rotation(reference.world_from_camera.rotation)
     except ValueError as error:
@@ -54,15 +59,15 @@ def create_request(scene_name: str, reference: NewReference) -> reference_pb.Cre
         scene=scene_name,
         reference_id=reference.reference_id,
         reference=reference_pb.Reference(
-            image=read_image(reference.image),
-            intrinsics=wire.camera_to_message(reference.camera),
+            image=read_image(reference.image, f"{field}.image"),
+            intrinsics=wire.camera_to_message(reference.camera, f"{field}.camera"),
             world_from_camera=world_from_camera,
         ),
     )
 
 
-def read_image(image: ImageSource) -> bytes:
-    """Reads the file's bytes; TypeError for an array of pixels, which has to be encoded first."""
+def read_image(image: ImageSource, field: str = "image") -> bytes:
+    """Reads the file's bytes; TypeError, with the field, for an array of pixels, which has to be encoded first."""
     if isinstance(image, bytes):
         return image
     try:
@@ -70,7 +75,7 @@ def read_image(image: ImageSource) -> bytes:
     except TypeError:
         kind = f"{type(image).__module__}.{type(image).__qualname__}"
         raise TypeError(
-            f"image is the path or the bytes of a JPEG, PNG or WebP file, not {kind}: encode pixels first, "
+            f"{field} is the path or the bytes of a JPEG, PNG or WebP file, not {kind}: encode pixels first, "
             'for instance with cv2.imencode(".jpg", pixels)[1].tobytes()'
         ) from None
     return path.read_bytes()

@@ -94,7 +94,8 @@ def unit_vector(x: float, y: float, z: float) -> Vector:
 
 
 def datum_to_message(datum: Datum) -> pb.Datum:
-    """Message of a datum."""
+    """Message of a datum; TypeError for another type."""
+    wire.require(datum, Datum, "datum")
     q = datum.enu_from_world
     return pb.Datum(
         latitude_deg=datum.latitude_deg,

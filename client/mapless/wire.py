@@ -6,7 +6,8 @@ field by its path in the request, "requests[3].reference.intrinsics.focal_x_px".
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from datetime import datetime
 from enum import Enum
 from typing import Any, TypeVar
 
@@ -62,18 +63,51 @@ def _parsed(parse: Callable[[str], T], text: str, field: str) -> T:
         raise FieldError(field, str(error)) from None
 
 
-def camera_to_message(camera: Camera) -> pb.CameraIntrinsics:
+def require(value: object, kind: type, field: str, advice: str = "") -> None:
+    """TypeError, with the argument's field and how to make such a value, for a value of another type."""
+    if not isinstance(value, kind):
+        article = "an" if kind.__name__[0] in "AEIO" else "a"
+        raise TypeError(f"{field} must be {article} {kind.__name__}, is {_kind(value)}{advice and f'; {advice}'}")
+
+
+def listed(values: Iterable[T], kind: type[T], field: str) -> Iterator[tuple[str, T]]:
+    """Items of a list, each with its field, "frames[2]"; TypeError for an item of another type, or for no list."""
+    wanted = [it.name for it in dataclasses.fields(kind) if it.default is it.default_factory]  # type: ignore[arg-type]
+    advice = f"one is made by {kind.__name__}({', '.join(wanted)})"
+    if isinstance(values, str | bytes) or not isinstance(values, Iterable):
+        raise TypeError(f"{field} must be a list of {kind.__name__}, is {_kind(values)}; {advice}")
+    for i, value in enumerate(values):
+        require(value, kind, f"{field}[{i}]", advice)
+        yield f"{field}[{i}]", value
+
+
+def set_numbers(message: Any, values: Mapping[str, object], path: str = "") -> None:
+    """Sets numbers, texts and truth values of a message; TypeError names the field of a value of another type."""
+    for name, value in values.items():
+        _set_number(message, name, value, path)
+
+
+def _set_number(message: Any, name: str, value: object, path: str) -> None:
+    try:
+        setattr(message, name, value)
+    except TypeError:
+        field = message.DESCRIPTOR.fields_by_name[name]
+        others = {field.CPPTYPE_DOUBLE: "a number", field.CPPTYPE_BOOL: "True or False"}
+        wanted = others.get(field.cpp_type, "a whole number")
+        raise TypeError(f"{joined(path, name)} must be {wanted}, is {value!r}") from None
+
+
+def set_time(timestamp: Any, time: datetime, field: str) -> None:
+    """Sets a message's timestamp; TypeError, naming the field, for another type than a time."""
+    require(time, datetime, field, "such as datetime.now(timezone.utc)")
+    timestamp.FromDatetime(time)
+
+
+def camera_to_message(camera: Camera, field: str = "camera") -> pb.CameraIntrinsics:
     """Message of a camera; TypeError, naming the field, if one is not a number, or for another type than a camera."""
-    if not isinstance(camera, Camera):
-        raise TypeError(f"camera must be a Camera, is {_kind(camera)}; read_camera makes one of a file")
+    require(camera, Camera, field, "read_camera makes one of a file")
     message = pb.CameraIntrinsics()
-    for name, value in vars(camera).items():
-        if name != "distortion":
-            try:
-                setattr(message, name, value)
-            except TypeError:
-                number = "a whole number" if name.startswith(("width", "height")) else "a number"
-                raise TypeError(f"camera.{name} must be {number}, is {value!r}") from None
+    set_numbers(message, {name: value for name, value in vars(camera).items() if name != "distortion"}, field)
     if camera.distortion is not None:
         model = lens_model_of(camera.distortion)
         if not hasattr(message, model):
@@ -122,12 +156,9 @@ def _distortion_from_message(message: pb.CameraIntrinsics, field: str) -> Distor
     return LENS_MODELS[kind](**coefficients)
 
 
-def transform_to_message(target_from_source: RigidTransform) -> pb.RigidTransform:
-    """Message of a rigid transform, its quaternion with w >= 0; TypeError for another type."""
-    if not isinstance(target_from_source, RigidTransform):
-        raise TypeError(
-            f"a pose must be a RigidTransform, is {_kind(target_from_source)}; RigidTransform.from_matrix makes one"
-        )
+def transform_to_message(target_from_source: RigidTransform, field: str = "a pose") -> pb.RigidTransform:
+    """Message of a rigid transform, its quaternion with w >= 0; TypeError, naming the field, for another type."""
+    require(target_from_source, RigidTransform, field, "RigidTransform.from_matrix makes one")
     q = target_from_source.quaternion()
     return pb.RigidTransform(
         rotation=pb.Quaternion(**vars(q)), translation_m=vector_to_message(target_from_source.translation)

@@ -10,6 +10,7 @@ import pytest
 
 from mapless import Client, names, wire
 from mapless.geometry import MAX_COORDINATE_M, Camera, RigidTransform
+from mapless.groups import RigImage, SequenceFrame
 from mapless.priors import PositionPrior, Priors, set_priors
 from mapless.requests import NewReference, create_request
 from mapless.v1 import geometry_pb2 as pb
@@ -31,17 +32,49 @@ def changed(**values: Any) -> Camera:
         (wire.camera_to_message, changed(focal_x_px="5"), "camera.focal_x_px must be a number, is '5'"),
         (wire.transform_to_message, np.eye(4), "must be a RigidTransform, is numpy.ndarray; "),
         (lambda it: names.reference_names("s", it), "r1", "references must be a list of .*, is the text 'r1'"),
-        (lambda it: set_priors(None, it), PositionPrior(np.zeros(3), 1.0), "must be a Priors, .* is a PositionPrior"),
+        (
+            lambda it: set_priors(None, it),
+            PositionPrior(np.zeros(3), 1.0),
+            "must be a Priors, is mapless.priors.PositionPrior; such as",
+        ),
         (
             lambda it: create_request("s", it),
             NewReference(3, b"x", CAMERA, RigidTransform.identity()),  # type: ignore[arg-type]
-            "reference_id must be a text, is 3",
+            "reference.reference_id must be a text, is 3",
         ),
         (
             lambda it: Client("localhost").localize(b"x", CAMERA, "s", intrinsics_uncertainty=it),
             40,
-            "must be an IntrinsicsUncertainty, .* is 40",
+            "must be an IntrinsicsUncertainty, is int; such as",
         ),
+        (
+            lambda it: Client("localhost").localize_sequence(it, "s"),
+            ["a.jpg"],
+            r"frames\[0\] must be a SequenceFrame, is str; one is made by SequenceFrame\(image, camera, session_from",
+        ),
+        (
+            lambda it: Client("localhost").localize_sequence([SequenceFrame(b"x", CAMERA, it)], "s"),
+            np.eye(4),
+            r"frames\[0\]\.session_from_camera must be a RigidTransform, is numpy.ndarray; ",
+        ),
+        (
+            lambda it: Client("localhost").localize_rig(it, "s"),
+            None,
+            "images must be a list of RigImage, is NoneType; ",
+        ),
+        (
+            lambda it: Client("localhost").localize_rig([RigImage(b"x", it, RigidTransform.identity())], "s"),
+            "camera.json",
+            r"images\[0\]\.camera must be a Camera, is str; read_camera",
+        ),
+        (
+            lambda it: Client("localhost").add_references("s", it),
+            ["a.jpg"],
+            r"references\[0\] must be a NewReference, ",
+        ),
+        (lambda it: Client("localhost").add_reference("s", it), "a.jpg", "reference must be a NewReference, is str; "),
+        (lambda it: Client("localhost").localize(b"x", CAMERA, it), None, "scene must be its id or name, is None"),
+        (lambda it: Client("localhost").localize(b"x", CAMERA, "s", coverage=it), "3", "coverage must be a number, is"),
     ],
 )
 def test_a_value_of_another_type_is_named(convert: Callable[[Any], Any], value: Any, error_text: str) -> None:

@@ -86,7 +86,7 @@ async def _localize_request(
         references=reference_names(scene, references),
         image=await connection.unblocked(read_image, image),
         intrinsics=wire.camera_to_message(camera),
-        options=pb.LocalizeOptions(
+        options=_options_to_message(
             variant=wire.enum_value(pb.Variant, variant),
             scale_strategy=wire.enum_value(pb.ScaleStrategy, scale_strategy),
             reference_count=reference_count,
@@ -103,9 +103,9 @@ async def _localize_request(
     if intrinsics_uncertainty is not None:
         request.intrinsics_uncertainty.CopyFrom(_uncertainty_to_message(intrinsics_uncertainty))
     if capture_time is not None:
-        request.capture_time.FromDatetime(capture_time)
+        wire.set_time(request.capture_time, capture_time, "capture_time")
     if session_from_camera is not None:
-        request.session_from_camera.CopyFrom(wire.transform_to_message(session_from_camera))
+        request.session_from_camera.CopyFrom(wire.transform_to_message(session_from_camera, "session_from_camera"))
     return request
 
 
@@ -193,13 +193,16 @@ async def localize_rig(
     """
     request = pb.LocalizeRigRequest(
         scene=scene_name(scene),
-        images=[await connection.unblocked(_rig_image_to_message, image, scene) for image in images],
-        options=pb.LocalizeOptions(reference_count=reference_count, coverage=coverage, confidential=confidential),
+        images=[
+            await connection.unblocked(_rig_image_to_message, image, scene, field)
+            for field, image in wire.listed(images, RigImage, "images")
+        ],
+        options=_options_to_message(reference_count=reference_count, coverage=coverage, confidential=confidential),
     )
     if capture_time is not None:
-        request.capture_time.FromDatetime(capture_time)
+        wire.set_time(request.capture_time, capture_time, "capture_time")
     if session_from_rig is not None:
-        request.session_from_rig.CopyFrom(wire.transform_to_message(session_from_rig))
+        request.session_from_rig.CopyFrom(wire.transform_to_message(session_from_rig, "session_from_rig"))
     return await connection.call("LocalizeRig", request, rig_from_message, timeout_s)
 
 
@@ -233,43 +236,50 @@ async def localize_sequence(
     """
     request = pb.LocalizeSequenceRequest(
         scene=scene_name(scene),
-        frames=[await connection.unblocked(_frame_to_message, frame, scene) for frame in frames],
-        estimate_session_scale=estimate_session_scale,
-        options=pb.LocalizeOptions(
+        frames=[
+            await connection.unblocked(_frame_to_message, frame, scene, field)
+            for field, frame in wire.listed(frames, SequenceFrame, "frames")
+        ],
+        options=_options_to_message(
             reference_count=reference_count,
             coverage=coverage,
             confidential=confidential,
             axes=wire.enum_value(pb.Axes, axes),
         ),
     )
+    wire.set_numbers(request, {"estimate_session_scale": estimate_session_scale})
     return await connection.call("LocalizeSequence", request, sequence_from_message, timeout_s)
 
 
 def _uncertainty_to_message(uncertainty: IntrinsicsUncertainty) -> pb.IntrinsicsUncertainty:
-    if not isinstance(uncertainty, IntrinsicsUncertainty):
-        raise TypeError(
-            "intrinsics_uncertainty must be an IntrinsicsUncertainty, such as "
-            f"IntrinsicsUncertainty(focal_sigma_px=20), is {uncertainty!r}"
-        )
+    advice = "such as IntrinsicsUncertainty(focal_sigma_px=20)"
+    wire.require(uncertainty, IntrinsicsUncertainty, "intrinsics_uncertainty", advice)
     return pb.IntrinsicsUncertainty(**asdict(uncertainty))
 
 
-def _photograph_to_message(message: M, given: RigImage | SequenceFrame, scene: str) -> M:
-    """Sets what the photographs of rigs and of sequences have in common; reads the file."""
-    message.image = read_image(given.image)
-    message.intrinsics.CopyFrom(wire.camera_to_message(given.camera))
+def _options_to_message(**values: Any) -> pb.LocalizeOptions:
+    options = pb.LocalizeOptions()
+    wire.set_numbers(options, values)
+    return options
+
+
+def _photograph_to_message(message: M, given: RigImage | SequenceFrame, scene: str, field: str) -> M:
+    """Sets what the photographs of rigs and of sequences have in common; reads the file. Errors name the field."""
+    message.image = read_image(given.image, f"{field}.image")
+    message.intrinsics.CopyFrom(wire.camera_to_message(given.camera, f"{field}.camera"))
     message.references.extend(reference_names(scene, given.references))
-    set_priors(message, given.priors)
+    set_priors(message, given.priors, f"{field}.priors")
     return message
 
 
-def _rig_image_to_message(image: RigImage, scene: str) -> pb.RigImage:
-    message = pb.RigImage(rig_from_camera=wire.transform_to_message(image.rig_from_camera))
-    return _photograph_to_message(message, image, scene)
+def _rig_image_to_message(image: RigImage, scene: str, field: str) -> pb.RigImage:
+    pose = wire.transform_to_message(image.rig_from_camera, f"{field}.rig_from_camera")
+    return _photograph_to_message(pb.RigImage(rig_from_camera=pose), image, scene, field)
 
 
-def _frame_to_message(frame: SequenceFrame, scene: str) -> pb.SequenceFrame:
-    message = pb.SequenceFrame(session_from_camera=wire.transform_to_message(frame.session_from_camera))
+def _frame_to_message(frame: SequenceFrame, scene: str, field: str) -> pb.SequenceFrame:
+    pose = wire.transform_to_message(frame.session_from_camera, f"{field}.session_from_camera")
+    message = pb.SequenceFrame(session_from_camera=pose)
     if frame.capture_time is not None:
-        message.capture_time.FromDatetime(frame.capture_time)
-    return _photograph_to_message(message, frame, scene)
+        wire.set_time(message.capture_time, frame.capture_time, f"{field}.capture_time")
+    return _photograph_to_message(message, frame, scene, field)

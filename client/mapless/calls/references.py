@@ -52,7 +52,7 @@ async def create_scene(
     request = pb.CreateSceneRequest(
         scene_id=scene_id,
         datum=None if datum is None else datum_to_message(datum),
-        down_in_world=None if down_in_world is None else wire.vector_to_message(down_in_world),
+        down_in_world=None if down_in_world is None else wire.vector_to_message(down_in_world, "down_in_world"),
         arbitrary_unit=arbitrary_unit,
     )
     on_repeat = partial(repeats.created_scene, request)
@@ -100,7 +100,7 @@ async def update_scene(
     if datum is not None and datum is not UNCHANGED:
         request.scene.datum.CopyFrom(datum_to_message(datum))
     if down_in_world is not None and down_in_world is not UNCHANGED:
-        request.scene.down_in_world.CopyFrom(wire.vector_to_message(down_in_world))
+        request.scene.down_in_world.CopyFrom(wire.vector_to_message(down_in_world, "down_in_world"))
     if calibration is not None and calibration is not UNCHANGED:
         request.scene.calibration.CopyFrom(calibration_to_message(calibration))
     request.scene.arbitrary_unit = arbitrary_unit is True
@@ -225,8 +225,8 @@ def _batches(
     """Yields requests in the references' order, in batches that fit a message; a larger request is sent alone."""
     batch: list[pb.CreateReferenceRequest] = []
     batch_bytes = 0
-    for reference in references:
-        request = create_request(scene_name(scene), reference)
+    for field, reference in wire.listed(references, NewReference, "references"):
+        request = create_request(scene_name(scene), reference, field)
         size_bytes = request.ByteSize()
         full = batch_bytes + size_bytes > options.batch_mib * 2**20 or len(batch) == options.batch_count
         if batch and full:
@@ -290,8 +290,8 @@ async def retrieve_references(
         scene=scene_name(scene),
         image=await connection.unblocked(read_image, image),
         intrinsics=wire.camera_to_message(camera),
-        count=count,
     )
+    wire.set_numbers(request, {"count": count})
     set_priors(request, priors or Priors())
     return await connection.call(
         "RetrieveReferences", request, lambda it: [read(RetrievedReference, each) for each in it.references], timeout_s
@@ -334,7 +334,7 @@ async def check_coverage(
     """Predicts whether a photograph taken at a pose would be localized."""
     request = pb.CheckCoverageRequest(
         scene=scene_name(scene),
-        world_from_camera=wire.transform_to_message(world_from_camera),
+        world_from_camera=wire.transform_to_message(world_from_camera, "world_from_camera"),
         intrinsics=wire.camera_to_message(camera),
     )
     return await connection.call("CheckCoverage", request, partial(read, Coverage), timeout_s)
