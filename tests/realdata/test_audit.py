@@ -96,9 +96,8 @@ def test_nothing_is_found_where_nothing_was_planted(photographs: Photographs, sc
     ("scene", "victims"),
     [
         (FOUNTAIN, (5,)),
-        (KITCHEN, (7,)),
-        pytest.param(FOUNTAIN, (0, 2, 8, 10), marks=pytest.mark.nightly),
-        pytest.param(KITCHEN, (0, 4, 15, 23, 28), marks=pytest.mark.nightly),
+        nightly(FOUNTAIN, (0, 2, 8, 10)),
+        nightly(KITCHEN, (0, 4, 7, 15, 23, 28)),
     ],
 )
 def test_a_planted_fault_is_named_and_nothing_else(
@@ -116,12 +115,7 @@ def test_a_planted_fault_is_named_and_nothing_else(
 
 @pytest.mark.parametrize(
     ("scene", "pair"),
-    [
-        (FOUNTAIN, (4, 5)),
-        pytest.param(FOUNTAIN, (1, 8), marks=pytest.mark.nightly),
-        (KITCHEN, (15, 21)),
-        pytest.param(KITCHEN, (3, 20), marks=pytest.mark.nightly),
-    ],
+    [(FOUNTAIN, (4, 5)), nightly(FOUNTAIN, (1, 8)), nightly(KITCHEN, (15, 21)), nightly(KITCHEN, (3, 20))],
 )
 def test_swapped_photographs_name_each_other_and_nothing_else(
     photographs: Photographs, scene: str, pair: tuple[int, int]
@@ -138,6 +132,7 @@ def test_swapped_photographs_name_each_other_and_nothing_else(
     assert [(a.reference, a.message) for a in found.values() if a.verdict is not AuditVerdict.CONSISTENT] == []
 
 
+@pytest.mark.nightly
 def test_coverage_is_predicted_where_photographs_were_taken(photographs: Photographs) -> None:
     """From every other reference, of the ones between: all of these are localized by the method."""
     views = load(photographs, KITCHEN)

@@ -73,7 +73,7 @@ def test_real_poses_pass_without_a_warning(photographs: Photographs, folder: str
 
 @pytest.mark.parametrize("folder", [FOUNTAIN, nightly(OFFICE)])
 def test_opengl_axes_and_inverse_poses_are_named(photographs: Photographs, folder: str) -> None:
-    frames = photographs(folder).frames
+    frames = photographs(folder).frames[:7]
     flip = np.diag([1.0, -1.0, -1.0])
     for name, fault in (
         ("OpenGL", lambda pose: RigidTransform(pose.rotation @ flip, pose.translation)),

@@ -428,8 +428,9 @@ class TestPriority:
             server.background.close()  # at once, though it waits
         assert server.counts.failures == 0
 
-    def test_a_gap_between_calls_is_not_idleness(self, store: Store) -> None:
+    def test_a_gap_between_calls_is_not_idleness(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
         """The server is idle whenever a step could begin, except for once."""
+        monkeypatch.setattr("mapless_server.scenes.background.CLAIM_S", 6.0)  # steps wait for 0.2 s and more
         looks = iter([False])
         options = BackgroundOptions(poll_s=0.01, busy_share=1e-9, quiet_s=60.0)
         server = Server(store, options, lambda: next(looks, True))
