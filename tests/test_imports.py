@@ -78,10 +78,17 @@ def _at_import(node: ast.AST, typing: bool) -> Iterator[ast.AST]:
 
 
 @cache
-def graph(*packages: str, deferred: bool) -> dict[str, set[str]]:
+def all_imports(*, deferred: bool) -> dict[str, set[str]]:
     """What each module imports; a package's own modules count as imported by those who import the package."""
-    known = {name: path for package in packages for name, path in modules_of(package).items()}
+    known = {name: path for package in SOURCES for name, path in modules_of(package).items()}
     return {name: set(imports_of(name, path, known, deferred=deferred)) - {name} for name, path in known.items()}
+
+
+def graph(*packages: str, deferred: bool) -> dict[str, set[str]]:
+    """What the modules of some packages import of one another."""
+    found = all_imports(deferred=deferred)
+    known = {name for name in found if name.partition(".")[0] in packages}
+    return {name: found[name] & known for name in known}
 
 
 def room_of(module: str) -> str:

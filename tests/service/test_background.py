@@ -21,7 +21,7 @@ from mapless_server.store import calibrations, pairs, rows
 from mapless_tools.child import child_server
 from mapless_tools.demo import room
 
-REFERENCES, QUERIES = 7, 2
+REFERENCES, QUERIES = 5, 1
 PAIRS = REFERENCES * (REFERENCES - 1) // 2
 
 

@@ -1,7 +1,8 @@
 """mapless on a real Ray cluster with Serve's ingress and a real PostgreSQL behaves like one server.
 
 Two replicas. They answer as the plain server does, bit for bit, with its errors and limits, and callers with the
-client's usual retries notice nothing when replicas are replaced, killed, or broken.
+client's usual retries notice nothing when replicas are replaced, killed, or broken. What needs no cluster is in
+tests/ray.
 """
 
 import os
@@ -59,8 +60,7 @@ from support.ray_app import FAILS, HANGS, SECRET
 from mapless_tools.load_ray.cluster import Cluster, Replica, application, running_cluster
 from mapless_tools.load_ray.replacing import Calls, Scenes, calling
 
-pytestmark = pytest.mark.timeout(300)
-nightly = pytest.mark.nightly("ray")
+pytestmark = [pytest.mark.timeout(300), pytest.mark.nightly("ray")]
 
 DATA = Path(os.environ.get("TEST_DATA", Path(__file__).parents[3] / "shared" / "data"))
 LIMIT_S = 60.0
@@ -144,7 +144,7 @@ def answered_twice(address: str, request: bytes) -> tuple[bool, bytes]:
     return bool(coarse), essence(final.answer)
 
 
-@pytest.mark.parametrize("make_place", [rendered, pytest.param(photographed, marks=nightly)])
+@pytest.mark.parametrize("make_place", [rendered, photographed])
 def test_answers_are_those_of_the_plain_server_bit_for_bit(
     url: str, real: Cluster, make_place: Callable[[], Place]
 ) -> None:
@@ -240,7 +240,6 @@ def who(client: Client, scene: str) -> int:
     return answer.inlier_count
 
 
-@nightly
 def test_errors_are_those_of_the_plain_server_with_details(url: str, guarded: Guarded, tmp_path: Path) -> None:
     with (
         serving(tmp_path, store=Store.connect(url), tokens_file=guarded.tokens_file) as plain,
@@ -251,7 +250,6 @@ def test_errors_are_those_of_the_plain_server_with_details(url: str, guarded: Gu
             assert_fails_alike(failing, SCENES[0], direct, through)
 
 
-@nightly
 def test_errors_are_internal_without_the_exceptions_text(guarded: Guarded) -> None:
     with guarded.stub() as stub, pytest.raises(grpc.RpcError) as caught:
         stub.Localize(localize_request("faulty"), timeout=30, metadata=guarded.metadata(("x-request-id", "mine")))
@@ -261,7 +259,6 @@ def test_errors_are_internal_without_the_exceptions_text(guarded: Guarded) -> No
     assert SECRET not in repr(failure.trailing_metadata())
 
 
-@nightly
 def test_invalid_tokens_and_other_tenants_are_kept_out(guarded: Guarded) -> None:
     with Client(guarded.cluster.address) as nobody, pytest.raises(MaplessError) as caught:
         nobody.get_scene(SCENES[0])
@@ -273,7 +270,6 @@ def test_invalid_tokens_and_other_tenants_are_kept_out(guarded: Guarded) -> None
         stranger.get_scene(SCENES[0])
 
 
-@nightly
 def test_the_callers_deadline_comes_along(guarded: Guarded, client: Client) -> None:
     """The replica itself says that it passed; and refuses at once what it knows to take longer."""
     with pytest.raises(DeadlineExceeded) as caught:
@@ -294,7 +290,6 @@ def test_the_callers_deadline_comes_along(guarded: Guarded, client: Client) -> N
         assert "DEADLINE_INFEASIBLE" in set(pool.map(reason, range(12)))
 
 
-@nightly
 def test_too_much_is_refused_with_the_time_to_come_back(guarded: Guarded) -> None:
     with guarded.client(max_attempts=1) as once, futures.ThreadPoolExecutor(32) as pool:
         calls = [pool.submit(once.localize, PHOTO, CAMERA, "slow", timeout_s=30) for _ in range(32)]
@@ -306,7 +301,6 @@ def test_too_much_is_refused_with_the_time_to_come_back(guarded: Guarded) -> Non
         assert error.retry_after_s
 
 
-@nightly
 @pytest.mark.parametrize(("size_mib", "expected"), [(20, "INVALID_ARGUMENT"), (33, "RESOURCE_EXHAUSTED")])
 def test_the_limit_of_messages_is_that_of_the_settings(guarded: Guarded, size_mib: int, expected: str) -> None:
     request = pb.LocalizeRequest(
@@ -317,7 +311,6 @@ def test_the_limit_of_messages_is_that_of_the_settings(guarded: Guarded, size_mi
     assert from_rpc_error(caught.value).code == expected
 
 
-@nightly
 def test_health_and_reflection_are_the_standard_ones(guarded: Guarded) -> None:
     with grpc.insecure_channel(guarded.cluster.address) as channel:
         for name in ("", *SERVICE_NAMES):
@@ -333,7 +326,6 @@ def test_health_and_reflection_are_the_standard_ones(guarded: Guarded) -> None:
 # Which replica answers
 
 
-@nightly
 def test_calls_of_a_scene_reach_one_replica_and_scenes_both(guarded: Guarded, client: Client) -> None:
     at = {scene: who(client, scene) for scene in SCENES}
     assert set(at.values()) == {replica.process_id for replica in guarded.cluster.replicas()}
@@ -341,7 +333,6 @@ def test_calls_of_a_scene_reach_one_replica_and_scenes_both(guarded: Guarded, cl
         assert {scene: who(another, scene) for scene in SCENES} == at
 
 
-@nightly
 def test_calls_that_name_no_scene_come_to_both_by_turns(guarded: Guarded) -> None:
     with guarded.stub() as stub:
         request = localize_request(SCENES[0])
@@ -381,7 +372,6 @@ def replaced(cluster: Cluster, gone: set[Replica]) -> bool:
     return len(now) == 2 and not now & gone
 
 
-@nightly
 def test_a_replica_that_is_killed_costs_retries_and_no_call(guarded: Guarded) -> None:
     victim = guarded.cluster.replicas()[0]
     with called(guarded):
@@ -389,7 +379,6 @@ def test_a_replica_that_is_killed_costs_retries_and_no_call(guarded: Guarded) ->
         wait_until(lambda: replaced(guarded.cluster, {victim}))
 
 
-@nightly
 def test_a_replica_whose_queue_hangs_ends_and_is_replaced(guarded: Guarded, client: Client) -> None:
     fill(client, "hanging", how=HANGS)
     victim = guarded.cluster.replicas()[0]
@@ -400,7 +389,6 @@ def test_a_replica_whose_queue_hangs_ends_and_is_replaced(guarded: Guarded, clie
     assert not Path(f"/proc/{victim.process_id}").exists()
 
 
-@nightly
 def test_a_redeploy_costs_no_call_and_ends_endless_streams(guarded: Guarded) -> None:
     """Not even a retry: calls that run are finished, and new ones come to the replicas that are left."""
     before = set(guarded.cluster.replicas())
@@ -425,7 +413,6 @@ def test_a_redeploy_costs_no_call_and_ends_endless_streams(guarded: Guarded) -> 
     assert not before & set(guarded.cluster.replicas())
 
 
-@nightly
 def test_without_any_replica_calls_may_be_retried(guarded: Guarded) -> None:
     with guarded.client(max_attempts=1, timeout_s=5.0) as once, guarded.client() as patient:
         for replica in guarded.cluster.replicas():

@@ -45,7 +45,6 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.features import make_extractor
-from mapless_server.services.capture.files import blobs_of, calls_of
 
 SERVICE = "mapless.v1.LocalizationService"
 RUN_BYTES = 16
@@ -283,26 +282,6 @@ def test_the_search_finds_what_is_captured(tmp_path: Path, search: Search) -> No
         wait_until(lambda: len(search.files(tmp_path)) >= 7)
         assert "calls are captured, photographs and all" in server.log
     assert {Path(it).parts[0] for it in search.files(tmp_path)} == {"captured"}
-
-
-def capture_one(server: Program, captured: Path, search: Search) -> Path:
-    """The file of a call that the server has just captured."""
-    with Client(server.address) as client:
-        client.create_scene("corner")
-        photo = marked(corner.photograph(corner.pose(0)), "r0")
-        client.add_reference("corner", NewReference("r0", photo, corner.CAMERA, corner.pose(0)))
-        client.localize(GOOD[0], corner.CAMERA, "corner")
-    wait_until(lambda: list(calls_of(captured)))
-    assert search.files(captured)
-    return next(calls_of(captured))
-
-
-def test_expired_captures_are_deleted_without_any_call(tmp_path: Path, search: Search) -> None:
-    captured = tmp_path / "captured"
-    with served(tmp_path / "server", capture_dir=captured, capture_hours=4 / 3600) as server:
-        capture_one(server, captured, search)
-        wait_until(lambda: not [*calls_of(captured), *blobs_of(captured)])
-        assert search.files(captured) == []
 
 
 @pytest.mark.parametrize("what", ["photograph", "comment", "pixels", "descriptors"])

@@ -38,7 +38,7 @@ from mapless_server.services.capture.calls import (
     decode_call,
 )
 from mapless_server.services.capture.deletion import StaleCalls
-from mapless_server.services.capture.files import calls_of
+from mapless_server.services.capture.files import blobs_of, calls_of
 from mapless_server.services.capture.folder import CaptureFolder, Retention
 from mapless_server.services.capture.recorder import Recorder
 from mapless_server.store import SceneAttributes, SceneRecord, Store, reader, time_us
@@ -376,6 +376,19 @@ def test_the_time_limit_holds_whatever_the_store_does(
         monkeypatch.undo()
         answer(recorder)
         wait_until(lambda: counts.kept == 2)
+
+
+def test_captured_calls_expire_without_any_call(tmp_path: Path) -> None:
+    """After as many hours as the settings say."""
+    folder = tmp_path / "captured"
+    with (
+        serving(tmp_path / "data", capture_dir=folder, capture_hours=1 / 3600) as server,
+        Client(server.address) as client,
+    ):
+        make_scene(client)
+        client.localize(PHOTO, CAMERA, "s")
+        wait_until(lambda: server.value("mapless_captured_total") == 1)
+        wait_until(lambda: not [*calls_of(folder), *blobs_of(folder)])
 
 
 def test_the_start_waits_for_no_store_and_retries_each_round(
