@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from itertools import combinations
 from pathlib import Path
 
@@ -32,9 +33,10 @@ QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 Fault = Callable[[RigidTransform], RigidTransform]
 
 
-def planted(*case: object, count: int = 8) -> list[PosedView]:
+@cache
+def planted(count: int = 8) -> list[PosedView]:
     """Views of a box of points, lifted and rolled so that no mistake is a symmetry; some matches are wrong."""
-    random = random_for("epipolar", *case)
+    random = random_for("epipolar")
     options = SceneOptions(point_count=250, outlier_share=0.05, distractor_count=50)
     x_in_world = (random.random((options.point_count, 3)) - 0.5) * options.box_m
     descriptors = unit_rows(random.standard_normal((options.point_count, options.descriptor_size)))
@@ -49,8 +51,10 @@ def planted(*case: object, count: int = 8) -> list[PosedView]:
     return views
 
 
-def matched(views: Sequence[PosedView]) -> list[MatchedPair]:
-    found = []
+@cache
+def matched(count: int = 8) -> list[MatchedPair]:
+    """Of the planted views: matches do not depend on poses."""
+    views, found = planted(count), []
     for i, j in combinations(range(len(views)), 2):
         matches = consistent_matches(views[i].view, views[j].view)
         if j - i <= 3 and len(matches):
@@ -63,8 +67,8 @@ def verdict_of(views: Sequence[PosedView], pairs: Sequence[MatchedPair]) -> Verd
 
 
 def test_good_poses_are_good() -> None:
-    views = planted("good")
-    verdict = verdict_of(views, matched(views))
+    views = planted()
+    verdict = verdict_of(views, matched())
     assert verdict.median_px < 1
     assert (verdict.is_wrong, verdict.suspects, verdict.bad_share) == (False, (), 0.0)
 
@@ -90,9 +94,8 @@ def mirrored(pose: RigidTransform) -> RigidTransform:
 
 
 def test_each_usual_mistake_is_noticed_and_named() -> None:
-    """One set of matches, since matches do not depend on poses."""
-    views = planted("mistakes", count=5)
-    pairs = matched(views)
+    views = planted(5)
+    pairs = matched(5)
     w_first, w_last = quaternion_reordered((3, 0, 1, 2)), quaternion_reordered((1, 2, 3, 0))
     faults: dict[str, Fault] = {
         "OpenGL": turned(OPENGL),
@@ -118,8 +121,8 @@ def test_each_usual_mistake_is_noticed_and_named() -> None:
 @pytest.mark.parametrize("quarters", [1, 2, 3])
 def test_photographs_turned_without_their_intrinsics_are_named(quarters: int) -> None:
     """By a gallery or a library that applies EXIF's orientation: pose and intrinsics stay those of the sensor."""
-    views = planted("turned", quarters)
-    pairs, wrong = matched(views), []
+    views = planted()
+    pairs, wrong = matched(), []
     for posed in views:
         view, camera = posed.view, posed.view.camera
         keypoints, size = view.features.keypoints, (camera.width_px, camera.height_px)
@@ -135,8 +138,8 @@ def test_photographs_turned_without_their_intrinsics_are_named(quarters: int) ->
 
 
 def test_intrinsics_of_a_photograph_before_it_was_reduced_are_named() -> None:
-    views = planted("reduced")
-    pairs = matched(views)
+    views = planted()
+    pairs = matched()
     camera = CAMERA.resized(2 * CAMERA.width_px, 2 * CAMERA.height_px)
     given = replace(camera, width_px=CAMERA.width_px, height_px=CAMERA.height_px)
     verdict = verdict_of([replace(view, view=replace(view.view, camera=given)) for view in views], pairs)
@@ -145,8 +148,8 @@ def test_intrinsics_of_a_photograph_before_it_was_reduced_are_named() -> None:
 
 @pytest.mark.parametrize("scale", [0.5, 2.0])
 def test_intrinsics_of_another_size_are_named_with_their_factor(scale: float) -> None:
-    views = planted("focal", scale)
-    pairs = matched(views)
+    views = planted()
+    pairs = matched()
     camera = replace(CAMERA, focal_x_px=scale * CAMERA.focal_x_px, focal_y_px=scale * CAMERA.focal_y_px)
     verdict = verdict_of([replace(view, view=replace(view.view, camera=camera)) for view in views], pairs)
     assert verdict.is_wrong
@@ -155,8 +158,8 @@ def test_intrinsics_of_another_size_are_named_with_their_factor(scale: float) ->
 
 
 def test_axes_that_are_mixed_are_named_with_the_photographs() -> None:
-    views = planted("mixed", count=9)
-    pairs = matched(views)
+    views = planted(9)
+    pairs = matched(9)
     mixed = {1, 4, 6, 7}
     fault = turned(OPENGL)
     wrong = [replace(v, world_from_camera=fault(v.world_from_camera)) if i in mixed else v for i, v in enumerate(views)]
@@ -167,8 +170,8 @@ def test_axes_that_are_mixed_are_named_with_the_photographs() -> None:
 
 
 def test_poses_of_nothing_are_wrong_without_an_explanation() -> None:
-    views = planted("nonsense")
-    pairs = matched(views)
+    views = planted()
+    pairs = matched()
     random = random_for("nonsense poses")
     poses = [RigidTransform(rotation_from_vector(random.normal(0, 1.5, 3)), random.normal(0, 2, 3)) for _ in views]
     wrong = [replace(view, world_from_camera=pose) for view, pose in zip(views, poses, strict=True)]
@@ -177,8 +180,8 @@ def test_poses_of_nothing_are_wrong_without_an_explanation() -> None:
 
 
 def test_a_single_wrong_pose_is_named_and_the_others_are_not() -> None:
-    views = planted("one wrong", count=12)
-    pairs = matched(views)
+    views = planted(12)
+    pairs = matched(12)
     wrong = RigidTransform(rotation_from_vector([0.2, 0.0, 0.1]), np.array([0.0, 0.3, 0.0])).compose(
         views[5].world_from_camera
     )
@@ -250,7 +253,7 @@ def frames_of(folder: Path, views: Sequence[PosedView], fault: Fault) -> list[Fr
 @pytest.mark.parametrize("fault", [RigidTransform.inverse, turned(OPENGL)])
 def test_wrong_poses_that_separate_neighbours_are_explained(tmp_path: Path, fault: Fault) -> None:
     """Photographs that are near in the folder's order are compared as well."""
-    views = planted("hidden", count=10)
+    views = planted(10)
     steps: list[str] = []
     verdict = check_frames(frames_of(tmp_path, views, fault), lambda step, *_: steps.append(step), NumberedViews(views))
     assert verdict.is_wrong
@@ -259,7 +262,7 @@ def test_wrong_poses_that_separate_neighbours_are_explained(tmp_path: Path, faul
 
 
 def test_photographs_that_cannot_be_read_are_left_to_the_upload(tmp_path: Path) -> None:
-    views = planted("unreadable", count=8)
+    views = planted()
     frames = frames_of(tmp_path, views, lambda pose: pose)
     (tmp_path / "0.png").write_bytes(b"no image")
     (tmp_path / "1.png").unlink()
