@@ -261,6 +261,20 @@ class TestTiers:
         assert "strong failed" in caplog.text
         assert "out of memory, say" in caplog.text
 
+    def test_stronger_features_wait_where_calls_come_together(
+        self, setting: Setting, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Each call costs more than there is room for beside the others, but its caller has the time."""
+        monkeypatch.setattr(CostModel, "predict", lambda _, stage, kind, *__: 3.0 if "tier 1" in kind else 0.01)
+        setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": localized(SURE_INLIERS)}
+        jobs = [setting.engine.query_job(query_of(("r0", "r1")), caller()) for _ in range(4)]
+
+        async def all_at_once() -> list[Result]:
+            return await asyncio.gather(*map(setting.engine.run, jobs))
+
+        results = setting.loop.run_until_complete(all_at_once())
+        assert [it.tier.extractor.name for it in results] == ["strong"] * 4
+
     def test_a_rejection_says_what_was_not_tried(self, setting: Setting) -> None:
         """A caller with a hint to check the intrinsics would, though asking again is what helps."""
         setting.replies = {"cheap": rejected(), "strong": rejected()}

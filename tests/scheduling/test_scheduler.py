@@ -5,6 +5,7 @@ import itertools
 import math
 import weakref
 from collections import Counter
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -110,6 +111,12 @@ class Toy:
         cost_s = COST_S[batch.stage.name] * len(batch.jobs)  # so that predictions stay what they are
         self.now_s = max(self.now_s, batch.start_s + (cost_s if seconds is None else seconds))
         self.scheduler.finish(batch, verdicts, self.now_s)
+
+    def fill(self) -> None:
+        """Admits jobs of one caller until one is refused."""
+        with suppress(Refused):
+            while True:
+                self.admit(client="many")
 
     def refusal(self, **what: Any) -> Refused:
         with pytest.raises(Refused) as caught:
@@ -410,31 +417,73 @@ class TestTime:
         ((predicted_s, actual_s),) = quota.settled
         assert actual_s == predicted_s > 0
 
-    @pytest.mark.parametrize(
-        ("kind", "others", "expected"),
-        [("toy", 0, None), ("toy", 6, Ending.OK), ("slow", 0, None), ("slow", 1, Ending.OK)],
-    )
-    def test_more_than_admitted_is_computed_only_where_room_is(
-        self, kind: str, others: int, expected: Ending | None
-    ) -> None:
-        """As when stronger features are to be tried; the only job is computed whatever it costs, as it is admitted."""
-        toy = Toy()
+    def again(self, toy: Toy, kind: str, others: int, due_s: float = 150.0) -> Job:
+        """A job that needs more than it was admitted with, as when stronger features are to be tried."""
         toy.learn("prepare", "slow", 50.0)
         job = toy.admit(stage="refine", client="mine", deadline_s=200.0)
         for i in range(others):
             toy.admit(client=f"other {i}")
         again = Step("prepare", kind, "b", "again")
-        toy.finish(toy.take("host"), Next(again, Fallback(lambda: Done("first"), 150.0)))
-        assert toy.ending_of(job) is expected
+        toy.finish(toy.take("host"), Next(again, Fallback(lambda: Done("first"), due_s)))
+        return job
+
+    @pytest.mark.parametrize(
+        ("kind", "others", "is_last"), [("toy", 0, False), ("toy", 6, True), ("slow", 0, False), ("slow", 1, True)]
+    )
+    def test_more_than_admitted_waits_for_an_idle_thread(self, kind: str, others: int, is_last: bool) -> None:
+        """Where others have the room; the only job is computed whatever it costs, as it is admitted."""
+        toy = Toy()
+        job = self.again(toy, kind, others)
+        assert (toy.ending_of(job), bool(job.booked_s)) == (None, not is_last)
+        order = []
+        while toy.scheduler.has_work("host"):
+            batch = toy.take("host")
+            order += [*batch.jobs]
+            toy.finish(batch, *(Done(None) for _ in batch.jobs))
+        assert order[-1 if is_last else 0] is job
+        assert (job.begins_until_s, toy.ending_of(job)) == (None, Ending.OK)
+
+    def test_a_step_beyond_the_bounds_takes_no_room(self) -> None:
+        """What waits for an idle thread lets as much be admitted as without it."""
+        toy, without = Toy(), Toy()
+        self.again(toy, "toy", 6)
+        without.admit(stage="refine", client="mine")
+        for i in range(6):
+            without.admit(client=f"other {i}")
+        without.finish(without.take("host"), Done(None))
+        for it in (toy, without):
+            it.fill()
+        assert toy.observer.admissions == without.observer.admissions
+
+    def test_a_step_waits_until_it_would_end_too_late(self) -> None:
+        toy = Toy()
+        job = self.again(toy, "slow", 4)
+        assert toy.scheduler.next_due_s is not None
+        toy.scheduler.expire(99.0)
+        assert toy.ending_of(job) is None
+        toy.scheduler.expire(99.9)  # 150 s less the predicted 50.5 s
+        assert toy.ends[0] == [(Ending.OK, "first")]
+        assert self.again(Toy(), "slow", 4, due_s=51.0).is_over  # too late from the beginning
+
+    def test_nothing_waits_for_an_idle_thread_while_jobs_are_refused(self) -> None:
+        """The answer that there is would come late for nothing: more calls come than are computed."""
+        toy = Toy()
+        toy.fill()
+        job = toy.admit(stage="refine", client="mine", deadline_s=200.0)
+        toy.learn("prepare", "slow", 50.0)
+        batch = toy.take("host")
+        assert batch.jobs == (job,)
+        toy.finish(batch, Next(Step("prepare", "slow", "b", "again"), Fallback(lambda: Done("first"), 150.0)))
+        assert toy.ending_of(job) is Ending.OK
 
     @pytest.mark.parametrize(
         ("due_s", "others", "kind"),
-        [(3.0, 0, "slow"), (1.0, 0, "toy"), (FAR_S, 5, "toy"), (0.7, 0, None), (FAR_S, 6, None)],
+        [(3.0, 0, "slow"), (1.0, 0, "toy"), (FAR_S, 5, "toy"), (0.7, 0, None), (0.7, 6, None)],
     )
     def test_the_alternative_is_computed_where_the_step_is_not(
         self, due_s: float, others: int, kind: str | None
     ) -> None:
-        """Too late or too much for the room; the fallback is given only if that holds for the alternative as well."""
+        """Too late or too much for the room; the fallback is given only if the alternative is too late as well."""
         toy = Toy()
         toy.learn("prepare", "slow", 2.0)
         toy.learn("refine", "another", 50.0)  # says nothing about `later_kind`

@@ -127,8 +127,8 @@ class Fallback:
 class Next:
     """The job needs another step. From now on it ends with the fallback, if there is one, instead of expiring.
 
-    The fallback is also given at once if the step would end too late or cost too much; before that an alternative, a
-    cheaper step, is tried.
+    The fallback is also given at once if the step would end too late; before that an alternative, a cheaper step, is
+    tried. A step that costs too much beside the other jobs waits until a thread would be idle otherwise.
     """
 
     step: Step
@@ -195,6 +195,7 @@ class Job:
         used_s: computing time so far.
         fallback: replaces expiry.
         waits_since_s: when it began to wait for the step, by the queue's clock.
+        begins_until_s: until when it waits for a thread that is idle otherwise; None if it does not wait so.
         booked_s: computing time still predicted for it, by lane.
         charged_s: computing time charged to its tenant at admission.
         unusual_s: part of the current batch's computing time that is not used for predictions; set by its stage.
@@ -212,6 +213,7 @@ class Job:
     used_s: float = 0.0
     fallback: Fallback | None = None
     waits_since_s: float = 0.0
+    begins_until_s: float | None = None
     booked_s: Counter[str] = field(default_factory=Counter)
     charged_s: float = 0.0
     unusual_s: float = 0.0
@@ -232,7 +234,8 @@ class Job:
     @property
     def due_s(self) -> float:
         """Latest time of its end, by the queue's clock."""
-        return self.deadline_s if self.fallback is None else min(self.fallback.at_s, self.deadline_s)
+        due_s = self.deadline_s if self.fallback is None else min(self.fallback.at_s, self.deadline_s)
+        return due_s if self.begins_until_s is None else min(due_s, self.begins_until_s)
 
     @property
     def check(self) -> Callable[[], None]:
@@ -272,6 +275,7 @@ class Lane:
         threads: number of threads.
         stages: the stages that they compute, in the order in which jobs go through them.
         queues: the jobs that wait for each of them.
+        spare: those that wait for each until a thread would be idle otherwise.
         free: number of idle threads.
         passed_over: batches since the first stage that has waiting jobs was served.
         busy_s: sum of the threads' computing times so far.
@@ -282,6 +286,7 @@ class Lane:
     threads: int
     stages: Sequence[Stage]
     queues: Sequence[Collection[Job]]
+    spare: Sequence[Collection[Job]]
     free: int
     passed_over: int = 0
     busy_s: float = 0.0

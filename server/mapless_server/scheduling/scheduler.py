@@ -5,6 +5,7 @@ A state machine without threads, waiting or a clock: times are passed in, so tha
 
 import heapq
 import itertools
+import math
 import weakref
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -85,11 +86,15 @@ class Scheduler:
         self._quota = quota
         self._stages = {stage.name: stage for stage in stages}
         self._queues: dict[str, FairQueue[Job]] = {stage.name: FairQueue(options.quantum_s) for stage in stages}
+        # Steps of admitted jobs that need more room than there is: computed by threads that are idle otherwise.
+        self._spare: dict[str, FairQueue[Job]] = {stage.name: FairQueue(options.quantum_s) for stage in stages}
+        self._refused_s = -math.inf  # when a job was last refused because of the others
         self._running: Counter[str] = Counter()
         self._lanes = {}
         for name, count in lanes.items():
             own = [stage for stage in stages if stage.lane == name]
-            self._lanes[name] = Lane(count, own, [self._queues[stage.name] for stage in own], count)
+            queues, spare = ([them[stage.name] for stage in own] for them in (self._queues, self._spare))
+            self._lanes[name] = Lane(count, own, queues, spare, count)
         self._limits: dict[tuple[str, str], BatchLimit] = {}
         self._declined: Counter[tuple[str, str]] = Counter()
         self._first_steps: OrderedDict[tuple[Flow, str], Step] = OrderedDict()
@@ -128,15 +133,15 @@ class Scheduler:
 
     def load(self, stage: str) -> StageLoad:
         """The jobs of a stage."""
-        queue = self._queues[stage]
-        return StageLoad(len(queue), queue.cost_s, self._running[stage])
+        queue, spare = self._queues[stage], self._spare[stage]
+        return StageLoad(len(queue) + len(spare), queue.cost_s + spare.cost_s, self._running[stage])
 
     def admit(self, job: Job, now_s: float) -> None:
         """Admits a job, which then ends exactly once; raises Refused without any change."""
         cost_s = self._predict(job.step, job.flow, now_s)
         if not job.continues:
             self._remember(job.flow, job.step)
-        with self._refusals_reported():
+        with self._refusals_reported(now_s):
             self._admission.check(job, cost_s, now_s)
             # The server's own jobs have no tenant and are free; a job that continues others is charged when it ends.
             if self._quota is not None and job.flow.tenant and not job.continues:
@@ -148,9 +153,9 @@ class Scheduler:
         self._ledger.open(job, self._admission.bookable(cost_s))
         self._enqueue(job, cost_s.total(), now_s)
 
-    def hold(self, flow: Flow, size_bytes: int) -> None:
+    def hold(self, flow: Flow, size_bytes: int, now_s: float) -> None:
         """Books memory that a call needs besides its jobs, until `release`; raises Refused if there is no room."""
-        with self._refusals_reported():
+        with self._refusals_reported(now_s):
             self._admission.check_memory(flow, size_bytes)
         self._ledger.hold(flow, size_bytes)
 
@@ -163,17 +168,14 @@ class Scheduler:
 
         That is a job as the caller's last one with this stage as its first, or with this step if there was none.
         """
-        try:
-            step = self._first_steps.get((flow, step.stage), step)
+        step = self._first_steps.get((flow, step.stage), step)
+        with self._refusals_reported(now_s):
             self._admission.check_queue(flow, self._predict(step, flow, now_s))
-        except Refused as refused:
-            self._observer.refused(refused.reason)
-            raise
 
     def has_work(self, lane_name: str) -> bool:
         """Whether a job waits for an idle thread of a lane."""
         lane = self._lanes[lane_name]
-        return lane.free > 0 and any(lane.queues)
+        return lane.free > 0 and (any(lane.queues) or any(lane.spare))
 
     def take(self, lane_name: str, now_s: float) -> Batch | None:
         """Selects what a thread of a lane computes now; None if all threads are busy or no job waits."""
@@ -190,16 +192,32 @@ class Scheduler:
 
         waiting = [it for it, queue in zip(lane.stages, lane.queues, strict=True) if any(map(is_allowed, queue))]
         if not waiting:
-            return None
+            return self._take_spare(lane, is_allowed, now_s)
         # Late stages first: jobs that have begun hold memory, and time has been spent on them.
         is_first_due = lane.passed_over >= FIRST_STAGE_INTERVAL - 1
         stage = waiting[0] if is_first_due else waiting[-1]
         lane.passed_over = 0 if stage is waiting[0] else lane.passed_over + 1
+        jobs = self._pop_batch(self._queues[stage.name], stage, is_allowed)
+        for job in jobs:
+            self._observer.waited(stage.name, now_s - job.waits_since_s)
+        return self._begin(lane, stage, jobs, now_s)
+
+    def _take_spare(self, lane: Lane, is_allowed: Callable[[Job], bool], now_s: float) -> Batch | None:
+        """Selects, for a thread that nothing else waits for, steps that need more room than there was."""
+        stages = [it for it, queue in zip(lane.stages, lane.spare, strict=True) if any(map(is_allowed, queue))]
+        if not stages:
+            return None
+        jobs = self._pop_batch(self._spare[stages[-1].name], stages[-1], is_allowed)
+        for job in jobs:
+            job.begins_until_s = None
+            self._set_timer(job)
+            self._ledger.rebook(job, self._admission.bookable(self._predict(job.step, job.flow, now_s)))
+        return self._begin(lane, stages[-1], jobs, now_s)
+
+    def _begin(self, lane: Lane, stage: Stage, jobs: tuple[Job, ...], now_s: float) -> Batch:
         lane.free -= 1
-        jobs = self._pop_batch(stage, is_allowed)
         for job in jobs:
             job.is_computed = True
-            self._observer.waited(stage.name, now_s - job.waits_since_s)
         self._running[stage.name] += len(jobs)
         batch = Batch(stage, jobs, now_s, next(self._batch_number))
         if self._step_s(jobs[0], now_s) > self._options.quantum_s:
@@ -287,10 +305,12 @@ class Scheduler:
             self.costs.observe(stage.name, kind, job.flow, None, now_s)
 
     @contextmanager
-    def _refusals_reported(self) -> Iterator[None]:
+    def _refusals_reported(self, now_s: float) -> Iterator[None]:
         try:
             yield
         except Refused as refused:
+            if refused.reason in (Refusal.QUEUE_FULL, Refusal.TOO_MUCH_MEMORY):
+                self._refused_s = now_s
             self._observer.refused(refused.reason)
             raise
 
@@ -321,7 +341,7 @@ class Scheduler:
     def _continue(self, job: Job, result: Next, now_s: float) -> None:
         """Queues a job for its next step, or, if that would end too late or cost too much, for the alternative.
 
-        Ends the job with its fallback if neither is worthwhile.
+        If neither is worthwhile, the job waits for an idle thread, or ends with its fallback if no thread will be idle.
         """
         job.step, job.fallback = result.step, result.fallback
         cost_s = self._predict(job.step, job.flow, now_s)
@@ -331,6 +351,11 @@ class Scheduler:
         elif not self._is_worthwhile(job, cost_s, now_s):
             if result.alternative is not None:  # never tried anyway: that could cost what the alternative gives
                 self._continue(job, Next(result.alternative, job.fallback), now_s)
+                return
+            if self._may_wait(job, cost_s, now_s):
+                self._ledger.rebook(job, Counter())
+                job.begins_until_s = job.due_s - in_order_s
+                self._enqueue(job, in_order_s, now_s)
                 return
             if not self._is_tried_anyway(job.step):
                 self._give_fallback(job, job.fallback, now_s)
@@ -345,6 +370,19 @@ class Scheduler:
         wait_s = sum(self._step_s(other, now_s) for stage in coming_first for other in self._queues[stage.name])
         return self._admission.fits(job, cost_s) and now_s + wait_s / lane.threads + cost_s.total() <= job.due_s
 
+    def _may_wait(self, job: Job, cost_s: Counter[str], now_s: float) -> bool:
+        """Whether a step beyond the bounds can be computed in time when all that is admitted has been.
+
+        It does not wait if jobs were refused lately: more come than is computed, so that its turn would never come.
+        """
+        if now_s - self._refused_s <= self._options.max_queued_s:
+            return False
+        before_s = (
+            (self._ledger.booked_s(name) + sum(self._spare[it.name].cost_s for it in lane.stages)) / lane.threads
+            for name, lane in self._lanes.items()
+        )
+        return now_s + max(before_s) + cost_s.total() <= job.due_s
+
     def _is_tried_anyway(self, step: Step) -> bool:
         """Whether to try a step against its prediction: once in a while, since only computing corrects a prediction."""
         self._declined[step.stage, step.kind] += 1
@@ -357,8 +395,15 @@ class Scheduler:
         """
         stage = self._stages[job.step.stage]
         job.waits_since_s = now_s
-        self._queues[stage.name].push(job, job.flow, cost_s)
+        self._queue_of(job).push(job, job.flow, cost_s)
         self._lanes[stage.lane].arrivals.append((job.flow, cost_s, now_s))
+        self._set_timer(job)
+
+    def _queue_of(self, job: Job) -> FairQueue[Job]:
+        """The queue in which a job waits for its step."""
+        return (self._queues if job.begins_until_s is None else self._spare)[job.step.stage]
+
+    def _set_timer(self, job: Job) -> None:
         if job.timer_s != job.due_s:
             job.timer_s = job.due_s
             heapq.heappush(self._due, (job.due_s, next(self._tick), weakref.ref(job)))
@@ -371,8 +416,7 @@ class Scheduler:
             self._due = [entry for entry in self._due if id(entry[2]()) in alive]
             heapq.heapify(self._due)
 
-    def _pop_batch(self, stage: Stage, is_allowed: Callable[[Job], bool]) -> tuple[Job, ...]:
-        queue = self._queues[stage.name]
+    def _pop_batch(self, queue: FairQueue[Job], stage: Stage, is_allowed: Callable[[Job], bool]) -> tuple[Job, ...]:
         first = queue.pop(is_allowed)
         bucket = first.step.bucket
         limit = self._limits.get((stage.name, bucket))
@@ -380,10 +424,9 @@ class Scheduler:
         return (first, *queue.pop_alike(lambda job: job.step.bucket == bucket, at_most - 1))
 
     def _end(self, job: Job, ending: Ending, value: Any, now_s: float) -> None:
-        stage = self._stages[job.step.stage]
-        waits = job in self._queues[stage.name]
-        if waits:
-            self._queues[stage.name].remove(job)
+        stage, queue = self._stages[job.step.stage], self._queue_of(job)
+        if job in queue:
+            queue.remove(job)
             job.records.append(StageRecord(stage.name, job.waits_since_s, now_s, now_s, batch=0, jobs=0))
         self._ledger.close(job)
         job.end(ending, value)  # before the observer and the quota, which may raise

@@ -173,7 +173,7 @@ class WorkQueue:
         Refused if there is no room for it.
         """
         with self._lock:
-            self._scheduler.hold(flow, size_bytes)
+            self._scheduler.hold(flow, size_bytes, time.monotonic())
         try:
             yield
         finally:
