@@ -12,7 +12,7 @@ OUTSIDE: dict[str, list[tuple[str, Any]]] = {
     "method.coarse.grids.GridOptions": [("pixel_limit", 10), ("aspects", ()), ("max_stretch", 0.9)]
     + [("max_half_field_deg", 90)],
     "method.coarse.token_cache.TokenCacheOptions": [("device_bytes", -1)],
-    "method.correspond.CorrespondOptions": [("reference_ratio", 1.1), ("query_ratio", 0.0), ("epipolar_px", NAN)]
+    "method.matching.CorrespondOptions": [("reference_ratio", 1.1), ("query_ratio", 0.0), ("epipolar_px", NAN)]
     + [("wide_ratio", 2.0), ("guided_similarity", -2.0)],
     "method.features.network.LearnedOptions": [("max_keypoints", 0), ("max_side_px", 8), ("min_score", 1.0)]
     + [("min_score", NAN)],

@@ -10,11 +10,12 @@ from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform
 from mapless_server.method.adjust import adjust_pose
-from mapless_server.method.bundle import Bundle, BundleProblem
+from mapless_server.method.bundle import BundleProblem
 from mapless_server.method.optimize import MinimizeOptions, minimize
 from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.pose_problem import AdjustOptions, optimum, pose_problem
 from mapless_server.method.results import PointMatches, PoseEstimate
+from mapless_server.method.unknowns import Bundle
 
 
 def problem_of(case: str, moved: float = 0.0) -> tuple[BundleProblem, Bundle]:

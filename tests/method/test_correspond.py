@@ -11,9 +11,10 @@ from support.planted import AnyRatio, same_points
 from support.scenes import CAMERA, SceneOptions, make_scene, random_for, unit_rows
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method import correspond, nearest
-from mapless_server.method.correspond import OPTIONS, CorrespondOptions, Matcher, SharedThreads, make_matcher
+from mapless_server.method import correspond, matching, nearest
+from mapless_server.method.correspond import Matcher, make_matcher
 from mapless_server.method.features import FEATURES
+from mapless_server.method.matching import OPTIONS, CorrespondOptions, SharedThreads
 from mapless_server.method.nearest import best_of_both, epipolar_distance_px, epipolar_distances_px, mutual_matches
 from mapless_server.method.views import Features, Matches, PosedView, View
 
@@ -225,7 +226,8 @@ def matched_pairs(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Features, Featu
         calls.append((first, second))
         return mutual_matches(first, second, ratio, either)
 
-    monkeypatch.setattr(correspond, "mutual_matches", spy)
+    for module in (correspond, matching):
+        monkeypatch.setattr(module, "mutual_matches", spy)
     return calls
 
 

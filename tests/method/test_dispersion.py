@@ -7,9 +7,10 @@ from support.planted import NOISE, true_structure
 from support.scenes import SceneOptions, make_scene, random_for
 
 from mapless.geometry import Array
-from mapless_server.method.bundle import Bundle, BundleProblem
+from mapless_server.method.bundle import BundleProblem
 from mapless_server.method.pose_problem import AdjustOptions, pose_problem
 from mapless_server.method.uncertainty.dispersion import LEAST_LEFT, Dispersion, disperse
+from mapless_server.method.unknowns import Bundle
 
 
 def planted(case: str, references: int = 4, points: int = 40) -> tuple[BundleProblem, Bundle]:

@@ -17,7 +17,8 @@ from support.scenes import CAMERA, SceneOptions, SyntheticScene, arc_poses, make
 from mapless.geometry import Array, RigidTransform
 from mapless_server.method import structure as stage
 from mapless_server.method.cache import LruCache
-from mapless_server.method.correspond import Correspondences, CorrespondOptions, MatchedReferences, Matcher
+from mapless_server.method.correspond import Correspondences, MatchedReferences, Matcher
+from mapless_server.method.matching import CorrespondOptions
 from mapless_server.method.observations import (
     MIN_NOISE_LEVEL_PX,
     ONE_PIXEL,

@@ -14,9 +14,10 @@ from mapless.geometry import RigidTransform
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.coarse.make import make_reconstructor
-from mapless_server.method.correspond import OPTIONS, make_matcher
+from mapless_server.method.correspond import make_matcher
 from mapless_server.method.features import make_extractor
 from mapless_server.method.localize import localize
+from mapless_server.method.matching import OPTIONS
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.priors.known import NO_PRIORS, Priors

@@ -20,8 +20,9 @@ from support.stores import DATABASES, Folder, Place, damage, let_pass, place_on
 from support.waiting import wait_until
 
 from mapless_server.errors import Unavailable
-from mapless_server.method import correspond, nearest
-from mapless_server.method.correspond import CorrespondOptions, Matcher, PairMatching, in_order
+from mapless_server.method import correspond, matching, nearest
+from mapless_server.method.correspond import Matcher, in_order
+from mapless_server.method.matching import CorrespondOptions, PairMatching
 from mapless_server.method.options import StageContext
 from mapless_server.method.views import Features, Matches, PosedView, View
 from mapless_server.scenes import background
@@ -133,7 +134,8 @@ def compared(monkeypatch: pytest.MonkeyPatch) -> Counter[int]:
         counts[round(1e3 * float(first.keypoints[0, 0] + second.keypoints[0, 0]))] += 1
         return usual(first, second, ratio, either)
 
-    monkeypatch.setattr(correspond, "mutual_matches", counting)
+    for module in (correspond, matching):
+        monkeypatch.setattr(module, "mutual_matches", counting)
     return counts
 
 

@@ -12,7 +12,8 @@ features/                    local features of a photograph
 cache                        results that are kept within a bound, here and by the server
 observations                 observations of the same point; metric points
 nearest                      nearest neighbours of two photographs' descriptors, and their epipolar lines
-lightglue, correspond        matches among references, and of the query with them (lightglue: by a network)
+matching, lightglue          how two photographs are matched: nearest neighbours, or a network
+correspond                   matches among references, and of the query with them
 priors/                      what is known of the query's pose beforehand
 intrinsics                   errors of the query's intrinsics, and the evidence of them
 results                      scale, structure, matches, pose estimate and its support: data between stages
@@ -22,6 +23,7 @@ match                        2D-3D matches of the query
 kept_depth                   (ours) points from depths that are kept with the references
 pnp                          pose and inliers
 resection                    pose and focal length from fixed points
+unknowns, normal_equations   (ours) poses, points and intrinsics; the equations for their steps
 bundle                       (ours) everything adjusted together
 uncertainty/                 the covariance of a pose
 pose_problem                 (ours) the problem of one pose, and the estimate at its optimum

@@ -41,8 +41,10 @@ def from_one_reference(coarse: Coarse, scale: MetricScale) -> Answer:
     return coarse.answer(replace(Localization.of(estimate, trust), scale_source=scale.source), support)
 
 
-def from_two_views(coarse: Coarse, answer: Answer) -> Answer:
-    """Estimates the pose from two-view and 2D-3D matches together; returns the given rejection if there is no pose."""
+def or_from_two_views(coarse: Coarse, answer: Answer) -> Answer:
+    """Estimates the pose from two-view and 2D-3D matches together, where that can help; else returns the answer."""
+    if not coarse.prepared.can_use_two_views(answer):
+        return answer
     support = _two_view_support(coarse, answer.support)
     answer = replace(answer, stage_seconds=dict(coarse.prepared.context.stage_seconds))
     if support is None or support.estimate is None:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from .adjust import adjust_pose, with_covariance
-from .alternatives import from_one_reference, from_two_views
+from .alternatives import from_one_reference, or_from_two_views
 from .answer import Answer, Localization, is_better
 from .options import LocalizeOptions, StageContext, Variant
 from .pipeline import Coarse, Pipeline, Prepared, reconstruct, structure_and_matches, with_wide_correspondences
@@ -93,24 +93,11 @@ def refine(coarse: Coarse) -> Answer:
         answer = _strict_then_wide(coarse, counts_agreement=True)
     is_rejected = isinstance(answer.outcome, Rejection)
     if not (prepared.priors and prepared.can_improve(answer) and (is_rejected or coarse.rests_on_priors)):
-        return _or_two_views(coarse, answer)
-    alone = _checked(prepared, _strict_then_wide(coarse.without_priors(), counts_agreement=False))
-    alone = _or_two_views(coarse, alone)
+        return or_from_two_views(coarse, answer)
+    alone = prepared.checked(_strict_then_wide(coarse.without_priors(), counts_agreement=False))
+    alone = or_from_two_views(coarse, alone)
     is_used = is_rejected or is_better(alone, answer, prepared.pipeline.options.max_radius_ratio)
     return alone if is_used else replace(answer, stage_seconds=alone.stage_seconds)
-
-
-def _or_two_views(coarse: Coarse, answer: Answer) -> Answer:
-    return from_two_views(coarse, answer) if coarse.prepared.can_use_two_views(answer) else answer
-
-
-def _checked(prepared: Prepared, answer: Answer) -> Answer:
-    """An answer computed without the priors, compared with them."""
-    outcome = answer.outcome
-    if isinstance(outcome, Rejection) or outcome.covariance is None:
-        return answer
-    checks = prepared.priors.shifted(prepared.origin).check(outcome.world_from_camera, outcome.covariance)
-    return replace(answer, outcome=replace(outcome, prior_checks=tuple(replace(it, used=False) for it in checks)))
 
 
 def _strict_then_wide(coarse: Coarse, counts_agreement: bool) -> Answer:

@@ -154,6 +154,14 @@ class Prepared:
         found = (RejectionReason.DEGENERATE_REFERENCES, RejectionReason.AMBIGUOUS, RejectionReason.GATE)
         return outcome.reason not in found
 
+    def checked(self, answer: Answer) -> Answer:
+        """Compares an answer that was computed without the priors with them."""
+        outcome = answer.outcome
+        if isinstance(outcome, Rejection) or outcome.covariance is None:
+            return answer
+        checks = self.priors.shifted(self.origin).check(outcome.world_from_camera, outcome.covariance)
+        return replace(answer, outcome=replace(outcome, prior_checks=tuple(replace(it, used=False) for it in checks)))
+
 
 @dataclass(frozen=True, eq=False)
 class Coarse:

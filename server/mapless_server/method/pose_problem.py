@@ -35,14 +35,16 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
-from .bundle import Bundle, BundleProblem, NormalEquations, bundle_of
+from .bundle import BundleProblem, bundle_of
 from .intrinsics import ContradictionOptions, IntrinsicsEvidence, intrinsics_evidence, keypoint_motion
+from .normal_equations import NormalEquations
 from .optimize import MinimizeOptions, minimize
 from .options import check_bounds
 from .perturbation import reprojection_errors_px, world_jacobian
 from .results import PointMatches, PoseEstimate, PoseStage, Structure
 from .structure import StructureOptions, tracks_with_query
 from .uncertainty.dispersion import UncertaintyOptions, disperse, dispersed_covariance
+from .unknowns import Bundle
 from .views import PosedView, View
 
 LEAST_DAMPING = 1e-9

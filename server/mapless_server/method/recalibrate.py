@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array
 
-from .bundle import Bundle, BundleProblem
+from .bundle import BundleProblem
 from .intrinsics import PRINCIPAL, ContradictionOptions, IntrinsicsEvidence, corrected_view
 from .perturbation import reprojection_errors_px
 from .pose_problem import (
@@ -26,6 +26,7 @@ from .pose_problem import (
 )
 from .priors.known import Priors
 from .results import PointMatches, PoseEstimate, Structure
+from .unknowns import Bundle
 from .views import PosedView, View
 
 WIDE_SIGMA = np.array([0.3, 0.3, 0.3, 1.0])

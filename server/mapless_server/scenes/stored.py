@@ -68,7 +68,7 @@ def matching_name(extractor: str, rule: str) -> str:
 
 
 class PairFinder:
-    """Implements `method.correspond.StoredPairs` for the matcher of one extractor's features."""
+    """Implements `method.matching.StoredPairs` for the matcher of one extractor's features."""
 
     def __init__(self, pairs: PairStore, extractor: str, observer: BackgroundObserver) -> None:
         """`extractor` is the name of the features that are matched."""

@@ -8,8 +8,8 @@ from typing import TypeVar
 
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, decode_image, image_size
-from mapless_server.method.correspond import OPTIONS, CorrespondOptions
 from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.matching import OPTIONS, CorrespondOptions
 from mapless_server.method.nearest import mutual_matches
 from mapless_server.method.views import PosedView, View
 from mapless_server.networks.weights import WeightsError

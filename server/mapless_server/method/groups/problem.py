@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
-from ..bundle import Bundle, BundleProblem, NormalEquations, Poses, bundle_of
+from ..bundle import BundleProblem, bundle_of
+from ..normal_equations import NormalEquations
 from ..observations import Tracks
 from ..optimize import solve_step
 from ..perturbation import reprojection_errors_px, world_jacobian
@@ -18,6 +19,7 @@ from ..pose_problem import LEAST_DAMPING, AdjustOptions, most_probable, pose_err
 from ..priors.known import Priors
 from ..results import PointMatches
 from ..structure import tracks_with_query
+from ..unknowns import Bundle, Poses
 from ..views import PosedView
 from .images import MatchedImage
 

@@ -75,12 +75,14 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
-from ..bundle import Bundle, BundleProblem, EliminatedPoints, ViewColumns
+from ..bundle import BundleProblem
 from ..intrinsics import IntrinsicsEquations
+from ..normal_equations import EliminatedPoints, ViewColumns
 from ..observations import summed
 from ..optimize import cauchy_weight, take
 from ..options import check_bounds
 from ..perturbation import world_jacobian
+from ..unknowns import Bundle
 from .radii import SUPPORTING_SHARE, gap_ratio
 
 
