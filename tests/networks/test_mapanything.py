@@ -38,7 +38,7 @@ from mapless_server.networks.view_conditions import (
     rotations_from_quaternions,
 )
 from mapless_server.networks.weights import CheckpointError
-from mapless_tools.bench_network.subject import Work, operations_of
+from mapless_tools.bench_network.subject import Work, flop_of
 
 HERE = Path(__file__).parents[1] / "fixtures" / "networks" / "mapanything"
 BESIDE = Path(os.environ.get("TEST_MAPANYTHING") or Path(__file__).parents[3] / "shared" / "mapanythingparity")
@@ -206,7 +206,7 @@ def test_operations_are_the_counted_ones(size: str, name: str) -> None:
     remaining = json.loads(existing(BESIDE / "flops.json").read_text())["by_size_HxW"][size]["remaining"]
     height, width = map(int, size.split("x"))
     work = replace(WORKS[name], views=11, grid=(height // 14, width // 14))
-    assert operations_of("mapanything", work).flop == pytest.approx(remaining[name], rel=1e-4)
+    assert flop_of("mapanything", work) == pytest.approx(remaining[name], rel=1e-4)
 
 
 # Laws

@@ -3,7 +3,7 @@
 Weights are random: time does not depend on them. `python -m mapless_tools.bench_network` is the same command without
 the dependencies of the others; all parts except whole queries need only torch and NumPy.
 
-    operations.py    counts operations and bytes, and predicts times from them
+    operations.py    counts operations, and the least time for them
     subject.py       the networks, their weights and their inputs, and what is counted of them
     forward.py       the network's forward pass, step by step; the device's limits and memory
     query.py         whole queries, on a network whose answer is replaced by the truth (planted.py)

@@ -11,8 +11,8 @@ import torch
 from mapless_server.networks.runner import CompiledShape, NetworkRunner
 from mapless_server.observability.provenance import cpu_model
 
-from .forward import measure_forward, measure_memory, measure_rates, reason_of
-from .operations import H200, Rates
+from .forward import measure_forward, measure_memory, measure_peak, reason_of
+from .operations import H200, Peak
 from .report import Figure, as_json, markdown, table
 from .subject import GRID, REFERENCES, count_all, make_network
 
@@ -58,16 +58,12 @@ class _Bench:
         name = torch.cuda.get_device_name(device) if cuda else f"{cpu_model()}, one thread"
         quickly = ", quick run: not comparable" if quick else ""
         self.title = f"{name}, torch {torch.__version__}{quickly}"
-        self.rates = self._ceilings() if cuda else H200
+        self.peak = self._measured_peak() if cuda else H200
 
-    def _ceilings(self) -> Rates:
-        rates = measure_rates(self.device)
-        self.figures += [
-            Figure("ceilings", "bfloat16 matrix product, 8192^3", rates.matrix_flops / 1e12, "TFLOP/s"),
-            Figure("ceilings", "copy on the device, bytes read and written", rates.copy_bytes / 1e12, "TB/s"),
-            Figure("ceilings", "launch of a kernel", 1e6 * rates.launch_s, "us"),
-        ]
-        return rates
+    def _measured_peak(self) -> Peak:
+        peak = measure_peak(self.device)
+        self.figures.append(Figure("ceiling", "bfloat16 matrix product, 8192^3", peak.flops / 1e12, "TFLOP/s"))
+        return peak
 
     def run(self, part: str) -> None:
         start_s = time.perf_counter()
@@ -87,9 +83,9 @@ class _Bench:
             raise RuntimeError("there is no CUDA device")
         kind, _, name = part.partition("-")
         parts: dict[str, Callable[[], Iterator[Figure]]] = {
-            "operations": lambda: count_all(self.rates),
+            "operations": lambda: count_all(self.peak),
             "memory": lambda: measure_memory(lambda: self._runner(name, "cpu"), self.device),
-            "forward": lambda: measure_forward(name, self.rates, self.device, self._repeats, not self.quick),
+            "forward": lambda: measure_forward(name, self.peak, self.device, self._repeats, not self.quick),
             "query": lambda: self._query(name),
         }
         yield from parts[kind]()

@@ -1,4 +1,4 @@
-"""A network's forward pass on a CUDA device: its steps with their least and predicted times; limits and memory."""
+"""A network's forward pass on a CUDA device: its steps with their least times; peak and memory."""
 
 import statistics
 import time
@@ -13,9 +13,9 @@ from torch import Tensor
 from mapless_server.networks.network import Network, NetworkOutput
 from mapless_server.networks.runner import NetworkRunner
 
-from .operations import Rates
+from .operations import Peak
 from .report import Figure
-from .subject import CACHED, GRID, REFERENCES, VIEWS, Scene, Work, make_network, operations_of
+from .subject import CACHED, GRID, REFERENCES, VIEWS, Scene, Work, flop_of, make_network
 
 PLAIN_MS, KEPT_MS = 90.0, 60.0
 """Targets: without and with what is kept."""
@@ -78,24 +78,22 @@ def _compiled(network: Network) -> tuple[Callable[..., Any], Callable[..., Any]]
     return encode, reconstruct
 
 
-def measure_forward(name: str, rates: Rates, device: torch.device, repeats: int, compiles: bool) -> Iterator[Figure]:
+def measure_forward(name: str, peak: Peak, device: torch.device, repeats: int, compiles: bool) -> Iterator[Figure]:
     """Measures each step and yields its figure."""
     part = f"{name} forward, {VIEWS} views of {GRID[1] * 14}x{GRID[0] * 14}"
     forward = Forward(make_network(name, device=device))
     for step in STEPS:
         if step.compiled and not compiles:
             continue
-        operations = operations_of(name, step.work)
-        floor_ms = 1e3 * operations.floor_s(rates)
-        predicted_ms = 1e3 * operations.predicted_s(rates, step.compiled)
-        figure = Figure(part, step.name, None, "ms", None, floor_ms, predicted_ms, step.target_ms)
+        flop = flop_of(name, step.work)
+        figure = Figure(part, step.name, None, "ms", floor_ms=peak.floor_ms(flop), target=step.target_ms)
         try:
             difference = _check(forward, step)
             times = median_s(partial(forward.run, step.work, step.compiled), device, repeats)
         except Exception as error:  # the other steps can still be measured
             yield replace(figure, note=reason_of(error))
             continue
-        note = f"{operations.flop / 1e12:.2f} TFLOP, {operations.kernels} kernels"
+        note = f"{flop / 1e12:.2f} TFLOP"
         note += f"; from eager by {difference:.2g} of the largest" if step.compiled else ""
         yield replace(figure, value=1e3 * times[0], again=1e3 * times[1], note=note)
 
@@ -124,8 +122,6 @@ def reason_of(error: Exception) -> str:
 
 
 PRODUCT_SIDE = 8192
-COPY_BYTES = 4 * 2**30
-"""Much larger than any cache."""
 LIMIT_GB = 8.0
 
 
@@ -155,27 +151,11 @@ def _median_s(work: Callable[[], object], device: torch.device, repeats: int) ->
     return statistics.median(float(start.elapsed_time(end)) for start, end in events) / 1000
 
 
-def measure_rates(device: torch.device, repeats: int = 20) -> Rates:
-    """Measures the limits of a CUDA device on random numbers, since zeros are faster."""
+def measure_peak(device: torch.device, repeats: int = 20) -> Peak:
+    """Measures the peak of a CUDA device on random numbers, since zeros are faster."""
     a, b = (torch.randn(PRODUCT_SIDE, PRODUCT_SIDE, device=device, dtype=torch.bfloat16) for _ in range(2))
     product_s = min(median_s(lambda: a @ b, device, repeats))
-    source = torch.randint(0, 255, (COPY_BYTES,), dtype=torch.uint8, device=device)
-    target = torch.empty_like(source)
-    copy_s = min(median_s(lambda: target.copy_(source), device, repeats))
-    name = torch.cuda.get_device_name(device)
-    return Rates(name, 2 * PRODUCT_SIDE**3 / product_s, 2 * COPY_BYTES / copy_s, _launch_s(device), measured=True)
-
-
-def _launch_s(device: torch.device, count: int = 2000) -> float:
-    """The host's time for an operation on a tiny tensor, whose kernel takes less time."""
-    x = torch.ones(1, device=device)
-    torch.cuda.synchronize(device)
-    start_s = time.perf_counter()
-    for _ in range(count):
-        x.add_(1)
-    took_s = time.perf_counter() - start_s
-    torch.cuda.synchronize(device)
-    return took_s / count
+    return Peak(torch.cuda.get_device_name(device), 2 * PRODUCT_SIDE**3 / product_s)
 
 
 def measure_memory(make_runner: Callable[[], NetworkRunner], device: torch.device) -> Iterator[Figure]:

@@ -18,7 +18,6 @@ class Figure:
     unit: str
     again: float | None = None
     floor_ms: float | None = None
-    predicted_ms: float | None = None
     target: float | None = None
     target_is_least: bool = False
     note: str = ""
@@ -31,7 +30,7 @@ class Figure:
         return self.value >= self.target if self.target_is_least else self.value <= self.target
 
 
-HEADINGS = ("figure", "measured", "again", "floor, ms", "x floor", "predicted, ms", "target", "met")
+HEADINGS = ("figure", "measured", "again", "floor, ms", "x floor", "target", "met")
 COLUMNS = 120
 """Of the table for people."""
 
@@ -70,7 +69,7 @@ def _cells(figure: Figure) -> tuple[str, ...]:
     measured = "not measured" if figure.value is None else f"{_short(figure.value)} {figure.unit}".rstrip()
     sign = "at least " if figure.target_is_least else "at most "
     target = "" if figure.target is None else sign + _short(figure.target)
-    numbers = (figure.again, figure.floor_ms, ratio, figure.predicted_ms)
+    numbers = (figure.again, figure.floor_ms, ratio)
     return (figure.name, measured, *map(_short, numbers), target, met)
 
 

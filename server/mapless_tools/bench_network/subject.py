@@ -12,7 +12,7 @@ from mapless_server.networks.mapanything import MapAnything, MapAnythingSizes
 from mapless_server.networks.network import Network, NetworkOutput
 from mapless_server.networks.pi3 import Pi3, Pi3X, Sizes
 
-from .operations import Operations, Rates, count_operations
+from .operations import Peak, count_flop
 from .report import Figure
 
 GRID = (28, 37)
@@ -129,18 +129,16 @@ class Scene:
         return network.query_pose(tokens, self.layout, *self.conditions)
 
 
-def operations_of(
-    name: str, work: Work, sizes: AnySizes | None = None, dtype: torch.dtype = torch.bfloat16
-) -> Operations:
-    """Counts what a forward pass executes."""
+def flop_of(name: str, work: Work, sizes: AnySizes | None = None, dtype: torch.dtype = torch.bfloat16) -> int:
+    """Counts the operations that a forward pass executes."""
     network = meta_network(name, sizes, dtype)
     scene = Scene(network, work.views, work.grid)
     shape = (1, work.views, network.token_count(work.grid), network.width)
     tokens = torch.empty(shape, dtype=dtype, device="meta")
-    encoded = count_operations(lambda: scene.encode(network, slice(work.encoded))) if work.encoded else Operations()
+    encoded = count_flop(lambda: scene.encode(network, slice(work.encoded))) if work.encoded else 0
     if work.query_only:
-        return encoded + count_operations(lambda: scene.query_pose(network, tokens))
-    return encoded + count_operations(lambda: scene.reconstruct(network, tokens, work.mapped))
+        return encoded + count_flop(lambda: scene.query_pose(network, tokens))
+    return encoded + count_flop(lambda: scene.reconstruct(network, tokens, work.mapped))
 
 
 def meta_network(name: str, sizes: AnySizes | None = None, dtype: torch.dtype = torch.bfloat16) -> Network:
@@ -159,27 +157,16 @@ WORKS = {
 }
 
 
-def count_all(rates: Rates) -> Iterator[Figure]:
+def count_all(peak: Peak) -> Iterator[Figure]:
     """Counts operations of forward passes of the official networks, and bytes on the device."""
     for name in NETWORKS:
-        part = f"{name}, {VIEWS} views of 518x392; times are those of {rates.device}, compiled"
+        part = f"{name}, {VIEWS} views of 518x392; floors are those of {peak.device}"
         for label, work in WORKS.items():
             if name == "mapanything" or not work.query_only:
-                yield _counted(part, label, operations_of(name, work), rates)
+                flop = flop_of(name, work)
+                yield Figure(part, label, flop / 1e12, "TFLOP", floor_ms=peak.floor_ms(flop))
         network = meta_network(name)
         weights = sum(it.nbytes for it in network.parameters())
         tokens = CACHED * network.token_count(GRID) * network.width * torch.bfloat16.itemsize
         yield Figure(f"{name} memory", "weights, linear layers in bfloat16", weights / 1e9, "GB")
         yield Figure(f"{name} memory", f"tokens of {CACHED} references of 518x392", tokens / 1e9, "GB")
-
-
-def _counted(part: str, label: str, operations: Operations, rates: Rates) -> Figure:
-    floor_ms, predicted_ms = 1e3 * operations.floor_s(rates), 1e3 * operations.predicted_s(rates, True)
-    note = (
-        f"eager {1e3 * operations.predicted_s(rates, False):.0f} ms; "
-        f"attention {operations.attention_flop / 1e12:.2f} TFLOP, "
-        f"in float32 {(operations.tf32_flop + operations.float32_flop) / 1e12:.2f}; "
-        f"{operations.kernels} kernels, {operations.eager_bytes / 1e9:.0f} GB between products, "
-        f"{operations.fused_bytes / 1e9:.0f} GB fused"
-    )
-    return Figure(part, label, operations.flop / 1e12, "TFLOP", None, floor_ms, predicted_ms, note=note)
