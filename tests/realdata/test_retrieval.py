@@ -63,9 +63,9 @@ def test_kitchen_queries_find_a_near_reference(photographs: Photographs) -> None
         assert shares >= 0.95
 
 
-def test_photographs_of_several_places_find_their_own_place(photographs: Photographs) -> None:
-    """In one index of three places, the most similar other photograph is of the same place."""
-    folders = ("fountain-P11", "herz-jesus-P8", "tum-fr3-office")
+def test_photographs_of_two_places_find_their_own_place(photographs: Photographs) -> None:
+    """In one index of a fountain and a portal, the most similar other photograph is of the same place."""
+    folders = ("fountain-P11", "herz-jesus-P8")
     for folder in folders:
         photographs(folder)
     views = {(folder, i): view for folder in folders for i, view in read_place_once(folder).views.items()}

@@ -33,7 +33,7 @@ SCENE = SceneKey("s")
 EXTRACTOR, DESCRIPTOR = StandInExtractor(), StandInDescriptor()
 KIND = calibration_kind(EXTRACTOR.name, "geometric", "1")
 REFERENCES = make_scene(
-    random_for("calibration"), SceneOptions(point_count=300, reference_count=8, baseline_m=0.3)
+    random_for("calibration"), SceneOptions(point_count=200, reference_count=7, baseline_m=0.3)
 ).references
 Change = Callable[[RigidTransform], RigidTransform]
 

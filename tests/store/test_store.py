@@ -400,7 +400,7 @@ class TestThreads:
         done = threading.Event()
 
         def write(writer: int) -> None:
-            for index in range(10):
+            for index in range(6):
                 pair = [make_reference(f"{writer}-{index}-{side}", index, count=2) for side in "ab"]
                 store.add_references(OFFICE, pair)
                 if index % 3 == 2:
@@ -428,5 +428,5 @@ class TestThreads:
                 done.set()
             assert all(reader.result(timeout=60) >= 1 for reader in readers)
         scene = store.get_scene(OFFICE)
-        assert scene.reference_count == 4 * (10 - 3) * 2
-        assert scene.generation == 1 + 4 * (10 + 2 * 3)
+        assert scene.reference_count == 4 * (6 - 2) * 2
+        assert scene.generation == 1 + 4 * (6 + 2 * 2)
