@@ -1,8 +1,6 @@
 """Servers that match references ahead of queries: the same answers for less work, also after one was killed."""
 
-import os
 import shutil
-import signal
 from contextlib import closing
 from pathlib import Path
 
@@ -13,12 +11,10 @@ from support.servers import RunningServer, serving_really
 from support.stores import Folder
 from support.waiting import wait_until
 
-from mapless import Client, LocalizationResult, NewReference, wire
+from mapless import Client, NewReference, wire
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.scenes.background import BackgroundMatching
-from mapless_server.store import calibrations, pairs, rows
-from mapless_tools.child import child_server
 from mapless_tools.demo import room
 
 REFERENCES, QUERIES = 5, 1
@@ -108,50 +104,3 @@ def test_switched_off_damaged_pairs_are_deleted(matched: Path, expected: list[by
         damaged = served.value("mapless_stored_pairs_total", result="damaged")
         wait_until(lambda: count_pairs(matched) == 2 * PAIRS - damaged)
         assert served.value("mapless_background_pairs_total") == 0
-
-
-@pytest.mark.nightly
-def test_what_a_killed_server_began_is_finished(
-    data_dir: Path, expected: list[bytes], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with child_server(data_dir) as child:
-        wait_until(lambda: count_pairs(data_dir) > 0)
-        os.kill(child.process_id, signal.SIGKILL)
-    begun = count_pairs(data_dir)
-    assert 0 < begun < 2 * PAIRS
-    now_us = rows.now_us
-    monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(1e6 * pairs.CLAIM_S))
-    with serving_really(data_dir) as served:
-        wait_until(lambda: served.value("mapless_background_pairs_total") == 2 * PAIRS - begun)
-    assert count_pairs(data_dir) == 2 * PAIRS
-    with serving_really(data_dir, background_matching=False) as served:
-        assert answers(served) == expected
-
-
-@pytest.mark.nightly
-def test_a_killed_servers_scene_is_calibrated_by_the_next(
-    matched: Path, expected: list[bytes], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def claims() -> int:
-        with closing(Folder(matched).open_as_is()) as database, database.read() as connection:
-            count = "SELECT count(*) FROM scene_calibration WHERE data IS NULL AND failure_count = 0"
-            return int(connection.exec_driver_sql(count).scalar_one())
-
-    Folder(matched).execute("DELETE FROM scene_calibration")
-    with child_server(matched) as child:
-        wait_until(lambda: claims() == 1)
-        os.kill(child.process_id, signal.SIGKILL)
-    assert claims() == 1
-    now_us = rows.now_us
-    monkeypatch.setattr(rows, "now_us", lambda: now_us() + round(1e6 * calibrations.CLAIM_S))
-    with serving_really(matched) as served:
-        wait_until(lambda: served.value("mapless_calibrations_total") == 1)
-        assert served.value("mapless_calibration_failures_total") == 0
-        assert answers(served) == expected  # which ask for no calibration
-        photograph = room().queries[0]
-        with Client(served.address) as client:
-            answer = client.localize(photograph.data, photograph.camera, "room")
-    assert isinstance(answer, LocalizationResult)
-    assert answer.accuracy is not None
-    assert answer.accuracy.calibration == "SELF"
-    assert 3 <= answer.accuracy.sample_size <= REFERENCES

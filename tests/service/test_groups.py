@@ -195,16 +195,6 @@ def test_what_shows_nothing_is_rejected_with_each_images_reason(corner: Client) 
     assert [report.rejected_alone for report in answer.images] == ["LOW_TEXTURE"] * 2
 
 
-def test_a_session_without_motion_has_no_scale(corner: Client, queries: list[bytes]) -> None:
-    frames = [SequenceFrame(queries[0], CORNER, pose(1.0))] * 2
-    answer = corner.localize_sequence(frames, "corner", estimate_session_scale=True)
-    assert isinstance(answer, GroupRejected)
-    assert answer.reason == "SCALE_UNRELIABLE"
-    assert answer.hint is not None
-    assert (answer.hint.stage, answer.hint.advice) == ("join", "RETAKE_PHOTOGRAPH")
-    assert answer.hint.best_reference.startswith("scenes/corner/references/p")
-
-
 def test_references_may_be_named_for_each_image(corner: Client, queries: list[bytes]) -> None:
     image = RigImage(queries[0], CORNER, RIG_FROM_CAMERA[0], ("p0", "p1", "p2"))
     answer = corner.localize_rig([image, image], "corner")
@@ -307,8 +297,3 @@ def test_a_group_with_too_many_bytes_is_refused(tmp_path: Path) -> None:
             client.localize_rig([image] * 2, "hall")
         assert (refused.value.code, refused.value.reason) == ("RESOURCE_EXHAUSTED", "TOO_LARGE")
         assert isinstance(client.localize_rig([image], "hall"), GroupRejected)
-
-
-def test_an_unknown_scene_is_not_found(stubs: Stubs) -> None:
-    error = failure_of(stubs.localization.LocalizeRig, rig_request("nowhere"))
-    assert (error.code, error.field) == ("NOT_FOUND", "scene")

@@ -41,7 +41,6 @@ from mapless import (
     NotFound,
     RigidTransform,
     Unavailable,
-    wire,
 )
 from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
@@ -299,16 +298,6 @@ def test_too_much_is_refused_with_the_time_to_come_back(guarded: Guarded) -> Non
         assert isinstance(error, MaplessError)
         assert (error.code, error.reason) == ("RESOURCE_EXHAUSTED", "QUEUE_FULL")
         assert error.retry_after_s
-
-
-@pytest.mark.parametrize(("size_mib", "expected"), [(20, "INVALID_ARGUMENT"), (33, "RESOURCE_EXHAUSTED")])
-def test_the_limit_of_messages_is_that_of_the_settings(guarded: Guarded, size_mib: int, expected: str) -> None:
-    request = pb.LocalizeRequest(
-        scene=f"scenes/{SCENES[0]}", image=bytes(size_mib * 2**20), intrinsics=wire.camera_to_message(CAMERA)
-    )
-    with guarded.stub() as stub, pytest.raises(grpc.RpcError) as caught:
-        stub.Localize(request, timeout=LIMIT_S, metadata=guarded.metadata())
-    assert from_rpc_error(caught.value).code == expected
 
 
 def test_health_and_reflection_are_the_standard_ones(guarded: Guarded) -> None:
