@@ -182,17 +182,8 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
     if to_pose is None:
         return None
 
-    gain, misfit = _whitened(seen, residual, weight, points)
-    cross = points.cross.reshape(len(data), 3, -1)
-    matrices, gradients = np.tile(prior, (len(seen.parts), 1, 1)), np.tile(prior_gradient, (len(seen.parts), 1))
-    matrices[0] += data
-    gradients[0] += gradient
-    for i, part in enumerate(seen.parts[:-1]):
-        lost = np.einsum("uan,abn->ubn", take(cross, seen.point[part]), gain[:, :, part]).reshape(len(data), -1)
-        others = np.ones(len(data), bool)
-        others[6 * i : 6 * i + 6] = False  # only the prior is left of its own pose
-        matrices[i + 1] += np.where(np.outer(others, others), data - lost @ lost.T, 0)
-        gradients[i + 1] += np.where(others, gradient + lost @ misfit[:, part].ravel(), 0)
+    matrices, gradients = _without_each(seen, data, gradient, points, *_whitened(seen, residual, weight, points))
+    matrices, gradients = prior + matrices, prior_gradient + gradients
     matrices[1:, query, query] += LEAST_LEFT * np.linalg.inv(to_pose[:, query])
     right = np.concatenate([matrices[:, posed, posed.stop :], gradients[:, posed, None]], axis=2)
     solved = np.linalg.solve(matrices[:, posed, posed], right)
@@ -247,6 +238,21 @@ def scale_covariance(world_from_camera: RigidTransform, centroid: Array, relativ
     arm = world_from_camera.translation - centroid
     covariance[:3, :3] = relative_sigma**2 * np.outer(arm, arm)
     return covariance
+
+
+def _without_each(
+    seen: ViewColumns, data: Array, gradient: Array, points: EliminatedPoints, gain: Array, misfit: Array
+) -> tuple[Array, Array]:
+    """Reduced equations (1 + V, U, U), (1 + V, U) of all observations, and of those without each of V references."""
+    cross = points.cross.reshape(len(data), 3, -1)
+    matrices, gradients = np.tile(data, (len(seen.parts), 1, 1)), np.tile(gradient, (len(seen.parts), 1))
+    for i, part in enumerate(seen.parts[:-1]):
+        lost = np.einsum("uan,abn->ubn", take(cross, seen.point[part]), gain[:, :, part]).reshape(len(data), -1)
+        others = np.ones(len(data), bool)
+        others[6 * i : 6 * i + 6] = False  # only the prior is left of its own pose
+        matrices[i + 1] = np.where(np.outer(others, others), data - lost @ lost.T, 0)
+        gradients[i + 1] = np.where(others, gradient + lost @ misfit[:, part].ravel(), 0)
+    return matrices, gradients
 
 
 def _thinned(seen: ViewColumns, bundle: Bundle, max_matches: int) -> tuple[ViewColumns, Bundle, int]:
