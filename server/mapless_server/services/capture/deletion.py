@@ -10,7 +10,6 @@ The limit of size is kept where calls are written, see `CaptureFolder.add`.
 import logging
 import threading
 import time
-from collections.abc import Callable
 from itertools import groupby
 
 from mapless_server.errors import DataLoss, NotFound, Unavailable
@@ -90,14 +89,10 @@ class StaleCalls:
 class Deletion:
     """Deletes the calls of one folder on time, until it is closed."""
 
-    def __init__(self, folder: CaptureFolder, store: Store, report_fault: Callable[[str, Exception], None]) -> None:
-        """Starts its threads, of which only one reads the store.
-
-        `report_fault` is called with what failed and the error, from any thread, and again after every attempt.
-        """
+    def __init__(self, folder: CaptureFolder, store: Store) -> None:
+        """Starts its threads, of which only one reads the store."""
         self._folder = folder
         self._stale = StaleCalls(store)
-        self._report_fault = report_fault
         self._closing = threading.Event()
         self._threads = [
             threading.Thread(target=self._expire, name="capture-expiry", daemon=True),
@@ -121,7 +116,7 @@ class Deletion:
             try:
                 pause_s = min(max(self._folder.expire(), _MIN_PAUSE_S), EXPIRY_CHECK_S)
             except Exception as error:
-                self._report_fault("captured calls that are too old cannot be deleted", error)
+                _log_fault("captured calls that are too old cannot be deleted", error)
 
     def _follow_store(self) -> None:
         pause_s = 0.0
@@ -130,7 +125,7 @@ class Deletion:
             try:
                 self._folder.forget_deleted()
             except Exception as error:
-                self._report_fault("what is left of captured calls cannot be deleted", error)
+                _log_fault("what is left of captured calls cannot be deleted", error)
             self._delete_stale()
             pause_s = max(begin_s + STORE_CHECK_S - time.monotonic(), _MIN_PAUSE_S)
 
@@ -142,4 +137,9 @@ class Deletion:
         except Unavailable:
             log.debug("the store is not available; captured calls are checked later")
         except Exception as error:
-            self._report_fault("captured calls cannot be compared with the store", error)
+            _log_fault("captured calls cannot be compared with the store", error)
+
+
+def _log_fault(what: str, error: Exception) -> None:
+    """Logs what failed; an unexpected error with its traceback."""
+    log.error("%s: %s", what, error, exc_info=None if isinstance(error, OSError) else error)

@@ -10,7 +10,7 @@ import platform
 import sys
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -51,8 +51,6 @@ FAULT_PAUSE_S = 60.0
 """After a fault of the disk, the time in which nothing is captured, queued calls neither."""
 CLOSING_LIMIT_S = 5.0
 """For writing the queued calls when the server stops."""
-LOG_PERIOD_S = 60.0
-"""Time in which the log has one line at most of each kind of fault: a fault may occur at every call."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,43 +69,6 @@ class QueuedCall:
     parts: tuple[UsedReferences, ...]
     attributes: SceneAttributes
     tiers: Sequence[Tier]
-
-
-class RateLimitedLog:
-    """Logs faults, at most one line of each kind in `LOG_PERIOD_S`; from any thread."""
-
-    def __init__(self) -> None:
-        self._guard = threading.Lock()
-        self._logged_s: dict[str, float] = {}
-        self._dropped: Counter[str] = Counter()
-
-    def fault(self, what: str, error: Exception, request_id: str = "") -> None:
-        """Logs that something failed, with the call's id, if any; an unexpected error with its traceback."""
-        if self._is_due(what):
-            origin = None if isinstance(error, OSError) else error
-            log.error("%s: %s", what, error, exc_info=origin, extra={"request_id": request_id} if request_id else None)
-
-    def dropped(self, reason: str) -> None:
-        """Counts a call that was not captured, for the next line in the log about such calls."""
-        with self._guard:
-            self._dropped[reason] += 1
-        if self._is_due("dropped"):
-            self.flush()
-
-    def flush(self) -> None:
-        """Logs how many calls were not captured since the last line about them."""
-        with self._guard:
-            counts, self._dropped = self._dropped, Counter()
-        if counts:
-            log.warning("calls were not captured: %s", ", ".join(f"{name} {count}" for name, count in counts.items()))
-
-    def _is_due(self, what: str) -> bool:
-        with self._guard:
-            now_s = time.monotonic()
-            is_due = now_s - self._logged_s.get(what, -LOG_PERIOD_S) >= LOG_PERIOD_S
-            if is_due:
-                self._logged_s[what] = now_s
-            return is_due
 
 
 class Recorder:
@@ -139,8 +100,7 @@ class Recorder:
         self._paused_until_s = 0.0
         self._closing_s: float | None = None
         self._changed = threading.Condition()
-        self._log = RateLimitedLog()
-        self._deletion = Deletion(folder, self._store, self._log.fault)
+        self._deletion = Deletion(folder, self._store)
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
         self._thread.start()
 
@@ -184,7 +144,6 @@ class Recorder:
             self._closing_s = time.monotonic() + CLOSING_LIMIT_S
             self._changed.notify()
         self._thread.join()
-        self._log.flush()
         self._deletion.close()
         self.folder.close()
 
@@ -229,14 +188,16 @@ class Recorder:
         except OSError as error:
             self._paused_until_s = time.monotonic() + FAULT_PAUSE_S
             self._drop("disk")
-            self._log.fault(f"nothing is captured for {FAULT_PAUSE_S:g} s", error)
+            log.error("nothing is captured for %g s: %s", FAULT_PAUSE_S, error)
         except (ReferencesDeleted, NotFound):
             self._drop("deleted")
         except (DataLoss, Unavailable):
             self._drop("store")
         except Exception as error:
             self._drop("fault")
-            self._log.fault("a call was not captured", error, queued.call.request_id)
+            log.error(
+                "capturing a call failed: %s", error, exc_info=error, extra={"request_id": queued.call.request_id}
+            )
 
     def _add(self, queued: QueuedCall, more_tries: int = 2) -> bool:
         try:
@@ -271,7 +232,7 @@ class Recorder:
 
     def _drop(self, reason: str) -> None:
         self._observer.count("capture_dropped", 1, reason)
-        self._log.dropped(reason)
+        log.warning("a call was not captured: %s", reason)  # the log limits how often
 
 
 def circumstances_of(settings: Settings, tiers: Sequence[Tier]) -> dict[str, str]:
