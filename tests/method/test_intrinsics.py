@@ -16,12 +16,14 @@ from mapless_server.method.intrinsics import (
     IntrinsicsEvidence,
     corrected,
     keypoint_motion,
+    read_as,
 )
 from mapless_server.method.options import IntrinsicsSigma
 from mapless_server.method.pose_problem import AdjustOptions, pose_problem, with_intrinsics
 from mapless_server.method.rejection import Advice, IntrinsicsParameter, Rejection, RejectionReason
 from mapless_server.method.results import PoseEstimate, Support
-from mapless_server.method.trust.intrinsics import intrinsics_checks, wrong_camera, wrong_intrinsics
+from mapless_server.method.trust.cameras import wrong_camera
+from mapless_server.method.trust.intrinsics import intrinsics_checks, wrong_intrinsics
 from mapless_server.method.views import undistort_pixels
 
 LENSES = {
@@ -259,7 +261,7 @@ def test_reduced_equations_equal_those_of_plain_rows() -> None:
     np.testing.assert_allclose(right / scale, slopes / scale, atol=1e-9 * np.abs(gradient[:split] / scale).max())
 
 
-FOCAL, X, Y, _ = IntrinsicsParameter
+FOCAL, X, Y, K1 = IntrinsicsParameter
 
 
 def rejection_of(
@@ -270,10 +272,13 @@ def rejection_of(
     sigma: float | None = None,
     doubted: float = 3.1,
     is_estimated: bool = False,
+    lens: Distortion | None = None,
+    given_lens: Distortion | None = None,
+    is_weak: bool = False,
 ) -> tuple[Rejection | None, Camera]:
     """Of a photograph with intrinsics that are wrong by these factors, and seem so by `doubted` standard deviations.
 
-    They may be estimated with the pose.
+    They may be estimated with the pose, and the lens may be another than the given one.
     """
     scene = make_scene(random_for("wrong camera"))
     random, true = random_for("outliers"), scene.query.camera
@@ -288,7 +293,10 @@ def rejection_of(
         principal * true.principal_x_px,
         principal * true.principal_y_px,
     )
-    query = replace(scene.query, camera=given, features=replace(scene.query.features, keypoints=keypoints))
+    raw = replace(true, distortion=lens).project(true.rays(keypoints.astype(np.float64)))
+    keypoints = undistort_pixels(raw, replace(true, distortion=given_lens)).astype(np.float32)
+    features = replace(scene.query.features, keypoints=keypoints)
+    query = replace(scene.query, camera=given, features=features, distortion=given_lens)
     structure, matches, estimate = stages(replace(scene, query=query), scene.references)
     if is_estimated:
         structure, matches, estimate = stages(scene, scene.references)
@@ -300,7 +308,7 @@ def rejection_of(
     nothing = tuple(np.empty((0, 2), np.int32) for _ in scene.references)
     estimate = replace(estimate, intrinsics=evidence)
     support = Support(query, scene.references, structure, matches, estimate, np.zeros(3), query_matches=nothing)
-    return wrong_camera(support, "a"), true
+    return wrong_camera(support, "a", is_doubted=is_weak), true
 
 
 @pytest.mark.parametrize(
@@ -325,11 +333,64 @@ def test_a_planted_gross_error_is_named_with_its_value(
     assert f"focal_x_px {focal.estimated:.0f} instead of {focal.given:.0f}" in rejection.message
 
 
+@pytest.mark.parametrize(
+    ("lens", "given_lens", "k1"),
+    [
+        (RadialTangential(-0.28, 0.07), None, -0.28),
+        (None, RadialTangential(-0.28, 0.07), 0.0),
+        (RadialTangential(-0.2), RadialTangential(0.1), -0.2),
+        (Fisheye(), None, -1 / 3),
+        (None, Fisheye(), 1 / 3),
+    ],
+    ids=["forgotten", "undistorted already", "wrong coefficient", "a fisheye's", "no fisheye"],
+)
+def test_another_lens_is_named_with_its_k1(lens: Distortion | None, given_lens: Distortion | None, k1: float) -> None:
+    """As a camera without it has it: a ray of slope r is shown at r + k1 r^3, by a fisheye at arctan r."""
+    rejection, _ = rejection_of(lens=lens, given_lens=given_lens)
+    assert rejection
+    (check,) = rejection.intrinsics_checks
+    assert (check.parameter, check.conflict) == (K1, True)
+    assert check.estimated == pytest.approx(k1, abs=0.06)
+    assert check.given == (given_lens.k1 if given_lens else 0.0)
+    assert f"k1 {check.estimated:.2f} instead of {check.given:.2f}" in rejection.message
+    assert rejection.hint
+    assert "lens" in rejection.hint.message
+
+
+def test_a_wrong_camera_is_found_behind_a_strong_lens() -> None:
+    """The photograph is read again with every camera that is tried: K of twice its size moves what the lens bends."""
+    lens = RadialTangential(-0.28, 0.07)
+    scene = make_scene(random_for("wrong camera"))
+    true = replace(scene.query.camera, distortion=lens)
+    given = replace(
+        true,
+        focal_x_px=2 * true.focal_x_px,
+        focal_y_px=2 * true.focal_y_px,
+        principal_x_px=true.width_px - 1,
+        principal_y_px=true.height_px - 1,
+    )
+    view = replace(scene.query, distortion=lens)
+    other = read_as(view, given)
+    again = read_as(other, true).features.keypoints
+    seen = np.isfinite(other.features.keypoints).all(axis=1)
+    assert seen.any()
+    np.testing.assert_allclose(again[seen], view.features.keypoints[seen], atol=0.1)
+
+
 @pytest.mark.parametrize(("is_estimated", "is_named"), [(False, True), (True, False)])
 def test_intrinsics_estimated_with_the_pose_are_its_own(is_estimated: bool, is_named: bool) -> None:
     """No other camera is named against intrinsics within what the caller allows."""
     rejection, _ = rejection_of(focal=1.25, sigma=0.08, is_estimated=is_estimated)
     assert (rejection is not None) == is_named
+
+
+@pytest.mark.parametrize(("focal", "k1", "is_evidence"), [(1.0, -0.1, False), (2.0, 0.0, True)])
+def test_a_weak_pose_is_evidence_only_if_very_clear(focal: float, k1: float, is_evidence: bool) -> None:
+    """Otherwise stronger features are tried, which checks of intrinsics would prevent."""
+    rejection, _ = rejection_of(focal=focal, lens=RadialTangential(k1), is_weak=True)
+    assert rejection
+    assert "all together fit one of" in rejection.message
+    assert bool(rejection.intrinsics_checks) == is_evidence
 
 
 def test_a_camera_that_nothing_doubts_is_not_compared() -> None:

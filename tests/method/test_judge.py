@@ -106,14 +106,16 @@ def test_poses_with_trust_below_1_minus_coverage_are_rejected() -> None:
 
 
 def test_a_doubted_pose_keeps_no_features_from_being_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another camera is named, but only a pose with enough evidence is evidence against its own."""
+    """The comparison with other cameras is told which poses have too little evidence."""
     check = IntrinsicsCheck(IntrinsicsParameter.FOCAL_LENGTH, 500.0, 600.0, 10.0, 1.5, True, False)
     named = Rejection(RejectionReason.GATE, "focal_x_px 600 instead of 500", intrinsics_checks=(check,))
-    monkeypatch.setattr("mapless_server.method.trust.judge.wrong_camera", lambda *_: named)
+    unchecked = replace(named, intrinsics_checks=())
+    compared = "mapless_server.method.trust.judge.wrong_camera"
+    monkeypatch.setattr(compared, lambda *given: unchecked if given[3] else named)
     support = support_of()
     trust, rejection = verdict(support, 1.0)
     assert rejection == named
-    assert verdict(support, 1 - trust - 1e-6)[1] == replace(named, intrinsics_checks=())
+    assert verdict(support, 1 - trust - 1e-6)[1] == unchecked
 
 
 @pytest.mark.parametrize(("share", "is_accepted"), [(0.079, True), (0.081, False), (1.0, False)])

@@ -25,7 +25,7 @@ from mapless_server.method.priors.known import PosePrior, Priors
 from mapless_server.method.rejection import Advice, IntrinsicsParameter, Rejection, RejectionReason
 from mapless_server.method.results import Support
 from mapless_server.method.structure import StructureOptions
-from mapless_server.method.trust.intrinsics import wrong_camera
+from mapless_server.method.trust.cameras import wrong_camera
 from mapless_server.method.trust.two_view import (
     TwoViewEvidence,
     lacks_distance,

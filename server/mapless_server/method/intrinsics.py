@@ -224,16 +224,23 @@ def corrected(camera: Camera, errors: Sequence[float] | Array) -> Camera:
 
 def corrected_view(view: View, errors: Array) -> View:
     """Returns the view after these errors are removed from its intrinsics; keypoints without an ideal pixel are NaN."""
-    lens = replace(view.camera, distortion=view.distortion)
-    pixels = lens.project(lens.rays(view.features.keypoints.astype(np.float64)))
-    better, photograph = corrected(lens, errors), view.photograph
+    better, photograph = corrected(replace(view.camera, distortion=view.distortion), errors), view.photograph
     if photograph is not None:
         scale = photograph.camera.width_px / view.camera.width_px
         photograph = replace(photograph, camera=corrected(photograph.camera, errors * [1, scale, scale, 1]))
-    features = replace(view.features, keypoints=undistort_pixels(pixels, better).astype(np.float32))
-    return replace(
-        view, camera=better.pinhole(), features=features, distortion=better.distortion, photograph=photograph
-    )
+    return replace(read_as(view, better), photograph=photograph)
+
+
+def read_as(view: View, camera: Camera) -> View:
+    """Returns the view as read with other intrinsics and another lens; keypoints without an ideal pixel are NaN.
+
+    The camera is in pixels of the view; that of the photograph stays as it is.
+    """
+    features, lens = view.features, replace(view.camera, distortion=view.distortion)
+    if camera.distortion is not None or lens.distortion is not None:
+        pixels = lens.project(lens.rays(features.keypoints.astype(np.float64)))
+        features = replace(features, keypoints=undistort_pixels(pixels, camera).astype(np.float32))
+    return replace(view, camera=camera.pinhole(), features=features, distortion=camera.distortion)
 
 
 def _by_k1(lens: Distortion, ideal: Array) -> Array:

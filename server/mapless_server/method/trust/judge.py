@@ -46,8 +46,9 @@ from ..rejection import Advice, Hint, Hypothesis, Rejection, RejectionReason
 from ..results import Support
 from ..uncertainty.radii import Accuracy, accuracy_from_covariance
 from ..views import Matches
+from .cameras import wrong_camera
 from .evidence import Evidence, Votes, evidence_of, votes_of
-from .intrinsics import wrong_camera, wrong_intrinsics
+from .intrinsics import wrong_intrinsics
 
 RIVAL_MIN_SHARE, RIVAL_MIN_KEYPOINTS = 0.5, 10
 """Least number of keypoints of a rival, as a share of those of the first pose, and in all. A place with less than half
@@ -164,9 +165,7 @@ def contradiction(
 ) -> Rejection | None:
     """Rejects a pose whose matches contradict the intrinsics or support a second pose, or whose radius is too large.
 
-    `intrinsics` are the caller's standard deviations, see `wrong_camera`. A pose that is doubted for lack of evidence
-    is none against its camera: what other cameras say is then named, but without the checks that keep stronger
-    features from being tried.
+    `intrinsics` are the caller's standard deviations; for these, and a pose that is doubted, see `wrong_camera`.
     """
     assert support.estimate is not None
     evidence = support.estimate.intrinsics
@@ -174,8 +173,8 @@ def contradiction(
     wrong = wrong_intrinsics(evidence, best, options.intrinsics) if evidence else None
     if wrong:
         return wrong
-    if wrong := wrong_camera(support, best, intrinsics):
-        return replace(wrong, intrinsics_checks=()) if is_doubted else wrong
+    if wrong := wrong_camera(support, best, intrinsics, is_doubted):
+        return wrong
     hypotheses = find_rival(support, votes)
     return _ambiguous(hypotheses) if hypotheses else _too_uncertain(support, options)
 

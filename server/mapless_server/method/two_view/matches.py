@@ -17,7 +17,7 @@ open; those of a second one determine it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,6 +87,12 @@ class TwoViewMatches:
     def sampson_px(self, world_from_query: RigidTransform) -> Array:
         """Sampson distances (T,) of the matches, pixels; NaN without a baseline."""
         return np.asarray(np.abs(self.signed_sampson_px(world_from_query)[0]))
+
+    def read_as(self, query: View) -> "TwoViewMatches":
+        """The same matches of the photograph, whose keypoints are read with other intrinsics."""
+        camera = query.camera
+        focal_px = np.tile([camera.focal_x_px, camera.focal_y_px], (len(self), 1))
+        return replace(self, ray=camera.rays(query.features.keypoints[self.keypoint]), focal_px=focal_px)
 
     def signed_sampson_px(self, world_from_query: RigidTransform) -> tuple[Array, Array]:
         """The distances (T,) with their signs, and their derivatives (T, 4) by the pixels of query and reference."""
