@@ -195,8 +195,10 @@ def resident_mib(process: Path) -> float:
 
 
 class TestMethods:
-    @pytest.mark.parametrize("where", ["rotation", "translation", "covariance", "reprojection_error_px"])
-    @pytest.mark.parametrize("number", [np.nan, np.inf])
+    @pytest.mark.parametrize(
+        ("where", "number"),
+        [("rotation", np.nan), ("translation", np.inf), ("covariance", np.nan), ("reprojection_error_px", np.inf)],
+    )
     def test_a_backend_with_invalid_output_is_an_internal_error(
         self, tmp_path: Path, where: str, number: float
     ) -> None:

@@ -145,11 +145,13 @@ def test_every_method_is_tried() -> None:
     assert set(ALL_REQUESTS) == set(METHOD_ROLES)
 
 
-@pytest.mark.parametrize("method", sorted(METHOD_ROLES))
 @pytest.mark.parametrize(
-    ("token", "reason"),
-    [(None, "TOKEN_MISSING"), ("mapless_wrong", "TOKEN_INVALID"), (EXPIRED, "TOKEN_EXPIRED")],
-    ids=["missing", "wrong", "expired"],
+    ("method", "token", "reason"),
+    [
+        *((method, None, "TOKEN_MISSING") for method in sorted(METHOD_ROLES)),
+        (REFERENCE_SERVICE + "GetScene", "mapless_wrong", "TOKEN_INVALID"),
+        (REFERENCE_SERVICE + "GetScene", EXPIRED, "TOKEN_EXPIRED"),
+    ],
 )
 def test_without_a_good_token_no_method_answers(guarded: Guarded, method: str, token: str | None, reason: str) -> None:
     failure = guarded.failure(method, ALL_REQUESTS[method], token)
