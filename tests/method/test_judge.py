@@ -111,7 +111,7 @@ def test_a_doubted_pose_keeps_no_features_from_being_tried(monkeypatch: pytest.M
     named = Rejection(RejectionReason.GATE, "focal_x_px 600 instead of 500", intrinsics_checks=(check,))
     unchecked = replace(named, intrinsics_checks=())
     compared = "mapless_server.method.trust.judge.wrong_camera"
-    monkeypatch.setattr(compared, lambda *given: unchecked if given[3] else named)
+    monkeypatch.setattr(compared, lambda *given: unchecked if given[2] else named)
     support = support_of()
     trust, rejection = verdict(support, 1.0)
     assert rejection == named

@@ -52,8 +52,8 @@ class Planted:
     references: tuple[PosedView, ...]
     correspondences: Correspondences
 
-    def solved(self) -> Support | None:
-        stages = StructureOptions(), MatchOptions(), AdjustOptions()
+    def solved(self, intrinsics: IntrinsicsSigma | None = None) -> Support | None:
+        stages = StructureOptions(), MatchOptions(), AdjustOptions(), intrinsics
         return solve_two_view(self.query, self.references, self.correspondences, (), ORIGIN, *stages)
 
     def evidence(self, support: Support) -> TwoViewEvidence:
@@ -263,7 +263,9 @@ def test_intrinsics_of_another_image_size_are_named(factor: float) -> None:
     found = {it.parameter: it.estimated for it in rejection.intrinsics_checks}
     assert found[IntrinsicsParameter.FOCAL_LENGTH] == pytest.approx(CAMERA.focal_x_px, rel=0.01)
     assert found[IntrinsicsParameter.PRINCIPAL_X] == pytest.approx((CAMERA.width_px - 1) / 2)
-    tried = wrong_camera(support, "a", IntrinsicsSigma(focal_share=0.2))
+    less_certain = problem.solved(IntrinsicsSigma(focal_share=0.2))
+    assert less_certain is not None
+    tried = wrong_camera(less_certain, "a")
     assert tried is not None
     assert tried.intrinsics_checks[0].given_sigma == pytest.approx(0.2 * camera.focal_x_px)
 
@@ -271,10 +273,28 @@ def test_intrinsics_of_another_image_size_are_named(factor: float) -> None:
 def test_cameras_that_the_caller_allows_are_not_compared() -> None:
     problem = planted((70, 60, 50), 0.5, 0.3)
     camera = replace(CAMERA, focal_x_px=2 * CAMERA.focal_x_px, focal_y_px=2 * CAMERA.focal_y_px)
-    support = replace(problem, query=replace(problem.query, camera=camera)).solved()
-    assert support is not None
-    assert wrong_camera(support, "a") is not None
-    assert wrong_camera(support, "a", IntrinsicsSigma(focal_share=0.5)) is None
+    problem = replace(problem, query=replace(problem.query, camera=camera))
+    given, uncertain = problem.solved(), problem.solved(IntrinsicsSigma(focal_share=0.5))
+    assert given is not None
+    assert uncertain is not None
+    assert wrong_camera(given, "a") is not None
+    assert wrong_camera(uncertain, "a") is None
+
+
+def test_uncertain_intrinsics_are_in_a_two_view_covariance() -> None:
+    """The caller's standard deviations, not the default ones: the pose moves along with errors of the intrinsics."""
+    problem = planted((70, 60, 50), 0.5)
+    usual, certain, uncertain = (
+        problem.solved(it)
+        for it in (IntrinsicsSigma(), IntrinsicsSigma(1e-6, 1e-6, 1e-6), IntrinsicsSigma(0.01, 0.01, 0.03))
+    )
+    sigmas_m = []
+    for support in (certain, usual, uncertain):
+        assert support is not None
+        assert support.estimate is not None
+        sigmas_m.append(np.sqrt(np.trace(support.estimate.covariance[:3, :3])))
+    assert sigmas_m[0] < sigmas_m[1] / 2
+    assert sigmas_m[1] < sigmas_m[2] / 1.5
 
 
 def test_references_are_always_matched_at_their_given_poses() -> None:

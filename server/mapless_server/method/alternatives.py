@@ -54,8 +54,7 @@ def or_from_two_views(coarse: Coarse, answer: Answer) -> Answer:
     with prepared.context.stage("judge"):
         evidence = two_view_evidence(support, query_matches)
         doubt, trust = two_view_failure(evidence), two_view_trust(evidence)
-        votes, sigma = votes_of(support, query_matches), prepared.options.intrinsics
-        rejection = None if doubt else contradiction(support, votes, options.judge, sigma)
+        rejection = None if doubt else contradiction(support, votes_of(support, query_matches), options.judge)
     if rejection:
         return coarse.answer(rejection, support)
     if doubt and lacks_distance(evidence):
@@ -75,7 +74,7 @@ def _two_view_support(coarse: Coarse, found: Support | None) -> Support | None:
     with context.stage("two_view"):
         in_world = prepared.references_in_world
         wide = matcher.correspond(query, in_world, True, context.check, query_matches)
-        stages = prepared.structure_options, prepared.match_options, options.adjust
+        stages = prepared.structure_options, prepared.match_options, options.adjust, prepared.options.intrinsics
         result = solve_two_view(query, references, wide, known, prepared.origin, *stages)
     if result is None or result.estimate is None:
         return None

@@ -119,17 +119,13 @@ class _Compared:
         return value / MIN_GAIN if is_bent else value, camera
 
 
-def wrong_camera(
-    support: Support, best_reference: str, intrinsics: IntrinsicsSigma | None = None, is_doubted: bool = False
-) -> Rejection | None:
+def wrong_camera(support: Support, best_reference: str, is_doubted: bool = False) -> Rejection | None:
     """A rejection that names what is wrong and the better value, if a pose of another camera scores clearly higher.
 
     A pose that rests on matches without points is compared whatever the linear check says, with few cameras by a brief
     search: these score 0.67 to 0.90 of the pose where the given camera is right, and 1.07 to 1.44 where its intrinsics
-    are those of an image of half or twice the size. Its linear check knows the defaults alone; `intrinsics` are the
-    caller's standard deviations, within three of which no camera is tried. What speaks against the camera of a pose
-    that is doubted for lack of evidence is named, but without the checks that keep stronger features from being tried,
-    unless it is very clear.
+    are those of an image of half or twice the size. What speaks against the camera of a pose that is doubted for lack
+    of evidence is named, but without the checks that keep stronger features from being tried, unless it is very clear.
     """
     assert support.estimate is not None
     query, evidence, by_lines = support.query, support.estimate.intrinsics, support.two_view is not None
@@ -137,8 +133,7 @@ def wrong_camera(
     if not by_lines and (count < MIN_MATCHES or evidence is None or not _is_doubtful(evidence)):
         return None
     steps = BY_LINES if by_lines else BY_POINTS
-    usual = (intrinsics or IntrinsicsSigma()).of(query.camera)
-    prior_sigma = usual if by_lines or evidence is None else evidence.prior_sigma
+    prior_sigma = evidence.prior_sigma if evidence else IntrinsicsSigma().of(query.camera)
     given = replace(query.camera, distortion=query.distortion)
     others = list(_other_cameras(given, prior_sigma, steps))
     if not others:

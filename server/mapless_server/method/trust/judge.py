@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Camera, RigidTransform, rotation_angle_deg
 
 from ..intrinsics import ContradictionOptions
-from ..options import IntrinsicsSigma, check_bounds
+from ..options import check_bounds
 from ..perturbation import pose_hessian, world_covariance
 from ..pnp import PnpOptions, false_alarms, ransac
 from ..rejection import Advice, Hint, Hypothesis, Rejection, RejectionReason
@@ -160,12 +160,11 @@ def contradiction(
     support: Support,
     votes: Votes,
     options: JudgeOptions,
-    intrinsics: IntrinsicsSigma | None = None,
     is_doubted: bool = False,
 ) -> Rejection | None:
     """Rejects a pose whose matches contradict the intrinsics or support a second pose, or whose radius is too large.
 
-    `intrinsics` are the caller's standard deviations; for these, and a pose that is doubted, see `wrong_camera`.
+    For one that is doubted for lack of evidence see `wrong_camera`.
     """
     assert support.estimate is not None
     evidence = support.estimate.intrinsics
@@ -173,7 +172,7 @@ def contradiction(
     wrong = wrong_intrinsics(evidence, best, options.intrinsics) if evidence else None
     if wrong:
         return wrong
-    if wrong := wrong_camera(support, best, intrinsics, is_doubted):
+    if wrong := wrong_camera(support, best, is_doubted):
         return wrong
     hypotheses = find_rival(support, votes)
     return _ambiguous(hypotheses) if hypotheses else _too_uncertain(support, options)

@@ -18,6 +18,7 @@ from ..adjust import adjust_pose
 from ..correspond import Correspondences
 from ..match import MatchOptions, match_points, vote
 from ..observations import Tracks
+from ..options import IntrinsicsSigma
 from ..perturbation import reprojection_errors_px
 from ..pose_problem import AdjustOptions
 from ..results import PointMatches, PoseEstimate, PoseStage, Structure, Support, TwoViewSupport
@@ -48,11 +49,13 @@ def solve_two_view(
     structure_options: StructureOptions,
     match_options: MatchOptions,
     adjust_options: AdjustOptions,
+    intrinsics: IntrinsicsSigma | None = None,
 ) -> Support | None:
     """Finds the pose that most matches of both kinds support, with these matches; None if there is none.
 
     There are two or more references, and matches between all photographs. The poses world_from_query of other stages,
-    `known`, are candidates too; for `origin` (3,) of their world see `Support`.
+    `known`, are candidates too; for `origin` (3,) of their world see `Support`. `intrinsics` are standard deviations
+    of those of the query; None for the defaults.
     """
     structure = triangulated_structure(references, correspondences, structure_options)
     matches = vote(structure, [len(it.view.features) for it in references], correspondences)
@@ -62,7 +65,7 @@ def solve_two_view(
     if pose is None:
         return None
     searched = match_points(query, references, structure, correspondences, pose, match_options)
-    problem = _Problem(evidence, structure, searched, adjust_options)
+    problem = _Problem(evidence, structure, searched, adjust_options, intrinsics)
     best = problem.at(pose)
     for _ in range(ROUNDS):
         adjusted = problem.adjusted(best)
@@ -107,6 +110,7 @@ class _Problem:
     structure: Structure
     matches: PointMatches
     adjust: AdjustOptions
+    intrinsics: IntrinsicsSigma | None
 
     def at(self, pose: RigidTransform, estimate: PoseEstimate | None = None) -> _Solution:
         """Finds the inliers of a pose."""
@@ -133,7 +137,8 @@ class _Problem:
         errors_px = np.concatenate([start.errors_px, start.support.errors_px[used]])
         inliers = np.concatenate([start.inliers, np.ones(len(rows), bool)])
         before = PoseEstimate(start.world_from_query, PoseStage.REFINED, inliers, errors_px, np.eye(6))
-        estimate = adjust_pose(self.evidence.query, self.evidence.references, structure, matches, before, self.adjust)
+        given = self.evidence.query, self.evidence.references, structure, matches, before, self.adjust
+        estimate = adjust_pose(*given, intrinsics=self.intrinsics)
         if not estimate.is_adjusted:
             return None
         found = self.at(estimate.world_from_camera)
