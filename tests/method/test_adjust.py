@@ -13,7 +13,7 @@ from mapless_server.method.adjust import adjust_pose
 from mapless_server.method.bundle import BundleProblem
 from mapless_server.method.optimize import MinimizeOptions, minimize
 from mapless_server.method.pnp import PnpOptions, solve_pose
-from mapless_server.method.pose_problem import AdjustOptions, optimum, pose_problem
+from mapless_server.method.pose_problem import AdjustInput, AdjustOptions, optimum, pose_problem
 from mapless_server.method.results import PointMatches, PoseEstimate
 from mapless_server.method.unknowns import Bundle
 
@@ -23,9 +23,8 @@ def problem_of(case: str, moved: float = 0.0) -> tuple[BundleProblem, Bundle]:
     scene = make_scene(random_for(case), SceneOptions(point_count=25, reference_count=3))
     structure, matches = true_structure(scene, NOISE)
     used = np.arange(len(matches))
-    problem, state = pose_problem(
-        scene.query, scene.references, structure, matches, used, scene.world_from_query, AdjustOptions()
-    )
+    given = AdjustInput(scene.query, scene.references, structure, matches, AdjustOptions())
+    problem, state = pose_problem(given, used, scene.world_from_query)
     random = random_for(case, "moved")
     motion = random.normal(0, moved, (len(state.poses.rotation), 6))
     return problem, state.moved(motion, random.normal(0, moved, state.points.shape))

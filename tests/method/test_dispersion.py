@@ -8,7 +8,7 @@ from support.scenes import SceneOptions, make_scene, random_for
 
 from mapless.geometry import Array
 from mapless_server.method.bundle import BundleProblem
-from mapless_server.method.pose_problem import AdjustOptions, pose_problem
+from mapless_server.method.pose_problem import AdjustInput, AdjustOptions, pose_problem
 from mapless_server.method.uncertainty.dispersion import LEAST_LEFT, Dispersion, disperse
 from mapless_server.method.unknowns import Bundle
 
@@ -19,7 +19,9 @@ def planted(case: str, references: int = 4, points: int = 40) -> tuple[BundlePro
     structure, matches = true_structure(scene, NOISE)
     used = np.arange(len(matches))
     pose = scene.world_from_query
-    problem, start = pose_problem(scene.query, scene.references, structure, matches, used, pose, AdjustOptions())
+    problem, start = pose_problem(
+        AdjustInput(scene.query, scene.references, structure, matches, AdjustOptions()), used, pose
+    )
     motion = random_for(case, "moved").normal(0, 1e-3, (references + 1, 6))
     return problem, start.moved(motion, np.zeros_like(start.points))
 

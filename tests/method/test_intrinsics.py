@@ -19,7 +19,7 @@ from mapless_server.method.intrinsics import (
     read_as,
 )
 from mapless_server.method.options import IntrinsicsSigma
-from mapless_server.method.pose_problem import AdjustOptions, pose_problem, with_intrinsics
+from mapless_server.method.pose_problem import AdjustInput, AdjustOptions, pose_problem, with_intrinsics
 from mapless_server.method.rejection import Advice, IntrinsicsParameter, Rejection, RejectionReason
 from mapless_server.method.results import PoseEstimate, Support
 from mapless_server.method.trust.cameras import wrong_camera
@@ -234,10 +234,8 @@ def test_reduced_equations_equal_those_of_plain_rows() -> None:
     """The last four unknowns of the normal equations, from the rows of the query's observations."""
     scene = make_scene(random_for("reduced"), SceneOptions(point_count=25, reference_count=3))
     structure, matches = true_structure(scene, NOISE)
-    problem, state = pose_problem(
-        scene.query, scene.references, structure, matches, np.arange(len(matches)), scene.world_from_query,
-        AdjustOptions(),
-    )  # fmt: skip
+    given = AdjustInput(scene.query, scene.references, structure, matches, AdjustOptions())
+    problem, state = pose_problem(given, np.arange(len(matches)), scene.world_from_query)
     wide, there = with_intrinsics(problem, state, scene.query)
     there = replace(there, intrinsics=np.array([1e-3, 0.5, -0.5, 2e-3]))
     point, view = wide.by_view.point, wide.by_view.view

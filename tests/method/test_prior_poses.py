@@ -17,7 +17,7 @@ from mapless_server.method.adjust import adjust_pose
 from mapless_server.method.optimize import MinimizeOptions
 from mapless_server.method.perturbation import moved
 from mapless_server.method.pnp import PnpOptions, solve_pose
-from mapless_server.method.pose_problem import AdjustOptions, pose_problem
+from mapless_server.method.pose_problem import AdjustInput, AdjustOptions, pose_problem
 from mapless_server.method.priors import informed
 from mapless_server.method.priors.informed import ransac_with_gravity, refine_pose, solve_pairs
 from mapless_server.method.priors.known import NO_PRIORS, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
@@ -240,9 +240,8 @@ def adjusted(
 def test_gradient_with_priors_equals_finite_differences() -> None:
     scene, structure, matches = scene_of("gradient")
     used = np.arange(len(matches))
-    problem, state = pose_problem(
-        scene.query, scene.references, structure, matches, used, scene.world_from_query, AdjustOptions()
-    )
+    given = AdjustInput(scene.query, scene.references, structure, matches, AdjustOptions())
+    problem, state = pose_problem(given, used, scene.world_from_query)
     problem = replace(problem, priors=all_priors(scene.world_from_query, 0.01), prior_weight=4.0)
     gradient = problem.linearize(state).pose_gradient[-6:]
 

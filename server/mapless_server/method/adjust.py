@@ -24,8 +24,15 @@ from mapless.geometry import Array
 
 from .observations import Tracks
 from .options import IntrinsicsSigma
-from .perturbation import reprojection_errors_px
-from .pose_problem import AdjustOptions, adjusted_estimate, errors_of_pose, optimum, pose_problem, shares_camera
+from .pose_problem import (
+    AdjustInput,
+    AdjustOptions,
+    adjusted_estimate,
+    errors_of_pose,
+    optimum,
+    pose_problem,
+    shares_camera,
+)
 from .priors.known import NO_PRIORS, Priors
 from .recalibrate import Solved, is_suspicious, recalibrated
 from .results import MetricScale, PointMatches, PoseEstimate, PoseStage, Structure, Support
@@ -39,8 +46,8 @@ references' points too, and moves the pose but little: focus and stabilization r
 errors exceeds all others in scenes of one camera, where radii hold too often."""
 
 
-Optimum = tuple[Structure, PointMatches, Solved]
-"""All points of an adjustment, the query's matches with them, and what was solved."""
+Optimum = tuple[AdjustInput, Solved]
+"""What was adjusted, with points of the query's own, and what was solved."""
 
 
 def adjust_pose(
@@ -71,10 +78,10 @@ def adjust_pose(
     Returns:
         The estimate with a refined pose and its covariance; unchanged if the adjustment fails.
     """
+    given = AdjustInput(query, references, structure, matches, options)
 
     def adjusted(start: PoseEstimate, active: Priors) -> tuple[PoseEstimate, Optimum | None] | None:
-        given = query, references, structure, matches, start, options, active, intrinsics
-        return _adjusted(*given, query_matches)
+        return _adjusted(given, start, active, intrinsics, query_matches)
 
     # If no prior is used, the answer is bit-identical to the one without priors.
     without_priors = estimate.without_priors or estimate
@@ -85,22 +92,20 @@ def adjust_pose(
     used = priors.consistent(checks)
     answer = alone or without_priors
     if used:
-        informed = _with_priors(query, alone, where, used, options) if alone and where else None
+        informed = _with_priors(alone, where, used) if alone and where else None
         answer = informed or (adjusted(estimate, used) or (estimate, None))[0]
     return replace(answer, prior_checks=checks)
 
 
-def _with_priors(
-    query: View, alone: PoseEstimate, where: Optimum, priors: Priors, options: AdjustOptions
-) -> PoseEstimate | None:
+def _with_priors(alone: PoseEstimate, where: Optimum, priors: Priors) -> PoseEstimate | None:
     """The estimate with priors that are consistent with the one without, from whose optimum it starts.
 
     What the photograph says of the pose's errors is computed there.
     """
-    structure, matches, (problem, start, used) = where
-    bundle = optimum(problem.replaced(priors=priors, prior_weight=options.error_inflation**2), start, options)
-    errors = alone.covariance, alone.intrinsics
-    found = adjusted_estimate(query, structure, matches, used, alone, bundle, options, errors)
+    given, (problem, start, used) = where
+    with_priors = problem.replaced(priors=priors, prior_weight=given.options.error_inflation**2)
+    bundle = optimum(with_priors, start, given.options)
+    found = adjusted_estimate(given, used, alone, bundle, (alone.covariance, alone.intrinsics))
     return found and _sharpened(_of_matches(found, len(alone.inliers)), priors)
 
 
@@ -114,12 +119,8 @@ def _of_matches(found: PoseEstimate, count: int) -> PoseEstimate:
 
 
 def _adjusted(
-    query: View,
-    references: Sequence[PosedView],
-    structure: Structure,
-    matches: PointMatches,
+    given: AdjustInput,
     estimate: PoseEstimate,
-    options: AdjustOptions,
     priors: Priors,
     intrinsics: IntrinsicsSigma | None,
     query_matches: Sequence[Matches],
@@ -129,75 +130,59 @@ def _adjusted(
     Points of the query's own are chosen at its pose, with whatever error the intrinsics give it, so they hide a part
     of this error: intrinsics that seem wrong with them are judged, and estimated, without them.
     """
-    terms = intrinsics_terms(query, references, intrinsics)
-
-    def solved(start: PoseEstimate, tracks: Tracks | None = None) -> tuple[PoseEstimate, Optimum] | None:
-        return _at_optimum(query, references, structure, matches, start, options, priors, terms, tracks)
-
-    own = _own_tracks(query, references, structure, matches, estimate, options, query_matches)
-    first = solved(estimate, own) if own and estimate.inliers.mean() >= options.agreeing_share else None
-    if first and not is_suspicious(first[0], options):
+    terms = intrinsics_terms(given.query, given.references, intrinsics)
+    own = _own_tracks(given, estimate, query_matches)
+    is_agreeing = estimate.inliers.mean() >= given.options.agreeing_share
+    first = _at_optimum(given, estimate, priors, terms, own) if own and is_agreeing else None
+    if first and not is_suspicious(first[0], given.options):
         return _sharpened(first[0], priors), first[1]
-    plain = solved(estimate)
+    plain = _at_optimum(given, estimate, priors, terms)
     if plain is None:
         return None
     found, where = plain
-    better = recalibrated(query, references, structure, matches, found, options, priors, terms[2], where[2])
+    better = recalibrated(given, found, priors, terms[2], where[1])
     if better is found and own:
-        more, where = first or solved(found, own) or plain
+        more, where = first or _at_optimum(given, found, priors, terms, own) or plain
         better = replace(more, intrinsics=found.intrinsics)
     return _sharpened(better, priors), where if better.view is None else None
 
 
-def _own_tracks(
-    query: View,
-    references: Sequence[PosedView],
-    structure: Structure,
-    matches: PointMatches,
-    estimate: PoseEstimate,
-    options: AdjustOptions,
-    query_matches: Sequence[Matches],
-) -> Tracks | None:
+def _own_tracks(given: AdjustInput, estimate: PoseEstimate, query_matches: Sequence[Matches]) -> Tracks | None:
     """Tracks of the query's keypoints that match references but no point; None if these are few."""
-    free = np.ones(len(query.features), bool)
-    free[matches.keypoint] = False
-    tracks = query_tracks(references, structure, query_matches, free)
-    is_many = tracks.point_count > 0 and tracks.point_count >= options.min_added_share * estimate.inliers.sum()
+    free = np.ones(len(given.query.features), bool)
+    free[given.matches.keypoint] = False
+    tracks = query_tracks(given.references, given.structure, query_matches, free)
+    is_many = tracks.point_count > 0 and tracks.point_count >= given.options.min_added_share * estimate.inliers.sum()
     return tracks if is_many else None
 
 
 def _at_optimum(
-    query: View,
-    references: Sequence[PosedView],
-    structure: Structure,
-    matches: PointMatches,
+    given: AdjustInput,
     estimate: PoseEstimate,
-    options: AdjustOptions,
     priors: Priors,
     terms: tuple[View, Array, Array, Array],
-    own: Tracks | None,
+    own: Tracks | None = None,
 ) -> tuple[PoseEstimate, Optimum] | None:
     """The estimate at the optimum, with points of the query's own tracks, and where it was found."""
-    given, pose = len(matches), estimate.world_from_camera
+    count, pose, options = len(given.matches), estimate.world_from_camera, given.options
     if own:
-        structure, matches = with_query_points(query, references, structure, matches, own, pose, options.query_points)
-    added = slice(given, None)
-    x_in_world, pixels = structure.x_in_world[matches.point[added]], query.features.keypoints[matches.keypoint[added]]
-    errors_px = reprojection_errors_px(query.camera, pose, x_in_world, pixels.astype(np.float64))
-    errors_px = np.concatenate([estimate.errors_px, errors_px])
-    start_inliers = np.concatenate([estimate.inliers, np.ones(len(matches) - given, bool)])
+        points = given.query, given.references, given.structure, given.matches, own, pose, options.query_points
+        structure, matches = with_query_points(*points)
+        given = replace(given, structure=structure, matches=matches)
+    errors_px = np.concatenate([estimate.errors_px, given.errors_px(pose, slice(count, None))])
+    start_inliers = np.concatenate([estimate.inliers, np.ones(len(given.matches) - count, bool)])
     used = np.flatnonzero(errors_px < options.max_error_px)
     if len(used) < 3:  # two equations each, for six unknowns
         return None
-    problem, start = pose_problem(query, references, structure, matches, used, pose, options)
+    problem, start = pose_problem(given, used, pose)
     with_priors = problem.replaced(priors=priors, prior_weight=options.error_inflation**2)
     bundle = optimum(with_priors, start, options)
     before = replace(estimate, inliers=start_inliers, errors_px=errors_px)
-    errors = errors_of_pose(query, problem, bundle, options, terms)
-    found = adjusted_estimate(query, structure, matches, used, before, bundle, options, errors)
+    errors = errors_of_pose(given.query, problem, bundle, options, terms)
+    found = adjusted_estimate(given, used, before, bundle, errors)
     if found is None:
         return None
-    return _of_matches(found, given), (structure, matches, (problem, bundle, used))
+    return _of_matches(found, count), (given, (problem, bundle, used))
 
 
 def intrinsics_terms(
@@ -231,7 +216,7 @@ def with_covariance(
     Raises:
         ValueError: there is no estimate.
     """
-    estimate, references, matches = support.estimate, support.references, support.matches
+    estimate, references = support.estimate, support.references
     if estimate is None:
         raise ValueError("support.estimate must not be None")
     if estimate.is_adjusted:
@@ -240,7 +225,8 @@ def with_covariance(
     if len(used) < 3:
         return estimate
     pose, is_initial = estimate.world_from_camera, estimate.stage is PoseStage.INITIAL
-    problem, bundle = pose_problem(support.query, references, support.structure, matches, used, pose, options)
+    given = AdjustInput(support.query, references, support.structure, support.matches, options)
+    problem, bundle = pose_problem(given, used, pose)
     terms = intrinsics_terms(support.query, references, intrinsics)
     errors = errors_of_pose(support.query, problem, bundle, options, terms, is_initial)
     if errors is None:
@@ -254,9 +240,7 @@ def with_covariance(
     if evidence is None:
         return found
     # The pose stays as it is; but an error is not seen in full before it is estimated.
-    given = support.query, references, support.structure, matches
-    solved = problem, bundle, used
-    estimated = recalibrated(*given, found, options, NO_PRIORS, terms[2], solved).intrinsics
+    estimated = recalibrated(given, found, NO_PRIORS, terms[2], (problem, bundle, used)).intrinsics
     if estimated is not None and estimated.contradicted(options.contradiction, terms[2]).any():
         found = replace(found, intrinsics=estimated)
     return found

@@ -126,34 +126,59 @@ class AdjustOptions:
         check_bounds(self, "rounds", at_least=2)  # the last one only reads the photograph again
 
 
+@dataclass(frozen=True, eq=False)
+class AdjustInput:
+    """What a pose is adjusted to.
+
+    Attributes:
+        query: the query.
+        references: the references, in the order of the structure's tracks.
+        structure: metric points.
+        matches: 2D-3D matches of the query with these points.
+        options: of the adjustment.
+    """
+
+    query: View
+    references: Sequence[PosedView]
+    structure: Structure
+    matches: PointMatches
+    options: AdjustOptions
+
+    def errors_px(self, world_from_query: RigidTransform, rows: slice = slice(None)) -> Array:
+        """Reprojection errors (M,) of matches at a pose, pixels; infinite behind the camera."""
+        pixels = self.query.features.keypoints[self.matches.keypoint[rows]].astype(np.float64)
+        x_in_world = self.structure.x_in_world[self.matches.point[rows]]
+        return reprojection_errors_px(self.query.camera, world_from_query, x_in_world, pixels)
+
+    def with_points(self, used: NDArray[np.intp], points: Array) -> "AdjustInput":
+        """Moves the points of the `used` matches to `points` (P, 3), in the order of the structure."""
+        x_in_world = self.structure.x_in_world.copy()
+        x_in_world[np.unique(self.matches.point[used])] = points
+        return replace(self, structure=replace(self.structure, x_in_world=x_in_world))
+
+
 def pose_problem(
-    query: View,
-    references: Sequence[PosedView],
-    structure: Structure,
-    matches: PointMatches,
-    used: NDArray[np.intp],
-    world_from_query: RigidTransform,
-    options: AdjustOptions,
-    information: Array | None = None,
+    given: AdjustInput, used: NDArray[np.intp], world_from_query: RigidTransform, information: Array | None = None
 ) -> tuple[BundleProblem, Bundle]:
     """Sets up the problem of one query without priors, and its start; `used` are the indices of the matches to use.
 
     `information` is that of the prior on the references' poses, which is estimated if None.
     """
+    query, references, structure, matches = given.query, given.references, given.structure, given.matches
     views = [*references, PosedView("", "", query, world_from_query)]
     tracks, chosen = tracks_with_query(structure, matches.point[used], matches.keypoint[used], len(references))
     observations, start, depth_m = bundle_of(tracks, views, structure, chosen)
-    given = start.poses[:-1]
+    poses = start.poses[:-1]
     free = np.zeros((6 * len(references),) * 2)
     planes = structure.planes[chosen] if structure.planes is not None else None
-    problem = BundleProblem(observations, tracks.view, given, free, options.loss_scale_sigma, planes=planes)
+    problem = BundleProblem(observations, tracks.view, poses, free, given.options.loss_scale_sigma, planes=planes)
     if information is not None:
         return problem.replaced(information=information), start
     centres = np.array([it.world_from_camera.translation for it in references])
     observing = np.unique(tracks.view)[:-1]  # the last is the query
     focal_px = float(np.median([references[i].view.camera.focal_x_px for i in observing]))
     level_px = structure.noise.level_px
-    errors = pose_errors(centres, given.rotation, world_from_query.translation, level_px, focal_px, depth_m, observing)
+    errors = pose_errors(centres, poses.rotation, world_from_query.translation, level_px, focal_px, depth_m, observing)
     matrix, gradient, _ = problem.linearize(start).reduced(LEAST_DAMPING)
     own, drift = most_probable(errors, matrix, gradient)
     covariance = errors.covariance(own, drift)
@@ -186,21 +211,15 @@ def shares_camera(query: View, references: Sequence[PosedView]) -> bool:
 
 
 def adjusted_estimate(
-    query: View,
-    structure: Structure,
-    matches: PointMatches,
+    given: AdjustInput,
     used: NDArray[np.intp],
     estimate: PoseEstimate,
     bundle: Bundle,
-    options: AdjustOptions,
     errors: tuple[Array, IntrinsicsEvidence | None] | None,
 ) -> PoseEstimate | None:
     """Returns the estimate at the optimum; None if it has diverged. `errors` are what `errors_of_pose` returns."""
-    pose = bundle.world_from_query
-    pixels = query.features.keypoints[matches.keypoint].astype(np.float64)
-    points = structure.x_in_world.copy()
-    points[np.unique(matches.point[used])] = bundle.points
-    errors_px = reprojection_errors_px(query.camera, pose, points[matches.point], pixels)
+    pose, options = bundle.world_from_query, given.options
+    errors_px = given.with_points(used, bundle.points).errors_px(pose)
     inliers = errors_px < options.inlier_px
     if errors is None or inliers.sum() < max(1, options.min_kept_share * estimate.inliers.sum()):
         return None

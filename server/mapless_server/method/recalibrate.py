@@ -4,7 +4,6 @@ First all together, which shows the wrong ones; then these alone, the most signi
 again with each value.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,8 +13,8 @@ from mapless.geometry import Array
 
 from .bundle import BundleProblem
 from .intrinsics import PRINCIPAL, ContradictionOptions, IntrinsicsEvidence, corrected_view
-from .perturbation import reprojection_errors_px
 from .pose_problem import (
+    AdjustInput,
     AdjustOptions,
     adjusted_estimate,
     errors_of_pose,
@@ -25,9 +24,8 @@ from .pose_problem import (
     with_intrinsics,
 )
 from .priors.known import Priors
-from .results import PointMatches, PoseEstimate, Structure
+from .results import PoseEstimate
 from .unknowns import Bundle
-from .views import PosedView, View
 
 WIDE_SIGMA = np.array([0.3, 0.3, 0.3, 1.0])
 """Of an estimated parameter: focal length and k1, and principal point as a share of the width."""
@@ -44,39 +42,29 @@ Solved = tuple[BundleProblem, Bundle, NDArray[np.intp]]
 """A problem, its solution, and the indices of the matches that it uses."""
 
 
-def recalibrated(
-    query: View,
-    references: Sequence[PosedView],
-    structure: Structure,
-    matches: PointMatches,
-    found: PoseEstimate,
-    options: AdjustOptions,
-    priors: Priors,
-    usual: Array,
-    solved: Solved,
-) -> PoseEstimate:
+def recalibrated(given: AdjustInput, found: PoseEstimate, priors: Priors, usual: Array, solved: Solved) -> PoseEstimate:
     """The estimate with the parameters that the photograph contradicts; the one found if it contradicts none.
 
-    `solved` is where the estimate was found.
+    `solved` is where the estimate was found; `usual` (4,) are the standard deviations of the intrinsics.
     """
+    query, options = given.query, given.options
     held, untried = usual, np.ones(4, bool)
     wide = np.maximum(usual, WIDE_SIGMA * np.array([1, query.camera.width_px, query.camera.width_px, 1]))
     if not is_suspicious(found, options):
         return found
     # With all estimated, the wrong ones stand out: an error that is held looks like errors of the others.
-    given = query, references, structure, matches
-    guide = _with_errors(*given, found, options, priors, usual, wide, solved) or found
+    guide = _with_errors(given, found, priors, usual, wide, solved) or found
     while (worst := _contradicted(guide, options.suspicion, untried)) is not None:
         untried[list(worst)] = False
         freed = held.copy()
         freed[list(worst)] = wide[list(worst)]
-        better = _with_errors(*given, guide, options, priors, usual, freed)
+        better = _with_errors(given, guide, priors, usual, freed)
         if better is None or better.intrinsics is None:
             continue
         if better.intrinsics.contradicted(options.contradiction)[list(worst)].any():
             guide, found, held = better, better, freed
         elif better.intrinsics.contradicted(options.suspicion)[list(worst)].any():
-            found = _doubted(found, better.intrinsics, worst, shares_camera(query, references))
+            found = _doubted(found, better.intrinsics, worst, shares_camera(query, given.references))
     return found
 
 
@@ -120,52 +108,42 @@ def _contradicted(
 
 
 def _with_errors(
-    query: View,
-    references: Sequence[PosedView],
-    structure: Structure,
-    matches: PointMatches,
-    found: PoseEstimate,
-    options: AdjustOptions,
-    priors: Priors,
-    usual: Array,
-    held: Array,
-    solved: Solved | None = None,
+    given: AdjustInput, found: PoseEstimate, priors: Priors, usual: Array, held: Array, solved: Solved | None = None
 ) -> PoseEstimate | None:
     """The estimate with intrinsics as unknowns of prior standard deviations `held`; None if it fails."""
     assert found.intrinsics is not None
-    errors, pose, view = found.intrinsics.removed, found.world_from_camera, found.view or query
+    query, options, errors, pose = given.query, given.options, found.intrinsics.removed, found.world_from_camera
     small = LINEAR_CHANGE * np.array([1, query.camera.width_px, query.camera.width_px, 1])
     rough = replace(options, min_motion_sigma=ROUGHLY * options.min_motion_sigma)
-    moved, bundle, change, information = structure, None, None, None
+    read = replace(given, query=found.view or query)  # the photograph as it is read with these errors removed
+    moved, bundle, change, information = read, None, None, None
     for left in reversed(range(options.rounds)):
         if solved is None:
-            pixels = view.features.keypoints[matches.keypoint].astype(np.float64)
-            errors_px = reprojection_errors_px(view.camera, pose, structure.x_in_world[matches.point], pixels)
+            errors_px = read.errors_px(pose)
             used = np.flatnonzero(errors_px < options.max_error_px)
         else:
             problem, start, used = solved
         if len(used) < LEAST_MATCHES:
             return None
         if solved is None:
-            problem, start = pose_problem(view, references, moved, matches, used, pose, options, information)
+            problem, start = pose_problem(moved, used, pose, information)
             start = start if bundle is None else replace(start, poses=bundle.poses)
         solved = None
         problem = problem.replaced(priors=priors, prior_weight=options.error_inflation**2)
         if not left or (change is not None and (np.abs(change) < small).all()):
             break
-        wider, there = with_intrinsics(problem, start, view)
+        wider, there = with_intrinsics(problem, start, read.query)
         wider = wider.replaced(intrinsics_information=held**-2.0, intrinsics_offset=errors)
         bundle = optimum(wider, there, rough)
         pose, change, information = bundle.world_from_query, bundle.intrinsics, problem.information
         errors = errors + change
         if np.abs(errors / held).max() > MAX_HELD:
             return None
-        view, points = corrected_view(query, errors), moved.x_in_world.copy()
-        points[np.unique(matches.point[used])] = bundle.points
-        moved = replace(structure, x_in_world=points)
+        read = replace(given, query=corrected_view(query, errors))
+        moved = replace(moved.with_points(used, bundle.points), query=read.query)
     terms = (query, errors, usual, held)
     before = replace(found, inliers=errors_px < options.inlier_px)
     bundle = optimum(problem, start, options)
-    its_errors = errors_of_pose(view, problem, bundle, options, terms)
-    better = adjusted_estimate(view, structure, matches, used, before, bundle, options, its_errors)
-    return better and replace(better, view=view)
+    its_errors = errors_of_pose(read.query, problem, bundle, options, terms)
+    better = adjusted_estimate(read, used, before, bundle, its_errors)
+    return better and replace(better, view=read.query)
