@@ -281,7 +281,7 @@ def test_references_at_one_place_are_rejected(strategy: ScaleStrategy, pose_nois
     options = ScaleOptions(strategy=strategy)
     rejection = rejection_of(network.reconstruct(scene.query, scene.references), scene, options)
     assert rejection.reason is RejectionReason.DEGENERATE_REFERENCES
-    assert "0.0017 m" in rejection.message
+    assert "0.0017 of" in rejection.message
 
 
 def test_references_too_close_for_the_scenes_depth_are_rejected() -> None:

@@ -10,6 +10,7 @@ from support.groups import NOTHING, caller_pose, drifting, error_m, images_of, r
 from support.scenes import SceneOptions, look_at, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg, rotation_from_vector
+from mapless_server.method.answer import Localization
 from mapless_server.method.groups.checks import check_tracking
 from mapless_server.method.groups.drift import SequenceState, step_sigma
 from mapless_server.method.groups.jumps import find_jumps
@@ -148,15 +149,17 @@ def test_a_jump_is_found_at_a_frame_with_too_few_matches_alone() -> None:
         assert error_m(found.world_from_camera[2], truth[2]) < 0.02
 
 
-def test_a_last_frame_that_contradicts_tracking_is_rejected() -> None:
-    """It has too few matches for a pose, and none is where the tracking says."""
+@pytest.mark.parametrize("turn_deg", [11.5, 170.0])
+def test_a_last_frame_that_contradicts_tracking_is_rejected(turn_deg: float) -> None:
+    """It has too few matches for a pose, and none is where the tracking says, which may be behind the camera."""
     random = random_for("lost")
     truth = walk(random, 4)
     images = images_of(random, truth, UNGUIDED, keep=[60, 60, 60, 40], alone=[True] * 3 + [False], own_noise_m=0.005)
     wrong = images_of(random_for("lost"), truth, UNGUIDED, keep=40, wrong_share=1.0)[3]
     right = drifting(random, truth, 0.01)
     assert not estimate(solve_sequence(images, right, False)).jumps
-    outcome = rejection(solve_sequence([*images[:3], wrong], jumping(right, 3, JUMP), False))
+    jump = RigidTransform(rotation_from_vector([0, np.radians(turn_deg), 0]), JUMP.translation)
+    outcome = rejection(solve_sequence([*images[:3], wrong], jumping(right, 3, jump), False))
     assert outcome.reason is RejectionReason.GATE
     assert "contradicts its tracked pose" in outcome.message
 
@@ -184,14 +187,44 @@ def test_a_session_in_another_unit_is_no_series_of_jumps(unit_m: float) -> None:
     assert "contradict the photographs between all 6" in rejection(outcome).message
 
 
-def test_steps_that_fit_no_unit_are_rejected() -> None:
+def test_a_single_step_that_fits_no_unit_is_rejected() -> None:
     random = random_for("no unit")
-    truth = walk(random, 3)
-    session = rescaled(jumping(drifting(random, truth, 0.01), 2, JUMP), 2.0)
+    truth = walk(random, 2)
+    session = rescaled(jumping(drifting(random, truth, 0.01), 1, JUMP), 2.0)
     images = images_of(random, truth, alone=True, own_noise_m=0.002)
-    outcome = rejection(solve_sequence(images, session, True))
+    outcome = rejection(solve_sequence(images, session, True, unit="units"))
     assert outcome.reason is RejectionReason.SCALE_UNRELIABLE
     assert "in any unit" in outcome.message
+    assert " units and" in outcome.message
+
+
+@pytest.mark.parametrize(("returns", "at"), [(False, 1), (False, 2), (True, 2)])
+def test_one_step_without_a_jump_shows_the_unit(returns: bool, at: int) -> None:
+    """Also where all long ways contain the jump."""
+    random = random_for("one step", returns, at)
+    truth = walk(random, 3)
+    if returns:
+        truth += truth[-2::-1] * 4
+    far = RigidTransform(JUMP.rotation, 20 * JUMP.translation)
+    session = rescaled(jumping(drifting(random, truth, 0.01), at, far), 2.0)
+    images = images_of(random, truth, alone=True, own_noise_m=0.002)
+    found = estimate(solve_sequence(images, session, True))
+    assert [(it.before, it.after) for it in found.jumps] == [(at - 1, at)]
+    assert found.jumps[0].shift_m == pytest.approx(20 * np.linalg.norm(JUMP.translation), rel=0.1)
+    assert error_m(found.world_from_camera[-1], truth[-1]) < 0.008
+
+
+@pytest.mark.parametrize("count", [2, 8])
+def test_radii_are_at_least_those_of_two_photographs(count: int) -> None:
+    """Those of one place share references, so that many are not as good as so many independent ones."""
+    random = random_for("radii", count)
+    truth = walk(random, count)
+    images = images_of(random, truth, alone=True, own_noise_m=0.005)
+    found = estimate(solve_sequence(images, drifting(random, truth, 0.01), False))
+    alone = images[-1].answer.outcome
+    assert isinstance(alone, Localization)
+    assert alone.covariance is not None
+    assert np.linalg.eigvalsh(2 * found.covariances[-1] - alone.covariance).min() > -1e-12
 
 
 @pytest.mark.parametrize("seed", range(5))

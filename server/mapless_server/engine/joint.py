@@ -35,7 +35,7 @@ def pose_sequence(
     """Estimates the poses of a sequence's frames, in order, in OpenCV's axes."""
     unit = results[0].attributes.unit
     coverage = queries[0].options.coverage
-    found = solve_sequence(_images(queries, results), session_from_camera, estimate_scale, coverage)
+    found = solve_sequence(_images(queries, results), session_from_camera, estimate_scale, coverage, unit)
     if not isinstance(found, Rejection):
         found = check_tracking(found, session_from_camera, unit)
     if not isinstance(found, Rejection) and not estimate_scale:

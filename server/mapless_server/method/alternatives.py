@@ -54,7 +54,8 @@ def or_from_two_views(coarse: Coarse, answer: Answer) -> Answer:
     with prepared.context.stage("judge"):
         evidence = two_view_evidence(support, query_matches)
         doubt, trust = two_view_failure(evidence), two_view_trust(evidence)
-        rejection = None if doubt else contradiction(support, votes_of(support, query_matches), options.judge)
+        votes = votes_of(support, query_matches)
+        rejection = None if doubt else contradiction(support, votes, options.judge, unit=prepared.unit)
     if rejection:
         return coarse.answer(rejection, support)
     if doubt and lacks_distance(evidence):

@@ -140,7 +140,7 @@ def solve(coarse: Coarse, counts_agreement: bool = False) -> Answer:
         estimate = with_covariance(support, scale, options.adjust, priors, predicted, sigma)
     support = replace(support, estimate=estimate)
     with stage("judge"):
-        judged = judge(support, query_matches, prepared.options.coverage, options.judge, chance)
+        judged = judge(support, query_matches, prepared.options.coverage, options.judge, chance, prepared.unit)
     if judged.rejection:
         return coarse.answer(judged.rejection, support)
     checks = intrinsics_checks(estimate.intrinsics, options.judge.intrinsics) if estimate.intrinsics else ()

@@ -122,6 +122,11 @@ class Prepared:
     is_metric: bool = True
 
     @property
+    def unit(self) -> str:
+        """The unit of length of the references' poses, in messages for a person."""
+        return "m" if self.is_metric else "units"
+
+    @property
     def structure_options(self) -> StructureOptions:
         """Options of the structure stage for this variant."""
         return self.pipeline.options.structure(self.options.variant)

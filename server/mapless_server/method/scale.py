@@ -230,7 +230,10 @@ def _check_references(references: Sequence[PosedView], options: ScaleOptions) ->
         return Rejection(RejectionReason.NO_USABLE_REFERENCES, message)
     radius_m = trajectory_radius(np.stack([reference.world_from_camera.translation for reference in references]))
     if not radius_m >= options.min_radius_m:
-        message = f"{count} references within {radius_m:.2g} m of their centroid, {options.min_radius_m:g} m needed"
+        message = (
+            f"{count} references within {radius_m:.2g} of their centroid, in the unit of their poses, "
+            f"{options.min_radius_m:g} needed"
+        )
         return Rejection(RejectionReason.DEGENERATE_REFERENCES, message)
     return None
 

@@ -11,12 +11,13 @@ the last is found that has the least cost: m^2 for each link, at most the thresh
 that for each pose left out. A pose that contradicts both its neighbours, which agree with each other, is left out; any
 other contradiction is a jump. The last pose is never left out: the answer follows its photograph.
 
-If the session's unit is unknown, the chain of least cost over the units that the pairs give is used.
+If the session's unit is unknown, the chain of least cost over the units that all pairs give is used. A step that is a
+jump gives a unit, too, in which the others are jumps; where such a chain costs hardly more, the jump is uncertain.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -46,9 +47,10 @@ class Jump:
     shift_m: float
     rotation_deg: float
 
-    def __str__(self) -> str:
+    def described(self, unit: str) -> str:
+        """One sentence about it; `unit` is the scene's unit of length."""
         return (
-            f"the tracking jumps by {self.shift_m:.2f} m and {self.rotation_deg:.1f} degrees between "
+            f"the tracking jumps by {self.shift_m:.2f} {unit} and {self.rotation_deg:.1f} degrees between "
             f"frames[{self.before}] and frames[{self.after}]"
         )
 
@@ -63,8 +65,12 @@ LEFT_OUT_COST = 1.5
 ALL_JUMPS = 3
 """Where so many steps or more are all jumps, the tracked poses are wrong; fewer may be jumps of a device."""
 
-UNITS = 20
-"""Largest number of pairs that an unknown unit is tried from, those with the longest steps."""
+UNIT_STEP = 1.005
+"""Units that an unknown unit is tried from differ by at least this factor; it is less than drift of 1.2 %."""
+
+OTHER_UNIT, CERTAIN_COST = 1.25, 0.5
+"""The jumps of a session in an unknown unit are certain if the chains in units that differ by this factor cost more by
+at least so many thresholds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,16 +81,20 @@ class Chain:
         frames: indices of the photographs, in order.
         jumps: the jumps between successive ones of them.
         scale: metres per unit of the session; the chain's own estimate where it was unknown.
+        cost: of the pairs, the jumps and the poses that are left out.
+        is_certain: whether the jumps are the same in any unit that the session may have.
     """
 
     frames: tuple[int, ...]
     jumps: tuple[Jump, ...]
     scale: float
+    cost: float
+    is_certain: bool = True
 
     @property
-    def link_count(self) -> int:
-        """Number of pairs of successive frames without a jump."""
-        return len(self.frames) - 1 - len(self.jumps)
+    def places(self) -> set[tuple[int, int]]:
+        """The photographs before and after each jump."""
+        return {(it.before, it.after) for it in self.jumps}
 
 
 def find_jumps(
@@ -101,20 +111,36 @@ def find_jumps(
     if not own:
         return None
     links = _Links.of(own, session_from_camera)
-    scales = links.scales() if scale is None else [scale]
-    if not scales:
+    if scale is not None:
+        return _chain(links, scale, is_known=True)
+    chains = [_chain(links, it, is_known=False) for it in links.scales()]
+    if not chains:
         return None
-    threshold = conflict_threshold(6)
-    chains = [_cheapest(links.squared(it), threshold, LEFT_OUT_COST * threshold) for it in scales]
-    best = min(range(len(scales)), key=lambda i: chains[i][0])
-    _, positions = chains[best]
-    squared = links.squared(scales[best])
-    neighbours = squared.diagonal(1)
-    if scale is not None and len(neighbours) >= ALL_JUMPS and (neighbours > threshold).all():
+    best = min(chains, key=lambda it: it.cost)
+    return replace(best, is_certain=not best.jumps or _is_certain(best, chains))
+
+
+def _chain(links: "_Links", scale: float, is_known: bool) -> Chain:
+    """The chain of least cost in a unit; of all poses if it is known and all steps, enough of them, are jumps."""
+    squared, threshold = links.squared(scale), conflict_threshold(6)
+    cost, positions = _cheapest(squared, threshold, LEFT_OUT_COST * threshold)
+    steps = squared.diagonal(1)
+    if is_known and len(steps) >= ALL_JUMPS and (steps > threshold).all():
         # Leaving poses out would explain some of it by the noise of long steps, as of a session in millimetres.
         positions = list(range(len(squared)))
-    jumps = [links.jump(i, j, scales[best]) for i, j in pairwise(positions) if squared[i, j] > threshold]
-    return Chain(tuple(int(links.frames[i]) for i in positions), tuple(jumps), scales[best])
+    jumps = tuple(links.jump(i, j, scale) for i, j in pairwise(positions) if squared[i, j] > threshold)
+    return Chain(tuple(links.frames[positions].tolist()), jumps, scale, cost)
+
+
+def _is_certain(best: Chain, chains: Sequence[Chain]) -> bool:
+    """Whether the jumps of the best chain, of those in all units, are the only ones that explain the session."""
+    if len(best.jumps) == len(best.frames) - 1:
+        return False  # the unit is that of a jump
+    limit = best.cost + CERTAIN_COST * conflict_threshold(6)
+    return not any(
+        it.cost < limit and it.places != best.places and abs(math.log(it.scale / best.scale)) > math.log(OTHER_UNIT)
+        for it in chains
+    )
 
 
 def _cheapest(squared: Array, threshold: float, left_out: float) -> tuple[float, list[int]]:
@@ -191,12 +217,14 @@ class _Links:
         )
 
     def scales(self) -> list[float]:
-        """Metres per unit that the pairs with the longest steps give, at most `UNITS` values."""
+        """Metres per unit that the pairs give, in order, without those that are nearly the same."""
         travelled, moved_m = np.linalg.norm(self.tracked, axis=1), np.linalg.norm(self.shift, axis=1)
-        usable = np.flatnonzero((travelled > 0) & (moved_m > 0))
-        neighbours_first = np.argsort(self.second[usable] - self.first[usable], kind="stable")
-        order = usable[neighbours_first][np.argsort(-moved_m[usable[neighbours_first]], kind="stable")]
-        return [float(moved_m[i] / travelled[i]) for i in order[:UNITS]]
+        usable = (travelled > 0) & (moved_m > 0)
+        found: list[float] = []
+        for scale in np.sort(moved_m[usable] / travelled[usable]).tolist():
+            if not found or scale > UNIT_STEP * found[-1]:
+                found.append(scale)
+        return found
 
     def squared(self, scale: float) -> Array:
         """The matrix (N, N) of each pair's m^2, above the diagonal."""

@@ -73,11 +73,13 @@ class Session:
         frames: `session_from_camera` of each frame.
         scale_is_free: whether its unit is unknown.
         priors: priors on the frames' poses, by index.
+        unit: the scene's unit of length, in messages.
     """
 
     frames: tuple[RigidTransform, ...]
     scale_is_free: bool
     priors: Mapping[int, Priors]
+    unit: str = "m"
 
     @property
     def moves(self) -> bool:
@@ -106,8 +108,8 @@ class Session:
                 message = f"no poses of the sequence explain four of {total} matches"
                 return Rejection(RejectionReason.PNP_FAILED, message)
             return Start(tuple(guess.transform_pose(frame) for frame in self.frames), guess.scale)
-        if self.scale_is_free and chain.jumps and chain.link_count < 2:
-            jumps = "; ".join(map(str, chain.jumps))
+        if not chain.is_certain:
+            jumps = "; ".join(it.described(self.unit) for it in chain.jumps)
             message = f"the session's steps contradict one another in any unit; in that of one of them, {jumps}"
             return Rejection(RejectionReason.SCALE_UNRELIABLE, message, CHECK_TRACKING)
         return self._cut(matched, {i: own[i][0] for i in chain.frames}, chain)

@@ -133,6 +133,7 @@ def judge(
     coverage: float,
     options: JudgeOptions,
     log10_chance: float = 0.0,
+    unit: str = "m",
 ) -> Judgement:
     """Judges the estimate of a support.
 
@@ -142,6 +143,7 @@ def judge(
         coverage: share of right answers to accept, above 0 and at most 1.
         options: options of the judge.
         log10_chance: see `Priors.log10_chance`.
+        unit: the scene's unit of length, in messages.
 
     Returns:
         The judgement. Its rejection, in the support's world, is GATE, with a hint, if the photograph contradicts its
@@ -153,7 +155,8 @@ def judge(
     evidence = evidence_of(support, votes, query_matches)
     trust = trust_of(evidence, options, log10_chance)
     doubt = low_trust(evidence, trust, coverage)
-    return Judgement(trust, evidence, contradiction(support, votes, options, is_doubted=doubt is not None) or doubt)
+    contradicted = contradiction(support, votes, options, is_doubted=doubt is not None, unit=unit)
+    return Judgement(trust, evidence, contradicted or doubt)
 
 
 def contradiction(
@@ -161,6 +164,7 @@ def contradiction(
     votes: Votes,
     options: JudgeOptions,
     is_doubted: bool = False,
+    unit: str = "m",
 ) -> Rejection | None:
     """Rejects a pose whose matches contradict the intrinsics or support a second pose, or whose radius is too large.
 
@@ -175,7 +179,7 @@ def contradiction(
     if wrong := wrong_camera(support, best, is_doubted):
         return wrong
     hypotheses = find_rival(support, votes)
-    return _ambiguous(hypotheses) if hypotheses else _too_uncertain(support, options)
+    return _ambiguous(hypotheses, unit) if hypotheses else _too_uncertain(support, options)
 
 
 def trust_of(evidence: Evidence, options: JudgeOptions, log10_chance: float = 0.0) -> float:
@@ -228,11 +232,11 @@ def _too_uncertain(support: Support, options: JudgeOptions) -> Rejection | None:
     return Rejection(RejectionReason.GATE, message, Hint("judge", Advice.ADD_REFERENCES, advice, names[0]))
 
 
-def _ambiguous(hypotheses: tuple[Hypothesis, Hypothesis]) -> Rejection:
+def _ambiguous(hypotheses: tuple[Hypothesis, Hypothesis], unit: str) -> Rejection:
     first, second = sorted(hypotheses, key=lambda it: -it.inlier_count)
-    apart_m = math.dist(first.world_from_camera.translation, second.world_from_camera.translation)
+    apart = math.dist(first.world_from_camera.translation, second.world_from_camera.translation)
     message = (
-        f"two poses {apart_m:.2f} m apart explain the photograph: {first.inlier_count} keypoints agree with one by "
+        f"two poses {apart:.2f} {unit} apart explain the photograph: {first.inlier_count} keypoints agree with one by "
         f"{len(first.references)} references, {second.inlier_count} with the other by {len(second.references)}"
     )
     return Rejection(RejectionReason.AMBIGUOUS, message, hypotheses=(first, second))
