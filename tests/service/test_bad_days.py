@@ -304,18 +304,6 @@ class TestDamagedPages:
             assert is_answered(client)
         assert not any("reference" in fault for fault in faults_of(tmp_path))
 
-    def test_its_scene_can_be_deleted_and_made_anew(self, tmp_path: Path) -> None:
-        with served(tmp_path) as client:
-            fill(client)
-        self.damage(tmp_path)
-        with served(tmp_path) as client:
-            client.delete_scene("s")
-            with pytest.raises(NotFound):
-                client.get_scene("s")
-            fill(client)
-            assert client.get_reference("s", "r1", include_image=True).image == large_photo(1)
-            client.delete_scene("s")
-
     def test_bad_sectors_of_the_schema_stop_the_start_with_advice(self, tmp_path: Path) -> None:
         with served(tmp_path) as client:
             fill(client, 1)
@@ -362,20 +350,6 @@ class TestTwoServers:
             (error,) = self.opened_by_another(data)
             assert "in use by another server" in error
         Store.open(data).close()
-
-    def test_a_lock_file_of_a_killed_server_blocks_no_start(self, tmp_path: Path) -> None:
-        code = """if True:
-            import os, sys
-            from pathlib import Path
-            from mapless_server.store import Store
-            Store.open(Path(sys.argv[1]))
-            os.kill(os.getpid(), 9)
-        """
-        killed = subprocess.run([sys.executable, "-c", code, str(tmp_path)], timeout=60)
-        assert killed.returncode == -9
-        assert (tmp_path / LOCK_FILE).read_text().isdigit()
-        with served(tmp_path) as client:
-            client.create_scene("s")
 
 
 class TestScenesThatGo:
