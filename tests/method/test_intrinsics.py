@@ -123,6 +123,24 @@ def test_a_camera_shared_with_the_references_errs_less() -> None:
     assert np.trace(shared.pose_covariance) < 0.2 * np.trace(stated.pose_covariance)
 
 
+@pytest.mark.parametrize(("error", "is_shared"), [(0.0, True), (0.008, False)])
+def test_a_photograph_that_errs_otherwise_shares_no_camera(error: float, is_shared: bool) -> None:
+    """K is that of the references, but the photograph is of a focal length of its own, too near to be named."""
+    scene = make_scene(random_for("other camera"), SceneOptions(point_count=600, noise_px=0.3))
+    query = scene.query
+    x_in_camera = query.camera.rays(query.features.keypoints.astype(float))
+    true = corrected(query.camera, (error, 0, 0, 0)).pinhole()
+    keypoints = true.project(x_in_camera).astype(np.float32)
+    scene = replace(scene, query=replace(query, features=replace(query.features, keypoints=keypoints)))
+    found, stated = adjusted(scene), adjusted(scene, IntrinsicsSigma())
+    assert found.intrinsics
+    assert wrong_intrinsics(found.intrinsics, "best", ContradictionOptions()) is None
+    sigma_m, stated_m = (np.sqrt(np.trace(it.covariance[:3, :3])) for it in (found, stated))
+    assert (sigma_m < 0.7 * stated_m) == is_shared, (sigma_m, stated_m, found.intrinsics.value, found.intrinsics.sigma)
+    off_m = np.linalg.norm(found.world_from_camera.translation - scene.world_from_query.translation)
+    assert off_m < 2 * sigma_m
+
+
 LARGE = {
     "focal length 3 %": (-0.03, 0, 0, 0),
     "focal length 10 %": (0.1, 0, 0, 0),
