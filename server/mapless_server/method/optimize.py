@@ -122,14 +122,13 @@ def minimize_each(
     linearize: Callable[[Array], tuple[Array, Array]],
     start: Array,
     iterations: int,
-    damping: float = 1e-3,
 ) -> Array:
     """Finds minima of many independent problems of three unknowns, each with its own damping, from points (3, P).
 
     All problems take the same number of steps. `cost` returns the costs (P,) at points (3, P); `linearize` the hessians
     (6, P), as in `optimize.SYMMETRIC`, and gradients (3, P) of half the cost.
     """
-    x, damped, least = start, np.full_like(start[0], damping), cost(start)
+    x, damped, least = start, np.full_like(start[0], 1e-3), cost(start)
     for _ in range(iterations):
         hessian, gradient = linearize(x)
         hessian[:3] *= 1 + damped  # the diagonals

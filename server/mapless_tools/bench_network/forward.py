@@ -125,9 +125,9 @@ PRODUCT_SIDE = 8192
 LIMIT_GB = 8.0
 
 
-def median_s(work: Callable[[], object], device: torch.device, repeats: int, warm_up: int = 3) -> tuple[float, float]:
+def median_s(work: Callable[[], object], device: torch.device, repeats: int) -> tuple[float, float]:
     """The median time of `work`, seconds, measured twice: a difference smaller than that of the two is none."""
-    for _ in range(warm_up):
+    for _ in range(3):  # the first are slower
         work()
     first, second = (_median_s(work, device, repeats) for _ in range(2))
     return first, second
@@ -151,10 +151,10 @@ def _median_s(work: Callable[[], object], device: torch.device, repeats: int) ->
     return statistics.median(float(start.elapsed_time(end)) for start, end in events) / 1000
 
 
-def measure_peak(device: torch.device, repeats: int = 20) -> Peak:
+def measure_peak(device: torch.device) -> Peak:
     """Measures the peak of a CUDA device on random numbers, since zeros are faster."""
     a, b = (torch.randn(PRODUCT_SIDE, PRODUCT_SIDE, device=device, dtype=torch.bfloat16) for _ in range(2))
-    product_s = min(median_s(lambda: a @ b, device, repeats))
+    product_s = min(median_s(lambda: a @ b, device, 20))
     return Peak(torch.cuda.get_device_name(device), 2 * PRODUCT_SIDE**3 / product_s)
 
 

@@ -129,22 +129,22 @@ class Scene:
         return network.query_pose(tokens, self.layout, *self.conditions)
 
 
-def flop_of(name: str, work: Work, sizes: AnySizes | None = None, dtype: torch.dtype = torch.bfloat16) -> int:
+def flop_of(name: str, work: Work, sizes: AnySizes | None = None) -> int:
     """Counts the operations that a forward pass executes."""
-    network = meta_network(name, sizes, dtype)
+    network = meta_network(name, sizes)
     scene = Scene(network, work.views, work.grid)
     shape = (1, work.views, network.token_count(work.grid), network.width)
-    tokens = torch.empty(shape, dtype=dtype, device="meta")
+    tokens = torch.empty(shape, dtype=torch.bfloat16, device="meta")
     encoded = count_flop(lambda: scene.encode(network, slice(work.encoded))) if work.encoded else 0
     if work.query_only:
         return encoded + count_flop(lambda: scene.query_pose(network, tokens))
     return encoded + count_flop(lambda: scene.reconstruct(network, tokens, work.mapped))
 
 
-def meta_network(name: str, sizes: AnySizes | None = None, dtype: torch.dtype = torch.bfloat16) -> Network:
+def meta_network(name: str, sizes: AnySizes | None = None) -> Network:
     """A network without memory, for counting."""
     network = network_without_weights(name, sizes)
-    network.requires_grad_(False).set_compute_type(dtype)
+    network.requires_grad_(False).set_compute_type(torch.bfloat16)
     return network.to("meta")
 
 

@@ -87,11 +87,11 @@ class Cluster:
         config = f"{self.folder}/ha/".encode()
         return [it for it in _processes(f"{_MARK}={self.folder}") if config in _read(it, "cmdline")]
 
-    def logged(self, last: int = 2000) -> str:
-        """The last characters of the output of the cluster and of the logs of Serve and the replicas."""
+    def logged(self) -> str:
+        """The last 2,000 characters of the cluster's output and of each log of Serve and the replicas."""
         logs = self.folder / "ray" / "session_latest" / "logs"
         paths = [self.folder / "log", *sorted(logs.glob("serve/*.log")), *sorted(logs.glob("worker-*.err"))]
-        texts = [path.read_text(encoding="utf-8", errors="replace")[-last:] for path in paths]
+        texts = [path.read_text(encoding="utf-8", errors="replace")[-2000:] for path in paths]
         return "\n".join(f"--- {path.name}\n{text}" for path, text in zip(paths, texts, strict=True) if text)
 
     def _ask(self, command: Json) -> Json:

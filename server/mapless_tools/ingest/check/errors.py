@@ -32,11 +32,11 @@ ORDER_STEPS = (1, 3, 10, 30)
 Pair = tuple[int, int]
 
 
-def pairs_by_pose(poses: Sequence[RigidTransform], count: int = PAIR_COUNT) -> list[Pair]:
+def pairs_by_pose(poses: Sequence[RigidTransform]) -> list[Pair]:
     """Pairs of neighbours that look the same way, with a good baseline; of few photographs each is in several."""
     near = _Neighbours(poses)
-    rounds = (_partner_of_each(near, len(poses), count, rank) for rank in range(3))
-    return _distinct(chain.from_iterable(rounds), count)
+    rounds = (_partner_of_each(near, len(poses), rank) for rank in range(3))
+    return _distinct(chain.from_iterable(rounds))
 
 
 def more_pairs(poses: Sequence[RigidTransform], reference: int, known: Sequence[Pair], count: int) -> list[Pair]:
@@ -46,16 +46,16 @@ def more_pairs(poses: Sequence[RigidTransform], reference: int, known: Sequence[
     return [pair for pair in candidates if pair not in known][:count]
 
 
-def pairs_by_order(frame_count: int, count: int = PAIR_COUNT) -> list[Pair]:
+def pairs_by_order(frame_count: int) -> list[Pair]:
     """Pairs of photographs that are near in the folder's order, spread over it."""
-    each = max(1, count // len(ORDER_STEPS))
+    each = PAIR_COUNT // len(ORDER_STEPS)
     pairs = (
         (int(first), int(first) + step)
         for step in ORDER_STEPS
         if step < frame_count
         for first in np.linspace(0, frame_count - 1 - step, each).round()
     )
-    return _distinct(pairs, count)
+    return _distinct(pairs)
 
 
 class _Neighbours:
@@ -80,14 +80,14 @@ class _Neighbours:
         return elsewhere, distances[elsewhere]
 
 
-def _partner_of_each(near: _Neighbours, frame_count: int, count: int, rank: int) -> list[Pair]:
-    anchors = np.linspace(0, frame_count - 1, min(frame_count, count)).round().astype(int)
+def _partner_of_each(near: _Neighbours, frame_count: int, rank: int) -> list[Pair]:
+    anchors = np.linspace(0, frame_count - 1, min(frame_count, PAIR_COUNT)).round().astype(int)
     found = ((int(anchor), near.ranked(int(anchor))[rank : rank + 1]) for anchor in anchors)
     return [(min(anchor, others[0]), max(anchor, others[0])) for anchor, others in found if others]
 
 
-def _distinct(pairs: Iterable[Pair], count: int) -> list[Pair]:
-    return list(dict.fromkeys(pairs))[:count]
+def _distinct(pairs: Iterable[Pair]) -> list[Pair]:
+    return list(dict.fromkeys(pairs))[:PAIR_COUNT]
 
 
 RATIO = 0.8
