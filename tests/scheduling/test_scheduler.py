@@ -444,13 +444,15 @@ class TestTime:
         assert (job.begins_until_s, toy.ending_of(job)) == (None, Ending.OK)
 
     def test_a_step_beyond_the_bounds_takes_no_room(self) -> None:
-        """What waits for an idle thread lets as much be admitted as without it."""
+        """What waits for an idle thread lets as much be admitted as without it, and does not ask for more servers."""
         toy, without = Toy(), Toy()
         self.again(toy, "toy", 6)
         without.admit(stage="refine", client="mine")
         for i in range(6):
             without.admit(client=f"other {i}")
         without.finish(without.take("host"), Done(None))
+        load, its_load = toy.scheduler.load("prepare"), without.scheduler.load("prepare")
+        assert load == its_load._replace(waiting=its_load.waiting + 1)
         for it in (toy, without):
             it.fill()
         assert toy.observer.admissions == without.observer.admissions

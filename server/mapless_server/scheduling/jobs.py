@@ -81,7 +81,10 @@ class Stage:
 
 
 class StageLoad(NamedTuple):
-    """The jobs that wait for a stage, their predicted computing time from there on, and the jobs that it computes."""
+    """The jobs that wait for a stage, their predicted computing time from there on, and the jobs that it computes.
+
+    The time is without that of jobs that wait until a thread is idle otherwise: it shows how far the queue is filled.
+    """
 
     waiting: int
     cost_s: float
@@ -354,7 +357,7 @@ class Observer:
         """A job was refused."""
 
     def waited(self, stage: str, seconds: float) -> None:
-        """A job was taken from a stage's waiting jobs after this time."""
+        """A job was taken from a stage's waiting jobs after this time; not called if it waited for an idle thread."""
 
     def computed(self, stage: str, bucket: str, jobs: int, seconds: float) -> None:
         """A batch of this many jobs of a bucket was computed."""

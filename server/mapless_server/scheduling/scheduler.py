@@ -134,7 +134,7 @@ class Scheduler:
     def load(self, stage: str) -> StageLoad:
         """The jobs of a stage."""
         queue, spare = self._queues[stage], self._spare[stage]
-        return StageLoad(len(queue) + len(spare), queue.cost_s + spare.cost_s, self._running[stage])
+        return StageLoad(len(queue) + len(spare), queue.cost_s, self._running[stage])
 
     def admit(self, job: Job, now_s: float) -> None:
         """Admits a job, which then ends exactly once; raises Refused without any change."""
