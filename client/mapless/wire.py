@@ -72,7 +72,8 @@ def require(value: object, kind: type, field: str, advice: str = "") -> None:
 
 def listed(values: Iterable[T], kind: type[T], field: str) -> Iterator[tuple[str, T]]:
     """Items of a list, each with its field, "frames[2]"; TypeError for an item of another type, or for no list."""
-    wanted = [it.name for it in dataclasses.fields(kind) if it.default is it.default_factory]  # type: ignore[arg-type]
+    parts, missing = dataclasses.fields(kind), dataclasses.MISSING  # type: ignore[arg-type]  # kind is a dataclass
+    wanted = [it.name for it in parts if it.default is missing and it.default_factory is missing]
     advice = f"one is made by {kind.__name__}({', '.join(wanted)})"
     if isinstance(values, str | bytes) or not isinstance(values, Iterable):
         raise TypeError(f"{field} must be a list of {kind.__name__}, is {_kind(values)}; {advice}")
@@ -82,7 +83,7 @@ def listed(values: Iterable[T], kind: type[T], field: str) -> Iterator[tuple[str
 
 
 def set_numbers(message: Any, values: Mapping[str, object], path: str = "") -> None:
-    """Sets numbers, texts and truth values of a message; TypeError names the field of a value of another type."""
+    """Sets numbers and truth values of a message; TypeError names the field of a value of another type."""
     for name, value in values.items():
         _set_number(message, name, value, path)
 

@@ -112,7 +112,7 @@ def delete_scene(client: Client, arguments: argparse.Namespace) -> int:
     """Deletes a scene and its references; exit code 1 if the user, asked, does not want it."""
     scene = client.get_scene(arguments.scene)
     if not is_confirmed(arguments, f"delete the scene {scene.scene_id} with its {scene.reference_count} references"):
-        return 1
+        return EXIT_FAILED
     client.delete_scene(arguments.scene)
     return 0
 
@@ -204,7 +204,7 @@ def download_reference(client: Client, arguments: argparse.Namespace) -> int:
 def delete_reference(client: Client, arguments: argparse.Namespace) -> int:
     """Deletes a reference; exit code 1 if the user, asked, does not want it."""
     if not is_confirmed(arguments, f"delete the reference {arguments.reference} of {arguments.scene}"):
-        return 1
+        return EXIT_FAILED
     client.delete_reference(arguments.scene, arguments.reference)
     return 0
 
