@@ -18,7 +18,7 @@ from support.images import encode, textured
 from mapless.axes import turned_raster
 from mapless.geometry import Camera
 from mapless_server.engine import stages
-from mapless_server.engine.options import EngineOptions
+from mapless_server.engine.options import EngineOptions, EscalationOptions
 from mapless_server.engine.query import TURN, Caller, Photo, Query, QueryRun, QueryViews, Result, Tier
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.answer import Answer, Localization
@@ -77,10 +77,11 @@ def localize(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Localize]:
 
 
 @contextmanager
-def localizing(folder: Path, tiers: Sequence[Tier]) -> Iterator[Localize]:
+def localizing(folder: Path, tiers: Sequence[Tier], doubtful_trust: float = 0.25) -> Iterator[Localize]:
     caller, loop = Caller(Flow("tenant", "client"), time.monotonic() + 600), asyncio.new_event_loop()
     with Store.open(folder) as store:
-        engine = engine_over(store, tiers, EngineOptions())
+        options = EngineOptions(escalation=EscalationOptions(doubtful_trust))
+        engine = engine_over(store, tiers, options)
         photos = [Photo(photograph(it), CAMERA, "image") for it in REFERENCE_POSES]
         described = loop.run_until_complete(engine.describe(photos, caller))
         store.create_scene(SCENE)
@@ -124,6 +125,15 @@ def test_an_upright_photograph_is_not_tried_turned(localize: Localize) -> None:
     result = localize(photograph(TRUE), CAMERA, ())
     assert isinstance(result.answer.outcome, Localization)
     assert not any(stage.endswith(TURN) for stage in result.stage_seconds)
+
+
+def test_a_pose_of_little_trust_is_compared_with_turns(tmp_path: Path) -> None:
+    tier = Tier(UprightSift(), Pipeline(), upright_only=True)
+    with localizing(tmp_path, [tier], doubtful_trust=1.1) as answer:
+        result = answer(photograph(TRUE), CAMERA)
+    assert isinstance(result.answer.outcome, Localization)
+    assert f"upright-sift/{TURN}" in result.stage_seconds
+    assert pose_error(result.answer.outcome.world_from_camera, TRUE)[0] < 0.01
 
 
 def test_a_photograph_found_beyond_its_limits_is_not_tried_turned(localize: Localize) -> None:

@@ -1,6 +1,7 @@
 """Which references a query uses: those that it names, or those that resemble the photograph and match it most.
 
-A photograph that was not localized is also compared with them turned, and with references elsewhere than priors say.
+A photograph that was not localized is also compared with them turned (so is one with a pose of little trust), and with
+references elsewhere than priors say.
 """
 
 from collections.abc import Sequence

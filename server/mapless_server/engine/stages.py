@@ -289,7 +289,7 @@ class QueryStages:
             elsewhere = replace(query, narrowing=query.narrowing.limits)
             return self._search(replace(self._further(run, elsewhere, run.tier, result), narrowed=query))
         is_first = run.tier == 0 and not run.tries_turns
-        if is_first and self._tiers[0].upright_only and _is_lost(result.answer, self._doubt_in(run)):
+        if is_first and self._tiers[0].upright_only and _may_be_turned(result.answer, self._doubt_in(run)):
             return self._search(replace(self._further(run, query, 0, result), tries_turns=True))
         return self._stronger(run, query, result)
 
@@ -393,11 +393,17 @@ def _told_unfinished(run: QueryRun, answer: Answer, tier: Tier) -> Answer:
     return replace(answer, outcome=replace(outcome, hint=replace(outcome.hint, message=advice)))
 
 
-def _is_lost(answer: Answer, options: EscalationOptions) -> bool:
-    """Whether a photograph was not localized and other matches may; one that fits two places was found as it is."""
-    found = RejectionReason.AMBIGUOUS, RejectionReason.PRIOR_CONFLICT
+def _may_be_turned(answer: Answer, options: EscalationOptions) -> bool:
+    """Whether the photograph may show more turned: not if it fits two places, or is where no prior allows it.
+
+    Of a facade that looks alike upside down, the little that matches of a turned photograph gives a pose of little
+    trust, far from the right one. A large radius alone is no sign of that.
+    """
     outcome = answer.outcome
-    return isinstance(outcome, Rejection) and outcome.reason not in found and is_doubtful(answer, options)
+    if isinstance(outcome, Localization):
+        return outcome.trust is not None and outcome.trust < options.doubtful_trust
+    found = RejectionReason.AMBIGUOUS, RejectionReason.PRIOR_CONFLICT
+    return outcome.reason not in found and is_doubtful(answer, options)
 
 
 def _shows_no_more(best: Result, turned: Result) -> bool:
