@@ -319,7 +319,7 @@ class QueryRun:
         start_s: when this tier began, by `time.monotonic`.
         give_up_s: time after which `best` is the answer, if this tier has none by then.
         narrowed: the query with the soft priors' choice of references, if references elsewhere are now searched.
-        tries_turns: whether the photograph is to be turned as it matches most, because it was not localized as it is, or with little trust.
+        tries_turns: whether the photograph is to be turned as it matches most: as it is, there is no or little trust.
         ambiguous: the rejection as ambiguous, if the references of the place that the priors decided for are now used.
         listings: how often the scene was listed in this tier.
         context: cancels and times this tier's stages; from here on set by the stage `prepare`.
