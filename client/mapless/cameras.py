@@ -1,6 +1,7 @@
 """Reads cameras and poses from the interface's JSON, from four numbers, or from a folder's cameras.json."""
 
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -113,6 +114,15 @@ def read_cameras(file: str | Path) -> dict[Path, Camera]:
     return dict(_photograph(path, index, frame) for index, frame in enumerate(frames))
 
 
+def with_slashes(folder: Path, path: str) -> str:
+    """A path from a folder, as a file in it names it: written on Windows, with slashes in place of backslashes.
+
+    Where there is a file of that very name, it stays as it is: elsewhere a backslash may be a character of a name.
+    """
+    # Not Path.is_file, which raises where a name is longer than any file's.
+    return path if "\\" not in path or os.path.isfile(folder / path) else path.replace("\\", "/")
+
+
 def camera_of_frame(frame: Mapping[str, Any]) -> Camera:
     """Camera of a frame of a cameras.json; ValueError names a field that is missing or wrong.
 
@@ -169,7 +179,7 @@ def _photograph(path: Path, index: int, frame: Any) -> tuple[Path, Camera]:
             raise ValueError(f"must be an object, {{...}}, is {shown(frame)}")
         if not isinstance(frame.get("image"), str):
             raise ValueError(f"image must be a path, is {shown(frame.get('image'))}")
-        return path.parent / frame["image"], _checked(camera_of_frame(frame))
+        return path.parent / with_slashes(path.parent, frame["image"]), _checked(camera_of_frame(frame))
     except FieldError as error:
         model, _, _ = error.field.partition(".")
         where = _FIELDS_OF_FRAMES.get(model, "dist")

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from mapless.cameras import with_slashes
 from mapless.geodesy import Datum
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless.scenes import Vector, unit_vector
@@ -116,7 +117,11 @@ def legal_id(stem: str, taken: Container[str]) -> str:
 
 
 def image_file(folder: Path, image: str) -> Path:
-    """The file of an image that a layout names; ValueError if there is none, or the path leads out of the folder."""
+    """The file of an image that a layout names; ValueError if there is none, or the path leads out of the folder.
+
+    Paths written on Windows are read, too (see `with_slashes`).
+    """
+    image = with_slashes(folder, image)
     if PurePosixPath(image).is_absolute() or ".." in PurePosixPath(image).parts:
         raise ValueError(f"image: {image!r} leads out of {folder}")
     file = folder / image

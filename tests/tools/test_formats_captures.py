@@ -81,6 +81,20 @@ def test_intrinsics_may_be_per_frame_and_endings_missing(tmp_path: Path) -> None
     assert_reads(read_dataset(folder), TRUTH)
 
 
+@pytest.mark.parametrize("written", [".\\images\\{}.png", "./images\\{}.png", "images\\{}"])
+def test_paths_written_on_windows_are_read(tmp_path: Path, written: str) -> None:
+    folder = write_transforms(tmp_path)
+
+    def change(content: Any) -> None:
+        for i, frame in enumerate(content["frames"]):
+            frame["file_path"] = written.format(i)
+
+    edit(folder / "transforms.json", change)
+    dataset = read_dataset(folder)
+    assert_reads(dataset, TRUTH)
+    assert [it.name for it in dataset.frames] == [f"images_{i}" for i in range(4)]
+
+
 def test_an_angle_of_view_and_the_file_size_give_the_focal(tmp_path: Path) -> None:
     """instant-ngp's and Blender's: the whole width is seen under the angle."""
     folder = write_transforms(tmp_path)

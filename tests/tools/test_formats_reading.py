@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support.layouts import CAMERA, Truth, assert_reads, reasons, truth, write_image, write_layout
 
+from mapless import read_cameras
 from mapless.geometry import Camera, Fisheye, RadialTangential, RigidTransform
 from mapless_tools.ingest import FORMATS
 from mapless_tools.ingest.formats import read_dataset, recognize
@@ -79,6 +80,27 @@ def test_cameras_json_keeps_what_is_usable_and_names_the_rest(tmp_path: Path) ->
     assert "frames[4] (images/0.png)" in next(iter(reasons(dataset)))
     with pytest.raises(ValueError, match=r"cameras\.json: frames\[4\].*named twice"):
         read_folder(tmp_path)  # what we wrote ourselves is right, or not ours
+
+
+def test_backslashes_separate_folders_unless_a_file_is_named_so(tmp_path: Path) -> None:
+    file = write_layout(tmp_path / "scene", "cameras", TRUTH) / "cameras.json"
+    content = json.loads(file.read_text())
+    frames = content["frames"]
+    frames[0]["image"] = "images\\0.png"
+    frames[1]["image"] = "images\\1.png"
+    write_image(file.parent / "images\\1.png", seed=9)
+    write_image(tmp_path / "out.png", seed=9)
+    frames += [
+        dict(frames[0], image=it) for it in ("images/0.png", "..\\out.png", "images\\..\\..\\out.png", "C:\\0.png")
+    ]
+    file.write_text(json.dumps(content))
+    dataset = read_dataset(file.parent)
+    images = {it.image_path for it in dataset.frames}
+    assert {file.parent / "images" / "0.png", file.parent / "images\\1.png"} <= images
+    assert len(images) == 4
+    expected = ["named twice", "leads out", "leads out", "no file"]
+    assert [part for part, why in zip(expected, reasons(dataset).values(), strict=True) if part in why] == expected
+    assert {*read_cameras(file)} >= images
 
 
 def test_a_folder_with_nothing_usable_says_why_of_the_first(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ is arbitrary), ``source``, ``ground_truth``, ``datum`` (where the world is on th
 """
 
 from dataclasses import replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from mapless.cameras import FOLDER_FILE, camera_of_frame
@@ -66,4 +66,4 @@ def add_frame(collector: Collector, entry: Any) -> None:
     camera = camera_of_frame(entry)
     if not (camera.focal_x_px > 0 and camera.focal_y_px > 0):
         raise ValueError(f"K: focal lengths must be above 0, are {camera.focal_x_px:g} and {camera.focal_y_px:g}")
-    collector.add(image, camera, pose, entry.get("split", ""), PurePosixPath(image).stem)
+    collector.add(image, camera, pose, entry.get("split", ""), collector.image(image).stem)

@@ -115,7 +115,7 @@ class Collector:
     ) -> None:
         """Adds a frame; ValueError names what is wrong.
 
-        The image is a path from the folder, with slashes. The frame's id is made from `name`, or else from that path
+        The image is a path from the folder. The frame's id is made from `name`, or else from that path
         without its ending.
         """
         file = self.image(image)
@@ -123,7 +123,7 @@ class Collector:
         if not np.abs(world_from_camera.translation).max() <= MAX_COORDINATE_M:  # NaN where a reader's sums overflowed
             raise ValueError(f"pose: lies more than {MAX_COORDINATE_M:g} m from the origin")
         # The folders belong to the id: sequences count their frames from 0, each of them.
-        parts = PurePosixPath(name or image.removesuffix(PurePosixPath(image).suffix)).parts
+        parts = PurePosixPath(name or file.relative_to(self.folder).with_suffix("")).parts
         identifier = legal_id("_".join(parts), self._ids)
         self.frames.append(Frame(identifier, file, camera, world_from_camera, split))
         self._ids.add(identifier)

@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from mapless.cameras import with_slashes
 from mapless.geometry import Camera, Distortion, Fisheye, RadialTangential, RigidTransform, nearest_rotation
 from mapless_tools.dataset import Dataset, finite_numbers, named, read_json
 
@@ -67,10 +68,10 @@ def _image(collector: Collector, frame: Mapping[str, Any]) -> str:
     path = frame.get("file_path")
     if not isinstance(path, str) or not path:
         raise ValueError("file_path must be a path")
-    path = str(PurePosixPath(path))
-    named = (path + ending for ending in _ENDINGS)
+    folder, path = collector.folder, str(PurePosixPath(path))
+    named = (with_slashes(folder, path + ending) for ending in _ENDINGS)
     # Not Path.is_file, which raises where a name is longer than any file's.
-    found = next((name for name in named if os.path.isfile(collector.folder / name)), path)
+    found = next((name for name in named if os.path.isfile(folder / name)), path)
     collector.image(found)
     return found
 

@@ -49,14 +49,15 @@ def read(path: Path, options: ReadOptions) -> Dataset:
             if len(words) != 2:
                 raise ValueError(f"expected a time and a path, found {len(words)} words")
             time_s = float(finite_numbers(words[0], "time"))
-            size = size_of(collector.image(words[1]))
+            file = collector.image(words[1])
+            size = size_of(file)
             if options.intrinsics is not None:
                 camera = options.intrinsics.camera(*size)
             elif lens is not None and size == _SIZE:
                 camera = lens
             else:
                 raise ValueError(f"image: is {size[0]}x{size[1]}, the known intrinsics are of 640x480")
-            collector.add(words[1], camera, trajectory.at(time_s), name=Path(words[1]).stem)
+            collector.add(words[1], camera, trajectory.at(time_s), name=file.stem)
     return collector.dataset(path.resolve().name, "tum", metric=True, source="TUM RGB-D", ground_truth="motion capture")
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mapless.cameras import with_slashes
 from mapless.geometry import Array, Camera, Quaternion, RigidTransform
 from mapless_tools.dataset import Dataset
 
@@ -137,7 +138,7 @@ def _images_folder(path: Path, model_folder: Path, model: Model, given: Path | N
     places = [path / "images", *(parent / "images" for parent in (model_folder, *model_folder.resolve().parents[:2]))]
     places += [path, model_folder]
     # Not Path.is_file, which raises where a name is longer than any file's.
-    found = {place: sum(os.path.isfile(place / name) for name in names) for place in places}
+    found = {place: sum(os.path.isfile(place / with_slashes(place, name)) for name in names) for place in places}
     best = max(found, key=lambda place: found[place])
     if names and not found[best]:
         raise ValueError(
