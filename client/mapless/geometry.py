@@ -152,11 +152,11 @@ class RigidTransform:
         m = np.asarray(matrix, float)
         if m.shape not in ((4, 4), (3, 4)):
             raise ValueError(f"expected a 4x4 or 3x4 matrix, got shape {m.shape}")
+        if not np.isfinite(m).all():
+            raise ValueError("the matrix of a rigid transform is not finite")
         if m.shape == (4, 4) and not np.abs(m[3] - [0, 0, 0, 1]).max() <= ROTATION_TOLERANCE:
             turned = "; is the matrix given column by column?" if np.array_equal(m[:, 3], [0, 0, 0, 1]) else ""
             raise ValueError(f"last row of a rigid transform must be 0 0 0 1{turned}")
-        if not np.isfinite(m[:3, 3]).all():
-            raise ValueError("translation is not finite")
         return RigidTransform(nearest_rotation(m[:3, :3]), m[:3, 3].copy())
 
     def matrix(self) -> Array:

@@ -18,9 +18,11 @@ def check_id(value: str) -> str:
 
 
 def scene_name(scene: str) -> str:
-    """The name of a scene given by id or by name; TypeError for another type than text."""
+    """The name of a scene given by id or by name; TypeError for another type than text, ValueError for an empty one."""
     if not isinstance(scene, str):
         raise TypeError(f"scene must be its id or name, is {scene!r}")
+    if not scene:
+        raise ValueError("scene must be its id or name, is empty")
     return scene if scene.startswith("scenes/") else f"scenes/{scene}"
 
 

@@ -3,6 +3,7 @@
 _MAX_JPEG_SEGMENTS = 2000  # 64 KiB each; bounds the walk through a file of nothing but empty ones
 # Start-of-frame markers: C0 to CF without DHT (C4), JPG (C8) and DAC (CC).
 JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_HEIF_BRANDS = frozenset(b"heic heix heim heis hevc hevx hevm hevs mif1 msf1".split())
 _JPEG_WITHOUT_LENGTH = frozenset(range(0xD0, 0xD8)) | {0x01}
 
 
@@ -30,6 +31,8 @@ def size_of_image(data: bytes, what: str = "photograph") -> tuple[int, int]:
     """
     kind = format_of_image(data)
     if not kind:
+        if data[4:8] == b"ftyp" and data[8:12] in _HEIF_BRANDS:
+            raise BadHeader(f"the {what} is a HEIC file; HEIC is not accepted: send a JPEG", "IMAGE_UNKNOWN_FORMAT")
         raise BadHeader(f"the {what} is not a JPEG, PNG or WebP file", "IMAGE_UNKNOWN_FORMAT")
     try:
         return {"jpeg": _size_of_jpeg, "png": _size_of_png, "webp": _size_of_webp}[kind](data)

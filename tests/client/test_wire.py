@@ -87,6 +87,11 @@ def test_a_prior_with_too_few_coordinates_is_named() -> None:
         set_priors(LocalizeRequest(), Priors(position=PositionPrior(np.array([1.0, 2.0]), 1.0)))
 
 
+def test_an_empty_scene_is_named() -> None:
+    with pytest.raises(ValueError, match="scene must be its id or name, is empty"):
+        Client("localhost").localize(b"x", CAMERA, "")
+
+
 def test_a_missing_argument_is_reported_by_the_call_s_own_name() -> None:
     with pytest.raises(TypeError, match=r"^localize\(\) missing 1 required positional argument: 'scene'"):
         Client("localhost").localize(b"x", CAMERA)  # type: ignore[call-arg]

@@ -169,6 +169,14 @@ def test_reasons(data: bytes, reason: str) -> None:
     assert refusal(data, field="requests[2].reference.image").reason == reason
 
 
+@pytest.mark.parametrize("brand", [b"heic", b"heix", b"mif1", b"hevc"])
+def test_a_heic_file_is_named_with_what_to_send(brand: bytes) -> None:
+    error = refusal(b"\x00\x00\x00\x24ftyp" + brand + bytes(100))
+    assert error.reason == "IMAGE_UNKNOWN_FORMAT"
+    assert "HEIC is not accepted: send a JPEG" in str(error)
+    assert "not a JPEG, PNG or WebP file" in str(refusal(b"\x00\x00\x00\x20ftypisom" + bytes(100)))
+
+
 def test_limits_are_inclusive() -> None:
     data = encode(".png", textured(32, 40))
     exact = ImageLimits(max_bytes=len(data), max_pixels=32 * 40, min_side_px=32, max_side_px=40)

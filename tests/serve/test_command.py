@@ -53,6 +53,10 @@ def test_help_shows_bound_and_default_of_each_setting() -> None:
         (["--coverage", "1"], "mapless-server: coverage (flag): "),
         (["--features", "surf"], "mapless-server: features (flag): must be one of auto, sift, "),
         (["--log-level", "loud"], "mapless-server: log_level (flag): "),
+        (
+            ["--address", "0.0.0.0:50051"],
+            "mapless-server: serve has no --address, which is the client's: give --host and",
+        ),
         (["--config", "absent.toml"], "mapless-server: absent.toml: no such file"),
     ],
 )

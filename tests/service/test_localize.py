@@ -211,12 +211,14 @@ SATELLITE = Priors(geo_position=GeoPositionPrior(47.3769, 8.5417, horizontal_sig
 
 
 @pytest.mark.parametrize(
-    ("priors", "field"),
-    [(GRAVITY, "gravity_prior.down_in_world"), (SATELLITE, "geo_position_prior")],
+    ("priors", "field", "flag"),
+    [(GRAVITY, "gravity_prior.down_in_world", "--down"), (SATELLITE, "geo_position_prior", "--datum")],
     ids=["gravity", "satellites"],
 )
-def test_what_the_scene_must_say_for_a_prior_is_named(client: Client, scene: str, priors: Priors, field: str) -> None:
-    with pytest.raises(InvalidArgument) as caught:
+def test_what_the_scene_must_say_for_a_prior_is_named(
+    client: Client, scene: str, priors: Priors, field: str, flag: str
+) -> None:
+    with pytest.raises(InvalidArgument, match=f"mapless scene update {flag}") as caught:
         client.localize(PHOTO, CAMERA, scene, priors=priors)
     assert caught.value.field == field
     client.update_scene(scene, datum=DATUM)

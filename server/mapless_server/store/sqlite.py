@@ -81,6 +81,8 @@ class SqliteDatabase:
         used, is in use, or contains something else.
         """
         path = folder / DATABASE_FILE
+        if folder.is_file():
+            raise StoreError(f"data folder {folder} is a file, not a folder")
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             folder_lock = FolderLock.take(folder, DATABASE_FILE)

@@ -65,7 +65,16 @@ def _require(extra: str, command: str) -> None:
         fail(f"{command} needs the Python package {package}: pip install 'mapless[{extra}]'")
 
 
-app.command("serve")(serve_command)
+class _ServeCommand(TyperCommand):
+    """Says what the server has in place of the flag of its clients."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if any(it.partition("=")[0] == "--address" for it in args):
+            fail("serve has no --address, which is the client's: give --host and --port")
+        return super().parse_args(ctx, args)
+
+
+app.command("serve", cls=_ServeCommand)(serve_command)
 app.add_typer(store_app, name="store")
 app.add_typer(token_app, name="token")
 app.add_typer(weights_app, name="weights")

@@ -279,7 +279,7 @@ def _geo_position(message: pb.GeoPositionPrior, attributes: SceneAttributes, fie
     """Converts a geographic position to the world; its covariance is given in east, north and up at the position."""
     datum = attributes.datum
     if datum is None:
-        raise FieldError(field, "needs a scene with a datum (UpdateScene sets one)")
+        raise FieldError(field, "needs a scene with a datum (UpdateScene sets one: mapless scene update --datum)")
     _check_within(message.latitude_deg, -90, 90, f"{field}.latitude_deg")
     _check_within(message.longitude_deg, -180, 180, f"{field}.longitude_deg")
     _check_within(message.horizontal_sigma_m, MIN_SIGMA_M, MAX_SIGMA_M, f"{field}.horizontal_sigma_m")
@@ -316,7 +316,9 @@ def _gravity(message: pb.GravityPrior, attributes: SceneAttributes, field: str) 
     in_world = _direction(message, "down_in_world", field) if message.HasField("down_in_world") else attributes.down()
     if in_world is None:
         raise FieldError(
-            f"{field}.down_in_world", "is required, since the scene has neither it nor a datum (UpdateScene sets them)"
+            f"{field}.down_in_world",
+            "is required, since the scene has neither it nor a datum (UpdateScene sets them: mapless scene update "
+            "--down or --datum)",
         )
     return GravityPrior(in_camera, in_world, message.sigma_deg)
 
