@@ -55,6 +55,9 @@ async def _localize_request(
 ) -> pb.LocalizeRequest:
     """Localizes a photograph: estimates the pose of its camera.
 
+    Returns `Rejected`, with `reason` and `hint`, if there is no pose that can be relied on: check `isinstance(answer,
+    Rejected)` first. Otherwise `world_from_camera` is the pose, and `accuracy.position_95_m` the radius of its errors.
+
     Args:
         image: the photograph.
         camera: the camera that took it, in pixels of the file as it is stored, before any EXIF rotation.
