@@ -99,7 +99,7 @@ class DeadlineExceeded(MaplessError):
 
 
 class Unavailable(MaplessError):
-    """The server cannot be reached, starts or drains; all retries failed."""
+    """The server cannot be reached, starts, drains, or went away during the answer; all retries failed."""
 
 
 class DataLoss(MaplessError):
@@ -115,8 +115,9 @@ class Internal(MaplessError):
 
 _BY_CODE: dict[str, type[MaplessError]] = {
     re.sub("(?<=.)(?=[A-Z])", "_", kind.__name__).upper(): kind for kind in MaplessError.__subclasses__()
-}
-"""Error classes by the name of their gRPC status: InvalidArgument by INVALID_ARGUMENT."""
+} | {"CANCELLED": Unavailable}
+"""Error classes by the name of their gRPC status: InvalidArgument by INVALID_ARGUMENT. A call that its caller did not
+cancel is CANCELLED where the server, or one behind a load balancer, goes away during the answer."""
 
 
 def from_rpc_error(error: Any) -> MaplessError:

@@ -10,7 +10,7 @@ import grpc
 import pytest
 from support.certificates import authority, signed
 
-from mapless import Client, ConnectOptions, MaplessError
+from mapless import Client, ConnectOptions, MaplessError, Unavailable
 from mapless.errors import REFUSED, _message
 from mapless.options import explained
 
@@ -180,3 +180,21 @@ def test_a_malformed_secret_is_rejected_without_showing_it(wrong: dict[str, Any]
     with pytest.raises(ValueError, match=error_text) as caught:
         ConnectOptions(**wrong)
     assert "SECRET" not in str(caught.value)
+
+
+def test_a_server_that_goes_away_is_unavailable() -> None:
+    """It, or one behind a load balancer, ends calls that it does not answer as CANCELLED."""
+
+    class GoingAway(grpc.GenericRpcHandler):
+        def service(self, handler_call_details: grpc.HandlerCallDetails) -> Any:
+            return grpc.unary_unary_rpc_method_handler(
+                lambda _, call: call.abort(grpc.StatusCode.CANCELLED, "CANCELLED")
+            )
+
+    server = grpc.server(ThreadPoolExecutor(1), handlers=(GoingAway(),))
+    port = server.add_insecure_port("127.0.0.1:0")
+    server.start()
+    with Client(f"127.0.0.1:{port}", ConnectOptions(max_attempts=1)) as client, pytest.raises(Unavailable) as caught:
+        client.get_scene("hall")
+    server.stop(None).wait()
+    assert caught.value.code == "CANCELLED"
