@@ -71,8 +71,7 @@ def errors_table() -> str:
     by_code = {kind.code: kind for kind in errors.RequestError.__subclasses__()}
     rows = []
     for code, client in client_errors._BY_CODE.items():
-        kind = by_code.get(code, errors.RequestError)
-        when = first_paragraph(kind) if code in by_code else "A fault of the server; the log has the rest."
+        when = first_paragraph(by_code.get(code, client))
         rows.append([f"`{code}`", f"`mapless.errors.{client.__name__}`", when])
     return table(["status", "Python client", "when"], rows)
 
