@@ -163,7 +163,7 @@ def test_references_without_matches_are_not_mapped_or_counted() -> None:
     assert "From above" in report_html(rejected(), PHOTO, CAMERA, BOTH)
 
 
-def test_matches_that_were_not_asked_for_are_told_from_none() -> None:
+def test_matches_that_were_not_asked_for_differ_from_none() -> None:
     assert "they need include_debug" in report_html(localized(debug=None), PHOTO, CAMERA)
     early = replace(diagnostics(), stage_s={"features": 0.1})
     assert "include_debug" not in report_html(rejected(diagnostics=early), PHOTO, CAMERA)

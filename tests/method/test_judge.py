@@ -106,7 +106,7 @@ def test_poses_with_trust_below_1_minus_coverage_are_rejected() -> None:
 
 
 def test_a_doubted_pose_keeps_no_features_from_being_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The comparison with other cameras is told which poses have too little evidence."""
+    """The comparison with other cameras is given which poses have too little evidence."""
     check = IntrinsicsCheck(IntrinsicsParameter.FOCAL_LENGTH, 500.0, 600.0, 10.0, 1.5, True, False)
     named = Rejection(RejectionReason.GATE, "focal_x_px 600 instead of 500", intrinsics_checks=(check,))
     unchecked = replace(named, intrinsics_checks=())

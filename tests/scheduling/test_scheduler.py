@@ -599,7 +599,7 @@ class Events(RuleBasedStateMachine):
         assert self.toy.observer.endings.total() == len(self.admitted) - len(alive)
 
     @invariant()
-    def what_is_told_is_so(self) -> None:
+    def what_it_reports_is_so(self) -> None:
         waiting = Counter(
             job.step.stage for job in self.toy.scheduler.jobs if not any(job in it.jobs for it in self.batches)
         )

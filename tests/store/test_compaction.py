@@ -142,7 +142,7 @@ def test_8_bits_are_read_where_an_older_server_added_float32(store: Store, place
     assert place.fetch("SELECT extractor FROM features") == [("sift+8bit",)]
 
 
-def test_compaction_stops_where_it_is_told_to(store: Store, place: Place) -> None:
+def test_compaction_stops_at_the_given_place(store: Store, place: Place) -> None:
     store.create_scene(OFFICE)
     store.add_references(OFFICE, [make_reference(f"r{i}", i) for i in range(3)])
     steps = iter([None, None])

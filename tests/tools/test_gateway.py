@@ -202,7 +202,7 @@ BAD: dict[str, tuple[Any, str, str]] = {
 
 
 @pytest.mark.parametrize("name", BAD)
-async def test_bad_requests_are_told_what_and_where(server: RunningServer, name: str) -> None:
+async def test_bad_requests_are_answered_with_what_and_where(server: RunningServer, name: str) -> None:
     request, field, words = BAD[name]
     async with gateway_of(server.address) as gateway:
         answer = await gateway.geopose(request)

@@ -76,7 +76,7 @@ async def test_the_form_is_answered_without_a_file(server: RunningServer, monkey
     assert long.status == 200, long.body
 
 
-async def test_bad_forms_are_told_what_and_where(server: RunningServer) -> None:
+async def test_bad_forms_are_answered_with_what_and_where(server: RunningServer) -> None:
     async with gateway_of(server.address, scene="") as gateway:
         cases = {
             "image": form(intrinsics=INTRINSICS, scene="hall"),

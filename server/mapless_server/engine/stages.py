@@ -5,7 +5,6 @@ against hard priors, chooses between the answers of two searches, and gives an a
 """
 
 import logging
-import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -31,7 +30,15 @@ from .choosing import is_searched, load_chosen, may_be_elsewhere, turned_to_matc
 from .failures import failure_of
 from .options import EscalationOptions
 from .query import COARSE, PREPARE, REFINE, TRACK, UNFINISHED, Query, QueryRun, Result, Tier
-from .tiers import better_of, inlier_count, is_doubtful, of_two_places, place_of_priors
+from .tiers import (
+    better_of,
+    inlier_count,
+    is_doubtful,
+    may_be_turned,
+    of_two_places,
+    place_of_priors,
+    shows_no_more,
+)
 
 log = logging.getLogger(__name__)
 
@@ -245,7 +252,7 @@ class QueryStages:
         if run.earlier is not None or not (run.query.allow_coarse or run.on_coarse is not None):
             return self._next(run, step)
         answer = self._method.coarse_answer(part)
-        if answer is None or not _is_finite(answer):
+        if answer is None or not answer.is_finite:
             return self._next(run, step)
         coarse = self._result(run, answer)
         if run.on_coarse is not None and isinstance(coarse.answer.outcome, Localization):
@@ -282,14 +289,14 @@ class QueryStages:
             result = replace(better, stage_seconds=result.stage_seconds)
         elif run.best is not None:
             better = better_of(run.best, result)
-            if run.tries_turns and better is result and _shows_no_more(run.best, result):
+            if run.tries_turns and better is result and shows_no_more(run.best, result):
                 better, run = run.best, run.but(views=run.views.not_turned)
             result = replace(better, stage_seconds=result.stage_seconds)
         elif self._searches_elsewhere(run, answer):
             elsewhere = replace(query, narrowing=query.narrowing.limits)
             return self._search(replace(self._further(run, elsewhere, run.tier, result), narrowed=query))
         is_first = run.tier == 0 and not run.tries_turns
-        if is_first and self._tiers[0].upright_only and _may_be_turned(result.answer, self._doubt_in(run)):
+        if is_first and self._tiers[0].upright_only and may_be_turned(result.answer, self._doubt_in(run)):
             return self._search(replace(self._further(run, query, 0, result), tries_turns=True))
         return self._stronger(run, query, result)
 
@@ -347,13 +354,13 @@ class QueryStages:
     def _unfinished(self, run: QueryRun) -> Done:
         assert run.earlier is not None
         unfinished = {f"{self._tiers[run.tier].features}{UNFINISHED}": time.monotonic() - run.start_s}
-        answer = _told_unfinished(run, run.earlier.answer, self._tiers[run.tier])
+        answer = _with_untried(run, run.earlier.answer, self._tiers[run.tier])
         result = replace(run.earlier, answer=answer, stage_seconds=run.earlier.stage_seconds | unfinished)
         return Done(result, _ending(result))
 
     def _result(self, run: QueryRun, answer: Answer) -> Result:
         """Makes the result for the caller from a tier's answer, after checking it against hard priors."""
-        if not _is_finite(answer):  # a pose of NaN must never leave the server
+        if not answer.is_finite:  # a pose of NaN must never leave the server
             raise ArithmeticError(f"the method's answer is not finite: {answer.outcome}, {answer.scale}")
         assert run.view is not None
         tier, narrowing = self._tiers[run.tier], run.query.narrowing
@@ -376,7 +383,7 @@ def _pipeline_in(run: QueryRun, tier: Tier) -> Pipeline:
     return tier.pipeline.with_trust(calibration.trust_quantiles if calibration else ())
 
 
-def _told_unfinished(run: QueryRun, answer: Answer, tier: Tier) -> Answer:
+def _with_untried(run: QueryRun, answer: Answer, tier: Tier) -> Answer:
     """Adds to a rejection's hint what was not tried: its advice alone would send elsewhere whom a repeat would help."""
     outcome = answer.outcome
     if not isinstance(outcome, Rejection):
@@ -393,32 +400,5 @@ def _told_unfinished(run: QueryRun, answer: Answer, tier: Tier) -> Answer:
     return replace(answer, outcome=replace(outcome, hint=replace(outcome.hint, message=advice)))
 
 
-def _may_be_turned(answer: Answer, options: EscalationOptions) -> bool:
-    """Whether the photograph may show more turned: not if it fits two places, or is where no prior allows it.
-
-    Of a facade that looks alike upside down, the little that matches of a turned photograph gives a pose of little
-    trust, far from the right one. A large radius alone is no sign of that.
-    """
-    outcome = answer.outcome
-    if isinstance(outcome, Localization):
-        return outcome.trust is not None and outcome.trust < options.doubtful_trust
-    found = RejectionReason.AMBIGUOUS, RejectionReason.PRIOR_CONFLICT
-    return outcome.reason not in found and is_doubtful(answer, options)
-
-
-def _shows_no_more(best: Result, turned: Result) -> bool:
-    """Whether a photograph was not localized turned either, and no more of it agrees with a pose than as it is."""
-    return isinstance(turned.answer.outcome, Rejection) and inlier_count(turned) <= inlier_count(best)
-
-
 def _ending(result: Result) -> Ending:
     return Ending.OK if isinstance(result.answer.outcome, Localization) else Ending.LOW_CONFIDENCE
-
-
-def _is_finite(answer: Answer) -> bool:
-    numbers = [] if answer.scale is None else [answer.scale.metres_per_unit, answer.scale.deviation]
-    if isinstance(answer.outcome, Localization):
-        outcome = answer.outcome
-        covariance = [] if outcome.covariance is None else outcome.covariance.ravel().tolist()
-        numbers += [*outcome.world_from_camera.matrix().ravel(), *covariance, outcome.reprojection_error_px]
-    return all(map(math.isfinite, numbers))

@@ -54,6 +54,24 @@ def is_doubtful(answer: Answer, options: EscalationOptions) -> bool:
     return outcome.trust < options.doubtful_trust or not radius_m <= options.doubtful_radius_m
 
 
+def may_be_turned(answer: Answer, options: EscalationOptions) -> bool:
+    """Whether the photograph may show more turned: not if it fits two places, or is where no prior allows it.
+
+    Of a facade that looks alike upside down, the little that matches of a turned photograph gives a pose of little
+    trust, far from the right one. A large radius alone is no sign of that.
+    """
+    outcome = answer.outcome
+    if isinstance(outcome, Localization):
+        return outcome.trust is not None and outcome.trust < options.doubtful_trust
+    found = RejectionReason.AMBIGUOUS, RejectionReason.PRIOR_CONFLICT
+    return outcome.reason not in found and is_doubtful(answer, options)
+
+
+def shows_no_more(best: Result, turned: Result) -> bool:
+    """Whether a photograph was not localized turned either, and no more of it agrees with a pose than as it is."""
+    return isinstance(turned.answer.outcome, Rejection) and inlier_count(turned) <= inlier_count(best)
+
+
 def better_of(cheaper: Result, stronger: Result) -> Result:
     """The better of a doubtful result and one with stronger features.
 

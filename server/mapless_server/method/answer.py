@@ -90,6 +90,16 @@ class Answer:
     reference_inlier_counts: tuple[int, ...] = ()
     support: Support | None = None
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether its pose, covariance, error and scale are numbers."""
+        numbers = [] if self.scale is None else [self.scale.metres_per_unit, self.scale.deviation]
+        if isinstance(self.outcome, Localization):
+            outcome = self.outcome
+            covariance = [] if outcome.covariance is None else outcome.covariance.ravel().tolist()
+            numbers += [*outcome.world_from_camera.matrix().ravel(), *covariance, outcome.reprojection_error_px]
+        return all(map(math.isfinite, numbers))
+
 
 def shifted(answer: Answer, offset: Array) -> Answer:
     """Returns the answer in a world whose coordinates are larger by `offset` (3,)."""
