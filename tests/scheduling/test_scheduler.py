@@ -112,11 +112,11 @@ class Toy:
         self.now_s = max(self.now_s, batch.start_s + (cost_s if seconds is None else seconds))
         self.scheduler.finish(batch, verdicts, self.now_s)
 
-    def fill(self) -> None:
-        """Admits jobs of one caller until one is refused."""
+    def fill(self, client: str = "many") -> None:
+        """Admits jobs of a caller until one is refused."""
         with suppress(Refused):
             while True:
-                self.admit(client="many")
+                self.admit(client=client)
 
     def refusal(self, **what: Any) -> Refused:
         with pytest.raises(Refused) as caught:
@@ -457,6 +457,19 @@ class TestTime:
             it.fill()
         assert toy.observer.admissions == without.observer.admissions
 
+    def test_what_waits_for_an_idle_thread_is_no_job_of_its_caller(self) -> None:
+        """Whose next job is admitted like a first one, which needs no more than its turn among the others' jobs."""
+        toy = Toy()
+        job = self.again(toy, "slow", 5)
+        toy.admit(client="other 0")
+        mine = toy.admit(client="mine")
+        assert "this caller's jobs in it: 1" in str(toy.refusal(client="mine"))
+        toy.scheduler.cancel(mine, toy.now_s)
+        toy.scheduler.cancel(job, toy.now_s)
+        run_through(toy)
+        assert not toy.scheduler.jobs
+        assert toy.scheduler.backlog_s == 0
+
     def test_a_step_waits_until_it_would_end_too_late(self) -> None:
         toy = Toy()
         job = self.again(toy, "slow", 4)
@@ -477,6 +490,21 @@ class TestTime:
         assert batch.jobs == (job,)
         toy.finish(batch, Next(Step("prepare", "slow", "b", "again"), Fallback(lambda: Done("first"), 150.0)))
         assert toy.ending_of(job) is Ending.OK
+
+    @pytest.mark.parametrize("is_crowded", [False, True])
+    def test_a_greedy_caller_takes_no_others_turn(self, is_crowded: bool) -> None:
+        """Where its own jobs are refused, others' steps take turns with them; not where others cannot come in either."""
+        toy = Toy()
+        toy.learn("coarse", "more", 0.5)
+        job = toy.admit(stage="refine", client="mine", deadline_s=200.0)
+        batch = toy.take("host")
+        toy.fill()
+        for client in map(str, range(100) if is_crowded else ()):
+            toy.fill(client)
+        step = Step("prepare", "more", "b", "again")
+        toy.finish(batch, Next(step, Fallback(lambda: Done("first"), 150.0)))
+        assert toy.ending_of(job) is (Ending.OK if is_crowded else None)
+        assert is_crowded or job in toy.take("host").jobs + toy.take("host").jobs
 
     @pytest.mark.parametrize(
         ("due_s", "others", "kind"),

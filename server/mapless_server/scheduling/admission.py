@@ -122,6 +122,7 @@ class Ledger:
 
     def __init__(self) -> None:
         self.jobs: set[Job] = set()
+        self._aside: set[Job] = set()
         self._flows: dict[Flow, _Holdings] = {}
         self._all = _Holdings()
 
@@ -143,8 +144,24 @@ class Ledger:
                 holdings.booked_s[lane] += seconds
         job.booked_s = cost_s
 
+    def set_aside(self, job: Job) -> None:
+        """Counts a job for nothing but its memory, because it waits until a thread is idle otherwise."""
+        self.rebook(job, Counter())
+        self._aside.add(job)
+        for holdings in (self._flows[job.flow], self._all):
+            holdings.aside += 1
+
+    def resume(self, job: Job, cost_s: Counter[str]) -> None:
+        """Undoes `set_aside`, with the computing time that is now predicted."""
+        self._aside.remove(job)
+        for holdings in (self._flows[job.flow], self._all):
+            holdings.aside -= 1
+        self.rebook(job, cost_s)
+
     def close(self, job: Job) -> None:
         """Removes a job that has ended."""
+        if job in self._aside:
+            self.resume(job, Counter())
         self.rebook(job, Counter())
         self.jobs.remove(job)
         for holdings in (self._flows[job.flow], self._all):
@@ -169,9 +186,10 @@ class Ledger:
         """Memory held by one caller, or by all."""
         return self._of(flow).size_bytes
 
-    def job_count(self, flow: Flow) -> int:
-        """Number of one caller's jobs."""
-        return self._of(flow).jobs
+    def job_count(self, flow: Flow | None = None) -> int:
+        """Number of jobs of one caller, or of all, without those that are set aside."""
+        holdings = self._of(flow)
+        return holdings.jobs - holdings.aside
 
     def booked_s(self, lane: str, flow: Flow | None = None) -> float:
         """Computing time predicted for the jobs of one caller, or of all."""
@@ -183,8 +201,12 @@ class Ledger:
         The caller's other jobs come first, and other callers get as much computing time as this one.
         """
         until_done_s = self.booked_s(lane, flow) + own_s
+        return until_done_s - own_s + self.of_others_s(flow, lane, until_done_s)
+
+    def of_others_s(self, flow: Flow, lane: str, share_s: float) -> float:
+        """Computing time predicted for the jobs of all callers but one, of each at most `share_s`."""
         of_others = (it.booked_s[lane] for other, it in self._flows.items() if other != flow)
-        return until_done_s - own_s + sum(min(other_s, until_done_s) for other_s in of_others)
+        return sum(min(other_s, share_s) for other_s in of_others)
 
     def _of(self, flow: Flow | None) -> "_Holdings":
         return self._all if flow is None else self._flows.get(flow, _NOTHING)
@@ -198,6 +220,7 @@ class Ledger:
 class _Holdings:
     def __init__(self) -> None:
         self.jobs = 0
+        self.aside = 0
         self.size_bytes = 0
         self.booked_s: Counter[str] = Counter()
 
@@ -234,7 +257,7 @@ class Admission:
             return
         self.check_queue(job.flow, cost_s)
         self.check_memory(job.flow, job.size_bytes)
-        if not ledger.jobs:
+        if not ledger.job_count():
             return
         own_s = cost_s.total()
         waits_s = (ledger.ahead_s(job.flow, lane, it) / self._threads[lane] for lane, it in cost_s.items())
@@ -253,7 +276,7 @@ class Admission:
         if self._is_closed:
             raise Refused(Refusal.DRAINING, "the server is stopping", UNKNOWN_RETRY_S)
         ledger = self._ledger
-        if not ledger.jobs:
+        if not ledger.job_count():
             return
         own_jobs = ledger.job_count(flow)
         is_first = not own_jobs
@@ -289,6 +312,16 @@ class Admission:
             return True
         added_s = {lane: own_s - job.booked_s[lane] for lane, own_s in cost_s.items()}
         return all(it <= 0 or self._excess_s(job.flow, lane, it) <= 0 for lane, it in added_s.items())
+
+    def has_turn(self, job: Job, cost_s: Counter[str]) -> bool:
+        """Whether an admitted job, its caller's only one, may continue although its caller's share is too small for it.
+
+        It may if it would be done soon although all others got as much of the server, as a first job is admitted.
+        """
+        ledger, flow = self._ledger, job.flow
+        if ledger.job_count(flow) > 1:
+            return False
+        return all(ledger.of_others_s(flow, lane, it) + it <= self._bound_s(lane) for lane, it in cost_s.items())
 
     def bookable(self, cost_s: Counter[str]) -> Counter[str]:
         """The part of a job's cost that is booked."""

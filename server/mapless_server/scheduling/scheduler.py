@@ -88,7 +88,8 @@ class Scheduler:
         self._queues: dict[str, FairQueue[Job]] = {stage.name: FairQueue(options.quantum_s) for stage in stages}
         # Steps of admitted jobs that need more room than there is: computed by threads that are idle otherwise.
         self._spare: dict[str, FairQueue[Job]] = {stage.name: FairQueue(options.quantum_s) for stage in stages}
-        self._refused_s = -math.inf  # when a job was last refused because of the others
+        # When a job was last refused because of those admitted, and when because of other callers' alone.
+        self._refused_s = self._crowded_s = -math.inf
         self._running: Counter[str] = Counter()
         self._lanes = {}
         for name, count in lanes.items():
@@ -141,7 +142,7 @@ class Scheduler:
         cost_s = self._predict(job.step, job.flow, now_s)
         if not job.continues:
             self._remember(job.flow, job.step)
-        with self._refusals_reported(now_s):
+        with self._refusals_reported(job.flow, now_s):
             self._admission.check(job, cost_s, now_s)
             # The server's own jobs have no tenant and are free; a job that continues others is charged when it ends.
             if self._quota is not None and job.flow.tenant and not job.continues:
@@ -155,7 +156,7 @@ class Scheduler:
 
     def hold(self, flow: Flow, size_bytes: int, now_s: float) -> None:
         """Books memory that a call needs besides its jobs, until `release`; raises Refused if there is no room."""
-        with self._refusals_reported(now_s):
+        with self._refusals_reported(flow, now_s):
             self._admission.check_memory(flow, size_bytes)
         self._ledger.hold(flow, size_bytes)
 
@@ -169,7 +170,7 @@ class Scheduler:
         That is a job as the caller's last one with this stage as its first, or with this step if there was none.
         """
         step = self._first_steps.get((flow, step.stage), step)
-        with self._refusals_reported(now_s):
+        with self._refusals_reported(flow, now_s):
             self._admission.check_queue(flow, self._predict(step, flow, now_s))
 
     def has_work(self, lane_name: str) -> bool:
@@ -211,7 +212,7 @@ class Scheduler:
         for job in jobs:
             job.begins_until_s = None
             self._set_timer(job)
-            self._ledger.rebook(job, self._admission.bookable(self._predict(job.step, job.flow, now_s)))
+            self._ledger.resume(job, self._admission.bookable(self._predict(job.step, job.flow, now_s)))
         return self._begin(lane, stages[-1], jobs, now_s)
 
     def _begin(self, lane: Lane, stage: Stage, jobs: tuple[Job, ...], now_s: float) -> Batch:
@@ -305,12 +306,14 @@ class Scheduler:
             self.costs.observe(stage.name, kind, job.flow, None, now_s)
 
     @contextmanager
-    def _refusals_reported(self, now_s: float) -> Iterator[None]:
+    def _refusals_reported(self, flow: Flow, now_s: float) -> Iterator[None]:
         try:
             yield
         except Refused as refused:
             if refused.reason in (Refusal.QUEUE_FULL, Refusal.TOO_MUCH_MEMORY):
                 self._refused_s = now_s
+                if not self._ledger.job_count(flow):
+                    self._crowded_s = now_s
             self._observer.refused(refused.reason)
             raise
 
@@ -341,7 +344,8 @@ class Scheduler:
     def _continue(self, job: Job, result: Next, now_s: float) -> None:
         """Queues a job for its next step, or, if that would end too late or cost too much, for the alternative.
 
-        If neither is worthwhile, the job waits for an idle thread, or ends with its fallback if no thread will be idle.
+        If neither is worthwhile, the job waits for an idle thread; or, if no thread will be idle because other callers
+        ask for more than their share, for its turn; or it ends with its fallback.
         """
         job.step, job.fallback = result.step, result.fallback
         cost_s = self._predict(job.step, job.flow, now_s)
@@ -353,11 +357,11 @@ class Scheduler:
                 self._continue(job, Next(result.alternative, job.fallback), now_s)
                 return
             if self._may_wait(job, cost_s, now_s):
-                self._ledger.rebook(job, Counter())
+                self._ledger.set_aside(job)
                 job.begins_until_s = job.due_s - in_order_s
                 self._enqueue(job, in_order_s, now_s)
                 return
-            if not self._is_tried_anyway(job.step):
+            if not (self._has_turn(job, cost_s, now_s) or self._is_tried_anyway(job.step)):
                 self._give_fallback(job, job.fallback, now_s)
                 return
         self._ledger.rebook(job, self._admission.bookable(cost_s))
@@ -375,13 +379,23 @@ class Scheduler:
 
         It does not wait if jobs were refused lately: more come than is computed, so that its turn would never come.
         """
-        if now_s - self._refused_s <= self._options.max_queued_s:
+        if self._is_recent(self._refused_s, now_s):
             return False
         before_s = (
             (self._ledger.booked_s(name) + sum(self._spare[it.name].cost_s for it in lane.stages)) / lane.threads
             for name, lane in self._lanes.items()
         )
         return now_s + max(before_s) + cost_s.total() <= job.due_s
+
+    def _has_turn(self, job: Job, cost_s: Counter[str], now_s: float) -> bool:
+        """Whether a step beyond the bounds takes turns with the jobs of callers that ask for more than their share."""
+        is_crowded = self._is_recent(self._crowded_s, now_s)
+        if is_crowded or not self._is_recent(self._refused_s, now_s) or not self._admission.has_turn(job, cost_s):
+            return False
+        return now_s + self._options.max_queued_s <= job.due_s
+
+    def _is_recent(self, refused_s: float, now_s: float) -> bool:
+        return now_s - refused_s <= self._options.max_queued_s
 
     def _is_tried_anyway(self, step: Step) -> bool:
         """Whether to try a step against its prediction: once in a while, since only computing corrects a prediction."""
