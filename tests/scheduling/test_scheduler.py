@@ -493,7 +493,7 @@ class TestTime:
 
     @pytest.mark.parametrize("is_crowded", [False, True])
     def test_a_greedy_caller_takes_no_others_turn(self, is_crowded: bool) -> None:
-        """Where its own jobs are refused, others' steps take turns with them; not where others cannot come in either."""
+        """Where its own jobs are refused, others' steps take turns with them; not where others have no room, too."""
         toy = Toy()
         toy.learn("coarse", "more", 0.5)
         job = toy.admit(stage="refine", client="mine", deadline_s=200.0)

@@ -439,6 +439,24 @@ class TestEndOfAll:
         assert "left behind" in said
 
 
+async def test_the_loop_is_woken_without_the_lock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It wakes at once, and its next step may need the lock."""
+    loop, held = asyncio.get_running_loop(), []
+    wake = loop.call_soon_threadsafe
+
+    def observed(callback: Any, *what: Any) -> asyncio.Handle:
+        if threading.current_thread() is not threading.main_thread():
+            held.append(toy.queue._lock.locked())
+        return wake(callback, *what)
+
+    monkeypatch.setattr(loop, "call_soon_threadsafe", observed)
+    async with Toy(options=WorkQueueOptions(max_queued_s=1e6, heartbeat_s=100.0)) as toy:
+        for i in range(5):
+            assert await toy.submit(i) == i
+    assert len(held) >= 5
+    assert not any(held)
+
+
 class TestCallersWhoLeave:
     @pytest.mark.parametrize("way", [Ending.CANCELLED, Ending.EXPIRED])
     async def test_a_thread_notices_at_its_next_check_that_a_job_ended(self, way: Ending) -> None:

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import Enum
+from functools import partial
 from typing import Any, Generic, TypeVar
 
 from .admission import WorkQueueOptions
@@ -84,8 +85,10 @@ class WorkQueue:
             return failure_of(error).value or Ending.FAILED
 
         self._scheduler = Scheduler(list(stages), lanes, options, observer, ending_of, quota)
-        # Guards the scheduler; held for microseconds. Each lane's idle threads wait on a condition of it.
+        # Guards the scheduler; held for microseconds. Each lane's idle threads wait on a condition of it. The loop is
+        # told about a change after it: woken at once, it may need the lock next.
         self._lock = threading.Lock()
+        self._for_loop: list[Callable[[], object]] = []
         self._wakes_threads = {lane: threading.Condition(self._lock) for lane in lanes}
         self._computing: set[Batch] = set()
         self._threads: list[threading.Thread] = []
@@ -150,10 +153,10 @@ class WorkQueue:
         future: asyncio.Future[Any] = loop.create_future()
 
         def on_end(_: Ending, value: Any) -> None:  # in whatever thread ends the job
-            loop.call_soon_threadsafe(_resolve, future, value)
+            self._for_loop.append(partial(loop.call_soon_threadsafe, _resolve, future, value))
 
         job.on_end = on_end
-        with self._lock:
+        with self._changing():
             if job.continues and self._is_closed:
                 raise Fatal("the server has stopped")
             self._scheduler.admit(job, time.monotonic())
@@ -163,7 +166,7 @@ class WorkQueue:
             return await future
         finally:
             if not job.is_over:
-                with self._lock:
+                with self._changing():
                     self._scheduler.cancel(job, time.monotonic())
 
     @contextmanager
@@ -215,8 +218,22 @@ class WorkQueue:
             if thread.is_alive():
                 log.error("the thread %s still computes and is left behind", thread.name)
 
+    @contextmanager
+    def _changing(self) -> Iterator[None]:
+        """Holds the lock during a change of the scheduler, and then tells the event loop what it has to know."""
+        calls: list[Callable[[], object]] = []
+        try:
+            with self._lock:
+                try:
+                    yield
+                finally:
+                    calls, self._for_loop = self._for_loop, calls
+        finally:
+            for call in calls:
+                call()
+
     def _end_all(self, error: Fatal) -> None:
-        with self._lock:
+        with self._changing():
             self._is_closed = True
             try:
                 self._scheduler.fail_all(error, time.monotonic())
@@ -229,7 +246,7 @@ class WorkQueue:
         try:
             while True:
                 self._wakes_timer.clear()
-                with self._lock:
+                with self._changing():
                     now_s = self.heartbeat_s = time.monotonic()
                     self._scheduler.expire(now_s)
                     self._check_for_stalls(now_s)
@@ -254,7 +271,7 @@ class WorkQueue:
         due_s = self._scheduler.next_due_s
         if due_s is not None and due_s < self._timer_at_s and self._loop is not None:
             self._timer_at_s = due_s
-            self._loop.call_soon_threadsafe(self._wakes_timer.set)
+            self._for_loop.append(partial(self._loop.call_soon_threadsafe, self._wakes_timer.set))
 
     def _check_for_stalls(self, now_s: float) -> None:
         for batch in self._computing:
@@ -280,7 +297,7 @@ class WorkQueue:
         try:
             while (batch := self._next_batch(lane)) is not None:
                 results = self._compute_batch(batch.stage, batch.jobs)
-                with self._lock:
+                with self._changing():
                     self._computing.discard(batch)
                     self._scheduler.finish(batch, results, time.monotonic())
                     self._notify(lane)
@@ -291,16 +308,18 @@ class WorkQueue:
 
     def _next_batch(self, lane: str) -> Batch | None:
         """Waits for the next batch; None when the queue is closed."""
-        with self._lock:
-            while not self._is_closed:
+        while True:
+            with self._changing():
+                if self._is_closed:
+                    return None
                 batch = self._scheduler.take(lane, time.monotonic())
                 if batch is not None:
                     self._computing.add(batch)
                     if self._scheduler.has_work(lane):
                         self._wakes_threads[lane].notify()
                     return batch
-                self._wakes_threads[lane].wait()
-        return None
+                if not self._for_loop:  # jobs that are due have ended, otherwise
+                    self._wakes_threads[lane].wait()
 
     def _compute_batch(self, stage: Stage, jobs: Sequence[Job]) -> list[StageResult]:
         """Computes the stage's result for each job; if the stage raises, computes halves of the batch."""
