@@ -13,10 +13,11 @@ Everything is float64 NumPy. Points are rows: ``(..., 3)``; pixels are ``(..., 2
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -218,14 +219,66 @@ class Similarity:
 
 
 @dataclass(frozen=True)
-class RadialTangential:
+class Distortion(ABC):
+    """A lens model: a frozen dataclass of its coefficients, all with a default."""
+
+    BEND_STEP: ClassVar[float] = 1e-7
+    """Step of the differences in `by_bend`; a model that is linear in its first radial coefficient has 1: no error."""
+
+    @abstractmethod
+    def distort(self, ideal: Array) -> Array:
+        """Normalized coordinates (..., 2) of an ideal pinhole to those the lens gives."""
+
+    @property
+    @abstractmethod
+    def cubic(self) -> float:
+        """What r^3 is multiplied by in the distance at which the lens shows a ray of slope r; for a pinhole 0.
+
+        As a share of what r is multiplied by, where that is not 1.
+        """
+
+    @property
+    def k1(self) -> float:
+        """The value that checks of intrinsics show as k1: the first radial coefficient if that is its name."""
+        return self.cubic
+
+    def bent(self, change: float) -> Distortion:
+        """The lens with so much more of `cubic`, by its first radial coefficient alone.
+
+        The lens itself, as here, if the model has no such coefficient: checks of intrinsics then hold it as it is.
+        """
+        return self
+
+    def by_bend(self, ideal: Array) -> Array:
+        """Derivative (..., 2) of `distort` by the change in `bent`; zeros if that changes nothing."""
+        return np.asarray((self.bent(self.BEND_STEP).distort(ideal) - self.distort(ideal)) / self.BEND_STEP)
+
+    def by_ideal(self, ideal: Array, step: float = 1e-6) -> Array:
+        """Derivative (N, 2, 2) of `distort` by its argument (N, 2), by finite differences."""
+        ahead = [self.distort(ideal + step * axis) - self.distort(ideal - step * axis) for axis in np.eye(2)]
+        return np.asarray(np.stack(ahead, axis=2) / (2 * step))
+
+
+@dataclass(frozen=True)
+class RadialTangential(Distortion):
     """OpenCV's radial-tangential distortion of normalized image coordinates."""
+
+    BEND_STEP: ClassVar[float] = 1.0
 
     k1: float = 0.0
     k2: float = 0.0
     p1: float = 0.0
     p2: float = 0.0
     k3: float = 0.0
+
+    @property
+    def cubic(self) -> float:
+        """See `Distortion`."""
+        return self.k1
+
+    def bent(self, change: float) -> RadialTangential:
+        """See `Distortion`."""
+        return replace(self, k1=self.k1 + change)
 
     def distort(self, ideal: Array) -> Array:
         """Normalized coordinates (..., 2) of an ideal pinhole to those the lens gives."""
@@ -238,13 +291,24 @@ class RadialTangential:
 
 
 @dataclass(frozen=True)
-class Fisheye:
+class Fisheye(Distortion):
     """OpenCV's fisheye distortion: theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)."""
+
+    BEND_STEP: ClassVar[float] = 1.0
 
     k1: float = 0.0
     k2: float = 0.0
     k3: float = 0.0
     k4: float = 0.0
+
+    @property
+    def cubic(self) -> float:
+        """See `Distortion`. Without coefficients it shows the ray at theta = arctan r = r - r^3 / 3 + ..."""
+        return self.k1 - 1 / 3
+
+    def bent(self, change: float) -> Fisheye:
+        """See `Distortion`."""
+        return replace(self, k1=self.k1 + change)
 
     def distort(self, ideal: Array) -> Array:
         """Normalized coordinates (..., 2) of an ideal pinhole to those the lens gives."""
@@ -255,9 +319,7 @@ class Fisheye:
         return ideal * np.where(r > 1e-12, theta_d / np.maximum(r, 1e-12), 1.0)
 
 
-Distortion = RadialTangential | Fisheye
-
-LENS_MODELS: Mapping[str, type[Distortion]] = {"radial_tangential": RadialTangential, "fisheye": Fisheye}
+LENS_MODELS: Mapping[str, type[Any]] = {"radial_tangential": RadialTangential, "fisheye": Fisheye}
 """Lens models by name. The interface (the oneof `distortion` of CameraIntrinsics), the store and cameras.json use these
 names, and the names of the coefficients; another model begins here."""
 

@@ -154,7 +154,8 @@ def _distortion_from_message(message: pb.CameraIntrinsics, field: str) -> Distor
             raise FieldError(
                 joined(field, f"{kind}.{name}"), f"must be at most {MAX_DISTORTION:g} in magnitude, is {value:g}"
             )
-    return LENS_MODELS[kind](**coefficients)
+    found: Distortion = LENS_MODELS[kind](**coefficients)
+    return found
 
 
 def transform_to_message(target_from_source: RigidTransform, field: str = "a pose") -> pb.RigidTransform:

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.compare import assert_pose_close
+from support.lenses import Division, Stereographic, add_planted_lenses
 from support.planted import NOISE, stages, true_structure
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
@@ -31,7 +32,16 @@ LENSES = {
     "strong": RadialTangential(-0.28, 0.07, 0.001, -0.002),
     "fisheye": Fisheye(0.03, -0.015, 0.004, -0.001),
     "empty fisheye": Fisheye(),
+    "without k1": Division(-0.2),
+    "without a radial coefficient": Stereographic(0.01),
 }
+
+
+@pytest.fixture(autouse=True)
+def planted_lenses(monkeypatch: pytest.MonkeyPatch) -> None:
+    add_planted_lenses(monkeypatch)
+
+
 ERRORS = {"focal length": (0.01, 0, 0, 0), "principal point": (0, 16.0, -14.0, 0), "k1": (0, 0, 0, 0.06)}
 
 
@@ -52,9 +62,9 @@ def test_keypoint_motion_equals_differences_of_undistortion(lens: Distortion | N
         np.testing.assert_allclose(motion[:, :, i], expected, atol=1e-3)
 
 
-def misread(scene: SyntheticScene, errors: tuple[float, ...]) -> SyntheticScene:
-    """The same photograph, whose intrinsics are given with these errors."""
-    query = scene.query
+def misread(scene: SyntheticScene, errors: tuple[float, ...], distortion: Distortion | None = None) -> SyntheticScene:
+    """The same photograph, by a camera of this lens, whose intrinsics are given with these errors."""
+    query = replace(scene.query, camera=replace(scene.query.camera, distortion=distortion))
     given = corrected(query.camera, -np.array(errors))
     raw = query.camera.project(query.camera.rays(query.features.keypoints.astype(float)))
     keypoints = undistort_pixels(raw, given).astype(np.float32)
@@ -67,15 +77,29 @@ def adjusted(scene: SyntheticScene, sigma: IntrinsicsSigma | None = None) -> Pos
     return adjust_pose(scene.query, scene.references, structure, matches, estimate, AdjustOptions(), intrinsics=sigma)
 
 
+@pytest.mark.parametrize("lens", [None, Division(-0.2)], ids=["pinhole", "without k1"])
 @pytest.mark.parametrize("parameter", ERRORS)
-def test_planted_errors_are_found_within_their_sigma(parameter: str) -> None:
+def test_planted_errors_are_found_within_their_sigma(parameter: str, lens: Distortion | None) -> None:
     """Within three of them, and they are significant."""
     errors = np.array(ERRORS[parameter], float)
-    evidence = adjusted(misread(make_scene(random_for("planted", parameter)), tuple(errors))).intrinsics
+    evidence = adjusted(misread(make_scene(random_for("planted", parameter)), tuple(errors), lens)).intrinsics
     assert evidence
     wrong = errors != 0
     assert (np.abs(evidence.value - errors)[wrong] < 3 * evidence.sigma[wrong]).all()
     assert (np.abs(evidence.value)[wrong] > 4 * evidence.sigma[wrong]).any()
+
+
+def test_a_lens_without_a_radial_coefficient_is_held() -> None:
+    """The other parameters are found as ever; of k1 only the prior is known, and nothing contradicts it."""
+    scene = misread(make_scene(random_for("planted", "held")), (0.03, 0, 0, 0), Stereographic())
+    evidence = adjusted(scene).intrinsics
+    assert evidence
+    assert abs(evidence.value[0] - 0.03) < 3 * evidence.sigma[0] < 0.01
+    assert (evidence.value[3], evidence.removed[3]) == (0.0, 0.0)
+    assert evidence.sigma[3] == pytest.approx(evidence.prior_sigma[3])
+    judged = wrong_intrinsics(evidence, "best", ContradictionOptions())
+    assert judged
+    assert [it.parameter for it in judged.intrinsics_checks if it.conflict] == [FOCAL]
 
 
 def test_what_the_matches_of_a_reference_share_is_in_the_sigma() -> None:
@@ -357,8 +381,14 @@ def test_a_planted_gross_error_is_named_with_its_value(
         (RadialTangential(-0.2), RadialTangential(0.1), -0.2),
         (Fisheye(), None, -1 / 3),
         (None, Fisheye(), 1 / 3),
+        (None, Division(-0.25), 0.0),
+        (Division(-0.28), Division(0.05), -0.28),
+        (None, Stereographic(), 0.0),
     ],
-    ids=["forgotten", "undistorted already", "wrong coefficient", "a fisheye's", "no fisheye"],
+    ids=[
+        *("forgotten", "undistorted already", "wrong coefficient", "a fisheye's", "no fisheye"),
+        *("no lens without k1", "wrong coefficient without k1", "no lens without a radial coefficient"),
+    ],
 )
 def test_another_lens_is_named_with_its_k1(lens: Distortion | None, given_lens: Distortion | None, k1: float) -> None:
     """As a camera without it has it: a ray of slope r is shown at r + k1 r^3, by a fisheye at arctan r."""

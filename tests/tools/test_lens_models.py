@@ -2,18 +2,19 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
+from support.lenses import Division, add_planted_lenses
 from support.planted_answers import diagnostics
 from support.scenes import CAMERA
 
-from mapless import geometry, wire
+from mapless import wire
 from mapless.cameras import read_cameras
-from mapless.geometry import LENS_MODELS, Camera, Distortion, RigidTransform
+from mapless.geometry import LENS_MODELS, Camera, RigidTransform
 from mapless.report.sections import provenance_section
 from mapless.v1 import geometry_pb2 as pb
 from mapless_server.method.views import undistort_pixels
@@ -22,19 +23,7 @@ from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.ingest.formats.colmap.cameras import from_camera
 from mapless_tools.ingest.formats.writing import PosedImage, cameras_files
 
-
-@dataclass(frozen=True)
-class Unified:
-    """A lens model that mapless does not have."""
-
-    xi: float = 0.0
-    alpha: float = 0.0
-
-    def distort(self, ideal: Any) -> Any:
-        """Not called."""
-
-
-UNIFIED = replace(CAMERA, distortion=cast(Distortion, Unified(0.5, 0.25)))
+UNKNOWN = replace(CAMERA, distortion=Division(-0.25))
 
 
 def sent(camera: Camera, folder: Path) -> Camera:
@@ -82,7 +71,7 @@ def undistorted(camera: Camera, folder: Path) -> Camera:
 def reported(camera: Camera, folder: Path) -> Camera:
     """The camera, if the report names its lens."""
     section = provenance_section(diagnostics(), camera)
-    return camera if "lens distortion" in section and "xi 0.5" in section else CAMERA
+    return camera if "lens distortion" in section and "coefficient -0.25" in section else CAMERA
 
 
 PLACES = [sent, stored, exported, listed, to_colmap, undistorted]
@@ -99,21 +88,21 @@ def test_every_place_knows_every_model(place: Place, model: str, tmp_path: Path)
 
 @pytest.mark.parametrize("place", [*PLACES, reported])
 def test_a_lens_that_is_not_in_the_table_is_named(place: Place, tmp_path: Path) -> None:
-    with pytest.raises(TypeError, match=r"camera\.distortion is a Unified.*RadialTangential, Fisheye"):
-        place(UNIFIED, tmp_path)
+    with pytest.raises(TypeError, match=r"camera\.distortion is a Division.*RadialTangential, Fisheye"):
+        place(UNKNOWN, tmp_path)
 
 
 @pytest.mark.parametrize("place", [*PLACES, reported])
 def test_a_model_in_the_table_works_or_fails_loudly(
     place: Place, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(cast(dict[str, Any], geometry.LENS_MODELS), "unified", Unified)
-    needs_code = place in (sent, listed, to_colmap, undistorted)  # a field of the interface, COLMAP's name, an inverse
+    add_planted_lenses(monkeypatch)
+    needs_code = place in (sent, listed, to_colmap)  # a field of the interface, COLMAP's name
     if needs_code:
-        with pytest.raises((TypeError, ValueError), match=r"camera\.distortion is a Unified"):
-            place(UNIFIED, tmp_path)
+        with pytest.raises((TypeError, ValueError), match=r"camera\.distortion is a Division"):
+            place(UNKNOWN, tmp_path)
     else:
-        assert place(UNIFIED, tmp_path) == UNIFIED
+        assert place(UNKNOWN, tmp_path) == UNKNOWN
 
 
 def test_the_interface_has_the_models_of_the_table() -> None:

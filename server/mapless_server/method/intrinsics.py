@@ -1,9 +1,9 @@
 """Errors of a photograph's intrinsics: what they do to its keypoints.
 
 Four numbers describe them: s = ln(f / f given), one for both axes; the shift (x, y) of the principal point, pixels; and
-the change of the lens model's first radial coefficient, k1. A keypoint is undistorted with the given intrinsics to a
-pixel y of the ideal pinhole camera, in normalized coordinates, by y = D^-1((u - c) / f). With other intrinsics the same
-keypoint is, to first order,
+the change of the lens model's first radial coefficient, k1, or of what stands for it (`Distortion.bent`). A keypoint is
+undistorted with the given intrinsics to a pixel y of the ideal pinhole camera, in normalized coordinates, by
+y = D^-1((u - c) / f). With other intrinsics the same keypoint is, to first order,
 
     y - J^-1 (s D(y) + dc / f + dk1 dD/dk1),    J = dD/dy,
 
@@ -180,7 +180,9 @@ def intrinsics_evidence(
         to_world: (6, 6) derivative of the world error by the pose's unknowns.
     """
     try:
-        others = np.where(np.eye(4, dtype=bool), 0.0, prior_sigma**-2.0)
+        # Of an error that moves no keypoint, k1 of a lens model without such a coefficient, only the prior is known.
+        is_seen = np.diag(np.diag(equations.matrices[0]) > 0)
+        others = np.where(is_seen, 0.0, prior_sigma**-2.0)
         found, covariance = equations.estimate(removed, others, inflation, region_factor)
         value, sigma = np.diag(found), np.sqrt(np.einsum("iii->i", covariance))
         # A camera that errs otherwise than the references' is not theirs, though K is the same: its lens may differ.
@@ -206,12 +208,12 @@ def keypoint_motion(camera: Camera, distortion: Distortion | None, pixels: Array
     """Shift (N, 2, 4) of ideal pixels (N, 2) for one unit of each of the four errors of the intrinsics."""
     ideal = camera.rays(pixels)[:, :2]
     lens = distortion or RadialTangential()
-    bent, by_k1 = lens.distort(ideal), _by_k1(lens, ideal)
+    bent, by_k1 = lens.distort(ideal), lens.by_bend(ideal)
     focal = np.array([camera.focal_x_px, camera.focal_y_px])
     by_principal = np.broadcast_to(np.diag(1 / focal), (len(pixels), 2, 2))
     motion = np.concatenate([bent[:, :, None], by_principal, by_k1[:, :, None]], axis=2)
     if distortion is not None:
-        motion = np.linalg.solve(_jacobian(lens, ideal), motion)
+        motion = np.linalg.solve(lens.by_ideal(ideal), motion)
     return np.asarray(motion * focal[:, None])
 
 
@@ -225,7 +227,7 @@ def corrected(camera: Camera, errors: Sequence[float] | Array) -> Camera:
         focal_y_px=camera.focal_y_px * np.exp(log_ratio),
         principal_x_px=camera.principal_x_px + x_px,
         principal_y_px=camera.principal_y_px + y_px,
-        distortion=replace(lens, k1=lens.k1 + k1),
+        distortion=lens.bent(k1),
     )
 
 
@@ -248,14 +250,3 @@ def read_as(view: View, camera: Camera) -> View:
         pixels = lens.project(lens.rays(features.keypoints.astype(np.float64)))
         features = replace(features, keypoints=undistort_pixels(pixels, camera).astype(np.float32))
     return replace(view, camera=camera.pinhole(), features=features, distortion=camera.distortion)
-
-
-def _by_k1(lens: Distortion, ideal: Array) -> Array:
-    """dD/dk1 (N, 2); lens models are linear in their coefficients."""
-    return np.asarray(replace(lens, k1=lens.k1 + 1.0).distort(ideal) - lens.distort(ideal))
-
-
-def _jacobian(lens: Distortion, ideal: Array, step: float = 1e-6) -> Array:
-    """dD/dy (N, 2, 2), by finite differences."""
-    ahead = [lens.distort(ideal + step * axis) - lens.distort(ideal - step * axis) for axis in np.eye(2)]
-    return np.asarray(np.stack(ahead, axis=2) / (2 * step))

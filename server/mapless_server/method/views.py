@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, Camera, Distortion, Fisheye, RadialTangential, RigidTransform, unknown_lens
+from mapless.geometry import Array, Camera, Distortion, Fisheye, RadialTangential, RigidTransform, lens_model_of
 
 Matches = NDArray[np.int32]
 """(M, 2): keypoint indices in the first and in the second of two views."""
@@ -269,13 +269,17 @@ def reduce_image(
 MAX_INCIDENCE_DEG = 80.0
 """Rays further from the optical axis are dropped: a pinhole's pixels run to infinity towards 90 degrees."""
 
+MAX_ITERATIONS = 50
+"""Of undistortion."""
+
 
 def undistort_pixels(pixels: Array, camera: Camera) -> Array:
     """Undistorts pixels (N, 2) to the ideal pinhole camera with the same K; NaN where the lens model has no inverse."""
     if camera.distortion is None or not len(pixels):  # OpenCV returns None for no pixels
         return pixels
     d, k = camera.distortion, camera.matrix()
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
+    lens_model_of(d)
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, MAX_ITERATIONS, 1e-9)
     points = np.ascontiguousarray(pixels, np.float64)[:, None]
     if isinstance(d, RadialTangential):
         coefficients = np.array([d.k1, d.k2, d.p1, d.p2, d.k3], float)
@@ -285,13 +289,28 @@ def undistort_pixels(pixels: Array, camera: Camera) -> Array:
             points, k, np.array([d.k1, d.k2, d.k3, d.k4], float), P=k, criteria=criteria
         )[:, 0]
     else:
-        raise unknown_lens(d)
+        ideal = camera.pinhole().project(_undistorted(d, camera.rays(pixels)))
     # The iteration may diverge where the model folds over; only pixels that project back to themselves are solutions.
     rays = camera.rays(ideal)
     returned = camera.project(rays)
     good = np.linalg.norm(returned - pixels, axis=1) < 0.05
     good &= np.linalg.norm(rays[:, :2], axis=1) < np.tan(np.radians(MAX_INCIDENCE_DEG))
     return np.where(good[:, None], ideal, np.nan)
+
+
+def _undistorted(lens: Distortion, seen: Array) -> Array:
+    """The rays (N, 3) at depth 1 that a lens shows at these (N, 3), by Newton's method."""
+    ideal, shown = seen[:, :2], seen[:, :2]
+    with np.errstate(all="ignore"):  # where the model folds over
+        for _ in range(MAX_ITERATIONS):
+            by_ideal, error = lens.by_ideal(ideal), lens.distort(ideal) - shown
+            (a, b), (c, d) = np.moveaxis(by_ideal, 0, -1)
+            x, y = error.T
+            change = np.stack([d * x - b * y, a * y - c * x], axis=1) / (a * d - b * c)[:, None]
+            ideal = ideal - change
+            if not np.nanmax(np.abs(change), initial=0.0) > 1e-9:
+                break
+    return np.concatenate([ideal, seen[:, 2:]], axis=1)
 
 
 def seen_share(camera: Camera) -> float:

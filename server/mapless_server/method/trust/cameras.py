@@ -217,12 +217,8 @@ def _k1_step(camera: Camera, steps: _Steps) -> float:
 
 
 def _bend(camera: Camera) -> float:
-    """What r^3 is multiplied by in the distance at which the lens shows a ray of slope r.
-
-    For a pinhole it is 0; a fisheye without coefficients shows the ray at arctan r, so that it is -1/3.
-    """
-    lens = camera.distortion
-    return 0.0 if lens is None else lens.k1 - (1 / 3 if isinstance(lens, Fisheye) else 0.0)
+    """What r^3 is multiplied by in the distance at which the lens shows a ray of slope r."""
+    return 0.0 if camera.distortion is None else camera.distortion.cubic
 
 
 def _checks(sent: Camera, prior_sigma: Array, given: Camera, found: Camera, steps: _Steps) -> Iterator[IntrinsicsCheck]:
