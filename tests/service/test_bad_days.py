@@ -48,7 +48,8 @@ from mapless_server.method.views import PosedView, View
 from mapless_server.serve import running
 from mapless_server.serve.running import watch_store
 from mapless_server.services.handlers import SERVICE_NAMES
-from mapless_server.store import Store, StoreError
+from mapless_server.store import Store, StoreError, deletion
+from mapless_server.store.reserve import RESERVE_FILE
 from mapless_server.store.sqlite import DATABASE_FILE, LOCK_FILE, SqliteDatabase
 from mapless_server.store.verification import verify
 
@@ -91,8 +92,9 @@ def health_of(client: HealthClient) -> tuple[bool, ...]:
 
 @pytest.fixture(autouse=True)
 def looks_often(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At its store, the server."""
+    """At its store, the server; and whether there is room to delete."""
     monkeypatch.setattr(running, "watch_store", partial(watch_store, interval_s=0.02))
+    monkeypatch.setattr(deletion, "AGAIN_S", 0.02)
 
 
 @contextmanager
@@ -111,6 +113,15 @@ def fill(client: Client, count: int = 3) -> None:
 
 def is_answered(client: Client, *references: str) -> bool:
     return isinstance(client.localize(PHOTO, CAMERA, "s", references), LocalizationResult)
+
+
+def fill_up(disk: Path) -> None:
+    """To the last byte."""
+    with (disk / "filler").open("ab", buffering=0) as filler:
+        for size in (2**16, 1):
+            with suppress(OSError):
+                while True:
+                    filler.write(bytes(size))
 
 
 def faults_of(folder: Path) -> tuple[str, ...]:
@@ -162,6 +173,7 @@ class TestDisk:
                 assert count_left() == 20
                 (disk / "filler").unlink()
             with served(disk / "data") as client:
+                (disk / "data" / RESERVE_FILE).unlink()
                 leave(150_000)
                 error = error_of(lambda: client.delete_scene("t"))
                 assert (error and error.code, error and error.reason) == ("RESOURCE_EXHAUSTED", "STORE_FULL")
@@ -169,10 +181,23 @@ class TestDisk:
                     client.get_scene("t")
                 assert count_left() > 0
                 (disk / "filler").unlink()
-                with pytest.raises(NotFound):
-                    client.delete_scene("t")
-                assert count_left() == 0
+                wait_until(lambda: count_left() == 0)
             assert large_photo(7)[1000:1016] not in (disk / "data" / DATABASE_FILE).read_bytes()
+
+    def test_what_fills_the_disk_can_be_deleted(self, tmp_path: Path) -> None:
+        with small_disk(tmp_path / "disk", 72) as disk, served(disk / "data") as client:
+            (disk / "filler").write_bytes(bytes(56 * 2**20))
+            fill(client, 1)
+            for i in range(1, 60):
+                if error_of(partial(client.add_reference, "s", large(i))) is not None:
+                    break
+            fill_up(disk)
+            for it in [it.reference_id for it in client.list_references("s")][1:]:
+                client.delete_reference("s", it)
+            client.delete_scene("s")
+            client.create_scene("t")
+            client.add_reference("t", large(0))
+            assert client.get_reference("t", "r0", include_image=True).image == large_photo(0)
 
     def test_a_disk_full_from_the_start_serves_queries(self, tmp_path: Path) -> None:
         with small_disk(tmp_path / "disk", 8) as disk:
@@ -180,11 +205,11 @@ class TestDisk:
                 fill(client, 2)
                 # What lies there while it runs is what a kill leaves behind.
                 shutil.copytree(disk / "stopped", disk / "killed")
-            with (disk / "filler").open("wb", buffering=0) as filler:
-                for size in (2**16, 1):
-                    with suppress(OSError):
-                        while True:
-                            filler.write(bytes(size))
+            fill_up(disk)
+            with served(disk / "stopped") as client:
+                assert is_answered(client)
+            (disk / "stopped" / RESERVE_FILE).unlink()
+            fill_up(disk)
             with pytest.raises(StoreError, match=r"the disk is full$"), served(disk / "stopped"):
                 pass
             with served(disk / "killed") as client:
@@ -322,7 +347,7 @@ class TestTwoServers:
         code = """if True:
             import sys
             from pathlib import Path
-            from mapless_server.store import Store, StoreError
+            from mapless_server.store import Store, StoreError, deletion
             for folder in sys.argv[1:]:
                 try:
                     Store.open(Path(folder))

@@ -111,6 +111,27 @@ class Database(Protocol):
         """Frees disk space that the database does not need for data, as far as that is quick; outside transactions."""
         ...
 
+    def reserve(self) -> AbstractContextManager[None]:
+        """Disk space that is kept for deleting is free within the block, in which nothing else is written."""
+        ...
+
     def close(self) -> None:
         """Closes all connections; no transaction may be running."""
         ...
+
+
+def with_room_to_delete(database: Database, delete: Callable[[], T]) -> T:
+    """Deletes; where the disk is full, again with the space that the database keeps for it.
+
+    Overloaded, which says what to do, if that is not enough either.
+    """
+    try:
+        return delete()
+    except Overloaded:
+        pass
+    try:
+        with database.reserve():
+            return delete()
+    except Overloaded as error:
+        message = "the store's disk is full, also for deleting: make room on it for a few megabytes, then delete again"
+        raise Overloaded(message, reason=error.reason) from error

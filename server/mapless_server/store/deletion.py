@@ -16,7 +16,7 @@ from sqlalchemy import Column, Connection, ScalarSelect, delete, func, insert, l
 from mapless_server.errors import Overloaded
 from mapless_server.security import SceneKey
 
-from .database import DamagedPages, Database
+from .database import DamagedPages, Database, with_room_to_delete
 from .queries import DETACHED, is_detached
 from .tables import features, global_descriptor, image, reference, reference_depth, reference_pair, scene
 
@@ -32,6 +32,9 @@ REFERENCES_AT_A_TIME = 100
 """Most references per transaction; other writers of SQLite wait as long."""
 PAUSE_S = 0.01
 """Between transactions, so that other writers get SQLite's lock, which is given in no order."""
+
+AGAIN_S = 30.0
+"""Between attempts where the disk is full."""
 
 _DAMAGED = f"{DETACHED}damaged"
 """Key of the references that were deleted but whose pages cannot be freed, since the database cannot read them."""
@@ -56,8 +59,16 @@ class PendingDeletions:
             return
         if is_pending:
             logger.info("completing deletions of scenes that were interrupted")
-            self._thread = threading.Thread(target=self._run_thread, name="deletions", daemon=True)
-            self._thread.start()
+            self._start(0.0)
+
+    def try_again(self) -> None:
+        """Starts a thread, unless there is one, that deletes what the disk had no room for, until it has."""
+        if self._thread is None or not self._thread.is_alive():
+            self._start(AGAIN_S)
+
+    def _start(self, pause_s: float) -> None:
+        self._thread = threading.Thread(target=self._run_thread, args=[pause_s], name="deletions", daemon=True)
+        self._thread.start()
 
     def close(self) -> None:
         """Ends the thread after its current portion."""
@@ -70,8 +81,10 @@ class PendingDeletions:
 
         Overloaded if the disk has too little space even to delete one reference.
         """
-        if not self._is_pending():
-            return
+        if self._is_pending():
+            with_room_to_delete(self._database, self._run)
+
+    def _run(self) -> None:
         at_most = count = REFERENCES_AT_A_TIME
         was_full = False
         while True:
@@ -108,11 +121,20 @@ class PendingDeletions:
             delete_empty(connection)
             return bool(keys) and is_pending(connection)
 
-    def _run_thread(self) -> None:
+    def _run_thread(self, pause_s: float) -> None:
+        while not self._closing.wait(pause_s) and not self._is_completed():
+            pause_s = AGAIN_S
+
+    def _is_completed(self) -> bool:
+        """Runs; False if the disk is too full."""
         try:
             self.run()
+        except Overloaded as error:
+            logger.warning("what is left of deleted scenes is deleted when there is room: %s", error)
+            return False
         except Exception as error:
             _log_failure(error)
+        return True
 
 
 def _log_failure(error: Exception) -> None:

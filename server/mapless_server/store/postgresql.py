@@ -118,6 +118,11 @@ class PostgresqlDatabase:
     def free_space(self) -> None:
         """Implements Database."""
 
+    @contextmanager
+    def reserve(self) -> Iterator[None]:
+        """Implements Database; there is none, since PostgreSQL deletes without overwriting."""
+        yield
+
     def close(self) -> None:
         """Implements Database."""
         self._writing_engine.dispose()

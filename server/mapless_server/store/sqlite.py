@@ -26,6 +26,7 @@ from mapless_server.errors import FailedPrecondition, RequestError, Unavailable
 
 from .database import RETRY_AFTER_S, DamagedPages, StoreError, disk_full, is_damage, translating, unavailable
 from .migrations import migrate, read_version
+from .reserve import Reserve
 from .tables import SCHEMA_VERSION
 
 logger = logging.getLogger(__name__)
@@ -71,6 +72,7 @@ class SqliteDatabase:
         # SQLite's writers poll for its lock, in no order; here they queue.
         self._write_lock = threading.Lock()
         self._folder_lock = folder_lock
+        self._reserve: Reserve | None = None
         self.only_reads = only_reads
 
     @staticmethod
@@ -90,7 +92,12 @@ class SqliteDatabase:
             if error.errno == errno.EROFS and path.is_file():
                 return SqliteDatabase._open_read_only(path)
             raise StoreError(f"data folder {folder} cannot be used: {error.strerror}") from error
-        return SqliteDatabase._opened(path, folder_lock)
+        reserve = Reserve(folder)
+        with reserve.used():
+            database = SqliteDatabase._opened(path, folder_lock)
+        reserve.keep()
+        database._reserve = reserve
+        return database
 
     @staticmethod
     def _open_read_only(path: Path) -> SqliteDatabase:
@@ -207,6 +214,17 @@ class SqliteDatabase:
                 _execute(connection, "PRAGMA wal_checkpoint(RESTART)")
             finally:
                 _execute(connection, f"PRAGMA busy_timeout={BUSY_TIMEOUT_MS}")
+
+    @contextmanager
+    def reserve(self) -> Iterator[None]:
+        """Implements Database."""
+        if self._reserve is None:
+            yield
+            return
+        with self._reserve.used():
+            self.free_space()  # now that what is in the journal has room in the file
+            yield
+            self.free_space()
 
     def close(self) -> None:
         """Closes all connections and unlocks the folder; nothing may be reading or writing."""

@@ -16,13 +16,13 @@ from sqlalchemy import Connection, insert, select, update
 from mapless.geodesy import Datum
 from mapless.names import scene_name
 from mapless.scenes import UNCHANGED, Calibration, UnchangedType, Vector
-from mapless_server.errors import AlreadyExists, DataLoss, NotFound
+from mapless_server.errors import AlreadyExists, DataLoss, NotFound, Overloaded
 from mapless_server.method.cache import LruCache
 from mapless_server.method.views import View
 from mapless_server.security import SceneKey, scene_id_of
 
 from . import deletion, queries, rows, tables
-from .database import DamagedPages, Database
+from .database import DamagedPages, Database, with_room_to_delete
 from .deletion import PendingDeletions
 from .postgresql import PostgresqlDatabase
 from .reader import NAME_CACHE_BYTES, StoreReader, observed
@@ -159,13 +159,10 @@ class Store(StoreReader):
         The scene does not exist any more after one transaction. Its rows are then deleted in portions, so that other
         calls need not wait; if that is interrupted, it is completed when the store is opened again, or by the next call
         of this method. NotFound if there is no such scene; Overloaded if the disk is full, and the scene may be deleted
-        all the same, with some of its rows left.
+        all the same, with some of its rows left until there is room.
         """
         try:
-            with self.changing() as connection:
-                queries.begin_change(connection, scene_key)
-                self.database.lift_limits(connection)
-                deletion.detach_scene(connection, scene_key)
+            with_room_to_delete(self.database, lambda: self._detach_scene(scene_key))
         except NotFound:
             self._pending_deletions.run()
             raise
@@ -174,8 +171,18 @@ class Store(StoreReader):
         gone = self.reference_cache.forget(lambda _, it: it.record.scene_key == scene_key)
         self._resolved.forget(lambda key, _: key[0] == scene_key)
         self._attributes.forget(lambda key, _: key == scene_key)
-        self._pending_deletions.run()
+        try:
+            self._pending_deletions.run()
+        except Overloaded:
+            self._pending_deletions.try_again()
+            raise
         return frozenset(key for key, _ in gone)
+
+    def _detach_scene(self, scene_key: SceneKey) -> None:
+        with self.changing() as connection:
+            queries.begin_change(connection, scene_key)
+            self.database.lift_limits(connection)
+            deletion.detach_scene(connection, scene_key)
 
     @observed
     def add_references(self, scene_key: SceneKey, references: Sequence[NewReference]) -> list[ReferenceRecord]:
@@ -248,12 +255,16 @@ class Store(StoreReader):
     def delete_reference(self, scene_key: SceneKey, reference_id: str) -> str:
         """Deletes a reference with its image and features, also a damaged one, whose pages are then lost.
 
-        Returns its key. NotFound if there is no such scene or reference.
+        Returns its key. NotFound if there is no such scene or reference; Overloaded if the disk is full.
         """
-        try:
-            key = self._delete_reference(scene_key, reference_id, deletion.delete_references)
-        except DamagedPages:
-            key = self._delete_reference(scene_key, reference_id, deletion.move_aside)
+
+        def delete() -> str:
+            try:
+                return self._delete_reference(scene_key, reference_id, deletion.delete_references)
+            except DamagedPages:
+                return self._delete_reference(scene_key, reference_id, deletion.move_aside)
+
+        key = with_room_to_delete(self.database, delete)
         self._last_deletion = object()
         self.reference_cache.forget(lambda _, it: it.record.key == key)
         return key
