@@ -341,13 +341,14 @@ def rejection_of(
     if is_estimated:
         structure, matches, estimate = stages(scene, scene.references)
         estimate = replace(estimate, view=scene.query)
-    usual = (IntrinsicsSigma() if sigma is None else IntrinsicsSigma(focal_share=sigma)).of(given)
+    stated = IntrinsicsSigma() if sigma is None else IntrinsicsSigma(focal_share=sigma)
+    usual = stated.of(given)
     zero = np.zeros(4)
     value = np.array([doubted * np.hypot(usual[0], usual[0]), 0, 0, 0])
     evidence = IntrinsicsEvidence(given, given, value, usual, usual, np.zeros((4, 4)), np.zeros((6, 4)), zero)
     nothing = tuple(np.empty((0, 2), np.int32) for _ in scene.references)
     estimate = replace(estimate, intrinsics=evidence)
-    support = Support(query, scene.references, structure, matches, estimate, np.zeros(3), query_matches=nothing)
+    support = Support(query, scene.references, structure, matches, estimate, np.zeros(3), None, nothing, stated)
     return wrong_camera(support, "a", is_doubted=is_weak), true
 
 

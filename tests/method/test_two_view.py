@@ -277,8 +277,16 @@ def test_cameras_that_the_caller_allows_are_not_compared() -> None:
     given, uncertain = problem.solved(), problem.solved(IntrinsicsSigma(focal_share=0.5))
     assert given is not None
     assert uncertain is not None
-    assert wrong_camera(given, "a") is not None
-    assert wrong_camera(uncertain, "a") is None
+    for support in (given, without_evidence(given)):
+        assert wrong_camera(support, "a") is not None
+    for support in (uncertain, without_evidence(uncertain)):
+        assert wrong_camera(support, "a") is None
+
+
+def without_evidence(support: Support) -> Support:
+    """Whose equations of the errors of the intrinsics are singular."""
+    assert support.estimate is not None
+    return replace(support, estimate=replace(support.estimate, intrinsics=None))
 
 
 def test_uncertain_intrinsics_are_in_a_two_view_covariance() -> None:

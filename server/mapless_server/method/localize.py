@@ -119,7 +119,8 @@ def solve(coarse: Coarse, counts_agreement: bool = False) -> Answer:
     query, references, options, priors = prepared.query, prepared.references, prepared.pipeline.options, prepared.priors
     structure, matches = structure_and_matches(coarse, scale)
     query_matches = tuple(prepared.correspondences.query_matches)
-    support = Support(query, references, structure, matches, None, prepared.origin, query_matches=query_matches)
+    sigma = prepared.options.intrinsics
+    support = Support(query, references, structure, matches, None, prepared.origin, None, query_matches, sigma)
     with stage("pnp"):
         estimate = solve_pose(query, structure, matches, scale.world_from_query, options.pnp, priors)
     if isinstance(estimate, Rejection):
@@ -129,7 +130,6 @@ def solve(coarse: Coarse, counts_agreement: bool = False) -> Answer:
     failure = gate_failure(query.camera, matches, inliers, options.pnp.inlier_px, chance)
     if failure:
         return coarse.answer(Rejection(RejectionReason.GATE, failure), replace(support, estimate=estimate))
-    sigma = prepared.options.intrinsics
     if prepared.options.variant is Variant.BEST:
         with stage("adjust"):
             given = query, references, structure, matches, estimate, options.adjust, priors, sigma

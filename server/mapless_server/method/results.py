@@ -13,6 +13,7 @@ from mapless.geometry import Array, RigidTransform, Similarity
 
 from .intrinsics import IntrinsicsEvidence
 from .observations import KeypointNoise, Tracks
+from .options import IntrinsicsSigma
 from .priors.known import PriorCheck
 from .views import Matches, PosedView, View
 
@@ -261,6 +262,7 @@ class Support:
         origin: (3,) origin of this world in the caller's world, metres.
         two_view: matches with single references, where the pose rests on them too.
         query_matches: matches of the query with each reference.
+        intrinsics_sigma: the caller's standard deviations of the query's intrinsics; None for the usual ones.
     """
 
     query: View
@@ -271,6 +273,7 @@ class Support:
     origin: Array
     two_view: TwoViewSupport | None = None
     query_matches: tuple[Matches, ...] = ()
+    intrinsics_sigma: IntrinsicsSigma | None = None
 
     def inlier_count(self) -> int:
         """Number of inliers of the estimate, two-view inliers included."""

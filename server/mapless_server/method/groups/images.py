@@ -232,7 +232,8 @@ def tracked_support(prepared: Prepared) -> Support | None:
     structure = triangulated_structure(references, correspondences, StructureOptions())
     matches = vote(structure, [len(r.view.features) for r in references], correspondences)
     query_matches = tuple(correspondences.query_matches)
-    support = Support(query, references, structure, matches, None, prepared.origin, query_matches=query_matches)
+    sigma = prepared.options.intrinsics
+    support = Support(query, references, structure, matches, None, prepared.origin, None, query_matches, sigma)
     return support if len(matches) else None
 
 

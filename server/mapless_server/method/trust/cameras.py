@@ -136,7 +136,7 @@ def wrong_camera(support: Support, best_reference: str, is_doubted: bool = False
     if not by_lines and (count < MIN_MATCHES or evidence is None or not _is_doubtful(evidence)):
         return None
     steps = BY_LINES if by_lines else BY_POINTS
-    prior_sigma = evidence.prior_sigma if evidence else IntrinsicsSigma().of(query.camera)
+    prior_sigma = (support.intrinsics_sigma or IntrinsicsSigma()).of(query.camera)
     given = replace(query.camera, distortion=query.distortion)
     others = list(_other_cameras(given, prior_sigma, steps))
     if not others:

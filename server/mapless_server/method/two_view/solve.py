@@ -74,8 +74,8 @@ def solve_two_view(
         best = adjusted
     if best.estimate is None or best.inlier_count < MIN_INLIERS:
         return None
-    query_matches = tuple(correspondences.query_matches)
-    return Support(query, tuple(references), structure, searched, best.estimate, origin, best.support, query_matches)
+    matched = best.support, tuple(correspondences.query_matches), intrinsics
+    return Support(query, tuple(references), structure, searched, best.estimate, origin, *matched)
 
 
 @dataclass(frozen=True, eq=False)
