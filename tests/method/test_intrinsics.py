@@ -22,7 +22,7 @@ from mapless_server.method.intrinsics import (
 from mapless_server.method.options import IntrinsicsSigma
 from mapless_server.method.pose_problem import AdjustInput, AdjustOptions, pose_problem, with_intrinsics
 from mapless_server.method.rejection import Advice, IntrinsicsParameter, Rejection, RejectionReason
-from mapless_server.method.results import PoseEstimate, Support
+from mapless_server.method.results import PointMatches, PoseEstimate, PoseStage, Support
 from mapless_server.method.trust.cameras import wrong_camera
 from mapless_server.method.trust.intrinsics import intrinsics_checks, wrong_intrinsics
 from mapless_server.method.views import undistort_pixels
@@ -452,3 +452,40 @@ def test_a_right_camera_is_not_accused_for_outliers(outliers: float) -> None:
 @pytest.mark.parametrize("focal", [1.1, 1.5])
 def test_a_focal_length_that_may_be_so_wrong_is_not_named(focal: float) -> None:
     assert rejection_of(focal=focal, sigma=0.5)[0] is None
+
+
+@pytest.mark.parametrize(
+    ("count", "share", "gain", "is_named"),
+    [
+        (400, 0.41, 1.05, False),
+        (400, 0.43, 1.15, True),
+        (400, 0.47, 1.12, False),
+        (110, 0.41, 1.15, True),
+        (90, 0.41, 1.15, False),
+        (90, 0.41, 1.25, True),
+    ],
+)
+def test_another_camera_must_be_clearly_better(count: int, share: float, gain: float, is_named: bool) -> None:
+    """1.1 times as good where few of many matches agree with the given camera, else 1.2 times.
+
+    A share of the matches is seen by the given camera, so many times as many by one of half its focal length.
+    """
+    scene = make_scene(random_for("gain"), SceneOptions(noise_px=0.1))
+    structure, matches, _ = stages(scene, scene.references)
+    random, camera = random_for("gain", count, share, gain), scene.query.camera
+    used = random.permutation(len(matches))[:count]
+    matches = PointMatches(matches.point[used], matches.keypoint[used], matches.guided[used], matches.radius_px)
+    keypoints, own = scene.query.features.keypoints.copy(), round(share * count)
+    other, wrong = np.split(matches.keypoint[own:], [round(gain * own)])
+    centre = np.array([camera.principal_x_px, camera.principal_y_px])
+    keypoints[other] = centre + (keypoints[other] - centre) / 2
+    keypoints[wrong] = random.uniform((0, 0), (camera.width_px, camera.height_px), (len(wrong), 2))
+    query = replace(scene.query, features=replace(scene.query.features, keypoints=keypoints))
+    inliers = np.arange(count) < own
+    usual, zero = IntrinsicsSigma().of(camera), np.zeros(4)
+    doubted = IntrinsicsEvidence(camera, camera, 5 * usual, usual, usual, np.zeros((4, 4)), np.zeros((6, 4)), zero)
+    estimate = PoseEstimate(scene.world_from_query, PoseStage.REFINED, inliers, zero, np.eye(6), intrinsics=doubted)
+    nothing = tuple(np.empty((0, 2), np.int32) for _ in scene.references)
+    support = Support(query, scene.references, structure, matches, estimate, np.zeros(3), None, nothing)
+    rejection = wrong_camera(support, "a")
+    assert (rejection is not None) == is_named
