@@ -15,9 +15,9 @@ import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
 from mapless.geometry import Array, Camera, RigidTransform
 
@@ -42,6 +42,10 @@ MAJORITY, LEAST_AGREEING = 0.5, 8
 
 LINEAR_SHARE, LINEAR_STEPS = 0.02, 5
 """Largest motion, and standard deviation, in which residuals are linear (of the distance, and radians); steps."""
+
+ROW, COLUMN = np.triu_indices(6)
+TWICE = np.where(ROW == COLUMN, 1.0, 2.0)
+"""The elements of a symmetric matrix of the pose's motion, and how often each occurs."""
 
 LEAST_DAMPING = 1e-9
 """Relative: a pose that matches do not determine has a large standard deviation, not none."""
@@ -86,7 +90,7 @@ class Votes:
 
     def keypoint_count(self, rows: NDArray[np.bool_]) -> int:
         """Number of different keypoints among the selected rows (V,)."""
-        return len(np.unique(self.keypoint[rows]))
+        return int(np.count_nonzero(np.bincount(self.keypoint[rows])))
 
 
 def votes_of(support: Support, query_matches: Sequence[Matches]) -> Votes:
@@ -218,18 +222,21 @@ def _shifts_nearby(
     chosen: NDArray[np.bool_] = (agreeing >= LEAST_AGREEING) & (agreeing > MAJORITY * halves.sum(axis=1))
     if not chosen.any():
         return shifts
-    by_pose = pose_jacobian(camera, x_in_camera[agrees])
-    products = (by_pose[:, :, None] * by_pose[:, None]).sum(axis=0).reshape(36, -1)
-    residual, motion = residual[agrees].T[:, None], np.zeros((int(chosen.sum()), 6))
+    (x, y), (right, down) = pose_jacobian(camera, x_in_camera[agrees]), residual[agrees].T
+    # Of each match what its squared residual |r + J m|^2 and its normal equations at any motion m are sums of.
+    products = np.concatenate([x[ROW] * x[COLUMN] + y[ROW] * y[COLUMN], right * x + down * y])
+    squared, in_half = right**2 + down**2, in_half[chosen].astype(np.float64)
+    motion = np.zeros((len(in_half), 6))
     largest = LINEAR_SHARE * np.repeat([distance_m, 1.0], 3)
     for _ in range(LINEAR_STEPS):
-        moved = residual + motion @ by_pose
-        weight = in_half[chosen] * cauchy_weight(moved[0] ** 2 + moved[1] ** 2, PNP.loss_scale_px)
-        gradient = (weight * moved[0]) @ by_pose[0].T + (weight * moved[1]) @ by_pose[1].T
-        hessian = (weight @ products.T).reshape(-1, 6, 6)
+        of_motion = np.concatenate([motion[:, ROW] * motion[:, COLUMN] * TWICE, 2 * motion], axis=1)
+        weight = in_half * cauchy_weight(squared + of_motion @ products, PNP.loss_scale_px)
+        sums = weight @ products.T
+        hessian = np.empty((len(sums), 6, 6))
+        hessian[:, ROW, COLUMN] = hessian[:, COLUMN, ROW] = sums[:, :-6]
+        gradient = sums[:, -6:, None] + hessian @ motion[:, :, None]
         hessian += LEAST_DAMPING * np.eye(6) * (hessian + 1)
-        step = np.linalg.solve(hessian, gradient[:, :, None])[:, :, 0]
-        motion = np.clip(motion - step, -largest, largest)
+        motion = np.clip(motion - np.linalg.solve(hessian, gradient)[:, :, 0], -largest, largest)
     sigma = np.sqrt(np.diagonal(np.linalg.inv(hessian), axis1=1, axis2=2))  # with a noise of one pixel
     is_small = np.asarray((np.maximum(np.abs(motion), sigma) < largest).all(axis=1))
     shifts[chosen] = np.where(is_small[:, None], -motion[:, :3] @ pose.rotation.T, np.nan)
@@ -321,7 +328,12 @@ def findable_count(view: View, x_in_world: Array, world_from_camera: RigidTransf
 def hull_share(query: View, matches: PointMatches, inliers: NDArray[np.bool_]) -> float:
     """Share of the image covered by the convex hull of the inliers (M,), three or more."""
     pixels = query.features.keypoints[matches.keypoint[inliers]]
-    return float(ConvexHull(pixels, qhull_options="QJ").volume) / (query.camera.width_px * query.camera.height_px)
+    return hull_px2(pixels) / (query.camera.width_px * query.camera.height_px)
+
+
+def hull_px2(pixels: NDArray[np.floating]) -> float:
+    """Area of the convex hull of pixels (N, 2), square pixels; 0 for fewer than three."""
+    return float(cv2.contourArea(cv2.convexHull(pixels.astype(np.float32)))) if len(pixels) >= 3 else 0.0
 
 
 def epipolar_share(

@@ -18,9 +18,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import ConvexHull
-
-from mapless.geometry import Array
 
 from ..pnp import false_alarms, format_false_alarms, log10_tail
 from ..rejection import Advice, Hint, Rejection, RejectionReason
@@ -28,6 +25,7 @@ from ..results import Support
 from ..two_view.matches import TwoViewMatches
 from ..two_view.pose import band_chance, disc_chance
 from ..views import Matches
+from .evidence import hull_px2
 
 MAX_LOG10_POSE = -15.0
 """Largest log10 of the expected number of such poses among wrong matches. Of 220 photographs with references of other
@@ -111,7 +109,7 @@ def two_view_evidence(support: Support, query_matches: Sequence[Matches]) -> Two
         points[0] + all_lines[0],
         other_inliers,
         float(counts[second] / max(1, len(query_matches[second]))),
-        _hull_px2(support.query.features.keypoints[keypoint]) / (camera.width_px * camera.height_px),
+        hull_px2(support.query.features.keypoints[keypoint]) / (camera.width_px * camera.height_px),
     )
 
 
@@ -153,8 +151,3 @@ def one_reference_rejection(reason: RejectionReason, message: str, support: Supp
 def two_view_trust(evidence: TwoViewEvidence) -> float:
     """Trust, 0 to 1: the share of right answers whose second reference has at most this share of inliers."""
     return float(np.interp(evidence.second_share, SHARES, LEVELS))
-
-
-def _hull_px2(pixels: Array) -> float:
-    """Area of the convex hull of pixels (N, 2), square pixels; 0 for fewer than three."""
-    return float(ConvexHull(pixels, qhull_options="QJ").volume) if len(pixels) >= 3 else 0.0

@@ -244,14 +244,18 @@ def _without_each(
     seen: ViewColumns, data: Array, gradient: Array, points: EliminatedPoints, gain: Array, misfit: Array
 ) -> tuple[Array, Array]:
     """Reduced equations (1 + V, U, U), (1 + V, U) of all observations, and of those without each of V references."""
-    cross = points.cross.reshape(len(data), 3, -1)
+    count, end = len(data), seen.parts[-1].start
+    # Rows of observations, because each takes the block of its point: a row of many numbers in one place.
+    by_point = np.ascontiguousarray(points.cross.reshape(count, 3, -1).T)  # (P, 3, U)
+    lost = np.ascontiguousarray(gain[:, :, :end].T) @ by_point[seen.point[:end]]  # (O, 2, U)
+    misfit = np.ascontiguousarray(misfit.T)
     matrices, gradients = np.tile(data, (len(seen.parts), 1, 1)), np.tile(gradient, (len(seen.parts), 1))
     for i, part in enumerate(seen.parts[:-1]):
-        lost = np.einsum("uan,abn->ubn", take(cross, seen.point[part]), gain[:, :, part]).reshape(len(data), -1)
-        others = np.ones(len(data), bool)
-        others[6 * i : 6 * i + 6] = False  # only the prior is left of its own pose
-        matrices[i + 1] = np.where(np.outer(others, others), data - lost @ lost.T, 0)
-        gradients[i + 1] = np.where(others, gradient + lost @ misfit[:, part].ravel(), 0)
+        its_own = lost[part].reshape(-1, count)
+        matrices[i + 1] -= its_own.T @ its_own
+        gradients[i + 1] += misfit[part].ravel() @ its_own
+        pose = slice(6 * i, 6 * i + 6)  # only the prior is left of its own pose
+        matrices[i + 1, pose], matrices[i + 1, :, pose], gradients[i + 1, pose] = 0, 0, 0
     return matrices, gradients
 
 
