@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from mapless_server.settings import Settings
 
@@ -10,8 +11,10 @@ from .access import Authenticator, Tokens
 from .binding import assess_binding
 from .rate import RateLimiter
 from .reloading import Reloading, SecurityError
-from .tls import Tls, TlsFiles
 from .tokens import read_tokens
+
+if TYPE_CHECKING:
+    from .tls import Tls
 
 log = logging.getLogger(__name__)
 
@@ -20,7 +23,7 @@ log = logging.getLogger(__name__)
 class Protection:
     """TLS, tokens and quota of a server; `refreshes` follow changes of their files."""
 
-    tls: Tls | None
+    tls: "Tls | None"
     tokens: Reloading[Tokens] | None
     quota: RateLimiter | None
 
@@ -34,6 +37,8 @@ class Protection:
             log.log(level, "%s", sentence)
         tls = tokens = None
         if settings.tls_certificate is not None and settings.tls_key is not None:
+            from .tls import Tls, TlsFiles  # cryptography's X.509, a twentieth of what a server imports
+
             tls = Tls(TlsFiles(settings.tls_certificate, settings.tls_key, settings.tls_client_ca))
         if (path := settings.tokens_file) is not None:
             tokens = Reloading([path], lambda: read_tokens(path), "tokens")

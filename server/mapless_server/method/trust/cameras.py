@@ -81,9 +81,13 @@ BY_POINTS, BY_LINES = _Steps(5, 4, 3, 0.08), _Steps(2, 2, 1, 0.16)
 
 @dataclass(frozen=True, eq=False)
 class _Compared:
-    """The matches that cameras are compared by: those of the whole image with points, and those with references."""
+    """The matches that cameras are compared by: those of the whole image with points, and those with references.
+
+    They are of every `step`-th keypoint, and so are the views: reading these with other lenses takes long.
+    """
 
     support: Support
+    step: int
     lines: TwoViewMatches
     x_in_world: Array
     keypoint: NDArray[np.intp]
@@ -94,10 +98,16 @@ class _Compared:
         step = 1 + len(lines) // MAX_LINES
         used = np.flatnonzero(~matches.guided & (matches.keypoint % step == 0))
         points = support.structure.x_in_world[matches.point[used]]
-        return _Compared(support, lines[lines.keypoint % step == 0], points, matches.keypoint[used])
+        lines = lines[lines.keypoint % step == 0]
+        lines = replace(lines, keypoint=lines.keypoint // step)
+        return _Compared(support, step, lines, points, matches.keypoint[used] // step)
+
+    def thinned(self, view: View) -> View:
+        """A view of the photograph with every `step`-th keypoint."""
+        return replace(view, features=view.features.every(self.step))
 
     def score_of(self, view: View, pose: RigidTransform | None = None) -> float:
-        """The score of a pose, by default of the best one that is found, of the photograph read as this view."""
+        """The score of a pose, by default of the best one that is found, of the photograph read as a thinned view."""
         is_seen = np.asarray(np.isfinite(view.features.keypoints).all(axis=1))
         points, keypoint, lines = self.x_in_world, self.keypoint, self.lines.read_as(view)
         if not is_seen.all():
@@ -116,7 +126,7 @@ class _Compared:
     def scored(self, camera: Camera) -> tuple[float, Camera]:
         """A camera with its score, comparable with that of the given camera's pose."""
         query = self.support.query
-        value = self.score_of(read_as(query, camera))
+        value = self.score_of(read_as(self.thinned(query), camera))
         # Without points a right camera has up to 0.98 of its score with another lens, 0.92 with another focal length.
         is_bent = self.support.two_view is not None and camera.distortion != query.distortion
         return value / MIN_GAIN if is_bent else value, camera
@@ -144,10 +154,11 @@ def wrong_camera(support: Support, best_reference: str, is_doubted: bool = False
     compared = _Compared.of(support)
     best = max(map(compared.scored, others), key=lambda it: it[0])
     # The estimate's own intrinsics are those that were estimated with it, within what the caller allows.
-    own, least = compared.score_of(support.estimate.view or query, support.estimate.world_from_camera), 1.0
+    given_view = compared.thinned(support.estimate.view or query)
+    own, least = compared.score_of(given_view, support.estimate.world_from_camera), 1.0
     if not by_lines:
         is_clear = count >= MANY_MATCHES and support.estimate.inliers.mean() < LARGE_SHARE
-        own, least = max(own, compared.score_of(query)), MIN_GAIN if is_clear else MIN_GAIN_ELSE
+        own, least = max(own, compared.score_of(compared.thinned(query))), MIN_GAIN if is_clear else MIN_GAIN_ELSE
         best = max([best, *map(compared.scored, _between(given, best[1], steps))], key=lambda it: it[0])
     if best[0] < least * own:
         return None

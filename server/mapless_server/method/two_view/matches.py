@@ -113,10 +113,10 @@ class TwoViewMatches:
 
     def _constraint(self, rotation: Array, in_world: Array, baseline: Array) -> tuple[Array, Array]:
         """The error e (T,) and grad e (T, 4) for baselines b (T, 3)."""
-        across = np.cross(baseline, self.reference_ray)
+        across = _cross(baseline, self.reference_ray)
         by_query = (across @ rotation)[:, :2] / self.focal_px
-        reference_across = np.einsum("tji,tj->ti", self.reference_rotation, np.cross(in_world, baseline))
-        by_reference = reference_across[:, :2] / self.reference_focal_px
+        reference_across = np.einsum("tji,tj->ti", self.reference_rotation[:, :, :2], _cross(in_world, baseline))
+        by_reference = reference_across / self.reference_focal_px
         return (in_world * across).sum(axis=1), np.concatenate([by_query, by_reference], axis=1)
 
     def triangulated(
@@ -135,3 +135,9 @@ class TwoViewMatches:
         _, direction = observations.rays()
         cosine = (direction[:, ::2] * direction[:, 1::2]).sum(axis=0).clip(-1, 1)
         return np.where(in_front[:, None], points, np.nan), np.rad2deg(np.arccos(cosine))
+
+
+def _cross(first: Array, second: Array) -> Array:
+    """Cross products (T, 3); np.cross takes half as long again."""
+    (a, b, c), (x, y, z) = first.T, second.T
+    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=1)
