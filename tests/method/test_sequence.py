@@ -1,14 +1,17 @@
 """Sequences: planted poses are found from photographs and a device's drifting tracking."""
 
 import itertools
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from support.compare import assert_jacobian, assert_pose_close, pose_error
-from support.groups import NOTHING, caller_pose, drifting, error_m, images_of, rescaled, walk
+from support.groups import NOTHING, caller_pose, drifting, error_m, images_of, looking, rescaled, walk
 from support.scenes import SceneOptions, look_at, random_for
 
+from mapless.axes import Axes, pose_to
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg, rotation_from_vector
 from mapless_server.method.answer import Localization
 from mapless_server.method.groups.checks import check_tracking
@@ -185,6 +188,40 @@ def test_a_session_in_another_unit_is_no_series_of_jumps(unit_m: float) -> None:
     if not isinstance(outcome, Rejection):
         outcome = check_tracking(outcome, session)
     assert "contradict the photographs between all 6" in rejection(outcome).message
+
+
+SENT: dict[str, tuple[Callable[[RigidTransform], RigidTransform], str]] = {
+    "OpenGL": (partial(pose_to, Axes.ARCORE), "y and z of the cameras reversed"),
+    "inverse": (RigidTransform.inverse, "as inverses, session_from_camera"),
+    "view matrix": (lambda pose: pose_to(Axes.ARCORE, pose).inverse(), "as inverses, with y and z"),
+    "ROS": (partial(pose_to, Axes.ROS), "in the axes of ROS"),
+    "Unity": (partial(pose_to, Axes.UNITY), "in the axes of Unity"),
+}
+
+
+@pytest.mark.parametrize("sent", SENT)
+@pytest.mark.parametrize("count", [3, 6])
+def test_wrong_axes_of_a_session_are_named(sent: str, count: int) -> None:
+    """From three photographs on; no others are named."""
+    random = random_for("axes", count)
+    steps = np.arange(count)
+    truth = looking(*np.stack([0.3 * steps - 0.6, 0.25 * steps - 0.5, 0.2 * (steps % 3) - 4.2], axis=1))
+    images = images_of(random, truth, alone=True, own_noise_m=0.002)
+    as_sent, words = SENT[sent]
+    session = [as_sent(it) for it in drifting(random, truth, 0.01)]
+    outcome = rejection(check_tracking(estimate(solve_sequence(images, session, False)), session))
+    assert words in outcome.message
+    assert outcome.message.count(" or ") == 0
+
+
+def test_jumps_that_no_other_axes_explain_name_none() -> None:
+    random = random_for("no axes")
+    truth = walk(random, 3)
+    images = images_of(random, truth, alone=True, own_noise_m=0.002)
+    session = jumping(jumping(drifting(random, truth, 0.01), 1, JUMP), 2, JUMP)
+    found = estimate(solve_sequence(images, session, False))
+    assert len(found.jumps) == 2
+    assert check_tracking(found, session) is found
 
 
 def test_a_single_step_that_fits_no_unit_is_rejected() -> None:

@@ -5,19 +5,20 @@ against it is the inliers that other photographs lose, and the length of the pat
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
+from mapless.axes import Axes, pose_from
 from mapless.geometry import RigidTransform
 
 from ..answer import Answer, Localization
 from ..hints import FEW_MATCHES, MANY_MATCHES
 from ..rejection import Advice, Hint, Rejection, RejectionReason
 from ..views import PosedView
-from .jumps import ALL_JUMPS
+from .jumps import ALL_JUMPS, find_jumps
 from .rig import RigEstimate
 from .sequence import SequenceEstimate
 from .start import CHECK_TRACKING, STAGE
@@ -30,6 +31,20 @@ KEPT_SHARE = 0.25
 
 UNIT_TOLERANCE = 1.25
 """Drift changes the length of a path by some per cent; wrong units are feet, centimetres, or an unknown scale."""
+
+LEAST_READ = 2
+"""A single step of a device that has jumped may agree with another reading of its poses by chance."""
+
+REVERSED = "with y and z of the cameras reversed, as between the axes of OpenCV and of OpenGL, ARKit and ARCore"
+
+READINGS: Mapping[str, Callable[[RigidTransform], RigidTransform]] = {
+    REVERSED: lambda pose: pose_from(Axes.ARCORE, pose),
+    "as inverses, session_from_camera instead of camera_from_session": RigidTransform.inverse,
+    f"as inverses, {REVERSED}": lambda pose: pose_from(Axes.ARCORE, pose.inverse()),
+    "in the axes of ROS": lambda pose: pose_from(Axes.ROS, pose),
+    "in the axes of Unity": lambda pose: pose_from(Axes.UNITY, pose),
+}
+"""How poses that the request says to be session_from_camera, in OpenCV's axes, may be meant."""
 
 SIGNIFICANT_SIGMAS = 4.0
 """Least difference of the path's lengths, in standard deviations."""
@@ -61,17 +76,31 @@ def check_tracking(
     """Checks that the session agrees with the photographs somewhere; `unit` is the scene's, in messages.
 
     It does not in wrong axes, inverse, or in a unit that is wrong by far. Returns a rejection GATE if all of
-    `ALL_JUMPS` steps or more are jumps.
+    `ALL_JUMPS` steps or more are jumps; or `LEAST_READ` or more, none of which is one if the session's poses are read
+    otherwise: the message then says how.
     """
-    poses = estimate.world_from_camera
-    if len(estimate.jumps) < max(len(poses) - 1, ALL_JUMPS):
+    poses, count = estimate.world_from_camera, len(estimate.jumps)
+    readings = list(_fitting_readings(estimate, session_from_camera)) if count >= LEAST_READ else []
+    if count < max(len(poses) - 1, ALL_JUMPS) and not readings:
         return estimate
     tracked, shown_m = (sum(_distance(*ends) for ends in pairwise(it)) for it in (session_from_camera, poses))
+    pairs = f"all {len(poses)}" if count == len(poses) - 1 else f"{count} pairs"
     message = (
-        f"the tracked poses contradict the photographs between all {len(poses)} of them: the session's path is "
+        f"the tracked poses contradict the photographs between {pairs} of them: the session's path is "
         f"{tracked:.2f} long, that of the photographs {shown_m:.2f} {unit}"
     )
+    if readings:
+        message += f"; read {' or '.join(readings)}, the tracked poses agree with all of them"
     return Rejection(RejectionReason.GATE, message, CHECK_TRACKING)
+
+
+def _fitting_readings(estimate: SequenceEstimate, session: Sequence[RigidTransform]) -> Iterator[str]:
+    """How the session's poses may be meant: what makes them agree with all photographs."""
+    own = dict(enumerate(zip(estimate.world_from_camera, estimate.covariances, strict=True)))
+    for words, read in READINGS.items():
+        chain = find_jumps(own, [read(it) for it in session], 1.0)
+        if chain and not chain.jumps and len(chain.frames) == len(own) and math.isfinite(chain.cost):
+            yield words
 
 
 def check_unit(
