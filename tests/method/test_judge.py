@@ -10,9 +10,11 @@ from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, ran
 
 from mapless.geometry import RigidTransform
 from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.perturbation import pose_jacobian
 from mapless_server.method.pnp import PnpOptions, solve_pose
 from mapless_server.method.rejection import IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason
 from mapless_server.method.results import PoseEstimate, Support
+from mapless_server.method.trust import evidence as halves_of
 from mapless_server.method.trust.evidence import (
     NO_AGREEMENT,
     Evidence,
@@ -261,6 +263,31 @@ def both(scene: SyntheticScene, support: Support) -> tuple[float, float]:
         disagreement_of_matches(support, DISTANCE_M),
         disagreement_of_references(support, votes, DISTANCE_M),
     )
+
+
+def test_halves_move_by_the_steps_of_each_alone() -> None:
+    """The steps of all halves at once are those of weighted least squares, half by half and match by match."""
+    support = support_of()
+    assert support.estimate is not None
+    matches, camera = support.matches, support.query.camera
+    points = support.structure.x_in_world[matches.point]
+    pixels = support.query.features.keypoints[matches.keypoint].astype(np.float64)
+    pose, random = support.estimate.world_from_camera, np.random.default_rng(0)
+    halves = random.random((3, len(matches))) < 0.5
+    shifts = halves_of._shifts_nearby(camera, points, pixels, halves, pose, DISTANCE_M)
+    in_camera = pose.inverse().apply(points)
+    jacobian, residual = np.moveaxis(pose_jacobian(camera, in_camera), 2, 0), camera.project(in_camera) - pixels
+    for half, shift in zip(halves & (np.linalg.norm(residual, axis=1) < halves_of.PNP.inlier_px), shifts, strict=True):
+        motion = np.zeros(6)
+        for _ in range(halves_of.LINEAR_STEPS):
+            hessian, gradient = np.zeros((6, 6)), np.zeros(6)
+            for slope, error in zip(jacobian[half], (residual + jacobian @ motion)[half], strict=True):
+                weight = 1 / (1 + error @ error / halves_of.PNP.loss_scale_px**2)
+                hessian += weight * slope.T @ slope
+                gradient += weight * slope.T @ error
+            motion = motion - np.linalg.solve(hessian, gradient)
+        np.testing.assert_allclose(shift, -pose.rotation @ motion[:3], rtol=1e-4, atol=1e-9)
+        assert np.linalg.norm(shift) > 1e-5
 
 
 @pytest.mark.parametrize("outlier_share", [0.0, 0.3])
