@@ -16,7 +16,7 @@ from collections.abc import AsyncGenerator, AsyncIterable, AsyncIterator, Awaita
 from contextlib import aclosing, contextmanager
 from copy import copy
 from dataclasses import replace
-from inspect import isawaitable
+from inspect import isawaitable, isfunction, signature
 from typing import Any, TypeVar
 
 import grpc
@@ -77,6 +77,15 @@ def scene_metadata(request: Message) -> tuple[tuple[str, str], ...]:
 
 class Connection:
     """A channel, blocking or asynchronous, with the options and metadata of its calls."""
+
+    def __init_subclass__(cls) -> None:
+        """Its calls are methods: `help` shows their first parameter, the connection, as self."""
+        super().__init_subclass__()
+        for call in filter(isfunction, vars(cls).values()):
+            first, *others = signature(call).parameters.values()
+            if first.name == "connection":
+                shown: Any = call
+                shown.__signature__ = signature(call).replace(parameters=[first.replace(name="self"), *others])
 
     def __init__(self, address: str, options: ConnectOptions, channel: Any) -> None:
         self.options = options

@@ -9,6 +9,8 @@ _SHOWN_CHARACTERS = 60  # of a wrong value in an error message: ids of 10,000 ha
 
 def check_id(value: str) -> str:
     """The id of a scene or a reference, unchanged; ValueError if the value is not an id."""
+    if not value:
+        raise ValueError("an id must not be empty")
     if not _ID.fullmatch(value) or ".." in value:
         raise ValueError(
             "an id is 1 to 128 characters of A-Z a-z 0-9 . _ -, begins and ends with a letter, digit or underscore and "
@@ -35,6 +37,9 @@ def reference_names(scene: str, references: Sequence[str]) -> list[str]:
     """The names of references, as `reference_name`; TypeError for a single one, which is a sequence of letters."""
     if isinstance(references, str):
         raise TypeError(f"references must be a list of ids or names, is the text {shown(references)}")
+    for i, reference in enumerate(references):
+        if not isinstance(reference, str):
+            raise TypeError(f"references[{i}] must be an id or a name, is {shown(repr(reference))}")
     return [reference_name(scene, reference) for reference in references]
 
 

@@ -33,6 +33,11 @@ def changed(**values: Any) -> Camera:
         (wire.transform_to_message, np.eye(4), "must be a RigidTransform, is numpy.ndarray; "),
         (lambda it: names.reference_names("s", it), "r1", "references must be a list of .*, is the text 'r1'"),
         (
+            lambda it: names.reference_names("s", it),
+            ["r1", None],
+            r"references\[1\] must be an id or a name, is 'None'",
+        ),
+        (
             lambda it: set_priors(None, it),
             PositionPrior(np.zeros(3), 1.0),
             "must be a Priors, is mapless.priors.PositionPrior; such as",

@@ -8,6 +8,7 @@ import asyncio
 import json
 import logging
 import re
+from collections.abc import Callable
 from datetime import datetime, timezone
 from functools import cache
 from typing import Any
@@ -65,6 +66,9 @@ class Context:
 
     def time_remaining(self) -> float | None:
         return self._limit_s
+
+    def add_done_callback(self, callback: Callable[[object], None]) -> None:
+        callback(self)
 
     def peer(self) -> str:
         return "ipv6:%5B::1%5D:1234"

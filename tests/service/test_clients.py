@@ -52,6 +52,7 @@ def test_both_have_the_same_methods_with_the_same_parameters() -> None:
         name: [*it.parameters.values()] for name, it in asynchronous.items() if name != "unblocked"
     }
     assert all(getattr(kind, name).__doc__ for kind in (Client, aio.Client) for name in blocking)
+    assert {next(iter(it.parameters)) for it in (*blocking.values(), *asynchronous.values())} == {"self"}
 
 
 def test_every_method_of_the_interface_is_there() -> None:

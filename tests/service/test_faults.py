@@ -54,7 +54,7 @@ from mapless import (
 from mapless.geometry import Camera
 from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless_server.method.answer import Answer, Localization
-from mapless_server.rpc import receiving
+from mapless_server.rpc import receiving, sending
 from mapless_server.serve import running as grpc_server
 from mapless_tools.load.driving import free_port
 from mapless_tools.load.watch import Scrape, read_metrics
@@ -114,6 +114,31 @@ class TestClients:
             for _ in range(5):
                 assert is_served(client, scene)
                 assert len(client.get_reference(scene, "large", include_image=True).image or b"") > 1_000_000
+
+    def test_answers_that_nobody_reads_are_limited(
+        self, server: RunningServer, client: Client, scene: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(sending, "UNREAD_BYTES", 4 * 2**20)
+        camera = Camera(800, 600, 700.0, 700.0, 399.5, 299.5)
+        noise = np.random.default_rng(0).integers(0, 256, (600, 800, 3)).astype(np.uint8)
+        client.add_reference(scene, NewReference("large", encode(".png", noise), camera, pose(9)))
+        asked = reference_pb.GetReferenceRequest(name=f"scenes/{scene}/references/large", include_image=True)
+        data, method = asked.SerializeToString(), "/mapless.v1.ReferenceService/GetReference"
+        once = client.acting_for(None)
+        once.options = replace(once.options, max_attempts=1)
+
+        def reason() -> str:
+            try:
+                once.get_reference(scene, "large", include_image=True)
+            except MaplessError as error:
+                return error.reason
+            return ""
+
+        with raw_http2.connect(server.address) as slow:
+            slow.sendall(raw_http2.hello(0) + b"".join(raw_http2.call(it, method, data) for it in range(1, 40, 2)))
+            wait_until(lambda: reason() == "UNREAD_ANSWERS")
+            assert is_served(client, scene)
+        wait_until(lambda: not reason())
 
     @pytest.mark.parametrize("method", ["grpc.health.v1.Health/Check", "grpc.health.v1.Health/Watch"])
     def test_callers_that_never_send_block_no_other(

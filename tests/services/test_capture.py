@@ -18,8 +18,10 @@ import pytest
 
 from mapless.geodesy import Datum
 from mapless.geometry import Camera, RadialTangential, RigidTransform, rotation_from_vector
+from mapless_server.observability.logs import RepeatFilter
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scenes import Choice, RankedReference
+from mapless_server.services.capture import deletion
 from mapless_server.services.capture import files as files_module
 from mapless_server.services.capture import folder as folder_module
 from mapless_server.services.capture.calls import (
@@ -553,3 +555,16 @@ def test_an_invalid_tenant_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="capture_tenants"), Store.open(tmp_path / "store") as store:
         open_recorder(settings, store, Metrics())
     assert not (tmp_path / "captured").exists()
+
+
+def test_a_frequent_fault_of_deleting_hides_no_other_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    def expire() -> None:
+        deletion._log_fault("too old", OSError(13, "Permission denied"))
+
+    def follow() -> None:
+        deletion._log_fault("deleted", OSError(13, "Permission denied"))
+
+    for log in (*[expire] * 20, follow):
+        log()
+    passes = RepeatFilter(burst=10).filter
+    assert [it.getMessage().split(":")[0] for it in caplog.records if passes(it)] == ["too old"] * 10 + ["deleted"]

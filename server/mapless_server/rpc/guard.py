@@ -29,7 +29,7 @@ from mapless_server.scheduling import Flow, StageRecord
 from mapless_server.security import ENDLESS_METHODS, OPEN_METHODS, Principal
 
 from .receiving import Context, OpenMethods, Receiver, quiet_ended_calls
-from .sending import ENDLESS_SEND_LIMIT_S, PACED_CODES, REQUEST_ID_KEY, SEND_LIMIT_S, Pace, Sender
+from .sending import ENDLESS_SEND_LIMIT_S, PACED_CODES, REQUEST_ID_KEY, SEND_LIMIT_S, Pace, Sender, Unread
 
 if TYPE_CHECKING:
     from mapless_server.observability.metrics import Metrics
@@ -150,6 +150,7 @@ class CallGuard:
         self._abandoned: set[asyncio.Task[Any]] = set()  # the loop holds only weak references
         self._receiver = Receiver()
         self._sender = Sender()
+        self._unread = Unread()
         self._pace = Pace()
         self._open = OpenMethods(self._receiver)
         quiet_ended_calls()
@@ -258,6 +259,7 @@ class CallGuard:
         except FieldError as error:
             raise InvalidArgument(str(error), field=error.field) from None
         data = bytes(handler.response_serializer(response))
+        self._unread.add(call.principal.tenant, len(data), context)
         call.note(bytes_out=len(data))
         return data
 

@@ -9,6 +9,7 @@ a status is always sent, behind the earlier messages, and waits for its reader w
 
 import asyncio
 import time
+from collections import Counter
 from collections.abc import Coroutine
 from typing import Any
 
@@ -17,7 +18,7 @@ from google.protobuf.message import Message
 from google.rpc import error_details_pb2, status_pb2
 from grpc_status import rpc_status
 
-from mapless_server.errors import AlreadyExists, DeadlineExceeded, NotFound, RequestError
+from mapless_server.errors import AlreadyExists, DeadlineExceeded, NotFound, Overloaded, RequestError
 
 from .receiving import Context, has_ended, retrieve
 
@@ -25,7 +26,7 @@ REQUEST_ID_KEY = "x-request-id"
 
 SEND_LIMIT_S = 10.0
 """For the caller of a finite stream to read a message that is ready. Answers of unary calls wait in grpc and cost only
-their memory; a stream without a reader keeps its call open."""
+their memory, see `Unread`; a stream without a reader keeps its call open."""
 ENDLESS_SEND_LIMIT_S = 60.0
 """For the caller of an endless stream, whose messages hold photographs: 4.5 Mbit/s for the largest default message. A
 caller that reads nothing for so long is gone, and its place is freed."""
@@ -98,6 +99,35 @@ class Sender:
     def _forget(self, task: asyncio.Task[None]) -> None:
         self._sending.discard(task)
         retrieve(task)
+
+
+UNREAD_BYTES = 256 * 2**20
+"""Answers that a tenant's callers have not read yet; grpc keeps them in memory as long as the connection lasts, though
+their handlers have ended. As many as sixteen of the largest photographs."""
+SMALL_ANSWER_BYTES = 256 * 1024
+"""Such an answer is sent all the same: callers that read nothing must not keep others from being localized."""
+
+
+class Unread:
+    """Limits the answers in memory that callers are slow to read; runs on the event loop."""
+
+    def __init__(self) -> None:
+        self._bytes: Counter[str] = Counter()
+
+    def add(self, tenant: str, size_bytes: int, context: Context) -> None:
+        """Counts an answer until it is sent; Overloaded for a large one where the tenant has too many."""
+        unread_bytes = self._bytes[tenant]
+        if size_bytes > SMALL_ANSWER_BYTES and unread_bytes and unread_bytes + size_bytes > UNREAD_BYTES:
+            message = f"answers of {unread_bytes // 2**20} MiB wait to be read by their callers"
+            raise Overloaded(message, reason="UNREAD_ANSWERS", retry_after_s=1.0)
+        self._bytes[tenant] += size_bytes
+
+        def sent(_: object) -> None:
+            self._bytes[tenant] -= size_bytes
+            if not self._bytes[tenant]:
+                del self._bytes[tenant]
+
+        context.add_done_callback(sent)
 
 
 _DOMAIN = "mapless"

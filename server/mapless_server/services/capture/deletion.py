@@ -141,5 +141,8 @@ class Deletion:
 
 
 def _log_fault(what: str, error: Exception) -> None:
-    """Logs what failed; an unexpected error with its traceback."""
-    log.error("%s: %s", what, error, exc_info=None if isinstance(error, OSError) else error)
+    """Logs what failed; an unexpected error with its traceback.
+
+    As a record of the caller's line: repeated records are limited by line, and one fault must not hide the others.
+    """
+    log.error("%s: %s", what, error, exc_info=None if isinstance(error, OSError) else error, stacklevel=2)
