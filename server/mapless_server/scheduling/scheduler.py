@@ -88,7 +88,7 @@ class Scheduler:
         self._queues: dict[str, FairQueue[Job]] = {stage.name: FairQueue(options.quantum_s) for stage in stages}
         # Steps of admitted jobs that need more room than there is: computed by threads that are idle otherwise.
         self._spare: dict[str, FairQueue[Job]] = {stage.name: FairQueue(options.quantum_s) for stage in stages}
-        # When a job was last refused because of those admitted, and when because of other callers' alone.
+        # When a job was last refused because of those admitted, and when one of a caller that has not most of these.
         self._refused_s = self._crowded_s = -math.inf
         self._running: Counter[str] = Counter()
         self._lanes = {}
@@ -312,10 +312,14 @@ class Scheduler:
         except Refused as refused:
             if refused.reason in (Refusal.QUEUE_FULL, Refusal.TOO_MUCH_MEMORY):
                 self._refused_s = now_s
-                if not self._ledger.job_count(flow):
+                if not self._has_most(flow):
                     self._crowded_s = now_s
             self._observer.refused(refused.reason)
             raise
+
+    def _has_most(self, flow: Flow) -> bool:
+        """Whether a caller's admitted jobs take longer than those of all others together."""
+        return any(2 * self._ledger.booked_s(lane, flow) > self._ledger.booked_s(lane) for lane in self._lanes)
 
     def _remember(self, flow: Flow, step: Step) -> None:
         """Keeps the first step of a caller's last job, without its payload, for `check_room`."""
