@@ -10,6 +10,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from support.disks import small_disk
 from support.stores import (
     DATABASES,
     EXTRACTOR,
@@ -234,6 +235,15 @@ def test_a_copy_that_differs_is_not_kept(backup: Path, tmp_path: Path, monkeypat
             back_up(store.database, backup)
     assert not backup.exists()
     assert not list(tmp_path.glob("*.unfinished")) + list(tmp_path.glob(".*.unfinished"))
+
+
+def test_without_room_for_a_backup_nothing_is_left(backup: Path, tmp_path: Path) -> None:
+    with Store.open(tmp_path / "data") as store, small_disk(tmp_path / "disk", 1) as disk:
+        fill(store)
+        (disk / "filler").write_bytes(bytes(900_000))
+        with pytest.raises(StoreError, match=r"cannot be made: .*full"):
+            back_up(store.database, disk / "backup.sqlite3")
+        assert [it.name for it in disk.iterdir()] == ["filler"]
 
 
 def test_commands_do_it_beside_a_server(tmp_path: Path, backup: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -59,7 +59,8 @@ def back_up(database: Database, path: Path, on_progress: Progress = ignore_progr
             unfinished.rename(path)
             _sync(path.parent)
     finally:
-        unfinished.unlink(missing_ok=True)
+        for left in (unfinished, unfinished.with_name(f"{unfinished.name}-journal")):  # SQLite leaves it on a full disk
+            left.unlink(missing_ok=True)
     return found
 
 
