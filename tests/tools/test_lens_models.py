@@ -74,7 +74,7 @@ def reported(camera: Camera, folder: Path) -> Camera:
     return camera if "lens distortion" in section and "coefficient -0.25" in section else CAMERA
 
 
-PLACES = [sent, stored, exported, listed, to_colmap, undistorted]
+PLACES = [sent, stored, exported, listed, undistorted]
 Place = Callable[[Camera, Path], Camera]
 
 
@@ -86,13 +86,18 @@ def test_every_place_knows_every_model(place: Place, model: str, tmp_path: Path)
     assert place(camera, tmp_path) == camera
 
 
-@pytest.mark.parametrize("place", [*PLACES, reported])
+@pytest.mark.parametrize("model", ["radial_tangential", "fisheye"])
+def test_colmap_knows_the_models_that_it_has(model: str, tmp_path: Path) -> None:
+    test_every_place_knows_every_model(to_colmap, model, tmp_path)
+
+
+@pytest.mark.parametrize("place", [*PLACES, to_colmap, reported])
 def test_a_lens_that_is_not_in_the_table_is_named(place: Place, tmp_path: Path) -> None:
     with pytest.raises(TypeError, match=r"camera\.distortion is a Division.*RadialTangential, Fisheye"):
         place(UNKNOWN, tmp_path)
 
 
-@pytest.mark.parametrize("place", [*PLACES, reported])
+@pytest.mark.parametrize("place", [*PLACES, to_colmap, reported])
 def test_a_model_in_the_table_works_or_fails_loudly(
     place: Place, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
