@@ -47,7 +47,7 @@ from .errors import (
     Unavailable,
 )
 from .geodesy import Datum, GeoPose
-from .geometry import Camera, Fisheye, Quaternion, RadialTangential, RigidTransform, Similarity
+from .geometry import Camera, Quaternion, RigidTransform, Similarity
 from .groups import (
     GroupRejected,
     ImageReport,
@@ -57,6 +57,7 @@ from .groups import (
     SequenceLocalization,
     TrackingJump,
 )
+from .lenses import Fisheye, RadialTangential
 from .options import ConnectOptions
 from .priors import GeoPositionPrior, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
 from .requests import IntrinsicsUncertainty, NewReference

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from . import wire
-from .geometry import DEFAULT_LENS_MODEL, Array, Camera, RigidTransform, lens_from_coefficients
+from .geometry import Array, Camera, RigidTransform
 from .json_input import read_json, read_message, shown
+from .lenses import DEFAULT_LENS_MODEL, lens_from_coefficients
 from .pixels import size_of_image
 from .v1 import geometry_pb2
 from .wire import FieldError

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import names
-from .geometry import LENS_MODELS, Array, Camera, Distortion, Quaternion, RigidTransform, lens_model_of, unknown_lens
+from .geometry import Array, Camera, Quaternion, RigidTransform
+from .lenses import LENS_MODELS, Distortion, lens_model_of, unknown_lens
 from .v1 import geometry_pb2 as pb
 
 T = TypeVar("T")

@@ -16,8 +16,9 @@ from mapless.cameras import read_camera
 from mapless.cli.arguments import make_parser
 from mapless.cli.localize import priors
 from mapless.cli.output import line, plain
-from mapless.geometry import Camera, Fisheye, RigidTransform, Similarity
+from mapless.geometry import Camera, RigidTransform, Similarity
 from mapless.groups import GroupRejected, RigLocalization, SequenceLocalization, TrackingJump
+from mapless.lenses import Fisheye
 from mapless.priors import Priors
 from mapless.requests import read_image
 from mapless.v1 import localization_service_pb2 as pb

@@ -15,10 +15,7 @@ from support.scenes import CAMERA, random_for
 from mapless.geometry import (
     Array,
     Camera,
-    Distortion,
-    Fisheye,
     Quaternion,
-    RadialTangential,
     RigidTransform,
     Similarity,
     cross_matrix,
@@ -29,6 +26,7 @@ from mapless.geometry import (
     rotation_angle_deg,
     rotation_from_vector,
 )
+from mapless.lenses import Distortion, Fisheye, RadialTangential
 
 coordinate = st.floats(-100.0, 100.0)
 point = st.tuples(coordinate, coordinate, coordinate).map(np.array)

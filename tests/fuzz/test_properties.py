@@ -21,7 +21,8 @@ from fuzz.images import chunk
 from fuzz.importing import CAMERA, image_of
 from fuzz.laws import check_pose, check_received_camera
 from mapless import names, wire
-from mapless.geometry import Camera, Distortion, Fisheye, RadialTangential, RigidTransform, rotation_from_vector
+from mapless.geometry import Camera, RigidTransform, rotation_from_vector
+from mapless.lenses import Distortion, Fisheye, RadialTangential
 from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless.wire import MAX_SIDE_PX, MIN_SIDE_PX, FieldError
 from mapless_server.errors import InvalidArgument

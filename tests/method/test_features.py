@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from support.images import textured
 from support.scenes import random_for
 
-from mapless.geometry import Array, Camera, Distortion, Fisheye, RadialTangential
+from mapless.geometry import Array, Camera
+from mapless.lenses import Distortion, Fisheye, RadialTangential
 from mapless_server.method.features import SiftExtractor, SiftOptions, make_extractor
 from mapless_server.method.views import MAX_INCIDENCE_DEG, Features, reduce_image, undistort_pixels
 

@@ -10,7 +10,8 @@ pytest.importorskip("PIL", reason="the networks' extra is not installed")
 from PIL import Image
 from support.images import textured
 
-from mapless.geometry import Array, Camera, Fisheye, RadialTangential
+from mapless.geometry import Array, Camera
+from mapless.lenses import Fisheye, RadialTangential
 from mapless_server.method.coarse.grids import (
     Grid,
     GridOptions,

@@ -10,7 +10,8 @@ from support.lenses import Division, Stereographic, add_planted_lenses
 from support.planted import NOISE, stages, true_structure
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
-from mapless.geometry import Array, Camera, Distortion, Fisheye, RadialTangential
+from mapless.geometry import Array, Camera
+from mapless.lenses import Distortion, Fisheye, RadialTangential
 from mapless_server.method.adjust import adjust_pose
 from mapless_server.method.intrinsics import (
     ContradictionOptions,

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from support.images import textured
 from support.scenes import random_for
 
-from mapless.geometry import Array, Camera, RadialTangential
+from mapless.geometry import Array, Camera
+from mapless.lenses import RadialTangential
 from mapless_server.method.features import FeatureExtractor, make_extractor
 from mapless_server.method.views import Features
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from support.images import textured
 
-from mapless.geometry import Camera, RadialTangential
+from mapless.geometry import Camera
+from mapless.lenses import RadialTangential
 from mapless_server.method.features.sift import SiftExtractor
 from mapless_server.method.features.turned import extract_turned
 from mapless_server.method.nearest import mutual_matches

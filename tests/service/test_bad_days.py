@@ -347,7 +347,7 @@ class TestTwoServers:
         code = """if True:
             import sys
             from pathlib import Path
-            from mapless_server.store import Store, StoreError, deletion
+            from mapless_server.store import Store, StoreError
             for folder in sys.argv[1:]:
                 try:
                     Store.open(Path(folder))

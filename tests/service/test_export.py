@@ -16,7 +16,7 @@ from support.stores import damage
 
 from mapless import Client, Datum, NewReference, Scene
 from mapless.geodesy import enu_from_y_up
-from mapless.geometry import Fisheye, RadialTangential
+from mapless.lenses import Fisheye, RadialTangential
 from mapless_server.security import SceneKey
 from mapless_server.store import Store
 from mapless_tools.ingest.formats import read_dataset

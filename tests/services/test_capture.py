@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 from mapless.geodesy import Datum
-from mapless.geometry import Camera, RadialTangential, RigidTransform, rotation_from_vector
+from mapless.geometry import Camera, RigidTransform, rotation_from_vector
+from mapless.lenses import RadialTangential
 from mapless_server.observability.logs import RepeatFilter
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scenes import Choice, RankedReference

@@ -10,7 +10,8 @@ import pytest
 from support.planted import true_structure
 from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for
 
-from mapless.geometry import Array, Camera, Fisheye, RadialTangential, RigidTransform
+from mapless.geometry import Array, Camera, RigidTransform
+from mapless.lenses import Fisheye, RadialTangential
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.method.perturbation import reprojection_errors_px
 from mapless_server.method.pnp import PnpOptions

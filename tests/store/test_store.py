@@ -22,7 +22,8 @@ from support.stores import (
     view_of,
 )
 
-from mapless.geometry import Distortion, Fisheye, RadialTangential, RigidTransform
+from mapless.geometry import RigidTransform
+from mapless.lenses import Distortion, Fisheye, RadialTangential
 from mapless_server import errors
 from mapless_server.method.views import Features, View
 from mapless_server.security import DEFAULT_TENANT, SceneKey

@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from mapless.geometry import Camera, Fisheye, RadialTangential, RigidTransform, rotation_from_vector
+from mapless.geometry import Camera, RigidTransform, rotation_from_vector
+from mapless.lenses import Fisheye, RadialTangential
 from mapless.ros import Messages, Outcome
 
 TYPES = get_typestore(Stores.ROS2_HUMBLE)

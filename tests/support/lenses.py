@@ -6,8 +6,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from mapless import geometry
-from mapless.geometry import Array, Distortion
+from mapless import lenses
+from mapless.geometry import Array
+from mapless.lenses import Distortion
 
 
 @dataclass(frozen=True)
@@ -46,4 +47,4 @@ class Stereographic(Distortion):
 def add_planted_lenses(monkeypatch: pytest.MonkeyPatch) -> None:
     """Adds their lines to the table for one test, by names that no lens model of the interface has."""
     for kind in (Division, Stereographic):
-        monkeypatch.setitem(cast(dict[str, Any], geometry.LENS_MODELS), f"planted_{kind.__name__.lower()}", kind)
+        monkeypatch.setitem(cast(dict[str, Any], lenses.LENS_MODELS), f"planted_{kind.__name__.lower()}", kind)

@@ -6,7 +6,8 @@ from datetime import datetime, timezone
 import numpy as np
 
 from mapless.answers import Accuracy, Debug, Diagnostics, Hint, LocalizationResult, PriorCheck, ReferenceUse, Rejected
-from mapless.geometry import Camera, RadialTangential, RigidTransform, rotation_from_vector
+from mapless.geometry import Camera, RigidTransform, rotation_from_vector
+from mapless.lenses import RadialTangential
 
 CAMERA = Camera(640, 480, 500.0, 505.0, 321.0, 238.0, RadialTangential(-0.1, 0.02, 0.001, 0.0, 0.0))
 NOW = datetime(2026, 11, 21, 12, 0, 0, tzinfo=timezone.utc)

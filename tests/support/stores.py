@@ -10,7 +10,8 @@ import numpy as np
 import psycopg
 import pytest
 
-from mapless.geometry import Camera, Distortion, RigidTransform, rotation_from_vector
+from mapless.geometry import Camera, RigidTransform, rotation_from_vector
+from mapless.lenses import Distortion
 from mapless_server.method.views import Features, View
 from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, Store, rows, sqlite

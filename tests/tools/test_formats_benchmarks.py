@@ -20,7 +20,8 @@ from support.layouts import (
     write_twelve_scenes,
 )
 
-from mapless.geometry import Camera, RadialTangential, RigidTransform
+from mapless.geometry import Camera, RigidTransform
+from mapless.lenses import RadialTangential
 from mapless_tools.ingest.formats import Intrinsics, ReadOptions, read_dataset
 
 TRUTH = truth(4, Camera(96, 64, 525.0, 525.0, 320.0, 240.0))

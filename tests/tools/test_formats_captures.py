@@ -21,7 +21,8 @@ from support.layouts import (
     write_image,
 )
 
-from mapless.geometry import Camera, Fisheye, RadialTangential, RigidTransform, rotation_from_vector
+from mapless.geometry import Camera, RigidTransform, rotation_from_vector
+from mapless.lenses import Fisheye, RadialTangential
 from mapless_tools.ingest.formats import Intrinsics, ReadOptions, read_dataset
 
 TRUTH = truth()

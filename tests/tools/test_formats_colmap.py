@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from support.layouts import CAMERA, Truth, assert_reads, assert_same_camera, reasons, truth, write_image
 
-from mapless.geometry import Fisheye, RadialTangential, RigidTransform
+from mapless.geometry import RigidTransform
+from mapless.lenses import Fisheye, RadialTangential
 from mapless_tools.ingest.formats import ReadOptions, read_dataset
 from mapless_tools.ingest.formats.colmap.cameras import MODEL_NAMES, ColmapCamera
 

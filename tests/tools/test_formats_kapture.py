@@ -20,7 +20,8 @@ from support.layouts import (
     write_layout,
 )
 
-from mapless.geometry import Camera, Fisheye, RadialTangential, RigidTransform, rotation_from_vector
+from mapless.geometry import Camera, RigidTransform, rotation_from_vector
+from mapless.lenses import Fisheye, RadialTangential
 from mapless_tools.dataset import Dataset
 from mapless_tools.ingest.formats import read_dataset
 from mapless_tools.ingest.formats.colmap.cameras import PARAMETERS

@@ -11,7 +11,8 @@ import pytest
 from support.layouts import CAMERA, Truth, assert_reads, reasons, truth, write_image, write_layout
 
 from mapless import read_cameras
-from mapless.geometry import Camera, Fisheye, RadialTangential, RigidTransform
+from mapless.geometry import Camera, RigidTransform
+from mapless.lenses import Fisheye, RadialTangential
 from mapless_tools.ingest import FORMATS
 from mapless_tools.ingest.formats import read_dataset, recognize
 from mapless_tools.ingest.formats.cameras import read_folder

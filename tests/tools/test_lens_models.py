@@ -14,7 +14,8 @@ from support.scenes import CAMERA
 
 from mapless import wire
 from mapless.cameras import read_cameras
-from mapless.geometry import LENS_MODELS, Camera, RigidTransform
+from mapless.geometry import Camera, RigidTransform
+from mapless.lenses import LENS_MODELS
 from mapless.report.sections import provenance_section
 from mapless.v1 import geometry_pb2 as pb
 from mapless_server.method.views import undistort_pixels

@@ -9,7 +9,8 @@ from typing import Any
 from ..cameras import read_camera, read_pose
 from ..client import Client
 from ..geodesy import Datum
-from ..geometry import Quaternion, RigidTransform, lens_model_of
+from ..geometry import Quaternion, RigidTransform
+from ..lenses import lens_model_of
 from ..names import check_id
 from ..pixels import format_of_image
 from ..requests import NewReference

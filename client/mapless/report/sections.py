@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..answers import Diagnostics, LocalizationResult, PriorCheck, Rejected
-from ..geometry import Array, Camera, RigidTransform, lens_model_of
+from ..geometry import Array, Camera, RigidTransform
+from ..lenses import lens_model_of
 from .markup import UNKNOWN, angle, duration, length, reference_id, section, table, text
 
 _AXES = ("x", "y", "z", "rx", "ry", "rz")

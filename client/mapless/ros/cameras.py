@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Camera, Distortion, Fisheye, RadialTangential
+from mapless.geometry import Camera
+from mapless.lenses import Distortion, Fisheye, RadialTangential
 
 from .images import encoded, file_from_image, pixels_from_image
 

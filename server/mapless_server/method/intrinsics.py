@@ -22,7 +22,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, Camera, Distortion, RadialTangential
+from mapless.geometry import Array, Camera
+from mapless.lenses import Distortion, RadialTangential
 
 from .options import IntrinsicsSigma, check_bounds
 from .views import View, undistort_pixels

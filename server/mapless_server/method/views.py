@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, Camera, Distortion, Fisheye, RadialTangential, RigidTransform, lens_model_of
+from mapless.geometry import Array, Camera, RigidTransform
+from mapless.lenses import Distortion, Fisheye, RadialTangential, lens_model_of
 
 Matches = NDArray[np.int32]
 """(M, 2): keypoint indices in the first and in the second of two views."""

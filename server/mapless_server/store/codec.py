@@ -41,7 +41,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geodesy import Datum
-from mapless.geometry import LENS_MODELS, Camera, Distortion, Quaternion, RigidTransform, lens_model_of
+from mapless.geometry import Camera, Quaternion, RigidTransform
+from mapless.lenses import LENS_MODELS, Distortion, lens_model_of
 from mapless.scenes import Calibration
 from mapless_server.method.views import Features, KeptDepth, Matches, View
 

@@ -112,7 +112,7 @@ class Database(Protocol):
         ...
 
     def reserve(self) -> AbstractContextManager[None]:
-        """Disk space that is kept for deleting is free within the block, in which nothing else is written."""
+        """Disk space that is kept for deleting is free within the block, in which the caller only deletes."""
         ...
 
     def close(self) -> None:

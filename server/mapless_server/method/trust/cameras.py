@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, Camera, Fisheye, RigidTransform
+from mapless.geometry import Array, Camera, RigidTransform
+from mapless.lenses import Fisheye
 
 from ..intrinsics import IntrinsicsEvidence, corrected, read_as
 from ..options import IntrinsicsSigma

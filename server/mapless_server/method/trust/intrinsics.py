@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mapless.geometry import Distortion, Fisheye
+from mapless.lenses import Distortion, Fisheye
 
 from ..intrinsics import ContradictionOptions, IntrinsicsEvidence
 from ..rejection import Advice, Hint, IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason

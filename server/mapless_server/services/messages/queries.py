@@ -15,7 +15,8 @@ import numpy as np
 
 from mapless import names, wire
 from mapless.geodesy import MAX_HEIGHT_M, MIN_HEIGHT_M, GeoPosition, world_from_enu_at, world_from_geodetic
-from mapless.geometry import MAX_COORDINATE_M, Array, lens_model_of
+from mapless.geometry import MAX_COORDINATE_M, Array
+from mapless.lenses import lens_model_of
 from mapless.v1 import geometry_pb2
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError, camera_from_message, joined, transform_from_message, vector_from_message

@@ -9,7 +9,8 @@ image's centre.
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
-from mapless.geometry import Camera, RadialTangential, RigidTransform
+from mapless.geometry import Camera, RigidTransform
+from mapless.lenses import RadialTangential
 from mapless_tools.dataset import Dataset, finite_numbers
 
 from .collecting import Collector, ReadOptions, from_corner, natural_order, read_text, rotation_of, size_of

@@ -15,7 +15,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from mapless.cameras import with_slashes
-from mapless.geometry import Camera, Distortion, Fisheye, RadialTangential, RigidTransform, nearest_rotation
+from mapless.geometry import Camera, RigidTransform, nearest_rotation
+from mapless.lenses import Distortion, Fisheye, RadialTangential
 from mapless_tools.dataset import Dataset, finite_numbers, named, read_json
 
 from .collecting import Collector, ReadOptions, from_corner, from_opengl, natural_order, size_of

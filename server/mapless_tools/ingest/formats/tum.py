@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mapless.geometry import Array, Camera, RadialTangential
+from mapless.geometry import Array, Camera
+from mapless.lenses import RadialTangential
 from mapless_tools.bags.trajectory import Trajectory
 from mapless_tools.dataset import Dataset, finite_numbers, named
 

@@ -7,7 +7,8 @@ from typing import Any
 
 from mapless import Scene
 from mapless.cameras import FOLDER_FILE
-from mapless.geometry import DEFAULT_LENS_MODEL, Camera, RigidTransform, lens_model_of
+from mapless.geometry import Camera, RigidTransform
+from mapless.lenses import DEFAULT_LENS_MODEL, lens_model_of
 
 from .colmap.cameras import from_camera
 from .kapture import PROPERTIES

@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 
-from mapless.geometry import Camera, Distortion, Fisheye, RadialTangential, unknown_lens
+from mapless.geometry import Camera
+from mapless.lenses import Distortion, Fisheye, RadialTangential, unknown_lens
 
 from ..collecting import from_corner
 
