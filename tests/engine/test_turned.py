@@ -24,7 +24,7 @@ from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.rejection import Advice, Rejection, RejectionReason
 from mapless_server.method.views import View, view_of
 from mapless_server.scenes import ANYWHERE, Narrowing, Sphere
 from mapless_server.scheduling import Flow
@@ -141,6 +141,18 @@ def test_a_photograph_found_beyond_its_limits_is_not_tried_turned(localize: Loca
     assert isinstance(result.answer.outcome, Rejection)
     assert result.answer.outcome.reason is RejectionReason.PRIOR_CONFLICT
     assert not any(stage.endswith(TURN) for stage in result.stage_seconds)
+
+
+@pytest.mark.parametrize("named", [NAMED, ()], ids=["named", "chosen"])
+def test_a_mirrored_photograph_is_rejected_as_mirrored(localize: Localize, named: tuple[str, ...]) -> None:
+    image = np.ascontiguousarray(decode_image(photograph(TRUE), ImageLimits())[:, ::-1])
+    mirrored = replace(CAMERA, principal_x_px=CAMERA.width_px - 1 - CAMERA.principal_x_px)
+    outcome = localize(encode(".png", image), mirrored, named).answer.outcome
+    assert isinstance(outcome, Rejection)
+    assert outcome.reason is RejectionReason.GATE
+    assert outcome.message.startswith("the photograph is mirrored")
+    assert outcome.hint is not None
+    assert outcome.hint.advice is Advice.CHECK_CALIBRATION
 
 
 def test_a_photograph_of_elsewhere_stays_rejected(localize: Localize) -> None:

@@ -7,9 +7,11 @@ references elsewhere than priors say.
 from collections.abc import Sequence
 from functools import partial
 
+from scipy.special import bdtrc
+
 from mapless_server.errors import DataLoss
 from mapless_server.method.answer import Answer
-from mapless_server.method.rejection import Rejection
+from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.scenes.library import Loaded, load_usable
 from mapless_server.scenes.retrieval.ranking import spread_choice
 
@@ -19,6 +21,10 @@ from .tiers import CLEARLY_MORE
 
 TURN_REFERENCES = 10
 """A photograph that was not localized is compared with so many references each way round, the most similar first."""
+
+MIRRORED_BY_CHANCE = 1e-6
+"""A photograph is mirrored only if matches that are as likely with it as with its mirror image would be shared so
+unevenly with less than this probability."""
 
 
 def with_named(run: QueryRun, tier: Tier) -> QueryRun:
@@ -56,20 +62,42 @@ def load_chosen(run: QueryRun, reference_ids: Sequence[str], tier: Tier) -> Load
     return load_usable(lambda some: run.load(some, tier), reference_ids, (DataLoss,), report)
 
 
-def turned_to_match(run: QueryRun, tier: Tier) -> QueryViews:
+def turned_to_match(run: QueryRun, tier: Tier) -> QueryViews | Rejection:
     """The photograph turned such that clearly more of it matches references than as it is; else as it is.
 
     The best of its references counts: others may not show the same.
+
+    Returns:
+        The photograph; or its rejection, since its mirror image matches clearly more than any of these, and that is not
+        chance. So it is of a mirrored photograph, which no camera sees, and of another side of something symmetric:
+        both get poses by parts that look like the mirror image of others.
     """
-    with run.context.stage(TURN):
-        found = [run.views, *(run.views.turned(turns, run.context) for turns in (1, 2, 3))]
-    counts = [_most_matches(run.but(views=views), tier) for views in found]
-    best = max(range(4), key=counts.__getitem__)
-    return found[best if counts[best] >= CLEARLY_MORE * counts[0] else 0]
+    context = run.context
+    with context.stage(TURN):
+        found = [run.views, *(run.views.turned(turns, context) for turns in (1, 2, 3)), run.views.mirrored(context)]
+    *turned, mirrored = [_most_matches(run.but(views=views), tier) for views in found]
+    best = max(turned, key=lambda it: it[0])
+    most, name = mirrored
+    chance = bdtrc(most - 1, most + best[0], 0.5) if most else 1.0
+    if most >= CLEARLY_MORE * best[0] and chance < MIRRORED_BY_CHANCE:
+        return _mirrored(most, best[0], name)
+    return found[turned.index(best) if best[0] >= CLEARLY_MORE * turned[0][0] else 0]
 
 
-def _most_matches(run: QueryRun, tier: Tier) -> int:
-    """Most matches of the photograph with one of the references that it resembles, or of those named."""
+def _mirrored(most: int, as_it_is: int, reference: str) -> Rejection:
+    message = (
+        "the photograph is mirrored, or shows another side of something symmetric: its mirror image has "
+        f"{most} matches with a reference, as it is {as_it_is}"
+    )
+    advice = (
+        "Send the photograph as the camera took it: previews of front cameras and some videos exchange left and right "
+        "(if so, the principal point is at width - 1 - x). If it is as taken, add references of this side."
+    )
+    return Rejection(RejectionReason.GATE, message, Hint(TURN, Advice.CHECK_CALIBRATION, advice, reference))
+
+
+def _most_matches(run: QueryRun, tier: Tier) -> tuple[int, str]:
+    """Most matches of the photograph with one of the references that it resembles, or of those named; its name."""
     query = run.query
     if query.chooses:
         chosen = run.choose(query.narrowing).references[:TURN_REFERENCES]
@@ -79,7 +107,9 @@ def _most_matches(run: QueryRun, tier: Tier) -> int:
     view = run.views.view(tier.extractor, run.context)
     with run.context.stage(TURN):
         matches = tier.pipeline.matcher.match_quickly(view, references, run.context.check)
-    return max(map(len, matches), default=0)
+    counts = list(map(len, matches))
+    best = max(range(len(counts)), key=counts.__getitem__, default=None)
+    return (0, "") if best is None else (counts[best], references[best].name)
 
 
 def may_be_elsewhere(run: QueryRun, tier: Tier, answer: Answer) -> bool:

@@ -219,6 +219,8 @@ class QueryViews:
 
     Attributes:
         quarter_turns: clockwise, of the raster in which its features are found.
+        is_mirrored: whether they are found in the raster exchanged left and right, and their pixels are of that: such a
+            view can be matched, but has no pose.
     """
 
     def __init__(self, photo: Photo, limits: ImageLimits) -> None:
@@ -227,7 +229,7 @@ class QueryViews:
         self._photograph: Photograph | None = None
         self._views: dict[str, View] = {}
         self._max_pixels: int | None = None
-        self.quarter_turns = 0
+        self.quarter_turns, self.is_mirrored = 0, False
         self._not_turned: QueryViews | None = None
 
     def view(self, extractor: FeatureExtractor, context: StageContext) -> View:
@@ -241,6 +243,8 @@ class QueryViews:
                     pixels, camera = reduce_image(pixels, camera, round(share * max(camera.width_px, camera.height_px)))
                 if self.quarter_turns:
                     view = extract_turned(extractor, pixels, camera, self.quarter_turns)
+                elif self.is_mirrored:
+                    view = extractor.extract(np.ascontiguousarray(pixels[:, ::-1]), camera)
                 else:
                     view = extractor.extract(pixels, camera)
             self._views[extractor.name] = replace(view, photograph=photograph)
@@ -260,6 +264,12 @@ class QueryViews:
         views = QueryViews(self._photo, self._limits)
         views._photograph, views.quarter_turns = self._decoded(context), quarter_turns
         views._not_turned = self.not_turned
+        return views
+
+    def mirrored(self, context: StageContext) -> QueryViews:
+        """The same photograph, decoded once, whose features are found in its raster exchanged left and right."""
+        views = QueryViews(self._photo, self._limits)
+        views._photograph, views.is_mirrored = self._decoded(context), True
         return views
 
     @property

@@ -140,9 +140,11 @@ class QueryStages:
             if run.tries_turns and not run.views.quarter_turns:
                 assert run.best is not None
                 views = turned_to_match(run, tier)
-                if not views.quarter_turns:
+                if isinstance(views, Rejection) or not views.quarter_turns:
                     spent_s = {f"{tier.features}/{name}": it for name, it in run.context.stage_seconds.items()}
                     best = replace(run.best, stage_seconds=run.best.seconds_with(spent_s))
+                    if isinstance(views, Rejection):  # no features see a mirrored photograph better
+                        return Done(replace(best, answer=replace(best.answer, outcome=views)), Ending.LOW_CONFIDENCE)
                     return self._stronger(run, query, best)
                 run = run.but(views=views)
             tracked = self._tracked(run, tier) if run.tracks else None
