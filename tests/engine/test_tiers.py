@@ -122,6 +122,12 @@ class TestBetter:
         assert isinstance(answer.answer.outcome, Rejection)
         assert answer.answer.outcome.reason is RejectionReason.LOW_OVERLAP
 
+    def test_radii_of_disagreeing_halves_join_no_two_places(self) -> None:
+        """Two poses 1 m apart contradict each other, though 0.5 m is claimed, as the jackknife knows them to 1 cm."""
+        first, second = (found(localized(x_m, 0.5, 100), x_m, 100, sigma_m=0.01) for x_m in (0.0, 1.0))
+        assert isinstance(better(first, second).answer.outcome, Rejection)
+        assert isinstance(better(localized(0.0, 0.5), localized(1.0, 0.5)).answer.outcome, Localization)
+
     @pytest.mark.parametrize(
         ("sigmas", "tier"), [((0.02, 0.01), STRONG), ((0.01, 0.02), CHEAP), ((0.02, 0.02), STRONG)]
     )

@@ -24,7 +24,9 @@ from mapless_server.method.localize import MIN_FEATURES, localize, prepare, refi
 from mapless_server.method.options import LocalizeOptions, ScaleStrategy, StageContext, Variant
 from mapless_server.method.pipeline import Coarse, Pipeline, Prepared, StageOptions, coarse_answer, reconstruct
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.results import PoseStage, ScaleStage
+from mapless_server.method.results import PoseEstimate, PoseStage, ScaleStage
+from mapless_server.method.trust.evidence import evidence_of, votes_of
+from mapless_server.method.uncertainty.radii import accuracy_from_covariance, covering_disagreement
 from mapless_server.method.views import Features, Matches, PosedView, Reconstruction, View
 
 SCENE = make_scene(random_for("localize"), SceneOptions(point_count=400, reference_count=5))
@@ -170,6 +172,30 @@ def test_errors_are_as_large_as_the_covariance() -> None:
         shift = found.world_from_camera.translation - scene.world_from_query.translation
         squares.append(shift @ np.linalg.solve(found.covariance[:3, :3], shift))
     assert 0.3 < np.mean(squares) < 4.5  # 3 if it were exact
+
+
+def test_radii_cover_half_of_the_distance_of_halves() -> None:
+    """Adds in quadrature to the radius by the jackknife; halves of the data alone give cameras that far apart."""
+    for seed in range(3):
+        scene = make_scene(random_for("apart", seed), SceneOptions(point_count=150, outlier_share=0.5))
+        answer = localize(scene.query, scene.references, pipeline_of("geometric", scene), LocalizeOptions(coverage=1.0))
+        found, support = pose_of(answer), answer.support
+        assert support is not None
+        assert support.estimate is not None
+        assert found.covariance is not None
+        votes = votes_of(support, support.query_matches)
+        apart_m = evidence_of(support, votes, support.query_matches).disagreement * support.distance_m()
+        radii = [accuracy_from_covariance(it) for it in (support.estimate.covariance, found.covariance)]
+        assert radii[1].position_68_m == pytest.approx(np.hypot(radii[0].position_68_m, apart_m / 2))
+        growth = radii[1].position_68_m / radii[0].position_68_m
+        assert growth > 1.001
+        assert radii[1].rotation_95_deg == pytest.approx(growth * radii[0].rotation_95_deg)
+
+
+def test_halves_say_nothing_of_a_pose_with_priors() -> None:
+    alone = PoseEstimate(SCENE.world_from_query, PoseStage.REFINED, np.ones(4, bool), np.ones(4), np.eye(6))
+    informed = replace(alone, without_priors=alone)
+    assert covering_disagreement(informed, 1.0) is informed
 
 
 # Wide correspondences

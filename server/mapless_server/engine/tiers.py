@@ -94,8 +94,10 @@ def better_of(cheaper: Result, stronger: Result) -> Result:
     else:
         pose, inlier_count = first.world_from_camera, first.inlier_count
         claims = _claim(first), _claim(second)
-        reach_m = max(SAME_POSITION_M, sum(claim.position_95_m for claim in claims))
-        reach_deg = max(SAME_ROTATION_DEG, sum(claim.rotation_95_deg for claim in claims))
+        # Halves of the data that disagree are no reason to take two poses for one.
+        known = [_without_halves(it.answer, claim) for it, claim in zip((cheaper, stronger), claims, strict=True)]
+        reach_m = max(SAME_POSITION_M, sum(it.position_95_m for it in known))
+        reach_deg = max(SAME_ROTATION_DEG, sum(it.rotation_95_deg for it in known))
     apart_m = float(np.linalg.norm(second.world_from_camera.translation - pose.translation))
     apart_deg = rotation_angle_deg(pose.rotation.T @ second.world_from_camera.rotation)
     if apart_m <= reach_m and apart_deg <= reach_deg:
@@ -220,6 +222,13 @@ def _places_apart(result: Result) -> Hint:
         "two places."
     )
     return Hint("judge", Advice.TELL_PLACES_APART, message, best)
+
+
+def _without_halves(answer: Answer, claim: Accuracy) -> Accuracy:
+    """The radii of an answer that claims these, before disagreeing halves of the data enlarged them."""
+    if answer.support is None or answer.support.estimate is None:
+        return claim
+    return accuracy_from_covariance(answer.support.estimate.covariance)
 
 
 def _claim(localization: Localization) -> Accuracy:

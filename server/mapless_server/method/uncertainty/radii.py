@@ -1,7 +1,7 @@
 """Radii of a pose, which errors do not exceed with a given probability; growth of errors with the distance."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,7 +9,7 @@ from scipy.special import gammaincinv
 
 from mapless.geometry import Array
 
-from ..results import Support
+from ..results import PoseEstimate, Support
 
 TAIL_95 = 1.47
 """Factor on the radius of 95 %, for heavy tails; the covariance is right at 68 %. Measured once (server/research)."""
@@ -48,6 +48,21 @@ def accuracy_from_covariance(covariance: Array) -> Accuracy:
 def self_tail(count: int) -> float:
     """Factor on the radius of 95 % in a scene that is calibrated by so many answers to its references."""
     return float(TAIL_95 * (SELF_TAIL_95 / TAIL_95) ** (count / (count + TAIL_PRIOR)))
+
+
+def covering_disagreement(estimate: PoseEstimate, apart_m: float) -> PoseEstimate:
+    """An estimate with larger radii where the cameras that halves of its data give are `apart_m` from each other.
+
+    Two independent halves have twice the variance of both together each, so their cameras are two standard deviations
+    apart: half of the distance is added in quadrature. The jackknife is linear at the pose, and does not see how far
+    halves move that fit as well elsewhere, as with a narrow view of something far, where turning and stepping aside
+    look alike. Turning belongs to it, so the whole covariance is multiplied. Halves know nothing of priors: an estimate
+    with these stays as it is.
+    """
+    radius_m = accuracy_from_covariance(estimate.covariance).position_68_m
+    if estimate.without_priors is not None or not radius_m > 0:
+        return estimate
+    return replace(estimate, covariance=estimate.covariance * (1 + (apart_m / 2 / radius_m) ** 2))
 
 
 def error_radii(covariance: Array, probabilities: ArrayLike) -> Array:
