@@ -46,6 +46,7 @@ class PendingDeletions:
     def __init__(self, database: Database) -> None:
         self._database = database
         self._closing = threading.Event()
+        self._starting = threading.Lock()  # one thread, which `close` waits for
         self._thread: threading.Thread | None = None
 
     def resume(self) -> None:
@@ -63,8 +64,9 @@ class PendingDeletions:
 
     def try_again(self) -> None:
         """Starts a thread, unless there is one, that deletes what the disk had no room for, until it has."""
-        if self._thread is None or not self._thread.is_alive():
-            self._start(AGAIN_S)
+        with self._starting:
+            if self._thread is None or not self._thread.is_alive():
+                self._start(AGAIN_S)
 
     def _start(self, pause_s: float) -> None:
         self._thread = threading.Thread(target=self._run_thread, args=[pause_s], name="deletions", daemon=True)
