@@ -25,9 +25,12 @@ MAX_SIDE_PX = 2**30
 def read_camera(source: str | Path, photo: str | Path | None = None) -> Camera:
     """Reads a camera: JSON (a file or text) in the form of CameraIntrinsics, or "fx,fy,cx,cy" in pixels.
 
+    Or that of one photograph of a cameras.json.
+
     Args:
         source: the file, the JSON text, or the numbers.
-        photo: a photograph of the camera, which gives the image size if the source is four numbers.
+        photo: a photograph of the camera, which gives the image size if the source is four numbers, and which a
+            cameras.json lists.
 
     Raises:
         OSError: a file cannot be read.
@@ -36,7 +39,7 @@ def read_camera(source: str | Path, photo: str | Path | None = None) -> Camera:
     text = str(source)
     if text.lstrip().startswith("{") or "," not in text or Path(text).is_file():
         if Path(text).name == FOLDER_FILE:
-            raise ValueError(f"{text} holds the cameras of a folder's photographs, but a single camera is needed")
+            return _listed_camera(text, photo)
         message = geometry_pb2.CameraIntrinsics()
         return read_message(text, message, _REQUIRED_OF_CAMERAS, wire.camera_from_message, "camera")
     try:
@@ -54,6 +57,15 @@ def read_camera(source: str | Path, photo: str | Path | None = None) -> Camera:
         return _checked(camera)
     except ValueError as error:
         raise ValueError(f"{text}: {error}") from None
+
+
+def _listed_camera(file: str, photo: str | Path | None) -> Camera:
+    if photo is None:
+        raise ValueError(f"{file} holds the cameras of a folder's photographs, but a single camera is needed")
+    cameras = {known.resolve(): its for known, its in read_cameras(file).items()}
+    if (path := Path(photo).resolve()) not in cameras:
+        raise ValueError(f"{file} does not list {photo}")
+    return cameras[path]
 
 
 def read_pose(source: str | Path) -> RigidTransform:

@@ -172,9 +172,15 @@ def test_pixels_are_to_be_encoded_first() -> None:
         read_image(np.zeros((4, 4, 3), np.uint8))  # type: ignore[arg-type]
 
 
-def test_the_cameras_of_a_folder_are_not_one_camera(tmp_path: Path) -> None:
+def test_of_a_folders_cameras_that_of_the_photograph_is_read(tmp_path: Path) -> None:
+    file = tmp_path / "cameras.json"
+    frame = {"image": "a.jpg", "width": 640, "height": 480, "K": [[500, 0, 320], [0, 500, 240], [0, 0, 1]]}
+    file.write_text(json.dumps({"frames": [frame, frame | {"image": "b.jpg", "width": 600}]}))
+    assert read_camera(file, tmp_path / "b.jpg") == Camera(600, 480, 500.0, 500.0, 320.0, 240.0)
     with pytest.raises(ValueError, match="a single camera is needed"):
-        read_camera(tmp_path / "cameras.json")
+        read_camera(file)
+    with pytest.raises(ValueError, match=r"cameras\.json does not list .*c\.jpg"):
+        read_camera(file, tmp_path / "c.jpg")
 
 
 @pytest.mark.parametrize(

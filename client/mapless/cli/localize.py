@@ -57,7 +57,8 @@ def run(client: Client, arguments: argparse.Namespace) -> int:
 
 
 def _one(client: Client, arguments: argparse.Namespace) -> int:
-    photo = Photo(arguments.photo, arguments.photo.name, _camera_of(arguments.photo, arguments.camera))
+    path, given = arguments.photo, arguments.camera
+    photo = Photo(path, path.name, _camera_beside(path) if given is None else read_camera(given, path))
     answers = _answers(client, photo, photo.path, arguments)
     first = next(answers)  # before the output file is created, which an error would leave empty
     indent = None if arguments.progressive else 2  # of several answers each is a line
@@ -117,25 +118,14 @@ def photos_of(folder: Path, camera: str | None) -> list[Photo]:
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDINGS)
     if not paths:
         raise ValueError(f"{folder} holds no photographs ({', '.join(sorted(ENDINGS))})")
-    return [Photo(path, path.name, _camera_of(path, camera)) for path in paths]
-
-
-def _camera_of(path: Path, camera: str | None) -> Camera:
-    if camera is None:
-        return _camera_beside(path)
-    if Path(camera).name != FOLDER_FILE:
-        return read_camera(camera, path)
-    cameras = {known.resolve(): its for known, its in read_cameras(camera).items()}
-    if path.resolve() not in cameras:
-        raise ValueError(f"{camera} does not list {path}")
-    return cameras[path.resolve()]
+    return [Photo(path, path.name, read_camera(camera, path)) for path in paths]
 
 
 def _camera_beside(path: Path) -> Camera:
     """Camera of a photograph, from the cameras.json of its folder or of the folder above."""
     for folder in path.resolve().parents[:2]:
         if (folder / FOLDER_FILE).is_file():
-            return _camera_of(path, str(folder / FOLDER_FILE))
+            return read_camera(folder / FOLDER_FILE, path)
     raise ValueError(f"give --camera, the camera of the photograph: there is no {FOLDER_FILE} beside it")
 
 
