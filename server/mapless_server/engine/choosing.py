@@ -84,10 +84,10 @@ def turned_to_match(run: QueryRun, tier: Tier) -> QueryViews | Rejection:
     return found[turned.index(best) if best[0] >= CLEARLY_MORE * turned[0][0] else 0]
 
 
-def _mirrored(most: int, as_it_is: int, reference: str) -> Rejection:
+def _mirrored(most: int, not_mirrored: int, reference: str) -> Rejection:
     message = (
         "the photograph is mirrored, or shows another side of something symmetric: its mirror image has "
-        f"{most} matches with a reference, as it is {as_it_is}"
+        f"{most} matches with a reference, as it is or turned at most {not_mirrored}"
     )
     advice = (
         "Send the photograph as the camera took it: previews of front cameras and some videos exchange left and right "
