@@ -192,7 +192,7 @@ def test_a_session_in_another_unit_is_no_series_of_jumps(unit_m: float) -> None:
 
 SENT: dict[str, tuple[Callable[[RigidTransform], RigidTransform], str]] = {
     "OpenGL": (partial(pose_to, Axes.ARCORE), "y and z of the cameras reversed"),
-    "inverse": (RigidTransform.inverse, "as inverses, session_from_camera"),
+    "inverse": (RigidTransform.inverse, "as inverses, camera_from_session"),
     "view matrix": (lambda pose: pose_to(Axes.ARCORE, pose).inverse(), "as inverses, with y and z"),
     "ROS": (partial(pose_to, Axes.ROS), "in the axes of ROS"),
     "Unity": (partial(pose_to, Axes.UNITY), "in the axes of Unity"),

@@ -85,8 +85,8 @@ class WorkQueue:
             return failure_of(error).value or Ending.FAILED
 
         self._scheduler = Scheduler(list(stages), lanes, options, observer, ending_of, quota)
-        # Guards the scheduler; held for microseconds. Each lane's idle threads wait on a condition of it. The loop is
-        # told about a change after it: woken at once, it may need the lock next.
+        # Guards the scheduler; held for microseconds. Each lane's idle threads wait on a condition of it. The
+        # event loop is called after a change: it wakes at once, and may need the lock next.
         self._lock = threading.Lock()
         self._for_loop: list[Callable[[], object]] = []
         self._wakes_threads = {lane: threading.Condition(self._lock) for lane in lanes}
@@ -220,7 +220,7 @@ class WorkQueue:
 
     @contextmanager
     def _changing(self) -> Iterator[None]:
-        """Holds the lock during a change of the scheduler, and then tells the event loop what it has to know."""
+        """Holds the lock during a change of the scheduler; then makes the calls to the event loop that follow."""
         calls: list[Callable[[], object]] = []
         try:
             with self._lock:

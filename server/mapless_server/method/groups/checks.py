@@ -39,7 +39,7 @@ REVERSED = "with y and z of the cameras reversed, as between the axes of OpenCV 
 
 READINGS: Mapping[str, Callable[[RigidTransform], RigidTransform]] = {
     REVERSED: lambda pose: pose_from(Axes.ARCORE, pose),
-    "as inverses, session_from_camera instead of camera_from_session": RigidTransform.inverse,
+    "as inverses, camera_from_session instead of session_from_camera": RigidTransform.inverse,
     f"as inverses, {REVERSED}": lambda pose: pose_from(Axes.ARCORE, pose.inverse()),
     "in the axes of ROS": lambda pose: pose_from(Axes.ROS, pose),
     "in the axes of Unity": lambda pose: pose_from(Axes.UNITY, pose),
