@@ -17,6 +17,7 @@ from mapless_server.security import DEFAULT_TENANT, SceneKey
 from mapless_server.store import Store, deletion, postgresql, reader
 from mapless_server.store.backup import back_up, restore
 from mapless_server.store.deletion import PendingDeletions
+from mapless_server.store.reserve import RESERVE_FILE, Reserve
 from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
 
 OFFICE, HALL = SceneKey("office"), SceneKey("hall")
@@ -355,3 +356,23 @@ def test_a_statement_s_limit_does_not_keep_a_scene_alive(shared: Shared, monkeyp
             )
         store.delete_scene(OFFICE)
         assert row_counts(shared) == EMPTY
+
+
+def test_the_space_for_deleting_is_used_by_one_at_a_time(tmp_path: Path) -> None:
+    """The end of one use would otherwise keep the space again within another."""
+    reserve, file, was_kept = Reserve(tmp_path), tmp_path / RESERVE_FILE, []
+    reserve.keep()
+    size_bytes = file.stat().st_size
+
+    def use() -> None:
+        with reserve.used():
+            was_kept.append(file.exists())
+
+    thread = threading.Thread(target=use)
+    with reserve.used():
+        thread.start()
+        thread.join(0.05)
+        assert thread.is_alive()
+    thread.join()
+    assert was_kept == [False]
+    assert file.stat().st_size == size_bytes > 0

@@ -5,6 +5,7 @@ disk that the store itself has filled could not be emptied by deleting.
 """
 
 import os
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,6 +22,7 @@ class Reserve:
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / RESERVE_FILE
+        self._in_use = threading.Lock()
 
     def keep(self) -> None:
         """Keeps the space, or as much as the disk can spare."""
@@ -28,14 +30,15 @@ class Reserve:
 
     @contextmanager
     def used(self) -> Iterator[None]:
-        """The space is free within the block; after it what is left is kept again."""
-        kept_bytes = self._kept_bytes()
-        with suppress(OSError):
-            self._path.unlink(missing_ok=True)
-        try:
-            yield
-        finally:
-            self._grow(min(kept_bytes, self._free_bytes()))
+        """The space is free within the block, for one thread after the other; after it what is left is kept again."""
+        with self._in_use:
+            kept_bytes = self._kept_bytes()
+            with suppress(OSError):
+                self._path.unlink(missing_ok=True)
+            try:
+                yield
+            finally:
+                self._grow(min(kept_bytes, self._free_bytes()))
 
     def _grow(self, wanted_bytes: int) -> None:
         if wanted_bytes <= self._kept_bytes():
