@@ -10,7 +10,7 @@ _SHOWN_CHARACTERS = 60  # of a wrong value in an error message: ids of 10,000 ha
 def check_id(value: str) -> str:
     """The id of a scene or a reference, unchanged; ValueError if the value is not an id."""
     if not value:
-        raise ValueError("an id must not be empty")
+        raise ValueError("an id is 1 to 128 characters; got an empty one")
     if not _ID.fullmatch(value) or ".." in value:
         raise ValueError(
             "an id is 1 to 128 characters of A-Z a-z 0-9 . _ -, begins and ends with a letter, digit or underscore and "

@@ -192,6 +192,14 @@ def test_radii_cover_half_of_the_distance_of_halves() -> None:
         assert radii[1].rotation_95_deg == pytest.approx(growth * radii[0].rotation_95_deg)
 
 
+@pytest.mark.parametrize(("apart_in_radii", "growth"), [(0.0, 1.0), (2.0, 2**0.5), (6.0, 10**0.5), (1e6, 10**0.5)])
+def test_halves_enlarge_radii_to_a_limit(apart_in_radii: float, growth: float) -> None:
+    estimate = PoseEstimate(SCENE.world_from_query, PoseStage.REFINED, np.ones(4, bool), np.ones(4), np.eye(6))
+    radius_m = accuracy_from_covariance(estimate.covariance).position_68_m
+    larger = covering_disagreement(estimate, apart_in_radii * radius_m)
+    assert accuracy_from_covariance(larger.covariance).position_68_m == pytest.approx(growth * radius_m)
+
+
 def test_halves_say_nothing_of_a_pose_with_priors() -> None:
     alone = PoseEstimate(SCENE.world_from_query, PoseStage.REFINED, np.ones(4, bool), np.ones(4), np.eye(6))
     informed = replace(alone, without_priors=alone)

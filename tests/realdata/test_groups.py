@@ -62,14 +62,13 @@ def walk_of(frames: Sequence[Frame], start: int) -> tuple[list[Frame], list[byte
 
 @pytest.mark.parametrize("start", STARTS)
 def test_a_sequence_is_no_worse_than_its_photographs(kitchen: tuple[Client, Sequence[Frame]], start: int) -> None:
-    """Of a device that loses 2 % of its way, in half metres; where all photographs are lost alone, it is not."""
+    """Of a device that loses 2 % of its way, in half metres. Photographs lost alone count as infinitely wrong."""
     client, frames = kitchen
     walk, images, truth = walk_of(frames, start)
     alone = [client.localize(image, frame.camera, "kitchen") for image, frame in zip(images, walk, strict=True)]
     errors_m = [
-        error_m(it.world_from_camera, pose)
+        error_m(it.world_from_camera, pose) if isinstance(it, LocalizationResult) else np.inf
         for it, pose in zip(alone, truth, strict=True)
-        if isinstance(it, LocalizationResult)
     ]
     session = rescaled(drifting(np.random.default_rng(start), truth, 0.02), 2.0)
     together = client.localize_sequence(
@@ -79,7 +78,7 @@ def test_a_sequence_is_no_worse_than_its_photographs(kitchen: tuple[Client, Sequ
     )
     assert isinstance(together, SequenceLocalization), together
     found_m = [error_m(*it) for it in zip(together.world_from_camera, truth, strict=True)]
-    assert np.median(found_m) <= 1.2 * np.median(errors_m or [0.05])
+    assert np.median(found_m) <= 1.2 * min(np.median(errors_m), 0.05)
     assert found_m[-1] <= together.accuracy.position_95_m
     assert together.world_from_session.scale == pytest.approx(0.5, abs=3 * together.scale_sigma)
 
