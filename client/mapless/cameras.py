@@ -25,7 +25,7 @@ MAX_SIDE_PX = 2**30
 def read_camera(source: str | Path, photo: str | Path | None = None) -> Camera:
     """Reads a camera: JSON (a file or text) in the form of CameraIntrinsics, or "fx,fy,cx,cy" in pixels.
 
-    Or that of one photograph of a cameras.json.
+    From a cameras.json it reads the camera of one photograph.
 
     Args:
         source: the file, the JSON text, or the numbers.

@@ -199,19 +199,46 @@ SENT: dict[str, tuple[Callable[[RigidTransform], RigidTransform], str]] = {
 }
 
 
+def climb(count: int) -> list[RigidTransform]:
+    """A walk with steps along all axes, and turns."""
+    steps = np.arange(count)
+    return looking(*np.stack([0.3 * steps - 0.6, 0.25 * steps - 0.5, 0.2 * (steps % 3) - 4.2], axis=1))
+
+
 @pytest.mark.parametrize("sent", SENT)
 @pytest.mark.parametrize("count", [3, 6])
 def test_wrong_axes_of_a_session_are_named(sent: str, count: int) -> None:
     """From three photographs on; no others are named."""
     random = random_for("axes", count)
-    steps = np.arange(count)
-    truth = looking(*np.stack([0.3 * steps - 0.6, 0.25 * steps - 0.5, 0.2 * (steps % 3) - 4.2], axis=1))
+    truth = climb(count)
     images = images_of(random, truth, alone=True, own_noise_m=0.002)
     as_sent, words = SENT[sent]
     session = [as_sent(it) for it in drifting(random, truth, 0.01)]
     outcome = rejection(check_tracking(estimate(solve_sequence(images, session, False)), session))
     assert words in outcome.message
     assert outcome.message.count(" or ") == 0
+
+
+def test_a_single_step_names_no_axes() -> None:
+    """Which a jump of the device may resemble by chance."""
+    random = random_for("one step")
+    truth = climb(2)
+    session = [pose_to(Axes.ARCORE, it) for it in truth]
+    found = estimate(solve_sequence(images_of(random, truth, alone=True, own_noise_m=0.002), session, False))
+    assert len(found.jumps) == 1
+    assert check_tracking(found, session) is found
+
+
+def test_axes_that_contradict_one_photograph_are_not_named() -> None:
+    random = random_for("one contradicts")
+    truth = climb(6)
+    session = [pose_to(Axes.ARCORE, it) for it in drifting(random, truth, 0.01)]
+    found = estimate(solve_sequence(images_of(random, truth, alone=True, own_noise_m=0.002), session, False))
+    assert "y and z of the cameras reversed" in rejection(check_tracking(found, session)).message
+    *others, last = found.world_from_camera
+    others[2] = others[2].shifted(np.array([0.5, 0.0, 0.0]))
+    message = rejection(check_tracking(replace(found, world_from_camera=(*others, last)), session)).message
+    assert "read" not in message
 
 
 def test_jumps_that_no_other_axes_explain_name_none() -> None:

@@ -469,6 +469,8 @@ class TestTime:
         run_through(toy)
         assert not toy.scheduler.jobs
         assert toy.scheduler.backlog_s == 0
+        toy.admit()
+        assert toy.refusal(deadline_s=toy.now_s + 0.1).reason is Refusal.DEADLINE_INFEASIBLE  # not idle any more
 
     def test_a_step_waits_until_it_would_end_too_late(self) -> None:
         toy = Toy()
@@ -491,20 +493,28 @@ class TestTime:
         toy.finish(batch, Next(Step("prepare", "slow", "b", "again"), Fallback(lambda: Done("first"), 150.0)))
         assert toy.ending_of(job) is Ending.OK
 
-    @pytest.mark.parametrize("is_crowded", [False, True])
-    def test_a_greedy_caller_takes_no_others_turn(self, is_crowded: bool) -> None:
-        """Where its own jobs are refused, others' steps take turns with them; not where others have no room, too."""
+    @pytest.mark.parametrize(
+        ("is_crowded", "own_jobs", "due_s", "goes_on"),
+        [(False, 1, 150.0, True), (True, 1, 150.0, False), (False, 2, 150.0, False), (False, 1, 1.9, False)],
+    )
+    def test_a_greedy_caller_takes_no_others_turn(
+        self, is_crowded: bool, own_jobs: int, due_s: float, goes_on: bool
+    ) -> None:
+        """Where its own jobs are refused, steps of others' only jobs take turns with them, if there is time for that.
+
+        Not where others have no room, too.
+        """
         toy = Toy()
         toy.learn("coarse", "more", 0.5)
-        job = toy.admit(stage="refine", client="mine", deadline_s=200.0)
+        job, *_ = [toy.admit(stage="refine", client="mine", deadline_s=200.0) for _ in range(own_jobs)]
         batch = toy.take("host")
         toy.fill()
         for client in map(str, range(100) if is_crowded else ()):
             toy.fill(client)
         step = Step("prepare", "more", "b", "again")
-        toy.finish(batch, Next(step, Fallback(lambda: Done("first"), 150.0)))
-        assert toy.ending_of(job) is (Ending.OK if is_crowded else None)
-        assert is_crowded or job in toy.take("host").jobs + toy.take("host").jobs
+        toy.finish(batch, Next(step, Fallback(lambda: Done("first"), due_s)))
+        assert toy.ending_of(job) is (None if goes_on else Ending.OK)
+        assert not goes_on or job in toy.take("host").jobs + toy.take("host").jobs
 
     @pytest.mark.parametrize(
         ("due_s", "others", "kind"),

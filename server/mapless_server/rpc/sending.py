@@ -115,7 +115,7 @@ class Unread:
         self._bytes: Counter[str] = Counter()
 
     def add(self, tenant: str, size_bytes: int, context: Context) -> None:
-        """Counts an answer until it is sent; Overloaded for a large one where the tenant has too many."""
+        """Counts an answer until it is sent; Overloaded for a large one beside too many of the tenant."""
         unread_bytes = self._bytes[tenant]
         if size_bytes > SMALL_ANSWER_BYTES and unread_bytes and unread_bytes + size_bytes > UNREAD_BYTES:
             message = f"answers of {unread_bytes // 2**20} MiB wait to be read by their callers"

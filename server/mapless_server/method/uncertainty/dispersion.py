@@ -245,7 +245,7 @@ def _without_each(
 ) -> tuple[Array, Array]:
     """Reduced equations (1 + V, U, U), (1 + V, U) of all observations, and of those without each of V references."""
     count, end = len(data), seen.parts[-1].start
-    # Rows of observations, because each takes the block of its point: a row of many numbers in one place.
+    # A row an observation, so that the block of its point is read from one place in memory.
     by_point = np.ascontiguousarray(points.cross.reshape(count, 3, -1).T)  # (P, 3, U)
     lost = np.ascontiguousarray(gain[:, :, :end].T) @ by_point[seen.point[:end]]  # (O, 2, U)
     misfit = np.ascontiguousarray(misfit.T)
