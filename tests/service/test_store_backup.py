@@ -6,7 +6,7 @@ import stat
 import subprocess
 import sys
 import threading
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
@@ -238,12 +238,18 @@ def test_a_copy_that_differs_is_not_kept(backup: Path, tmp_path: Path, monkeypat
 
 
 def test_without_room_for_a_backup_nothing_is_left(backup: Path, tmp_path: Path) -> None:
-    with Store.open(tmp_path / "data") as store, small_disk(tmp_path / "disk", 1) as disk:
+    """Neither for the copy, nor for reading it again."""
+    with Store.open(tmp_path / "data") as store:
         fill(store)
-        (disk / "filler").write_bytes(bytes(900_000))
-        with pytest.raises(StoreError, match=r"cannot be made: .*full"):
-            back_up(store.database, disk / "backup.sqlite3")
-        assert [it.name for it in disk.iterdir()] == ["filler"]
+        back_up(store.database, backup)
+        size_bytes = backup.stat().st_size
+        for room_bytes in (size_bytes // 3, *range(size_bytes, size_bytes + 2**16, 2**13)):
+            with small_disk(tmp_path / f"disk-{room_bytes}", 1) as disk:
+                (disk / "filler").write_bytes(bytes(2**20 - room_bytes))
+                with suppress(StoreError):
+                    back_up(store.database, disk / "backup.sqlite3")
+                assert {it.name for it in disk.iterdir()} <= {"filler", "backup.sqlite3"}
+                assert room_bytes >= size_bytes or not (disk / "backup.sqlite3").exists()
 
 
 def test_commands_do_it_beside_a_server(tmp_path: Path, backup: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -296,6 +296,16 @@ class TestFullDisk:
         assert row_counts(place) == EMPTY
 
 
+    def test_what_is_left_is_tried_again_by_one_thread_until_it_is_closed(self, tmp_path: Path) -> None:
+        with Store.open(tmp_path) as store:
+            pending = PendingDeletions(store.database)
+            for _ in range(3):
+                pending.try_again()
+            assert [it.name for it in threading.enumerate()].count("deletions") == 1
+            pending.close()
+            assert "deletions" not in [it.name for it in threading.enumerate()]
+
+
 class TestMemory:
     """Of scenes that are deleted nothing is held; of others all."""
 

@@ -59,8 +59,8 @@ def back_up(database: Database, path: Path, on_progress: Progress = ignore_progr
             unfinished.rename(path)
             _sync(path.parent)
     finally:
-        for left in (unfinished, unfinished.with_name(f"{unfinished.name}-journal")):  # SQLite leaves it on a full disk
-            left.unlink(missing_ok=True)
+        for ending in ("", "-journal", "-wal", "-shm"):  # on a full disk SQLite leaves what it needs beside the file
+            unfinished.with_name(unfinished.name + ending).unlink(missing_ok=True)
     return found
 
 
