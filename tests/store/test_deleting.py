@@ -295,7 +295,6 @@ class TestFullDisk:
                 store.delete_scene(OFFICE)
         assert row_counts(place) == EMPTY
 
-
     def test_what_is_left_is_tried_again_by_one_thread_until_it_is_closed(self, tmp_path: Path) -> None:
         with Store.open(tmp_path) as store:
             pending = PendingDeletions(store.database)
