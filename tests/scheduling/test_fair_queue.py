@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapless_server.scheduling import Flow
-from mapless_server.scheduling.admission import MAX_DEBTORS, FairQueue
+from mapless_server.scheduling.fair_queue import MAX_DEBTORS, FairQueue
 
 QUANTUM_S = 1.0
 COSTS = st.floats(0.01, 3.0)

@@ -6,11 +6,11 @@ job         A call's work (`jobs`). It goes through stages, such as "prepare", "
             names the stage and carries the input. What a stage returns (`StageResult`) ends the job or gives the next
             step.
 admission   A job is admitted if its predicted computing time and its memory fit within the bounds and it can end before
-            its deadline (`admission`); otherwise it is refused at once. Predictions are averages of the caller's
-            earlier jobs of the same kind, or else typical of all callers'.
+            its deadline (`admission`); otherwise it is refused at once. Predictions (`costs`) are averages of the
+            caller's earlier jobs of the same kind, or else typical of all callers'.
 lane        A group of threads, such as "host" or "device". Each stage is computed by one lane.
 fairness    Of the jobs that wait for a stage, the next one is chosen by deficit round robin over tenants and their
-            clients (`FairQueue`). While short jobs keep coming, long steps leave one thread of a lane to them.
+            clients (`fair_queue`). While short jobs keep coming, long steps leave one thread of a lane to them.
 batch       Waiting jobs of the same stage and bucket are computed together, up to the stage's `max_batch`.
 deadline    A job ends at its deadline wherever it is, and with its fallback, if it has one, shortly before. The thread
             that computes it notices at its next `Job.check`.
@@ -19,7 +19,8 @@ deadline    A job ends at its deadline wherever it is, and with its fallback, if
 threads that compute what the scheduler selects, and callers that wait on an event loop.
 """
 
-from .admission import CostModel, WorkQueueOptions
+from .admission import WorkQueueOptions
+from .costs import CostModel
 from .jobs import (
     Abandoned,
     Done,
@@ -30,6 +31,7 @@ from .jobs import (
     Job,
     Next,
     Observer,
+    Quota,
     Refusal,
     Refused,
     Stage,
@@ -38,7 +40,6 @@ from .jobs import (
     StageResult,
     Step,
 )
-from .scheduler import Quota
 from .work_queue import ComputeItem, Failure, Fatal, ItemList, WorkQueue, compute_items
 
 __all__ = [

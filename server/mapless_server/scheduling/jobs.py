@@ -6,7 +6,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 
 class Flow(NamedTuple):
@@ -367,3 +367,15 @@ class Observer:
 
     def ran_out_of_memory(self) -> None:
         """A batch was too large for the device; called in the thread that computed it, without the lock."""
+
+
+class Quota(Protocol):
+    """Limits the computing rate of tenants."""
+
+    def charge(self, tenant: str, cost_s: float, now_s: float) -> float:
+        """Books predicted computing time and returns 0; if the limit is reached, returns the seconds to wait."""
+        ...
+
+    def settle(self, tenant: str, predicted_s: float, actual_s: float, now_s: float) -> None:
+        """Replaces booked computing time by the time used."""
+        ...

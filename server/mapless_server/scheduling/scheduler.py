@@ -3,17 +3,17 @@
 A state machine without threads, waiting or a clock: times are passed in, so that it is tested on a virtual clock.
 """
 
-import heapq
 import itertools
 import math
-import weakref
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
-from .admission import MAX_OF_CALLERS, Admission, CostModel, FairQueue, Ledger, WorkQueueOptions
+from .admission import Admission, Ledger, WorkQueueOptions
+from .costs import MAX_OF_CALLERS, CostModel, StageCosts
+from .fair_queue import FairQueue
 from .jobs import (
     Abandoned,
     Batch,
@@ -27,6 +27,7 @@ from .jobs import (
     Lane,
     Next,
     Observer,
+    Quota,
     Refusal,
     Refused,
     Stage,
@@ -35,26 +36,12 @@ from .jobs import (
     StageResult,
     Step,
 )
+from .timers import Timers
 
 FIRST_STAGE_INTERVAL = 4
 """One of so many batches of a lane is of the first stage, if several stages wait."""
 
 _TRY_ONE_IN = 8
-
-_ENDED_TIMERS = 16
-"""Timers of ended jobs that are kept in any case, so that they are not swept out too often."""
-
-
-class Quota(Protocol):
-    """Limits the computing rate of tenants."""
-
-    def charge(self, tenant: str, cost_s: float, now_s: float) -> float:
-        """Books predicted computing time and returns 0; if the limit is reached, returns the seconds to wait."""
-        ...
-
-    def settle(self, tenant: str, predicted_s: float, actual_s: float, now_s: float) -> None:
-        """Replaces booked computing time by the time used."""
-        ...
 
 
 class Scheduler:
@@ -85,6 +72,7 @@ class Scheduler:
         self._ending_of = ending_of
         self._quota = quota
         self._stages = {stage.name: stage for stage in stages}
+        self._stage_costs = StageCosts(self.costs, self._stages)
         self._queues: dict[str, FairQueue[Job]] = {stage.name: FairQueue(options.quantum_s) for stage in stages}
         # Steps of admitted jobs that need more room than there is: computed by threads that are idle otherwise.
         self._spare: dict[str, FairQueue[Job]] = {stage.name: FairQueue(options.quantum_s) for stage in stages}
@@ -101,9 +89,7 @@ class Scheduler:
         self._first_steps: OrderedDict[tuple[Flow, str], Step] = OrderedDict()
         self._ledger = Ledger()
         self._admission = Admission(options, lanes, self._ledger)
-        # Timers. Weak references, because a job holds photographs and must be freed when it ends, not when it is due.
-        self._due: list[tuple[float, int, weakref.ref[Job]]] = []
-        self._tick = itertools.count()
+        self._timers = Timers()
         self._batch_number = itertools.count(1)
 
     @property
@@ -124,13 +110,7 @@ class Scheduler:
     @property
     def next_due_s(self) -> float | None:
         """Time of the next necessary call of `expire`; None if there is no job."""
-        while self._due:
-            due_s, _, reference = self._due[0]
-            job = reference()
-            if job is not None and not job.is_over and job.due_s == due_s:
-                return due_s
-            heapq.heappop(self._due)  # the job has ended or is now due at another time
-        return None
+        return self._timers.next_due_s
 
     def load(self, stage: str) -> StageLoad:
         """The jobs of a stage."""
@@ -139,7 +119,7 @@ class Scheduler:
 
     def admit(self, job: Job, now_s: float) -> None:
         """Admits a job, which then ends exactly once; raises Refused without any change."""
-        cost_s = self._predict(job.step, job.flow, now_s)
+        cost_s = self._stage_costs.of(job.step, job.flow, now_s)
         if not job.continues:
             self._remember(job.flow, job.step)
         with self._refusals_reported(job.flow, now_s):
@@ -171,7 +151,7 @@ class Scheduler:
         """
         step = self._first_steps.get((flow, step.stage), step)
         with self._refusals_reported(flow, now_s):
-            self._admission.check_queue(flow, self._predict(step, flow, now_s))
+            self._admission.check_queue(flow, self._stage_costs.of(step, flow, now_s))
 
     def has_work(self, lane_name: str) -> bool:
         """Whether a job waits for an idle thread of a lane."""
@@ -188,7 +168,7 @@ class Scheduler:
         def is_allowed(job: Job) -> bool:
             if not lane.has_one_left:
                 return True
-            step_s = self._step_s(job, now_s)
+            step_s = self._stage_costs.of_step(job, now_s)
             return step_s <= self._options.quantum_s or not lane.expects_shorter(job.flow, step_s, now_s)
 
         waiting = [it for it, queue in zip(lane.stages, lane.queues, strict=True) if any(map(is_allowed, queue))]
@@ -211,8 +191,8 @@ class Scheduler:
         jobs = self._pop_batch(self._spare[stages[-1].name], stages[-1], is_allowed)
         for job in jobs:
             job.begins_until_s = None
-            self._set_timer(job)
-            self._ledger.resume(job, self._admission.bookable(self._predict(job.step, job.flow, now_s)))
+            self._timers.set(job)
+            self._ledger.resume(job, self._admission.bookable(self._stage_costs.of(job.step, job.flow, now_s)))
         return self._begin(lane, stages[-1], jobs, now_s)
 
     def _begin(self, lane: Lane, stage: Stage, jobs: tuple[Job, ...], now_s: float) -> Batch:
@@ -221,7 +201,7 @@ class Scheduler:
             job.is_computed = True
         self._running[stage.name] += len(jobs)
         batch = Batch(stage, jobs, now_s, next(self._batch_number))
-        if self._step_s(jobs[0], now_s) > self._options.quantum_s:
+        if self._stage_costs.of_step(jobs[0], now_s) > self._options.quantum_s:
             lane.long.add(batch.number)
         return batch
 
@@ -242,9 +222,9 @@ class Scheduler:
         for job, result in zip(batch.jobs, results, strict=True):
             # Failures are not learned from, since they come early; abandoned jobs only if they took long already.
             usual_s = max(0.0, seconds - unusual_s) / len(batch.jobs)
-            is_slow = isinstance(result, Abandoned) and usual_s > self._step_s(job, now_s)
+            is_slow = isinstance(result, Abandoned) and usual_s > self._stage_costs.of_step(job, now_s)
             if is_slow or not isinstance(result, Exception):
-                self._learn(job, stage, usual_s, isinstance(result, Done), now_s)
+                self._stage_costs.learn(job, usual_s, isinstance(result, Done), now_s)
             job.used_s += share_s
             job.unusual_s = 0.0
             job.is_computed = False
@@ -266,9 +246,7 @@ class Scheduler:
 
     def expire(self, now_s: float) -> None:
         """Ends the jobs that are due, waiting or being computed."""
-        while (due_s := self.next_due_s) is not None and due_s <= now_s:
-            job = heapq.heappop(self._due)[2]()
-            assert job is not None
+        while (job := self._timers.pop_due(now_s)) is not None:
             if job.fallback is None:
                 error = Expired("the deadline passed while the call waited or was computed")
                 self._end(job, Ending.EXPIRED, error, now_s)
@@ -297,14 +275,6 @@ class Scheduler:
                 self._ledger.close(job)
                 job.end(Ending.FAILED, error)
 
-    def _learn(self, job: Job, stage: Stage, seconds: float, is_done: bool, now_s: float) -> None:
-        """Records what a job took in a stage, and that one that is done does not reach those that usually follow."""
-        kind = job.step.kind
-        self.costs.observe(stage.name, kind, job.flow, seconds, now_s)
-        while is_done and stage.then:
-            stage, kind = self._stages[stage.then], job.step.later_kind or kind
-            self.costs.observe(stage.name, kind, job.flow, None, now_s)
-
     @contextmanager
     def _refusals_reported(self, flow: Flow, now_s: float) -> Iterator[None]:
         try:
@@ -329,22 +299,6 @@ class Scheduler:
         if len(self._first_steps) > MAX_OF_CALLERS:
             self._first_steps.popitem(last=False)
 
-    def _predict(self, step: Step, flow: Flow, now_s: float) -> Counter[str]:
-        """Predicted computing time, by lane, of a caller's step and of those that usually follow."""
-        cost_s: Counter[str] = Counter()
-        stage: Stage | None = self._stages[step.stage]
-        kind, is_certain = step.kind, True
-        while stage is not None:
-            predicted_s = self.costs.predict(stage.name, kind, flow, now_s, is_certain)
-            cost_s[stage.lane] += predicted_s  # type: ignore[assignment]  # not int
-            stage = self._stages[stage.then] if stage.then else None
-            kind, is_certain = step.later_kind or step.kind, False
-        return cost_s
-
-    def _step_s(self, job: Job, now_s: float) -> float:
-        """Predicted computing time of a job's current step."""
-        return self.costs.predict(job.step.stage, job.step.kind, job.flow, now_s)
-
     def _continue(self, job: Job, result: Next, now_s: float) -> None:
         """Queues a job for its next step, or, if that would end too late or cost too much, for the alternative.
 
@@ -352,7 +306,7 @@ class Scheduler:
         ask for more than their share, for its turn; or it ends with its fallback.
         """
         job.step, job.fallback = result.step, result.fallback
-        cost_s = self._predict(job.step, job.flow, now_s)
+        cost_s = self._stage_costs.of(job.step, job.flow, now_s)
         in_order_s = cost_s.total()
         if job.fallback is None:
             cost_s &= job.booked_s  # it was admitted for no more
@@ -375,7 +329,9 @@ class Scheduler:
         """Whether a job's next step fits within the bounds and ends before the job is due."""
         lane = self._lanes[self._stages[job.step.stage].lane]
         coming_first = lane.stages[lane.stages.index(self._stages[job.step.stage]) :]
-        wait_s = sum(self._step_s(other, now_s) for stage in coming_first for other in self._queues[stage.name])
+        wait_s = sum(
+            self._stage_costs.of_step(other, now_s) for stage in coming_first for other in self._queues[stage.name]
+        )
         return self._admission.fits(job, cost_s) and now_s + wait_s / lane.threads + cost_s.total() <= job.due_s
 
     def _may_wait(self, job: Job, cost_s: Counter[str], now_s: float) -> bool:
@@ -415,24 +371,11 @@ class Scheduler:
         job.waits_since_s = now_s
         self._queue_of(job).push(job, job.flow, cost_s)
         self._lanes[stage.lane].arrivals.append((job.flow, cost_s, now_s))
-        self._set_timer(job)
+        self._timers.set(job)
 
     def _queue_of(self, job: Job) -> FairQueue[Job]:
         """The queue in which a job waits for its step."""
         return (self._queues if job.begins_until_s is None else self._spare)[job.step.stage]
-
-    def _set_timer(self, job: Job) -> None:
-        if job.timer_s != job.due_s:
-            job.timer_s = job.due_s
-            heapq.heappush(self._due, (job.due_s, next(self._tick), weakref.ref(job)))
-            self._sweep_timers()
-
-    def _sweep_timers(self) -> None:
-        """Removes outdated timers, so that their number stays close to that of the jobs."""
-        if len(self._due) > 2 * len(self._ledger.jobs) + _ENDED_TIMERS:
-            alive = {id(job) for job in self._ledger.jobs}
-            self._due = [entry for entry in self._due if id(entry[2]()) in alive]
-            heapq.heapify(self._due)
 
     def _pop_batch(self, queue: FairQueue[Job], stage: Stage, is_allowed: Callable[[Job], bool]) -> tuple[Job, ...]:
         first = queue.pop(is_allowed)

@@ -13,8 +13,8 @@ from functools import partial
 from typing import Any, Generic, TypeVar
 
 from .admission import WorkQueueOptions
-from .jobs import Batch, Done, Ending, Flow, Job, Next, Observer, Stage, StageLoad, StageResult, Step
-from .scheduler import Quota, Scheduler
+from .jobs import Batch, Done, Ending, Flow, Job, Next, Observer, Quota, Stage, StageLoad, StageResult, Step
+from .scheduler import Scheduler
 
 log = logging.getLogger(__name__)
 

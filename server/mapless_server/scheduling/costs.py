@@ -1,0 +1,100 @@
+"""Predicted computing times: of a job in a stage, from earlier ones of its kind, and in all the stages that follow."""
+
+import math
+from collections import Counter, OrderedDict, deque
+from collections.abc import Mapping
+from statistics import median_low
+
+from .jobs import Flow, Job, Stage, Step
+
+FIRST_GUESS_S = 0.25
+"""Predicted before anything is observed."""
+_EXPECTED = ", if reached"
+"""Of a stage's name, where jobs that did not reach it count."""
+MEMORY = 10
+"""About so many of the last jobs of a kind count."""
+MAX_OF_CALLERS = 4000
+"""Predictions for single callers that are kept, about six of each."""
+FORGOTTEN_S = 30.0
+"""What a caller's jobs cost longer ago does not count: as long as it is refused, nothing corrects its prediction."""
+
+
+class CostModel:
+    """Predicts the computing time of a job in a stage from earlier ones of its kind.
+
+    Photographs of a caller resemble one another, and those of another caller may take fifty times as long: so its own
+    jobs count, as an average with more weight for recent ones, which begins with what is typical. That is the median of
+    all callers' last jobs.
+    """
+
+    def __init__(self) -> None:
+        self._of_callers: OrderedDict[tuple[str, str, Flow], tuple[int, float, float]] = OrderedDict()
+        self._of_all: dict[tuple[str, str], deque[float]] = {}
+
+    def forget(self) -> None:
+        """Forgets all observations."""
+        self._of_callers.clear()
+        self._of_all.clear()
+
+    def predict(self, stage: str, kind: str, flow: Flow, now_s: float, is_certain: bool = True) -> float:
+        """Predicted seconds; for an unknown kind, what is typical of all kinds in the stage.
+
+        Unless it `is_certain` that the job reaches the stage, jobs that did not count as well, with nothing.
+        """
+        stage += "" if is_certain else _EXPECTED
+        _, mean_s, seen_s = self._of_callers.get((stage, kind, flow), (0, 0.0, -math.inf))
+        if now_s - seen_s <= FORGOTTEN_S:
+            return mean_s
+        known = self._of_all.get((stage, kind)) or self._of_all.get((stage, ""))
+        return median_low(known) if known else FIRST_GUESS_S
+
+    def observe(self, stage: str, kind: str, flow: Flow, seconds: float | None, now_s: float) -> None:
+        """Records the computing time of a job, its share if it was computed with others; None if it was not reached."""
+        if seconds is not None:
+            self._observe(stage, kind, flow, seconds, now_s)
+        self._observe(stage + _EXPECTED, kind, flow, seconds or 0.0, now_s)
+
+    def _observe(self, stage: str, kind: str, flow: Flow, seconds: float, now_s: float) -> None:
+        count, mean_s, seen_s = self._of_callers.pop((stage, kind, flow), (0, 0.0, -math.inf))
+        if now_s - seen_s > FORGOTTEN_S:
+            known = self._of_all.get((stage, kind))
+            count, mean_s = (1, median_low(known)) if known else (0, 0.0)
+        count = min(count + 1, MEMORY)
+        self._of_callers[stage, kind, flow] = (count, mean_s + (seconds - mean_s) / count, now_s)
+        if len(self._of_callers) > MAX_OF_CALLERS:
+            self._of_callers.popitem(last=False)
+        for key in (kind, ""):
+            self._of_all.setdefault((stage, key), deque(maxlen=MEMORY)).append(seconds)
+
+
+class StageCosts:
+    """Predicts what jobs cost in the stages that they go through."""
+
+    def __init__(self, model: CostModel, stages: Mapping[str, Stage]) -> None:
+        """`stages` are by name."""
+        self._model = model
+        self._stages = stages
+
+    def of(self, step: Step, flow: Flow, now_s: float) -> Counter[str]:
+        """Predicted computing time, by lane, of a caller's step and of those that usually follow."""
+        cost_s: Counter[str] = Counter()
+        stage: Stage | None = self._stages[step.stage]
+        kind, is_certain = step.kind, True
+        while stage is not None:
+            predicted_s = self._model.predict(stage.name, kind, flow, now_s, is_certain)
+            cost_s[stage.lane] += predicted_s  # type: ignore[assignment]  # not int
+            stage = self._stages[stage.then] if stage.then else None
+            kind, is_certain = step.later_kind or step.kind, False
+        return cost_s
+
+    def of_step(self, job: Job, now_s: float) -> float:
+        """Predicted computing time of a job's current step."""
+        return self._model.predict(job.step.stage, job.step.kind, job.flow, now_s)
+
+    def learn(self, job: Job, seconds: float, is_done: bool, now_s: float) -> None:
+        """Records what a job took in its stage, and that one that is done does not reach those that usually follow."""
+        stage, kind = self._stages[job.step.stage], job.step.kind
+        self._model.observe(stage.name, kind, job.flow, seconds, now_s)
+        while is_done and stage.then:
+            stage, kind = self._stages[stage.then], job.step.later_kind or kind
+            self._model.observe(stage.name, kind, job.flow, None, now_s)
