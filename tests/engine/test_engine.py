@@ -18,7 +18,8 @@ from support.servers import CAMERA, PHOTO, StandInDescriptor, StandInExtractor, 
 
 from mapless.geometry import RigidTransform
 from mapless_server.engine.options import EngineOptions, EscalationOptions
-from mapless_server.engine.query import Caller, Description, Photo, Query, Result, Tier
+from mapless_server.engine.photos import Description, Photo
+from mapless_server.engine.query import Caller, Query, Result, Tier
 from mapless_server.engine.stages import MAX_LISTINGS, QueryStages
 from mapless_server.errors import InvalidArgument, Unavailable
 from mapless_server.images import ImageLimits, decode_image

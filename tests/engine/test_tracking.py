@@ -15,7 +15,8 @@ from support.images import encode, textured
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.engine import stages
 from mapless_server.engine.options import EngineOptions
-from mapless_server.engine.query import TRACK, Caller, Photo, Query, Result, Tier
+from mapless_server.engine.photos import Photo
+from mapless_server.engine.query import TRACK, Caller, Query, Result, Tier
 from mapless_server.errors import DataLoss
 from mapless_server.method.answer import Localization
 from mapless_server.method.features import SiftExtractor

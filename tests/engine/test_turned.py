@@ -21,7 +21,8 @@ from mapless.geometry import Camera
 from mapless_server.engine import choosing, stages
 from mapless_server.engine.choosing import turned_to_match
 from mapless_server.engine.options import EngineOptions, EscalationOptions
-from mapless_server.engine.query import TURN, Caller, Photo, Query, QueryRun, QueryViews, Result, Tier
+from mapless_server.engine.photos import Photo, QueryViews
+from mapless_server.engine.query import TURN, Caller, Query, QueryRun, Result, Tier
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.options import LocalizeOptions

@@ -16,7 +16,8 @@ from mapless_server.scenes.library import Loaded, load_usable
 from mapless_server.scenes.retrieval.ranking import spread_choice
 
 from . import tracking
-from .query import TURN, QueryRun, QueryViews, Tier
+from .photos import QueryViews
+from .query import TURN, QueryRun, Tier
 from .tiers import CLEARLY_MORE
 
 TURN_REFERENCES = 10

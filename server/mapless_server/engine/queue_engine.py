@@ -31,20 +31,8 @@ from mapless_server.security import SceneKey
 
 from .failures import failure_of
 from .options import EngineOptions
-from .query import (
-    COARSE,
-    PREPARE,
-    REFINE,
-    Caller,
-    Description,
-    Photo,
-    Query,
-    QueryRun,
-    QueryViews,
-    ReferenceSource,
-    Result,
-    Tier,
-)
+from .photos import Description, Photo, QueryViews
+from .query import COARSE, PREPARE, REFINE, Caller, Query, QueryRun, ReferenceSource, Result, Tier
 from .references import References
 from .stages import Method, QueryStages
 

@@ -13,7 +13,8 @@ from mapless_server.scenes.audit.scene_auditor import SceneAuditor, SceneTools
 from mapless_server.scenes.retrieval.ranking import nearest_references
 from mapless_server.security import SceneKey, scene_id_of
 
-from .query import POSE_PRIOR, Description, Photo, QueryViews
+from .photos import Description, Photo, QueryViews
+from .query import POSE_PRIOR
 
 
 class References:
