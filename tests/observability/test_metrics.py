@@ -1,7 +1,6 @@
 """Metrics count each event once, and do not grow with what callers send."""
 
 import asyncio
-import logging
 import math
 import re
 import socket
@@ -21,7 +20,7 @@ from mapless_server.method.coarse.token_cache import TokenCacheCounters
 from mapless_server.method.rejection import RejectionReason
 from mapless_server.observability import exporter
 from mapless_server.observability.exporter import MAX_CONNECTIONS, MetricsServer
-from mapless_server.observability.metrics import COUNTED, LOCALIZED, STAGES, Metrics, watch_event_loop
+from mapless_server.observability.metrics import COUNTED, LOCALIZED, STAGES, Metrics
 from mapless_server.scheduling import Ending, Refusal, StageLoad
 
 LOCALIZE = "/mapless.v1.LocalizationService/Localize"
@@ -376,51 +375,3 @@ def test_the_port_answers_while_the_event_loop_is_blocked(server: MetricsServer)
             return pool.submit(scrape, server.port).result(30)  # waited for on the loop's own thread
 
     assert "mapless_fatal_total" in asyncio.run(block())
-
-
-# The event loop
-
-
-class Heard(Metrics):
-    def __init__(self) -> None:
-        super().__init__()
-        self.lags_s: list[float] = []
-        self.beats = 0
-
-    def loop_lagged(self, seconds: float) -> None:
-        self.lags_s.append(seconds)
-
-    def beat(self) -> None:
-        self.beats += 1
-
-
-async def test_a_blocked_loop_is_measured_and_logged(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("mapless_server.observability.metrics.WARN_S", 0.1)
-    heard = Heard()
-    caplog.set_level(logging.WARNING)
-    watching = asyncio.create_task(watch_event_loop(heard))
-    while not heard.lags_s:
-        await asyncio.sleep(0.001)
-    time.sleep(0.3)
-    count = len(heard.lags_s)
-    while len(heard.lags_s) == count:
-        await asyncio.sleep(0.001)
-    watching.cancel()
-    with pytest.raises(asyncio.CancelledError):
-        await watching
-    assert max(heard.lags_s) >= 0.28
-    assert min(heard.lags_s) >= 0
-    assert heard.beats == len(heard.lags_s)
-    record = next(r for r in caplog.records if r.getMessage() == "the event loop was blocked")
-    assert vars(record)["lag_ms"] >= 280
-
-
-async def test_a_dead_scheduler_does_not_beat() -> None:
-    heard = Heard()
-    watching = asyncio.create_task(watch_event_loop(heard, is_alive=lambda: len(heard.lags_s) <= 2))
-    while len(heard.lags_s) < 5:
-        await asyncio.sleep(0.001)
-    watching.cancel()
-    assert heard.beats == 2

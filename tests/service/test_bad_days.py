@@ -49,8 +49,9 @@ from mapless_server.serve import running
 from mapless_server.serve.running import watch_store
 from mapless_server.services.handlers import SERVICE_NAMES
 from mapless_server.store import Store, StoreError, deletion
+from mapless_server.store.folder_lock import LOCK_FILE
 from mapless_server.store.reserve import RESERVE_FILE
-from mapless_server.store.sqlite import DATABASE_FILE, LOCK_FILE, SqliteDatabase
+from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
 from mapless_server.store.verification import verify
 
 ONCE = ConnectOptions(max_attempts=1, timeout_s=30)

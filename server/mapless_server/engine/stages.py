@@ -38,6 +38,7 @@ from .tiers import (
     of_two_places,
     place_of_priors,
     shows_no_more,
+    with_untried,
 )
 
 log = logging.getLogger(__name__)
@@ -356,7 +357,7 @@ class QueryStages:
     def _unfinished(self, run: QueryRun) -> Done:
         assert run.earlier is not None
         unfinished = {f"{self._tiers[run.tier].features}{UNFINISHED}": time.monotonic() - run.start_s}
-        answer = _with_untried(run, run.earlier.answer, self._tiers[run.tier])
+        answer = with_untried(run, run.earlier.answer, self._tiers[run.tier])
         result = replace(run.earlier, answer=answer, stage_seconds=run.earlier.stage_seconds | unfinished)
         return Done(result, _ending(result))
 
@@ -383,23 +384,6 @@ class QueryStages:
 def _pipeline_in(run: QueryRun, tier: Tier) -> Pipeline:
     calibration = run.attributes.self_calibration(tier.kind)
     return tier.pipeline.with_trust(calibration.trust_quantiles if calibration else ())
-
-
-def _with_untried(run: QueryRun, answer: Answer, tier: Tier) -> Answer:
-    """Adds to a rejection's hint what was not tried: its advice alone would send elsewhere whom a repeat would help."""
-    outcome = answer.outcome
-    if not isinstance(outcome, Rejection):
-        return answer
-    assert outcome.hint is not None  # `_result` adds it
-    untried = f"with {tier.features.partition('-')[0]} features"
-    if run.tries_turns:
-        untried = "turned by 90, 180 and 270 degrees"
-    elif run.narrowed is not None:
-        untried = "with references of the whole scene"
-    elif run.ambiguous is not None:
-        untried = "with references of one of the places"
-    advice = f"{outcome.hint.message} Trying it {untried} was not finished: asking again, when less is asked, may help."
-    return replace(answer, outcome=replace(outcome, hint=replace(outcome.hint, message=advice)))
 
 
 def _ending(result: Result) -> Ending:

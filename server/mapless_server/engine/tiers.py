@@ -17,7 +17,7 @@ from mapless_server.method.rejection import Advice, Hint, Hypothesis, Rejection,
 from mapless_server.method.uncertainty.radii import Accuracy, accuracy_from_covariance
 
 from .options import EscalationOptions
-from .query import Result
+from .query import QueryRun, Result, Tier
 
 UNRECOVERABLE = frozenset({RejectionReason.NO_USABLE_REFERENCES, RejectionReason.DEGENERATE_REFERENCES})
 """Rejections because of the references themselves, which no features change."""
@@ -70,6 +70,23 @@ def may_be_turned(answer: Answer, options: EscalationOptions) -> bool:
 def shows_no_more(best: Result, turned: Result) -> bool:
     """Whether a photograph was not localized turned either, and no more of it agrees with a pose than as it is."""
     return isinstance(turned.answer.outcome, Rejection) and inlier_count(turned) <= inlier_count(best)
+
+
+def with_untried(run: QueryRun, answer: Answer, tier: Tier) -> Answer:
+    """Adds to a rejection's hint what was not tried: its advice alone would send elsewhere whom a repeat would help."""
+    outcome = answer.outcome
+    if not isinstance(outcome, Rejection):
+        return answer
+    assert outcome.hint is not None  # `_result` adds it
+    untried = f"with {tier.features.partition('-')[0]} features"
+    if run.tries_turns:
+        untried = "turned by 90, 180 and 270 degrees"
+    elif run.narrowed is not None:
+        untried = "with references of the whole scene"
+    elif run.ambiguous is not None:
+        untried = "with references of one of the places"
+    advice = f"{outcome.hint.message} Trying it {untried} was not finished: asking again, when less is asked, may help."
+    return replace(answer, outcome=replace(outcome, hint=replace(outcome.hint, message=advice)))
 
 
 def better_of(cheaper: Result, stronger: Result) -> Result:

@@ -5,8 +5,6 @@ scenes, tenants and requests are in the log. Series whose labels are known befor
 series that appears with its first event hides that event from `rate`.
 """
 
-import asyncio
-import logging
 import math
 import sys
 import time
@@ -25,8 +23,6 @@ from mapless_server.scheduling import Ending, Observer, Refusal, StageLoad
 from mapless_server.security import ENDLESS_METHODS
 
 from .scraped import Scraped
-
-log = logging.getLogger(__name__)
 
 STAGES = ("prepare", "coarse", "refine", "join", "describe", "retrieve", "audit", "coverage")
 """Stages of the queue."""
@@ -405,22 +401,3 @@ class Metrics(Observer, BackgroundObserver):
 def _observe(histogram: Histogram, value: float | None) -> None:
     if value is not None and math.isfinite(value):  # one NaN would make the histogram's sum NaN for good
         histogram.observe(value)
-
-
-TICK_S = 0.01
-"""The timer's period, by which a lag may be underestimated; waking up so often costs 1 to 2 % of a core."""
-WARN_S = 1.0
-"""Less is usual where other processes take the processors; the metric has all."""
-
-
-async def watch_event_loop(metrics: Metrics, is_alive: Callable[[], bool] = lambda: True) -> None:
-    """Measures until it is cancelled, and calls `beat` as long as the scheduler is alive."""
-    while True:
-        due_s = time.monotonic() + TICK_S
-        await asyncio.sleep(TICK_S)
-        lag_s = max(0.0, time.monotonic() - due_s)
-        metrics.loop_lagged(lag_s)
-        if lag_s > WARN_S:
-            log.warning("the event loop was blocked", extra={"lag_ms": round(1000 * lag_s)})
-        if is_alive():
-            metrics.beat()

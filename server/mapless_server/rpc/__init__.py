@@ -4,7 +4,8 @@ May import observability and everything below it. Begin with `guard.CallGuard`, 
 `Call`, has `receiving` read its message and `sending` write its messages, and turns errors into statuses.
 """
 
-from .guard import CLIENT_ID_KEY, Authenticate, Call, CallGuard
+from .call import Call
+from .guard import CLIENT_ID_KEY, Authenticate, CallGuard
 from .sending import REQUEST_ID_KEY, to_status
 
 __all__ = ["CLIENT_ID_KEY", "REQUEST_ID_KEY", "Authenticate", "Call", "CallGuard", "to_status"]

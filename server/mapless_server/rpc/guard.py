@@ -14,7 +14,7 @@ import re
 import time
 from collections.abc import AsyncGenerator, Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
 from contextlib import aclosing, contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 from urllib.parse import unquote
 
@@ -22,12 +22,11 @@ import grpc
 from google.protobuf.message import DecodeError
 
 from mapless.wire import FieldError
-from mapless_server import __version__
-from mapless_server.engine.query import Caller
 from mapless_server.errors import DeadlineExceeded, InvalidArgument, RequestError, Unavailable
-from mapless_server.scheduling import Flow, StageRecord
+from mapless_server.scheduling import Flow
 from mapless_server.security import ENDLESS_METHODS, OPEN_METHODS, Principal
 
+from .call import Call
 from .receiving import Context, OpenMethods, Receiver, quiet_ended_calls
 from .sending import ENDLESS_SEND_LIMIT_S, PACED_CODES, REQUEST_ID_KEY, SEND_LIMIT_S, Pace, Sender, Unread
 
@@ -40,7 +39,6 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 CLIENT_ID_KEY = "x-client-id"
-TIME_KEY, VERSION_KEY = "x-mapless-time", "x-mapless-version"
 ANSWER_MARGIN_SHARE = 0.02
 """Share of the time given by which the answer is early: gRPC rounds the time up when it sends it, by at most 1 %."""
 ANSWER_MARGIN_S = 0.01
@@ -60,42 +58,6 @@ Raises Unauthenticated or PermissionDenied; called on the event loop.
 
 Opening = Coroutine[Any, Any, AsyncGenerator[Any, None]]
 """A servicer's method of a stream: gives an iterator of messages."""
-
-
-@dataclass(frozen=True)
-class Call:
-    """A call, for its servicer; times are by `time.monotonic`.
-
-    The request id identifies it in the log; it is the caller's own if that is well-formed. The message may arrive later
-    than the headers, at `arrived_s`. `client` distinguishes callers: the id that the caller gives, else the address of
-    its connection. `notes` are fields of its line in the log, `stages` those of the queue that its jobs have passed.
-    """
-
-    request_id: str
-    arrived_s: float
-    deadline_s: float
-    principal: Principal = field(default_factory=Principal)
-    client: str = ""
-    notes: dict[str, object] = field(default_factory=dict, repr=False, compare=False)
-    stages: list[StageRecord] = field(default_factory=list, repr=False, compare=False)
-
-    @property
-    def caller(self) -> Caller:
-        """The caller in the engine's form."""
-        return Caller(Flow(self.principal.tenant, self.client), self.deadline_s)
-
-    @property
-    def trailers(self) -> tuple[tuple[str, str], ...]:
-        """Trailers of a successful answer: its caller is authenticated, and may know the version."""
-        return (REQUEST_ID_KEY, self.request_id), (TIME_KEY, f"{time.time():.3f}"), (VERSION_KEY, __version__)
-
-    def note(self, **fields: object) -> None:
-        """Adds fields to the call's line in the log and to its trace; they cannot replace the standard fields."""
-        self.notes.update(fields)
-
-    def record(self, stages: Iterable[StageRecord]) -> None:
-        """Records the queue's stages that a job of the call has passed."""
-        self.stages.extend(stages)
 
 
 @dataclass

@@ -14,8 +14,9 @@ import grpc
 from mapless_server import __version__
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.errors import RequestError
+from mapless_server.observability.event_loop import watch_event_loop
 from mapless_server.observability.exporter import MetricsServer
-from mapless_server.observability.metrics import Metrics, watch_event_loop
+from mapless_server.observability.metrics import Metrics
 from mapless_server.observability.scraped import gpu_memory
 from mapless_server.scheduling import Fatal
 from mapless_server.security import SecurityError
