@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -291,25 +291,20 @@ class Camera:
         return np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1)
 
 
-def normalize(x_in_camera: ArrayLike, library: Any = np) -> Array:
-    """The perspective division: (..., 3) in the camera frame to (..., 2) at depth 1; NaN where not in front.
-
-    `library` is the module whose arrays these are, where its functions are called as NumPy's (torch).
-    """
-    x: Any = np.asarray(x_in_camera, float) if library is np else x_in_camera
-    normalized: Array = x[..., :2] / library.where(x[..., 2:] > 0, x[..., 2:], np.nan)
-    return normalized
+def normalize(x_in_camera: ArrayLike) -> Array:
+    """The perspective division: (..., 3) in the camera frame to (..., 2) at depth 1; NaN where not in front."""
+    x = np.asarray(x_in_camera, float)
+    return np.asarray(x[..., :2] / np.where(x[..., 2:] > 0, x[..., 2:], np.nan))
 
 
-def normalize_jacobian(x_in_camera: ArrayLike, library: Any = np) -> Array:
+def normalize_jacobian(x_in_camera: ArrayLike) -> Array:
     """Derivative (..., 2, 3) of `normalize` by its argument."""
-    x: Any = np.asarray(x_in_camera, float) if library is np else x_in_camera
-    inverse_depth = 1 / library.where(x[..., 2] > 0, x[..., 2], np.nan)
-    by_depth = -normalize(x, library) * inverse_depth[..., None]
-    zero = library.zeros_like(inverse_depth)
+    x = np.asarray(x_in_camera, float)
+    inverse_depth = 1 / np.where(x[..., 2] > 0, x[..., 2], np.nan)
+    by_depth = -normalize(x) * inverse_depth[..., None]
+    zero = np.zeros_like(inverse_depth)
     entries = [inverse_depth, zero, by_depth[..., 0], zero, inverse_depth, by_depth[..., 1]]
-    jacobian: Array = library.stack(entries, -1).reshape((*x.shape[:-1], 2, 3))
-    return jacobian
+    return np.stack(entries, -1).reshape((*x.shape[:-1], 2, 3))
 
 
 Number = TypeVar("Number", float, NDArray[np.floating])

@@ -51,8 +51,9 @@ class Distortion(ABC):
         """Derivative (..., 2) of `distort` by the change in `bent`; zeros if that changes nothing."""
         return np.asarray((self.bent(self.BEND_STEP).distort(ideal) - self.distort(ideal)) / self.BEND_STEP)
 
-    def by_ideal(self, ideal: Array, step: float = 1e-6) -> Array:
+    def by_ideal(self, ideal: Array) -> Array:
         """Derivative (N, 2, 2) of `distort` by its argument (N, 2), by finite differences."""
+        step = 1e-6
         ahead = [self.distort(ideal + step * axis) - self.distort(ideal - step * axis) for axis in np.eye(2)]
         return np.asarray(np.stack(ahead, axis=2) / (2 * step))
 
@@ -125,18 +126,18 @@ DEFAULT_LENS_MODEL = "radial_tangential"
 """Of a cameras.json that names none; the last coefficient, k3, may be left out there, as in OpenCV."""
 
 
-def lens_model_of(lens: object, field: str = "camera.distortion") -> str:
-    """The name of a lens's model; TypeError, naming the field, if it has none."""
+def lens_model_of(lens: object) -> str:
+    """The name of a lens's model; TypeError, naming the field, camera.distortion, if it has none."""
     for name, kind in LENS_MODELS.items():
         if isinstance(lens, kind):
             return name
-    raise unknown_lens(lens, field)
+    raise unknown_lens(lens)
 
 
-def unknown_lens(lens: object, field: str = "camera.distortion") -> TypeError:
+def unknown_lens(lens: object) -> TypeError:
     """The error of a lens whose model has no counterpart where it is needed."""
-    known = ", ".join(kind.__name__ for kind in LENS_MODELS.values())
-    return TypeError(f"{field} is a {type(lens).__name__}, which has no counterpart here; lens models: {known}")
+    kind, known = type(lens).__name__, ", ".join(it.__name__ for it in LENS_MODELS.values())
+    return TypeError(f"camera.distortion is a {kind}, which has no counterpart here; lens models: {known}")
 
 
 def lens_from_coefficients(model: object, coefficients: Sequence[float] | None) -> Distortion | None:

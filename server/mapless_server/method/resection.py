@@ -39,6 +39,10 @@ class Fit:
     squared: Array
 
 
+MAX_LOG_STEP = 0.5
+"""Largest change of s in one step."""
+
+
 @dataclass(frozen=True, eq=False)
 class Resection:
     """The cost and its derivatives; see `optimize.Problem`.
@@ -51,9 +55,9 @@ class Resection:
         loss_scale_sigma: scale of the Cauchy loss, in standard deviations.
         unknowns: which of v, w and s are free.
         behind_sigma: residual of a point behind the camera; if NaN, no step may move a point there.
-        max_log_step: largest change of s in one step.
-        shorten_all: whether a step with a larger change is shortened as a whole, which keeps its direction near the
-            minimum, or in s alone, so that a pose far from the minimum still moves by the full step.
+        shorten_all: whether a step with a larger change of s than `MAX_LOG_STEP` is shortened as a whole, which keeps
+            its direction near the minimum, or in s alone, so that a pose far from the minimum still moves by the full
+            step.
     """
 
     camera: Camera
@@ -63,7 +67,6 @@ class Resection:
     loss_scale_sigma: float
     unknowns: tuple[int, ...] = (0, 1, 2, 3, 4, 5, 6)
     behind_sigma: float = math.nan
-    max_log_step: float = 0.5
     shorten_all: bool = True
 
     def at(self, camera_from_world: RigidTransform, log_ratio: float = 0.0) -> Fit:
@@ -103,5 +106,5 @@ class Resection:
             return None
         step = np.zeros(7)
         step[free] = found
-        step[slice(7) if self.shorten_all else 6] *= min(1.0, self.max_log_step / max(abs(step[6]), 1e-12))
+        step[slice(7) if self.shorten_all else 6] *= min(1.0, MAX_LOG_STEP / max(abs(step[6]), 1e-12))
         return self.at(perturbed(fit.camera_from_world, step[:6]), fit.log_ratio + float(step[6]))

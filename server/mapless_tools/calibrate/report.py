@@ -129,10 +129,10 @@ def held_rows(report: CalibrationReport) -> Iterator[tuple[str, ...]]:
 COLUMNS = ("radius", "held, as claimed", "factor", "with the factors of all others")
 
 
-def worst(report: CalibrationReport, count: int = 10) -> list[Outcome]:
-    """The answers that exceed a claimed 95 % radius, by most first."""
+def worst(report: CalibrationReport) -> list[Outcome]:
+    """The ten answers that exceed a claimed 95 % radius by most, these first."""
     answered = [it for it in report.found.outcomes if it.position is not None and it.rotation is not None]
-    return sorted((it for it in answered if _excess(it) > 1), key=lambda it: -_excess(it))[:count]
+    return sorted((it for it in answered if _excess(it) > 1), key=lambda it: -_excess(it))[:10]
 
 
 def print_report(report: CalibrationReport, console: Console) -> None:

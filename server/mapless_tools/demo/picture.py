@@ -106,11 +106,11 @@ def draw(
     return np.frombuffer(pixels.getvalue(), np.uint8).reshape(SIZE_PX[1], SIZE_PX[0], 4)[..., :3]
 
 
-def contact_sheet(pictures: Sequence[Canvas], columns: int = 2) -> Canvas:
-    """Pictures of one size in a grid, each at half its size."""
+def contact_sheet(pictures: Sequence[Canvas]) -> Canvas:
+    """Pictures of one size, two in a row, each at half its size."""
     small = [np.asarray(cv2.resize(p, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8) for p in pictures]
-    small += [np.zeros_like(small[0])] * (-len(small) % columns)
-    rows = [np.concatenate(small[i : i + columns], axis=1) for i in range(0, len(small), columns)]
+    small += [np.zeros_like(small[0])] * (len(small) % 2)
+    rows = [np.concatenate(small[i : i + 2], axis=1) for i in range(0, len(small), 2)]
     return np.concatenate(rows)
 
 
