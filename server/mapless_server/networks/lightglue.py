@@ -79,9 +79,7 @@ class LightGlue(nn.Module):
             query = query.expand(len(reference), -1, -1)
             reference = _attend_within(layer.self_attn, reference, reference_rotation, key_mask)
             query, reference = _attend_across(layer.cross_attn, query, reference, key_mask)
-        head = self.log_assignment[-1]
-        assert isinstance(head, MatchAssignment)
-        return _mutual_best(_log_probabilities(head, query, reference, mask))
+        return _mutual_best(_log_probabilities(self._head(-1), query, reference, mask))
 
     def match_one(
         self,
@@ -119,8 +117,7 @@ class LightGlue(nn.Module):
             uncertain_count = sum(int((~it).sum()) for it in certain)
             if 1 - uncertain_count / count > depth_confidence:
                 break
-            head = self.log_assignment[number]
-            assert isinstance(head, MatchAssignment)
+            head = self._head(number)
             sides = [
                 side.kept(~sure | (head.matchability(side.x)[0, :, 0].sigmoid() > 1 - width_confidence))
                 for side, sure in zip(sides, certain, strict=True)
@@ -131,12 +128,16 @@ class LightGlue(nn.Module):
         index = torch.zeros(first[0].shape[1], dtype=torch.long, device=first[0].device)
         score = torch.zeros(first[0].shape[1], device=first[0].device)
         if all(len(side.index) for side in sides):
-            head = self.log_assignment[number]
-            assert isinstance(head, MatchAssignment)
             everything = torch.ones(1, len(sides[1].index), dtype=torch.bool, device=index.device)
-            column, probability = _mutual_best(_log_probabilities(head, sides[0].x, sides[1].x, everything))
+            found = _log_probabilities(self._head(number), sides[0].x, sides[1].x, everything)
+            column, probability = _mutual_best(found)
             index[sides[0].index], score[sides[0].index] = sides[1].index[column[0]], probability[0]
         return index, score
+
+    def _head(self, number: int) -> MatchAssignment:
+        head = self.log_assignment[number]
+        assert isinstance(head, MatchAssignment)
+        return head
 
     def _is_certain(self, number: int, x: Tensor) -> Tensor:
         """Mask (N,) of the keypoints whose matches no later layer will change, by the authors' threshold."""

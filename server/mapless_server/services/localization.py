@@ -15,7 +15,7 @@ from mapless.v1 import localization_service_pb2_grpc as rpcs
 from mapless_server.engine.groups import MAX_FRAMES, MAX_RIG_IMAGES, MIN_FRAMES, GroupResult, PhotoGroup
 from mapless_server.engine.query import TRACK, Query, Result
 from mapless_server.errors import RequestError
-from mapless_server.method.answer import Localization
+from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.results import MetricScale
 from mapless_server.observability.metrics import LOCALIZED, Metrics
@@ -129,16 +129,20 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         if isinstance(answer.outcome, Localization):
             call.note(pose_stage=answer.outcome.pose_stage.value)
         self._report(answer.outcome, response.localization, [result], call, answer.scale)
-        debug = None
-        is_watched = query.scene_key in self._watchers.by_scene
-        if answer.support is not None and (request.options.include_debug or is_watched):
-            debug = await asyncio.to_thread(debug_to_message, answer.support)
+        debug = await self._debug_of(request, query, answer)
         if request.options.include_debug and debug is not None:
             response.debug.CopyFrom(debug)
         self._capture(request, response, call, [(query, result)])
         if query.scene_key in self._watchers.by_scene and not request.options.confidential:
             self._watchers.publish(query.scene_key, request, response, debug)
         return response
+
+    async def _debug_of(self, request: pb.LocalizeRequest, query: Query, answer: Answer) -> pb.Debug | None:
+        """What the pose rests on, if the caller or a watcher of the scene wants it, and there is any."""
+        is_wanted = request.options.include_debug or query.scene_key in self._watchers.by_scene
+        if answer.support is None or not is_wanted:
+            return None
+        return await asyncio.to_thread(debug_to_message, answer.support)
 
     async def LocalizeRig(self, request: pb.LocalizeRigRequest, call: Call) -> pb.LocalizeRigResponse:
         """Implements LocalizationService.LocalizeRig."""

@@ -271,14 +271,8 @@ def create_sqlite_engine(
     journal_mode, synchronous = ("delete", "EXTRA") if safe_mode else ("wal", "FULL")
     if is_scratch:
         journal_mode, synchronous = "off", "OFF"
-    url = URL.create("sqlite", database=str(path))
-    if only_reads:
-        # With a URI a missing file is not created. The mode is not read-only, because readers share WAL's index.
-        url = URL.create("sqlite", database=f"{_URI_PREFIX}{quote(str(path))}", query={"mode": "rw", "uri": "true"})
-    if never_changes:
-        url = url.update_query_dict({"mode": "ro", "immutable": "1"})
     engine = create_engine(
-        url,
+        _url_of(path, only_reads, never_changes),
         module=library,
         max_overflow=-1,  # bounded by the number of threads, which use one connection each
         hide_parameters=True,  # an error's text must not carry image bytes into the log
@@ -311,6 +305,14 @@ def create_sqlite_engine(
         connection.exec_driver_sql(connection.get_execution_options().get(_BEGIN_OPTION, "BEGIN"))
 
     return engine
+
+
+def _url_of(path: Path, only_reads: bool, never_changes: bool) -> URL:
+    url = URL.create("sqlite", database=str(path))
+    if only_reads:
+        # With a URI a missing file is not created. The mode is not read-only, because readers share WAL's index.
+        url = URL.create("sqlite", database=f"{_URI_PREFIX}{quote(str(path))}", query={"mode": "rw", "uri": "true"})
+    return url.update_query_dict({"mode": "ro", "immutable": "1"}) if never_changes else url
 
 
 def choose_library() -> ModuleType:

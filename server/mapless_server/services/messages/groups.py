@@ -15,7 +15,7 @@ from mapless.geometry import Array, RigidTransform, Similarity
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server.engine.query import Query
-from mapless_server.method.options import Variant
+from mapless_server.method.options import LocalizeOptions, Variant
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.uncertainty.radii import accuracy_from_covariance
 from mapless_server.security import key_of
@@ -72,13 +72,7 @@ def queries_from_message(
     least, most = bounds
     if not least <= len(messages) <= most:
         raise FieldError(list_name, f"must be {least} to {most}, are {len(messages)}")
-    options = options_from_message(request.options, engine.coverage)
-    if options.variant is not Variant.BEST:
-        raise FieldError(
-            "options.variant", f"must be BEST, the default, for several photographs, is {options.variant.name}"
-        )
-    if isinstance(request, pb.LocalizeRigRequest) and axes_from_message(request.options) is not Axes.OPENCV:
-        raise FieldError("options.axes", "must be OPENCV, the default, for a rig")
+    options = _options_of(request, engine.coverage)
     reranks = request.options.rerank_references
     count = reference_count_from_message(request.options)
     most_references = MAX_CANDIDATES if reranks else MAX_REFERENCES
@@ -105,6 +99,17 @@ def queries_from_message(
             )
         )
     return tuple(queries)
+
+
+def _options_of(request: pb.LocalizeRigRequest | pb.LocalizeSequenceRequest, coverage: float) -> LocalizeOptions:
+    """The request's options; FieldError for those that only a single photograph has. `coverage` is the default."""
+    options = options_from_message(request.options, coverage)
+    if options.variant is not Variant.BEST:
+        message = f"must be BEST, the default, for several photographs, is {options.variant.name}"
+        raise FieldError("options.variant", message)
+    if isinstance(request, pb.LocalizeRigRequest) and axes_from_message(request.options) is not Axes.OPENCV:
+        raise FieldError("options.axes", "must be OPENCV, the default, for a rig")
+    return options
 
 
 @contextmanager
