@@ -1,0 +1,141 @@
+"""Steps that need more than their jobs were admitted with, such as second attempts: when they are computed."""
+
+import pytest
+from support.toy_scheduler import FAR_S, Toy, run_through
+
+from mapless_server.scheduling import Done, Ending, Fallback, Job, Next, Refusal, Step
+
+
+def again(toy: Toy, kind: str, others: int, due_s: float = 150.0) -> Job:
+    """A job that needs more than it was admitted with, as when stronger features are to be tried."""
+    toy.learn("prepare", "slow", 50.0)
+    job = toy.admit(stage="refine", client="mine", deadline_s=200.0)
+    for i in range(others):
+        toy.admit(client=f"other {i}")
+    step = Step("prepare", kind, "b", "again")
+    toy.finish(toy.take("host"), Next(step, Fallback(lambda: Done("first"), due_s)))
+    return job
+
+
+@pytest.mark.parametrize(
+    ("kind", "others", "is_last"), [("toy", 0, False), ("toy", 6, True), ("slow", 0, False), ("slow", 1, True)]
+)
+def test_more_than_admitted_waits_for_an_idle_thread(kind: str, others: int, is_last: bool) -> None:
+    """Where others have the room; the only job is computed whatever it costs, as it is admitted."""
+    toy = Toy()
+    job = again(toy, kind, others)
+    assert (toy.ending_of(job), bool(job.booked_s)) == (None, not is_last)
+    order = []
+    while toy.scheduler.has_work("host"):
+        batch = toy.take("host")
+        order += [*batch.jobs]
+        toy.finish(batch, *(Done(None) for _ in batch.jobs))
+    assert order[-1 if is_last else 0] is job
+    assert (job.begins_until_s, toy.ending_of(job)) == (None, Ending.OK)
+
+
+def test_a_step_beyond_the_bounds_takes_no_room() -> None:
+    """What waits for an idle thread lets as much be admitted as without it, and does not ask for more servers."""
+    toy, without = Toy(), Toy()
+    again(toy, "toy", 6)
+    without.admit(stage="refine", client="mine")
+    for i in range(6):
+        without.admit(client=f"other {i}")
+    without.finish(without.take("host"), Done(None))
+    load, its_load = toy.scheduler.load("prepare"), without.scheduler.load("prepare")
+    assert load == its_load._replace(waiting=its_load.waiting + 1)
+    for it in (toy, without):
+        it.fill()
+    assert toy.observer.admissions == without.observer.admissions
+
+
+def test_what_waits_for_an_idle_thread_is_no_job_of_its_caller() -> None:
+    """Whose next job is admitted like a first one, which needs no more than its turn among the others' jobs."""
+    toy = Toy()
+    job = again(toy, "slow", 5)
+    toy.admit(client="other 0")
+    mine = toy.admit(client="mine")
+    assert "this caller's jobs in it: 1" in str(toy.refusal(client="mine"))
+    toy.scheduler.cancel(mine, toy.now_s)
+    toy.scheduler.cancel(job, toy.now_s)
+    run_through(toy)
+    assert not toy.scheduler.jobs
+    assert toy.scheduler.backlog_s == 0
+    toy.admit()
+    assert toy.refusal(deadline_s=toy.now_s + 0.1).reason is Refusal.DEADLINE_INFEASIBLE  # not idle any more
+
+
+def test_a_step_waits_until_it_would_end_too_late() -> None:
+    toy = Toy()
+    job = again(toy, "slow", 4)
+    assert toy.scheduler.next_due_s is not None
+    toy.scheduler.expire(99.0)
+    assert toy.ending_of(job) is None
+    toy.scheduler.expire(99.9)  # 150 s less the predicted 50.5 s
+    assert toy.ends[0] == [(Ending.OK, "first")]
+    assert again(Toy(), "slow", 4, due_s=51.0).is_over  # too late from the beginning
+
+
+def test_nothing_waits_for_an_idle_thread_while_jobs_are_refused() -> None:
+    """The answer that there is would come late for nothing: more calls come than are computed."""
+    toy = Toy()
+    toy.fill()
+    job = toy.admit(stage="refine", client="mine", deadline_s=200.0)
+    toy.learn("prepare", "slow", 50.0)
+    batch = toy.take("host")
+    assert batch.jobs == (job,)
+    toy.finish(batch, Next(Step("prepare", "slow", "b", "again"), Fallback(lambda: Done("first"), 150.0)))
+    assert toy.ending_of(job) is Ending.OK
+
+
+@pytest.mark.parametrize(
+    ("is_crowded", "own_jobs", "due_s", "goes_on"),
+    [(False, 1, 150.0, True), (True, 1, 150.0, False), (False, 2, 150.0, False), (False, 1, 1.9, False)],
+)
+def test_a_greedy_caller_takes_no_others_turn(is_crowded: bool, own_jobs: int, due_s: float, goes_on: bool) -> None:
+    """Where its own jobs are refused, steps of others' only jobs take turns with them, if there is time for that.
+
+    Not where others have no room, too.
+    """
+    toy = Toy()
+    toy.learn("coarse", "more", 0.5)
+    job, *_ = [toy.admit(stage="refine", client="mine", deadline_s=200.0) for _ in range(own_jobs)]
+    batch = toy.take("host")
+    toy.fill()
+    for client in map(str, range(100) if is_crowded else ()):
+        toy.fill(client)
+    step = Step("prepare", "more", "b", "again")
+    toy.finish(batch, Next(step, Fallback(lambda: Done("first"), due_s)))
+    assert toy.ending_of(job) is (None if goes_on else Ending.OK)
+    assert not goes_on or job in toy.take("host").jobs + toy.take("host").jobs
+
+
+@pytest.mark.parametrize(
+    ("due_s", "others", "kind"),
+    [(3.0, 0, "slow"), (1.0, 0, "toy"), (FAR_S, 5, "toy"), (0.7, 0, None), (0.7, 6, None)],
+)
+def test_the_alternative_is_computed_where_the_step_is_not(due_s: float, others: int, kind: str | None) -> None:
+    """Too late or too much for the room; the fallback is given only if the alternative is too late as well."""
+    toy = Toy()
+    toy.learn("prepare", "slow", 2.0)
+    toy.learn("refine", "another", 50.0)  # says nothing about `later_kind`
+    step, alternative = Step("prepare", "slow", "b", 0, "toy"), Step("prepare", "toy", "b", 0)
+    job = toy.admit(stage="refine", client="mine")
+    for i in range(others):
+        toy.admit(client=f"other {i}")
+    toy.finish(toy.take("host"), Next(step, Fallback(lambda: Done("first"), due_s), alternative))
+    assert toy.ending_of(job) is (None if kind else Ending.OK)
+    assert kind in (None, job.step.kind)
+
+
+def test_the_only_job_leaves_room_for_the_next_caller() -> None:
+    """Though it costs more than the server computes for all callers, and another thread is free."""
+    toy = Toy()
+    toy.learn("prepare", "slow", 50.0)
+    job = toy.admit(stage="refine", client="mine", deadline_s=200.0)
+    step = Step("prepare", "slow", "b", "again")
+    toy.finish(toy.take("host"), Next(step, Fallback(lambda: Done("first"), 150.0)))
+    toy.take("host")
+    other = toy.admit(client="other", deadline_s=5.0)
+    assert toy.take("host").jobs == (other,)
+    assert toy.ending_of(job) is None
