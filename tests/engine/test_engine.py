@@ -6,145 +6,43 @@ import hashlib
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any, cast
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 from support.images import encode, textured
-from support.servers import CAMERA, PHOTO, StandInDescriptor, StandInExtractor, StandInReconstructor, pose, whole
+from support.planted_engine import (
+    DOUBTFUL_INLIERS,
+    ESCALATION,
+    FEATURES,
+    NEAR_ORIGIN,
+    PIXELS,
+    SCENE,
+    SURE_INLIERS,
+    Setting,
+    caller,
+    hint_of,
+    is_outcome,
+    localized,
+    query_of,
+    rejected,
+)
+from support.servers import CAMERA, PHOTO, StandInExtractor, pose, whole
 
-from mapless.geometry import RigidTransform
-from mapless_server.engine.options import EngineOptions, EscalationOptions
-from mapless_server.engine.photos import Description, Photo
-from mapless_server.engine.query import Caller, Query, Result, Tier
+from mapless_server.engine.options import EngineOptions
+from mapless_server.engine.photos import Photo
+from mapless_server.engine.query import Result, Tier
 from mapless_server.engine.stages import MAX_LISTINGS, QueryStages
 from mapless_server.errors import InvalidArgument, Unavailable
-from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.answer import Answer, Localization
-from mapless_server.method.options import LocalizeOptions
-from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
-from mapless_server.method.results import PoseStage
+from mapless_server.method.rejection import Advice, Rejection, RejectionReason
 from mapless_server.method.trust.judge import LEVELS, JudgeOptions
-from mapless_server.method.views import Features, Matches, PosedView, View
+from mapless_server.method.views import PosedView, View
 from mapless_server.scenes import Narrowing, Sphere
-from mapless_server.scheduling import CostModel, Done, Flow, Job, Next
-from mapless_server.security import SceneKey
+from mapless_server.scheduling import CostModel, Done, Job
 from mapless_server.serve.assembly import engine_over
-from mapless_server.store import NewReference, SelfCalibration, Store, calibrations
-
-SURE_INLIERS, DOUBTFUL_INLIERS = 500, 5
-ESCALATION = EscalationOptions(doubtful_trust=0.1, doubtful_radius_m=0.2)
-SCENE = SceneKey("s")
-DESCRIPTOR = StandInDescriptor()
-PIXELS = decode_image(PHOTO, ImageLimits())
-FEATURES = Features(np.zeros((1, 2), np.float32), np.full((1, 4), 0.5, np.float32), np.ones(1, np.float32))
-
-
-def localized(inliers: int, at: RigidTransform | None = None) -> Answer:
-    covariance, trust = np.diag([1e-4] * 3 + [1e-6] * 3), 0.5 if inliers == SURE_INLIERS else 0.01
-    found = Localization(at or pose(0.0), covariance, PoseStage.REFINED, inliers, 2 * inliers, 0.7, trust=trust)
-    return Answer(found, None, {"coarse": 0.25}, (1, 2), (3, 4))
-
-
-def rejected(reason: RejectionReason = RejectionReason.TOO_FEW_MATCHES) -> Answer:
-    return Answer(Rejection(reason, "planted"), None, {"correspond": 0.125})
-
-
-Reply = Answer | Callable[[View, Sequence[PosedView], Callable[[], None]], Answer]
-
-
-def caller(deadline_s: float = 60.0) -> Caller:
-    return Caller(Flow("tenant", "client"), time.monotonic() + deadline_s)
-
-
-@dataclass
-class Setting:
-    """An engine of two tiers whose method answers what is planted, and which tiers ran."""
-
-    store: Store
-    replies: dict[str, Reply] = field(default_factory=dict)
-    asked: list[str] = field(default_factory=list)
-    seen: list[tuple[View, Sequence[PosedView]]] = field(default_factory=list)
-    judges: list[JudgeOptions] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.extractors = {name: StandInExtractor(name) for name in ("cheap", "strong")}
-        pipelines = {name: Pipeline(cast(Any, StandInReconstructor())) for name in self.extractors}
-
-        def method(
-            query: View, references: Sequence[PosedView], pipeline: Pipeline, _: Any, check: Callable[[], None]
-        ) -> Answer:
-            (name,) = (name for name, it in pipelines.items() if it.reconstructor is pipeline.reconstructor)
-            self.judges.append(pipeline.options.judge)
-            self.asked.append(name)
-            self.seen.append((query, references))
-            reply = self.replies[name]
-            return reply(query, references, check) if callable(reply) else reply
-
-        self.tiers = [Tier(extractor, pipelines[name]) for name, extractor in self.extractors.items()]
-        self.engine = engine_over(
-            self.store, self.tiers, EngineOptions(escalation=ESCALATION), None, None, whole(method), DESCRIPTOR
-        )
-        self.loop = asyncio.new_event_loop()
-
-    def describe(self, photos: Sequence[Photo]) -> list[Description]:
-        return self.loop.run_until_complete(self.engine.describe(photos, caller()))
-
-    def close(self) -> None:
-        self.loop.run_until_complete(self.engine.close())
-        self.loop.close()
-
-    def localize(self, deadline_s: float = 60.0, **changes: Any) -> Result:
-        named: dict[str, Any] = {"reference_ids": ("r0", "r1"), "narrowing": Narrowing(), "reference_count": 2}
-        values = named | changes
-        query = Query(SCENE, photo=Photo(PHOTO, CAMERA, "image"), options=LocalizeOptions(), **values)
-        return self.run(query, caller(deadline_s))[0]
-
-    def run(self, query: Query, caller: Caller) -> tuple[Result, Job]:
-        job = self.engine.query_job(query, caller)
-        return self.loop.run_until_complete(self.engine.run(job)), job
-
-
-@pytest.fixture
-def setting(tmp_path: Path) -> Iterator[Setting]:
-    with Store.open(tmp_path) as store:
-        setting = Setting(store)
-        store.create_scene(SCENE)
-        photos = [Photo(encode(".png", textured(seed=i)), CAMERA, "image") for i in range(3)]
-        described = setting.describe(photos)
-        store.add_references(
-            SCENE,
-            [
-                NewReference(f"r{i}", photo.image, CAMERA, pose(float(i)), found.views, found.descriptors)
-                for i, (photo, found) in enumerate(zip(photos, described, strict=True))
-            ],
-        )
-        for extractor in setting.extractors.values():
-            extractor.seen.clear()
-        yield setting
-        setting.close()
-
-
-def is_outcome(result: Result, planted: Answer) -> bool:
-    """Whether an answer's outcome is given, to a rejection of which a hint is added."""
-    given = result.answer.outcome
-    if isinstance(given, Rejection):
-        return replace(given, hint=None) == planted.outcome
-    return given is planted.outcome
-
-
-NEAR_ORIGIN = Narrowing(Sphere(pose(0.0).translation, 0.5))
-
-
-def hint_of(result: Result) -> Hint:
-    """The hint of a rejection."""
-    assert isinstance(result.answer.outcome, Rejection)
-    assert result.answer.outcome.hint is not None
-    return result.answer.outcome.hint
+from mapless_server.store import NewReference, SelfCalibration, calibrations
 
 
 class TestTiers:
@@ -331,85 +229,6 @@ class TestTiers:
                 engine_over(setting.store, tiers, EngineOptions())
 
 
-class OneMatch:
-    """A pair matching that matches keypoint 0 with the number of its call."""
-
-    name = "one match"
-
-    def __init__(self, seconds: float = 0.0) -> None:
-        self.seconds, self.calls = seconds, 0
-
-    def match_one(self, first: View, second: View, pause: Callable[[], None] = lambda: None) -> Matches:
-        time.sleep(self.seconds)
-        self.calls += 1
-        return np.array([[0, self.calls]], np.int32)
-
-
-class TestRematching:
-    """The strong tier matches a doubtful photograph again, by a slow network, with one reference after another."""
-
-    def pair_matching(self, setting: Setting, seconds: float = 0.0) -> OneMatch:
-        setting.replies = {"cheap": rejected(), "strong": localized(SURE_INLIERS)}
-        planted = setting.engine.tiers[1].pipeline.matcher.pair_matching = OneMatch(seconds)
-        return planted
-
-    @pytest.mark.parametrize("chooses", [False, True])
-    def test_each_reference_is_a_step_of_its_own(self, setting: Setting, chooses: bool) -> None:
-        planted = self.pair_matching(setting)
-        result, job = setting.run(query_of(() if chooses else ("r0", "r1")), caller())
-        assert planted.calls == 2
-        assert [it.stage for it in job.records].count("prepare") == 1 + 1 + 2
-        assert result.stage_seconds["strong/rematch"] >= 0
-        assert result.tier.extractor.name == "strong"
-
-    def test_the_method_gets_the_new_matches(self, setting: Setting) -> None:
-        self.pair_matching(setting)
-        got: list[Sequence[Matches]] = []
-        usual = whole(lambda *_: rejected())
-
-        def prepare(*arguments: Any) -> Any:
-            got.append(arguments[5])
-            return usual.prepare(*arguments)
-
-        stages = QueryStages(setting.engine.tiers, ESCALATION, replace(usual, prepare=prepare))
-        job = setting.engine.query_job(query_of(("r0", "r1")), caller())
-        job.step.payload.__dict__["tier"] = 1
-        steps = 0
-        while job.step.stage == "prepare":
-            (done,) = stages.prepare([job])
-            assert isinstance(done, Next)
-            job.step = done.step
-            steps += 1
-        assert steps == 3
-        assert [it.tolist() for it in got[0]] == [[[0, 1]], [[0, 2]]]
-
-    @pytest.mark.parametrize(("known_s", "calls"), [(None, 1), (100.0, 0)])
-    def test_pairs_that_would_end_too_late_are_not_begun(
-        self, setting: Setting, known_s: float | None, calls: int
-    ) -> None:
-        """The pose is then computed from the matches that there are."""
-        planted = self.pair_matching(setting, seconds=1.0)
-        setting.engine.tiers[1].pipeline.matcher.pair_s = known_s
-        result = setting.localize(deadline_s=3.0)
-        assert planted.calls == calls
-        assert result.tier.extractor.name == "strong"
-
-    @pytest.mark.parametrize(("deadline_s", "calls"), [(20.0, 0), (30.0, 2)])
-    def test_where_only_the_pose_is_in_time_it_is_computed(
-        self, setting: Setting, monkeypatch: pytest.MonkeyPatch, deadline_s: float, calls: int
-    ) -> None:
-        """From the matches at hand: the pair alone would be in time, the pose after it would not."""
-        planted = self.pair_matching(setting)
-        setting.engine.tiers[1].pipeline.matcher.pair_s = 8.0
-        cost_s = {"prepare": 0.1, "coarse": 0.5, "refine": 9.0}
-        monkeypatch.setattr(
-            CostModel, "predict", lambda _, stage, kind, *__: 8.0 if "rematch" in kind else cost_s[stage]
-        )
-        result = setting.localize(deadline_s)
-        assert result.tier.extractor.name == "strong"
-        assert planted.calls == calls
-
-
 class TestMemory:
     def test_a_group_photo_is_counted_with_its_group_only(
         self, setting: Setting, monkeypatch: pytest.MonkeyPatch
@@ -520,11 +339,6 @@ class TestDescribingReferences:
         (took_s,) = (it.end_s - it.start_s for it in job.records if it.stage == "prepare")
         assert took_s - seconds >= 2 * self.STEP_S
         assert seconds >= self.STEP_S, "the photograph's own description is part of it"
-
-
-def query_of(reference_ids: tuple[str, ...]) -> Query:
-    photo = Photo(PHOTO, CAMERA, "image")
-    return Query(SCENE, reference_ids, photo, Narrowing(), reference_count=2, options=LocalizeOptions())
 
 
 def add_undescribed(setting: Setting, count: int) -> None:

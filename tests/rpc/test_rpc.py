@@ -3,144 +3,39 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import re
-import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
-from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
-from typing import Any, cast
+from collections.abc import Mapping
+from typing import Any
 
 import grpc
 import pytest
-from grpc_health.v1 import health, health_pb2, health_pb2_grpc
-from support import raw_http2
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from support.guarded import (
+    LIMIT_S,
+    METHOD,
+    Answer,
+    Counted,
+    ask,
+    echo,
+    failure,
+    lines_of,
+    raising,
+    serving,
+)
 from support.waiting import until
 
 from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
-from mapless_server.errors import NotFound, Overloaded, PermissionDenied, RequestError, Unauthenticated, Unavailable
-from mapless_server.rpc import Call, CallGuard, receiving, sending
+from mapless_server.errors import NotFound, Overloaded, PermissionDenied, Unauthenticated
+from mapless_server.rpc import Call
 from mapless_server.rpc.guard import ANSWER_MARGIN_SHARE
-from mapless_server.rpc.receiving import OpenMethods, Receiver
-from mapless_server.scheduling import Flow, StageRecord
+from mapless_server.scheduling import StageRecord
 from mapless_server.security import Principal, Role
-
-CHECK, WATCH = "/grpc.health.v1.Health/Check", "/grpc.health.v1.Health/Watch"
-METHOD = "/mapless.v1.LocalizationService/Localize"
-LIMIT_S = 30.0
-
-Channel = Any
-"""grpc.aio.Channel, whose annotations are wrong in places."""
-Answer = Callable[[Any, Call], Awaitable[Any]]
-
-
-@dataclass
-class Counted:
-    """Counts and traces of calls."""
-
-    trace_id: str = ""
-    started: list[str] = field(default_factory=list)
-    handled: list[tuple[str, str, float, str]] = field(default_factory=list)
-    ended: list[tuple[str, Sequence[StageRecord], Mapping[str, object]]] = field(default_factory=list)
-
-    def call_started(self, method: str) -> None:
-        self.started.append(method)
-
-    def call_handled(self, method: str, code: str, seconds: float, trace_id: str) -> None:
-        self.handled.append((method, code, seconds, trace_id))
-
-    def begin(self, method: str, metadata: Any, start_s: float) -> Counted:
-        return self
-
-    def end(self, code: str, stages: Sequence[StageRecord], attributes: Mapping[str, object]) -> None:
-        self.ended.append((code, stages, attributes))
-
-    def close(self, limit_s: float) -> None:
-        pass
-
-    @property
-    def codes(self) -> list[str]:
-        """Statuses; checks that counts and traces agree."""
-        assert len(self.started) == len(self.handled) == len(self.ended)
-        assert [code for _, code, *_ in self.handled] == [code for code, *_ in self.ended]
-        return [code for _, code, *_ in self.handled]
-
-
-@asynccontextmanager
-async def serving(answer: Answer, counted: Counted, **options: Any) -> AsyncIterator[Channel]:
-    """A channel to a server on loopback whose Localize gives this answer."""
-    async with listening(answer, counted, **options) as port, grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel:
-        yield channel
-
-
-@asynccontextmanager
-async def listening(answer: Answer, counted: Counted, **options: Any) -> AsyncIterator[int]:
-    """The port of such a server."""
-    guard = CallGuard(observer=cast(Any, counted), tracer=cast(Any, counted), **options)
-    server = grpc.aio.server(options=[("grpc.max_receive_message_length", 2**20)])
-    method = grpc.unary_unary_rpc_method_handler(
-        answer, pb.LocalizeRequest.FromString, pb.LocalizeResponse.SerializeToString
-    )
-    server.add_generic_rpc_handlers(
-        [
-            grpc.method_handlers_generic_handler(
-                "mapless.v1.LocalizationService", {"Localize": guard.guarded(METHOD, method)}
-            )
-        ]
-    )
-    healthy = health.aio.HealthServicer()  # type: ignore[attr-defined]
-    forms = health_pb2.HealthCheckRequest.FromString, health_pb2.HealthCheckResponse.SerializeToString
-    check = grpc.unary_unary_rpc_method_handler(healthy.Check, *forms)
-    watch = grpc.unary_stream_rpc_method_handler(healthy.Watch, *forms)
-    guarded = {"Check": guard.guarded(CHECK, check), "Watch": guard.guarded(WATCH, watch)}
-    server.add_generic_rpc_handlers([grpc.method_handlers_generic_handler("grpc.health.v1.Health", guarded)])
-    await healthy.set("", health_pb2.HealthCheckResponse.SERVING)
-    port = server.add_insecure_port("127.0.0.1:0")
-    await server.start()
-    try:
-        yield port
-    finally:
-        await server.stop(5)
-
-
-async def ask(channel: Channel, data: bytes = b"", timeout: float | None = LIMIT_S, **metadata: str) -> Any:
-    """The answer's bytes."""
-    pairs = [(name.replace("_", "-"), value) for name, value in metadata.items()]
-    return await channel.unary_unary(METHOD)(data, timeout=timeout, metadata=pairs)
-
-
-async def failure(channel: Channel, data: bytes = b"", **arguments: Any) -> Any:
-    with pytest.raises(grpc.RpcError) as caught:
-        await ask(channel, data, **arguments)
-    return from_rpc_error(caught.value)
-
-
-def lines_of(caplog: pytest.LogCaptureFixture) -> list[dict[str, Any]]:
-    """The fields of the calls' lines in the log."""
-    return [vars(it)["fields"] for it in caplog.records if hasattr(it, "fields")]
-
-
-async def echo(request: Any, call: Call) -> Any:
-    return pb.LocalizeResponse()
 
 
 async def unserializable(request: Any, call: Call) -> Any:
     return "not a message"
-
-
-def raising(error: Exception) -> Answer:
-    async def answer(request: Any, call: Call) -> Any:
-        raise error
-
-    return answer
-
-
-@pytest.fixture
-def counted(caplog: pytest.LogCaptureFixture) -> Counted:
-    caplog.set_level(logging.INFO, "mapless_server.rpc.guard")
-    return Counted()
 
 
 @pytest.mark.parametrize(
@@ -296,137 +191,6 @@ async def test_the_caller_is_authenticated_before_its_message(
     assert "tenant" not in unknown
     assert (known["tenant"], known["principal"], known["client"]) == ("acme", "robot-7", "headset-3")
     assert not any("good-secret" in str(value) for line in lines_of(caplog) for value in line.values())
-
-
-class TestCallsWithHeadersOnly:
-    @staticmethod
-    async def ended(port: int, *begun: bytes, stream: int = 1) -> None:
-        """Returns when the server has ended the stream, one of those begun."""
-        reader, writer = await asyncio.open_connection("127.0.0.1", port)
-        writer.write(raw_http2.hello() + b"".join(begun))
-        await asyncio.wait_for(raw_http2.until_ended(reader, stream), LIMIT_S)
-        writer.close()
-
-    async def test_a_rejected_call_needs_no_message(self, counted: Counted) -> None:
-        def authenticate(*_: Any) -> Principal:
-            raise Unauthenticated("a token is needed", reason="TOKEN_MISSING")
-
-        async with listening(echo, counted, authenticate=authenticate) as port:
-            await self.ended(port, raw_http2.begin(1, METHOD))
-        assert counted.codes == ["UNAUTHENTICATED"]
-
-    @pytest.mark.parametrize(("error", "is_paced"), [(Overloaded("full"), True), (Unavailable("stopping"), False)])
-    async def test_refusals_beyond_a_rate_wait_for_their_turn(
-        self, counted: Counted, monkeypatch: pytest.MonkeyPatch, error: RequestError, is_paced: bool
-    ) -> None:
-        monkeypatch.setattr(sending, "PER_S", 20)
-        monkeypatch.setattr(sending, "BURST", 2)
-
-        def refuse(method: str, flow: Flow) -> None:
-            raise error
-
-        start_s = time.monotonic()
-        async with serving(echo, counted, check_admission=refuse) as channel:
-            failures = await asyncio.gather(*(failure(channel) for _ in range(10)))
-        took_s = time.monotonic() - start_s
-        assert {it.code for it in failures} == {error.code}
-        assert (took_s > 7 / 20) is is_paced
-
-    async def test_the_message_has_to_come_before_the_deadline(
-        self, counted: Counted, caplog: pytest.LogCaptureFixture
-    ) -> None:
-        async with listening(echo, counted, default_deadline_s=0.2) as port:
-            await self.ended(port, raw_http2.begin(1, METHOD))
-        assert counted.codes == ["DEADLINE_EXCEEDED"]
-        assert lines_of(caplog)[0]["reason"] == "MESSAGE_LATE"
-
-    @pytest.mark.parametrize("method", [CHECK, WATCH])
-    async def test_the_message_of_an_open_method_has_little_time(
-        self, counted: Counted, monkeypatch: pytest.MonkeyPatch, method: str
-    ) -> None:
-        monkeypatch.setattr(receiving, "OPEN_MESSAGE_LIMIT_S", 0.2)
-        async with listening(echo, counted) as port:
-            await self.ended(port, raw_http2.begin(1, method))
-
-    async def test_of_many_waiting_calls_the_oldest_is_evicted(
-        self, counted: Counted, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(receiving, "OPEN_MESSAGE_LIMIT_S", 1000.0)
-        monkeypatch.setattr(receiving, "MAX_OPEN_WAITING", 2)
-        async with listening(echo, counted) as port:
-            await self.ended(port, *(raw_http2.begin(stream, CHECK) for stream in (1, 3, 5)), stream=1)
-            async with grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel:
-                await check_health(channel)
-
-
-async def check_health(channel: Channel) -> None:
-    answer = await health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=LIMIT_S)
-    assert answer.status == health_pb2.HealthCheckResponse.SERVING
-
-
-async def test_open_streams_are_limited_and_block_no_probe(counted: Counted, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(receiving, "MAX_OPEN_STREAMS", 2)
-    async with serving(echo, counted) as channel:
-        stub = health_pb2_grpc.HealthStub(channel)
-
-        async def watch() -> Any:
-            """One that has begun."""
-            watching = stub.Watch(health_pb2.HealthCheckRequest(), timeout=LIMIT_S)
-            assert (await watching.read()).status == health_pb2.HealthCheckResponse.SERVING
-            return watching
-
-        async def is_let_in() -> bool:
-            try:
-                await watch()
-            except grpc.RpcError as error:
-                codes.add(from_rpc_error(error).code)
-                return False
-            return True
-
-        codes: set[str] = set()
-        first, _ = await watch(), await watch()
-        assert not await is_let_in()
-        await check_health(channel)
-        first.cancel()
-        while not await is_let_in():
-            await asyncio.sleep(0.01)
-        assert not await is_let_in()
-        assert codes == {"RESOURCE_EXHAUSTED"}
-
-
-class Unread:
-    """A call whose caller reads only later."""
-
-    def __init__(self) -> None:
-        self.may_read = asyncio.Event()
-        self.begun, self.seen = 0, list[int]()
-
-    async def read(self) -> bytes:
-        return b""
-
-    async def write(self, message: health_pb2.HealthCheckResponse) -> None:
-        self.begun += 1
-        await self.may_read.wait()
-        self.seen.append(message.status)
-
-
-async def test_a_health_watcher_that_reads_nothing_blocks_no_change() -> None:
-    """Its servicer holds a lock while it writes, which a server that stops needs, too."""
-    status = health_pb2.HealthCheckResponse
-    healthy = health.aio.HealthServicer()  # type: ignore[attr-defined]
-    method = grpc.unary_stream_rpc_method_handler(
-        healthy.Watch, health_pb2.HealthCheckRequest.FromString, status.SerializeToString
-    )
-    call = Unread()
-    watching = asyncio.ensure_future(OpenMethods(Receiver()).guarded(method).stream_stream(None, call))
-    for now in (status.SERVING, status.NOT_SERVING, status.UNKNOWN, status.NOT_SERVING):
-        await asyncio.wait_for(healthy.set("", now), LIMIT_S)
-        await until(lambda: call.begun == 1)
-        await asyncio.sleep(0)
-    call.may_read.set()
-    await until(lambda: call.seen[-1:] == [status.NOT_SERVING])
-    assert len(call.seen) == 2  # the first, and how it is now
-    watching.cancel()
 
 
 async def test_a_call_without_a_message_is_rejected(counted: Counted) -> None:

@@ -12,166 +12,37 @@ import threading
 import time
 import weakref
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.queues import CountingObserver
+from support.toy_queue import (
+    FAR_S,
+    LIMIT_S,
+    MAX_BATCH,
+    PlantedError,
+    Toy,
+    echo,
+    outcomes,
+    then,
+    until,
+)
 
 from mapless_server.scheduling import (
     Abandoned,
     Done,
     Ending,
     Expired,
-    Failure,
-    Fallback,
-    Fatal,
     Flow,
     Job,
     Next,
-    Refusal,
     Refused,
-    Stage,
     StageResult,
     Step,
-    WorkQueue,
     WorkQueueOptions,
 )
-from mapless_server.scheduling.work_queue import ComputeBatch
-
-ROOMY = WorkQueueOptions(max_queued_s=1e6, heartbeat_s=0.05)
-LIMIT_S = 20.0
-FAR_S = 600.0
-MAX_BATCH = 8
-
-
-class PlantedError(Exception):
-    """Of a job."""
-
-
-class LostDevice(Exception):
-    """After which nothing is trusted."""
-
-
-def failure_of(error: Exception) -> Failure:
-    if isinstance(error, LostDevice):
-        return Failure.DEVICE_LOST
-    return Failure.OUT_OF_MEMORY if isinstance(error, MemoryError) else Failure.JOB_FAILED
-
-
-def echo(jobs: Sequence[Job]) -> Sequence[StageResult]:
-    return [Done(job.step.payload) for job in jobs]
-
-
-def then(job: Job, payload: Any = None, fallback: Fallback | None = None) -> Next:
-    """To the second stage."""
-    return Next(Step("then", "toy", "b", job.step.payload if payload is None else payload), fallback)
-
-
-class Toy:
-    """A queue of the stages "first", of two threads, and "then", in batches of one thread; closed at the end.
-
-    Attributes:
-        compute: computes both stages.
-        gate: opens the threads that are blocked by jobs with the payload "plug".
-        seen: payloads in the order in which they were computed, batch by batch.
-        fatals: that the owner was notified of.
-    """
-
-    def __init__(self, compute: ComputeBatch = echo, options: WorkQueueOptions = ROOMY) -> None:
-        self.compute = compute
-        self.options = options
-        self.observer = CountingObserver()
-        self.gate = threading.Event()
-        self.seen: list[list[Any]] = []
-        self.fatals: list[Fatal] = []
-        self._plugged = threading.Semaphore(0)
-        self._plugs: list[asyncio.Task[Any]] = []
-
-    async def __aenter__(self) -> Toy:
-        first, then = Stage("first", "toy-host", "then"), Stage("then", "toy-device", max_batch=MAX_BATCH)
-        stages, lanes = {first: self._serve, then: self._serve}, {"toy-host": 2, "toy-device": 1}
-        self.queue = WorkQueue(stages, lanes, self.options, self.observer, failure_of)
-        self.queue.on_fatal = self.fatals.append
-        self._others = asyncio.all_tasks()
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        """Neither threads nor tasks may be left."""
-        self.gate.set()
-        await asyncio.wait_for(self.queue.close(), LIMIT_S)
-        await outcomes(self._plugs)
-        assert asyncio.all_tasks() <= self._others
-        assert not [it.name for it in threading.enumerate() if it.name.startswith("toy-")]
-        assert self.queue.job_count == 0
-
-    def _serve(self, jobs: Sequence[Job]) -> Sequence[StageResult]:
-        payloads = [job.step.payload for job in jobs]
-        if payloads == ["plug"]:
-            self._plugged.release()
-            assert self.gate.wait(LIMIT_S)
-            return [Done("plug")]
-        self.seen.append(payloads)
-        return self.compute(jobs)
-
-    def submit(
-        self, payload: Any, stage: str = "then", *, client: str = "c", bucket: str = "b", lasts_s: float = FAR_S
-    ) -> asyncio.Task[Any]:
-        """A caller that waits for a job; the task's result is the job's."""
-        deadline_s = time.monotonic() + lasts_s
-
-        async def call() -> Any:
-            return await self.queue.run(Job(Flow("t", client), Step(stage, "toy", bucket, payload), deadline_s, 1))
-
-        return asyncio.ensure_future(call())
-
-    async def plug(self, stage: str = "then", threads: int = 1) -> list[asyncio.Task[Any]]:
-        """Keeps threads busy until the gate is opened, so that jobs wait."""
-        plugs = [self.submit("plug", stage, client="plug", bucket="plug") for _ in range(threads)]
-        self._plugs += plugs
-        for _ in plugs:
-            assert await asyncio.to_thread(self._plugged.acquire, timeout=LIMIT_S)
-        return plugs
-
-    async def waiting(self, payloads: Iterable[Any], **more: Any) -> list[asyncio.Task[Any]]:
-        """Callers whose jobs all wait for the second stage, behind a plug."""
-        self.gate.clear()
-        await self.plug()
-        calls = [self.submit(payload, **more) for payload in payloads]
-        await self.until_jobs(len(calls) + 1)
-        return calls
-
-    async def together(self, payloads: Iterable[Any], **more: Any) -> list[Any]:
-        """Outcomes of jobs that are computed in one batch, as far as it is large enough."""
-        calls = await self.waiting(payloads, **more)
-        self.gate.set()
-        return await outcomes(calls)
-
-    async def until_jobs(self, count: int) -> None:
-        await until(lambda: self.queue.job_count == count)
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + LIMIT_S
-    while not condition():
-        assert time.monotonic() < deadline_s
-        await asyncio.sleep(0.002)
-
-
-async def outcomes(calls: Sequence[asyncio.Task[Any]]) -> list[Any]:
-    """Results and exceptions, in order."""
-    return await asyncio.wait_for(asyncio.gather(*calls, return_exceptions=True), LIMIT_S)
-
-
-@pytest.fixture(autouse=True)
-def _nothing_unhandled(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
-    """An exception that reaches only the loop is a failure."""
-    yield
-    logged = [*caplog.get_records("call"), *caplog.get_records("teardown")]
-    assert not [it for it in logged if it.name == "asyncio" and it.levelname == "ERROR"]
 
 
 class TestResults:
@@ -316,127 +187,6 @@ class TestFailure:
             toy.seen.clear()
             await toy.together(range(1, 9))
         assert [len(it) for it in toy.seen] == [1] * 8
-
-
-class TestEndOfAll:
-    async def _ends(self, toy: Toy, calls: Sequence[asyncio.Task[Any]]) -> None:
-        """Every caller and, once, the owner learns it, and nothing is computed any more."""
-        for outcome in await outcomes(calls):
-            assert isinstance(outcome, Fatal)
-        assert [type(it) for it in toy.fatals] == [Fatal]
-        assert not toy.queue.is_alive_within(FAR_S)
-        computed = len(toy.seen)
-        for stage in ("first", "then"):
-            (refused,) = await outcomes([toy.submit("late", stage)])
-            assert isinstance(refused, Refused)
-            assert refused.reason is Refusal.DRAINING
-        assert len(toy.seen) == computed
-        assert toy.queue.job_count == 0
-
-    @pytest.mark.parametrize("is_raised", [True, False])
-    async def test_a_lost_device_ends_the_queue(self, is_raised: bool, caplog: pytest.LogCaptureFixture) -> None:
-        error = LostDevice("poisoned context")
-
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
-            payloads = [job.step.payload for job in jobs]
-            if is_raised and "lost" in payloads:
-                raise error
-            return [error if it == "lost" else Done("garbage") for it in payloads]
-
-        async with Toy(compute) as toy:
-            await toy.plug()
-            busy = await toy.plug("first", threads=2)
-            calls = [toy.submit(payload) for payload in (0, "lost", 2)]
-            calls += [toy.submit("waits", "first"), toy.submit("another", bucket="other")]
-            await toy.until_jobs(8)
-            toy.gate.set()
-            await outcomes(busy)
-            await self._ends(toy, calls[:3])
-            # The jobs of the other lane were computed before or failed.
-            for outcome in await outcomes(calls[3:]):
-                assert isinstance(outcome, Fatal) or outcome == "garbage"
-        critical = [it.getMessage() for it in caplog.records if it.levelname == "CRITICAL"]
-        assert critical == ["the device is lost: poisoned context"] == [str(it) for it in toy.fatals]
-
-    async def test_two_threads_that_lose_it_at_once_are_one_end(self) -> None:
-        both = threading.Barrier(2, timeout=LIMIT_S)
-
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
-            both.wait()
-            raise LostDevice
-
-        async with Toy(compute) as toy:
-            await self._ends(toy, [toy.submit(i, "first") for i in range(2)])
-
-    @pytest.mark.parametrize("event", ["waited", "computed", "ended"])
-    async def test_a_bug_in_the_loop_itself_ends_the_queue(self, event: str) -> None:
-        """Such as an observer that raises, which it must not."""
-        broken = threading.Event()
-
-        def raise_if_broken(*_: Any) -> None:
-            if broken.is_set():
-                raise PlantedError(event)
-
-        async with Toy() as toy:
-            asyncio.get_running_loop().set_exception_handler(lambda *_: None)  # which may be called, too
-            setattr(toy.observer, event, raise_if_broken)
-            calls = await toy.waiting(range(3))
-            broken.set()
-            toy.gate.set()
-            await until(lambda: bool(toy.fatals))
-            await self._ends(toy, calls)
-            broken.clear()
-
-    @pytest.mark.parametrize("error", [SystemExit(3), KeyboardInterrupt()])
-    async def test_a_stage_that_wants_to_end_the_program_ends_the_queue(self, error: BaseException) -> None:
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
-            raise error
-
-        async with Toy(compute) as toy:
-            await self._ends(toy, [toy.submit(0)])
-
-    async def test_a_stage_that_hangs_ends_the_queue(self) -> None:
-        async with Toy(options=replace(ROOMY, stall_limit_s=0.2)) as toy:
-            plugs = await toy.plug()
-            await self._ends(toy, [*plugs, toy.submit("waits")])
-        assert "the stage then has computed for" in str(toy.fatals[0])
-        assert "hangs" in str(toy.fatals[0])
-
-    async def test_a_long_stage_that_checks_between_steps_does_not_hang(self) -> None:
-        def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
-            until_s = time.monotonic() + (2.0 if jobs[0].step.payload == "long" else 0.1)
-            while time.monotonic() < until_s:
-                jobs[-1].check()
-                time.sleep(0.02)
-            if jobs[0].step.payload == "hangs":
-                assert toy.gate.wait(LIMIT_S)
-            return echo(jobs)
-
-        async with Toy(compute, replace(ROOMY, stall_limit_s=1.0)) as toy:
-            assert await outcomes([toy.submit("long")]) == ["long"]
-            assert not toy.fatals
-            await self._ends(toy, [toy.submit("hangs")])
-
-    async def test_closing_ends_waiting_jobs_and_awaits_the_computing(self) -> None:
-        async with Toy() as toy:
-            calls = await toy.waiting(range(3))
-            closing = asyncio.ensure_future(toy.queue.close())
-            for outcome in await outcomes(calls):
-                assert isinstance(outcome, Fatal)
-            assert not closing.done()
-            toy.gate.set()
-            await asyncio.wait_for(closing, LIMIT_S)
-        assert not toy.seen
-        assert not toy.fatals
-
-    async def test_closing_does_not_wait_for_ever(self, caplog: pytest.LogCaptureFixture) -> None:
-        async with Toy() as toy:
-            await toy.plug()
-            await asyncio.wait_for(toy.queue.close(limit_s=0.1), LIMIT_S)
-            assert not toy.gate.is_set()
-        (said,) = [it.getMessage() for it in caplog.records if it.levelname == "ERROR"]
-        assert "toy-device" in said
-        assert "left behind" in said
 
 
 async def test_the_loop_is_woken_without_the_lock(monkeypatch: pytest.MonkeyPatch) -> None:
