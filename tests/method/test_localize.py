@@ -156,6 +156,26 @@ def test_halves_say_nothing_of_a_pose_with_priors() -> None:
     assert covering_disagreement(informed, 1.0) is informed
 
 
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_an_answer_is_finite_where_all_its_numbers_are(number: float) -> None:
+    answer = answer_of(pipeline_of("geometric"))
+    found, scale = pose_of(answer), answer.scale
+    assert scale is not None
+    assert found.covariance is not None
+    assert answer.is_finite
+    assert replace(answer, scale=None, outcome=replace(found, covariance=None)).is_finite
+    at = found.world_from_camera
+    for outcome in (
+        replace(found, world_from_camera=replace(at, rotation=at.rotation * number)),
+        replace(found, world_from_camera=replace(at, translation=np.array([0.0, number, 0.0]))),
+        replace(found, covariance=np.diag([0.01] * 5 + [number])),
+        replace(found, reprojection_error_px=number),
+    ):
+        assert not replace(answer, outcome=outcome).is_finite
+    for spoilt in (replace(scale, metres_per_unit=number), replace(scale, deviation=number)):
+        assert not replace(answer, scale=spoilt).is_finite
+
+
 # Wide correspondences
 
 

@@ -69,9 +69,9 @@ def turned_to_match(run: QueryRun, tier: Tier) -> QueryViews | Rejection:
     The best of its references counts: others may not show the same.
 
     Returns:
-        The photograph; or its rejection, since its mirror image matches clearly more than any of these, and that is not
-        chance. So it is of a mirrored photograph, which no camera sees, and of another side of something symmetric:
-        both get poses by parts that look like the mirror image of others.
+        The photograph; or its rejection, where its mirror image matches clearly more than any of these, and not by
+        chance. So it does if the photograph is mirrored, or shows another side of something symmetric: parts of the
+        place that look like the mirror image of others would give it a wrong pose.
     """
     context = run.context
     with context.stage(TURN):
