@@ -30,7 +30,7 @@ from mapless_server.method.options import LocalizeOptions, ScaleStrategy, StageC
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.results import PoseEstimate, PoseStage, ScaleStage
 from mapless_server.method.trust.evidence import evidence_of, votes_of
-from mapless_server.method.uncertainty.radii import accuracy_from_covariance, covering_disagreement
+from mapless_server.method.uncertainty.radii import JACKKNIFE_SHARE, accuracy_from_covariance, with_halves
 from mapless_server.method.views import Matches, PosedView, View
 
 # Accuracy
@@ -124,36 +124,38 @@ def test_errors_are_as_large_as_the_covariance() -> None:
     assert 0.3 < np.mean(squares) < 4.5  # 3 if it were exact
 
 
-def test_radii_cover_half_of_the_distance_of_halves() -> None:
-    """Adds in quadrature to the radius by the jackknife; halves of the data alone give cameras that far apart."""
+def test_radii_contain_the_distance_of_halves() -> None:
+    """Half of it, in quadrature with a share of the radius by the jackknife; what halves share counts in full."""
     for seed in range(3):
         scene = make_scene(random_for("apart", seed), SceneOptions(point_count=150, outlier_share=0.5))
         answer = localize(scene.query, scene.references, pipeline_of("geometric", scene), LocalizeOptions(coverage=1.0))
         found, support = pose_of(answer), answer.support
         assert support is not None
         assert support.estimate is not None
+        assert support.estimate.intrinsics is not None
         assert found.covariance is not None
         votes = votes_of(support, support.query_matches)
         apart_m = evidence_of(support, votes, support.query_matches).disagreement * support.distance_m()
-        radii = [accuracy_from_covariance(it) for it in (support.estimate.covariance, found.covariance)]
-        assert radii[1].position_68_m == pytest.approx(np.hypot(radii[0].position_68_m, apart_m / 2))
-        growth = radii[1].position_68_m / radii[0].position_68_m
-        assert growth > 1.001
-        assert radii[1].rotation_95_deg == pytest.approx(growth * radii[0].rotation_95_deg)
+        given, shared = support.estimate.covariance, support.estimate.intrinsics.pose_covariance
+        halves = (apart_m / 2 / accuracy_from_covariance(given).position_68_m) ** 2
+        assert halves > 0.001
+        expected = JACKKNIFE_SHARE * (given - shared) + shared + halves * given
+        np.testing.assert_allclose(found.covariance, expected, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize(("apart_in_radii", "growth"), [(0.0, 1.0), (2.0, 2**0.5), (6.0, 10**0.5), (1e6, 10**0.5)])
-def test_halves_enlarge_radii_to_a_limit(apart_in_radii: float, growth: float) -> None:
+@pytest.mark.parametrize(("apart_in_radii", "halves"), [(0.0, 0.0), (2.0, 1.0), (6.0, 9.0), (1e6, 9.0)])
+def test_halves_enlarge_radii_to_a_limit(apart_in_radii: float, halves: float) -> None:
+    growth = np.sqrt(JACKKNIFE_SHARE + halves)
     estimate = PoseEstimate(SCENE.world_from_query, PoseStage.REFINED, np.ones(4, bool), np.ones(4), np.eye(6))
     radius_m = accuracy_from_covariance(estimate.covariance).position_68_m
-    larger = covering_disagreement(estimate, apart_in_radii * radius_m)
+    larger = with_halves(estimate, apart_in_radii * radius_m)
     assert accuracy_from_covariance(larger.covariance).position_68_m == pytest.approx(growth * radius_m)
 
 
 def test_halves_say_nothing_of_a_pose_with_priors() -> None:
     alone = PoseEstimate(SCENE.world_from_query, PoseStage.REFINED, np.ones(4, bool), np.ones(4), np.eye(6))
     informed = replace(alone, without_priors=alone)
-    assert covering_disagreement(informed, 1.0) is informed
+    assert with_halves(informed, 1.0) is informed
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])

@@ -9,7 +9,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.compare import assert_jacobian, finite_differences
-from support.planted import NOISE, disturbed, drift_field, drifted, metric_scale, stages, true_structure
+from support.planted import (
+    NOISE,
+    disturbed,
+    drift_field,
+    drifted,
+    metric_scale,
+    stages,
+    true_correspondences,
+    true_structure,
+)
 from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
@@ -33,13 +42,14 @@ from mapless_server.method.pose_problem import (
     pose_errors,
 )
 from mapless_server.method.results import PoseEstimate, PoseStage, Structure, Support
+from mapless_server.method.trust.evidence import evidence_of, votes_of
 from mapless_server.method.uncertainty.dispersion import (
     Dispersion,
     UncertaintyOptions,
     dispersed_covariance,
     scale_covariance,
 )
-from mapless_server.method.uncertainty.radii import error_radii
+from mapless_server.method.uncertainty.radii import error_radii, with_halves
 
 POSITION, ROTATION = slice(0, 3), slice(3, 6)
 PLAIN = UncertaintyOptions(gap_growth=0.0)
@@ -62,8 +72,11 @@ def true_by_stated(errors: list[Array], covariances: list[Array], axes: slice) -
 
 def adjusted_poses(
     references: int, own_px: float, drift_px: float, options: UncertaintyOptions = PLAIN, seeds: int = 20
-) -> tuple[float, float]:
-    """True by stated; references are turned and moved by so many pixels, each on its own and with the distance."""
+) -> Array:
+    """True by stated, position and rotation, (2, 2): by the jackknife alone, and with halves of the data.
+
+    References are turned and moved by so many pixels, each on its own and with the distance.
+    """
     planted = SceneOptions(point_count=150, reference_count=references, distractor_count=0)
     own, drift = own_px / planted.camera.focal_x_px, drift_px / planted.camera.focal_x_px
     errors, covariances = [], []
@@ -75,24 +88,30 @@ def adjusted_poses(
         noisy = drifted(noisy, centre, random, drift * planted.distance_m, np.degrees(drift))
         structure, matches, estimate = stages(scene, noisy)
         adjusted = adjust_pose(scene.query, noisy, structure, matches, estimate, AdjustOptions(uncertainty=options))
+        support = Support(scene.query, noisy, structure, matches, adjusted, np.zeros(3))
+        query_matches = true_correspondences(scene).query_matches
+        halves = evidence_of(support, votes_of(support, query_matches), query_matches)
+        covered = with_halves(adjusted, halves.disagreement * support.distance_m())
         errors.append(error(adjusted.world_from_camera, scene.world_from_query))
-        covariances.append(adjusted.covariance)
-    return true_by_stated(errors, covariances, POSITION), true_by_stated(errors, covariances, ROTATION)
+        covariances.append((adjusted.covariance, covered.covariance))
+    stated = [list(it) for it in zip(*covariances, strict=True)]
+    return np.array([[true_by_stated(errors, it, axes) for axes in (POSITION, ROTATION)] for it in stated])
 
 
 @pytest.mark.parametrize(("references", "own_px"), [(4, 0.0), (8, 0.0), (5, 1.0), (10, 1.0)])
 def test_covariance_of_planted_noise_equals_sampling(references: int, own_px: float) -> None:
     """Within a third: noise of pixels (half a pixel), and of reference poses, each its own."""
-    position, rotation = adjusted_poses(references, own_px, 0.0)
-    assert 0.7 < position < 1.35
-    assert 0.7 < rotation < 1.35
+    jackknife, with_its_halves = adjusted_poses(references, own_px, 0.0)
+    assert jackknife.min() > 0.7
+    assert with_its_halves.min() > 0.67
+    assert max(jackknife.max(), with_its_halves.max()) < 1.35
 
 
 def test_drift_of_reference_poses_is_found_in_part() -> None:
     """By twice the pixels' noise; leaving out one reference does not show what its neighbours share."""
-    position, rotation = adjusted_poses(8, 0.0, 1.0)
-    assert 0.8 < position < 1.8
-    assert 0.8 < rotation < 1.8
+    found = adjusted_poses(8, 0.0, 1.0)
+    assert found.min() > 0.8
+    assert found.max() < 1.8
 
 
 def support_of(

@@ -242,7 +242,7 @@ def _places_apart(result: Result) -> Hint:
 
 
 def _without_halves(answer: Answer, claim: Accuracy) -> Accuracy:
-    """The radii of an answer that claims these, before disagreeing halves of the data enlarged them."""
+    """The radii of an answer that claims these, by the jackknife alone, before halves of the data changed them."""
     if answer.support is None or answer.support.estimate is None:
         return claim
     return accuracy_from_covariance(answer.support.estimate.covariance)

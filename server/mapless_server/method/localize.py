@@ -20,7 +20,7 @@ from .rejection import Rejection, RejectionReason
 from .results import ScaleStage, Support
 from .trust.intrinsics import intrinsics_checks
 from .trust.judge import judge
-from .uncertainty.radii import covering_disagreement
+from .uncertainty.radii import with_halves
 from .views import Matches, PosedView, View
 
 MIN_FEATURES = 12
@@ -144,6 +144,6 @@ def solve(coarse: Coarse, counts_agreement: bool = False) -> Answer:
         judged = judge(support, query_matches, prepared.options.coverage, options.judge, chance, prepared.unit)
     if judged.rejection:
         return coarse.answer(judged.rejection, support)
-    estimate = covering_disagreement(estimate, judged.evidence.disagreement * support.distance_m())
+    estimate = with_halves(estimate, judged.evidence.disagreement * support.distance_m())
     checks = intrinsics_checks(estimate.intrinsics, options.judge.intrinsics) if estimate.intrinsics else ()
     return coarse.answer(Localization.of(estimate, judged.trust, None, checks), support)

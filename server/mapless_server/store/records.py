@@ -26,7 +26,7 @@ class DatumWithoutMetres(ValueError):
     """A scene has a datum, although its unit of length is not the metre."""
 
 
-CALIBRATION_MODEL = 3
+CALIBRATION_MODEL = 4
 """Raised whenever the same references would give another `SelfCalibration`, or answers use it in another way."""
 
 

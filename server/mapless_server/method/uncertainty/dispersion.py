@@ -24,7 +24,7 @@ the references' errors drift by twice the pixels' noise, errors are up to 1.8 ti
 
 What the references cannot say of themselves enlarges both: keypoints move with the viewpoint, for all references to the
 same side. Within 11 of 12 scenes errors grow more than radii with the gap, the distance to the nearest reference by the
-depth. Where halves of the data disagree by more than all this says, the answer's radii are larger (`radii`).
+depth. The radii of an answer contain, too, how far halves of its data disagree (`radii`).
 
 Three factors remain: on the standard deviations of positions and of angles, and on the radii of 95 %, because errors
 have heavier tails than the normal distribution. They were measured on scenes with known poses, each tested

@@ -50,26 +50,45 @@ def self_tail(count: int) -> float:
     return float(TAIL_95 * (SELF_TAIL_95 / TAIL_95) ** (count / (count + TAIL_PRIOR)))
 
 
+JACKKNIFE_SHARE = 0.6
+"""Of the jackknife's variance where halves count, too; alone it has to contain all of the errors. Of 32
+places, each left out, the others choose 0.5 or 0.6 (20 and 12); planted noise of reference poses requires 0.56."""
+
 MOST_DISAGREEMENT = 3.0
-"""Of half of the distance between halves, in 68 % radii, so that these grow at most 3.2-fold. Halves further apart have
-failed, one of them at least, and how far says nothing any more: 3 has the best likelihood of 694 answers of 32 places
-(2 and 4 nearly so; no limit -0.06 by answer, and one right answer of a hundred has a radius of over 8 %)."""
+"""Of half of the distance between halves, in 68 % radii by the jackknife, so that these grow at most 3.2-fold. Halves
+further apart have failed, one of them at least, and how far says nothing any more."""
 
 
-def covering_disagreement(estimate: PoseEstimate, apart_m: float) -> PoseEstimate:
-    """An estimate with larger radii where the cameras that halves of its data give are `apart_m` from each other.
+def with_halves(estimate: PoseEstimate, apart_m: float) -> PoseEstimate:
+    """An estimate whose radii contain, too, that the cameras by halves of its data are `apart_m` from each other.
 
     Two independent halves have twice the variance of both together each, so their cameras are two standard deviations
-    apart: half of the distance is added in quadrature. The jackknife is linear at the pose, and does not see how far
-    halves move that fit as well elsewhere, as with a narrow view of something far, where turning and stepping aside
-    look alike. Turning belongs to it, so the whole covariance is multiplied. Halves know nothing of priors: an estimate
-    with these stays as it is.
+    apart, and the square of half of the distance estimates the variance. The jackknife is linear at the pose, and does
+    not see how far halves move that fit as well elsewhere, as with a narrow view of something far, where turning and
+    stepping aside look alike. The distance of a few splits varies, and shows no errors of reference poses that all
+    references share, so a share of the jackknife's variance is added. Turning belongs to stepping aside, so the whole
+    covariance is multiplied. Errors of the intrinsics are the same in both halves, so they count in full. Halves know
+    nothing of priors: an estimate with these stays as it is.
     """
     radius_m = accuracy_from_covariance(estimate.covariance).position_68_m
     if estimate.without_priors is not None or not radius_m > 0:
         return estimate
     in_radii = min(apart_m / 2 / radius_m, MOST_DISAGREEMENT)
-    return replace(estimate, covariance=estimate.covariance * (1 + in_radii**2))
+    covariance = (JACKKNIFE_SHARE + in_radii**2) * estimate.covariance + (1 - JACKKNIFE_SHARE) * _shared(estimate)
+    return replace(estimate, covariance=covariance)
+
+
+def _shared(estimate: PoseEstimate) -> Array:
+    """The part (6, 6) of the covariance by errors of the intrinsics, which are the same in all halves of the data.
+
+    Evidence that was estimated anew, because it contradicts the intrinsics, says more than the covariance contains: no
+    more than this counts, of position and rotation.
+    """
+    if estimate.intrinsics is None:
+        return np.zeros((6, 6))
+    found, total = estimate.intrinsics.pose_covariance, estimate.covariance
+    least = max(1.0, *(np.trace(found[part, part]) / np.trace(total[part, part]) for part in (slice(3), slice(3, 6))))
+    return np.asarray(found / least)
 
 
 def error_radii(covariance: Array, probabilities: ArrayLike) -> Array:

@@ -54,7 +54,7 @@ class FitOptions:
         least_answers: with fewer right answers, the calibration changes nothing.
     """
 
-    median_ratio: float = 0.72
+    median_ratio: float = 0.76
     scatter: float = 0.65
     factor_log: float = 0.4
     noise_share: float = 0.3
