@@ -11,6 +11,8 @@ from support.planted_engine import ESCALATION, SURE_INLIERS, Setting, caller, lo
 from support.servers import whole
 
 from mapless_server.engine.stages import QueryStages
+from mapless_server.method.correspond import Matcher
+from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.views import Matches, View
 from mapless_server.scheduling import CostModel, Next
 
@@ -45,6 +47,21 @@ class TestRematching:
         assert [it.stage for it in job.records].count("prepare") == 1 + 1 + 2
         assert result.stage_seconds["strong/rematch"] >= 0
         assert result.tier.extractor.name == "strong"
+
+    @pytest.mark.parametrize(("is_alone", "steps"), [(True, 1), (False, 2)])
+    def test_alone_as_many_pairs_as_threads_are_a_step(self, setting: Setting, is_alone: bool, steps: int) -> None:
+        planted = self.pair_matching(setting)
+        tier = replace(setting.engine.tiers[1], pipeline=Pipeline(matcher=Matcher(threads=2, pair_matching=planted)))
+        stages = QueryStages([setting.engine.tiers[0], tier], ESCALATION, is_alone=lambda: is_alone)
+        job = setting.engine.query_job(query_of(("r0", "r1")), caller())
+        job.step.payload.__dict__["tier"] = 1
+        (chosen,) = stages.prepare([job])
+        assert isinstance(chosen, Next)
+        run = chosen.step.payload
+        for _ in range(steps):
+            run = stages._rematched(run)
+        assert not run.unmatched
+        assert planted.calls == 2
 
     def test_the_method_gets_the_new_matches(self, setting: Setting) -> None:
         self.pair_matching(setting)

@@ -87,7 +87,7 @@ class QueueEngine:
         self.options = options
         self.references = references
         self.background: BackgroundMatching | None = None
-        stages = QueryStages(self.tiers, options.escalation, method)
+        stages = QueryStages(self.tiers, options.escalation, method, is_alone=self._is_alone)
         is_batched = any(tier.pipeline.reconstructor.is_batched for tier in tiers)
         coarse = Stage(COARSE, DEVICE, REFINE, options.max_batch) if is_batched else Stage(COARSE, HOST, REFINE)
         self.queue = WorkQueue(
@@ -103,6 +103,10 @@ class QueueEngine:
             failure_of,
             quota,
         )
+
+    def _is_alone(self) -> bool:
+        """Whether the queue has one job only."""
+        return self.queue.job_count == 1
 
     def query_job(
         self,

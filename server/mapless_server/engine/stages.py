@@ -81,15 +81,18 @@ class QueryStages:
         escalation: EscalationOptions,
         method: Method | None = None,
         gives_up: Callable[[QueryRun], bool] = lambda run: False,
+        is_alone: Callable[[], bool] = lambda: False,
     ) -> None:
         """Uses these tiers, the cheapest first; see `EngineOptions` for the options.
 
-        A further search that `gives_up` is not begun, as if there were no time: where a captured call is replayed.
+        A further search that `gives_up` is not begun, as if there were no time: where a captured call is replayed. A
+        query that `is_alone` may use all threads where otherwise others would wait for one.
         """
         self._tiers = tiers
         self._escalation = escalation
         self._method = method or Method()
         self._gives_up = gives_up
+        self._is_alone = is_alone
 
     def prepare(self, jobs: Sequence[Job]) -> list[StageResult]:
         """Loads references, finds features and computes correspondences."""
@@ -174,14 +177,17 @@ class QueryStages:
         return self._matched_further(run)
 
     def _rematched(self, run: QueryRun) -> QueryRun:
-        """Matches the photograph again with the next reference."""
+        """Matches the photograph again with the next reference, or with as many as there are threads if it is alone."""
         assert run.view is not None
         assert run.query_matches is not None
-        index, *others = run.unmatched
-        matches = list(run.query_matches)
+        matcher, matches = self._tiers[run.tier].pipeline.matcher, list(run.query_matches)
+        count = matcher.threads if self._is_alone() else 1
+        indices, others = run.unmatched[:count], run.unmatched[count:]
         with run.context.stage("rematch"):
-            matches[index] = self._tiers[run.tier].pipeline.matcher.rematch(run.view, run.references[index])
-        return run.but(query_matches=tuple(matches), unmatched=tuple(others))
+            found = matcher.rematch_together(run.view, [run.references[i] for i in indices])
+        for i, it in zip(indices, found, strict=True):
+            matches[i] = it
+        return run.but(query_matches=tuple(matches), unmatched=others)
 
     def _matched_further(self, run: QueryRun) -> StageResult:
         """Matches the next reference, or goes on with the query if all are matched or no time is left for more."""

@@ -212,6 +212,15 @@ class Matcher:
         self.pair_s = spent_s if usual_s is None else usual_s + (spent_s - usual_s) / _PAIRS_THAT_COUNT
         return matches
 
+    def rematch_together(self, query: View, references: Sequence[PosedView]) -> list[Matches]:
+        """Matches a query with each of some references by the `pair_matching`, in the threads that are free."""
+        return self._threads.map(lambda reference: self.rematch(query, reference), references)
+
+    @property
+    def threads(self) -> int:
+        """How many pairs are matched at a time, where no other query matches."""
+        return self._threads.threads
+
     def close(self) -> None:
         """Ends the threads."""
         self._threads.close()

@@ -136,8 +136,8 @@ class SharedThreads:
 
     def __init__(self, threads: int) -> None:
         """Uses so many threads for one query, its own among them."""
-        self._helpers = threads - 1
-        self._pool = ThreadPoolExecutor(max(1, self._helpers), "match")
+        self.threads = threads
+        self._pool = ThreadPoolExecutor(max(1, threads - 1), "match")
 
     def map(self, compute: Callable[[ItemT], Matches], items: Sequence[ItemT]) -> list[Matches]:
         """The results for all items, in order; raises what a computation raises, when no other one is running."""
@@ -152,7 +152,7 @@ class SharedThreads:
                 deque(rest, 0)
                 raise
 
-        helpers = [self._pool.submit(work) for _ in range(min(self._helpers, len(items) - 1))]
+        helpers = [self._pool.submit(work) for _ in range(min(self.threads, len(items)) - 1)]
         try:
             work()
         finally:

@@ -173,8 +173,8 @@ class _Side:
 
 def _attend_within(block: SelfBlock, x: Tensor, rotation: Tensor, key_mask: Tensor | None) -> Tensor:
     """SelfBlock of kornia with a mask of keys instead of pairs: (B, N, C) to (B, N, C)."""
-    qkv = block.Wqkv(x).unflatten(-1, (block.num_heads, -1, 3)).transpose(1, 2)
-    q, k, v = qkv.unbind(-1)
+    # Made contiguous: the layer interleaves them, and attention over strided values holds all its weights in memory.
+    q, k, v = block.Wqkv(x).unflatten(-1, (block.num_heads, -1, 3)).permute(4, 0, 2, 1, 3).contiguous().unbind()
     q, k = apply_cached_rotary_emb(rotation, q), apply_cached_rotary_emb(rotation, k)
     context = scaled_dot_product_attention(q.to(v.dtype), k.to(v.dtype), v, attn_mask=key_mask)
     message = block.out_proj(context.transpose(1, 2).flatten(start_dim=-2))
