@@ -1,7 +1,7 @@
 """Learned extractors: planted score maps give keypoints where they are, through reduction and lens; random weights."""
 
-import hashlib
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,9 +30,7 @@ from mapless_server.method.features.network import (  # noqa: E402
     image_tensor,
 )
 from mapless_server.method.features.xfeat import SHIFT_PX, XfeatExtractor  # noqa: E402
-from mapless_server.networks.checkpoint import load_strictly  # noqa: E402
 from mapless_server.networks.edgepoint2 import VARIANTS, EdgePoint2  # noqa: E402
-from mapless_server.networks.local_features import DERIVED, aliked_components  # noqa: E402
 from mapless_server.networks.weights import CheckpointError  # noqa: E402
 
 CAMERA = Camera(320, 256, 300.0, 300.0, 159.5, 127.5)
@@ -138,11 +136,9 @@ def test_aliked_keypoints_are_the_peaks_of_the_score_map(
 
 
 @pytest.mark.parametrize("size", [(160, 224), (97, 131), (7, 9)])
-def test_aliked_scores_and_descriptors_are_those_of_kornia(weights: dict[str, Path], size: tuple[int, int]) -> None:
+def test_aliked_scores_and_descriptors_are_those_of_kornia(aliked: AlikedExtractor, size: tuple[int, int]) -> None:
     """Offsets of the convolutions and of the samples reach several pixels, beyond the borders too."""
-    network = ALIKED("aliked-n16")
-    load_strictly(network, weights["aliked"], optional=DERIVED)
-    network.eval()
+    network = deepcopy(aliked._network)
     for name, parameter in network.named_parameters():
         if "offset_conv" in name and "bias" in name:
             nn.init.normal_(parameter, 0, 3.0)
@@ -152,23 +148,6 @@ def test_aliked_scores_and_descriptors_are_those_of_kornia(weights: dict[str, Pa
         ours = maps.scores, describe(network.desc_head, maps, keypoints)
         features, scores = network.extract_dense_map(image)
         torch.testing.assert_close(ours, (scores, network.desc_head(features, [keypoints])[0][0]), rtol=0, atol=2e-5)
-
-
-def test_aliked_descriptors_are_the_components_of_kornias(aliked: AlikedExtractor, weights: dict[str, Path]) -> None:
-    network = ALIKED("aliked-n16")
-    load_strictly(network, weights["aliked"], optional=DERIVED)
-    image, keypoints = torch.rand(1, 3, 96, 128), 2 * torch.rand(50, 2) - 1
-    with torch.inference_mode():
-        ours = describe(aliked._network.desc_head, find_maps(aliked._network, image), keypoints)
-        theirs = describe(network.eval().desc_head, find_maps(network, image), keypoints) @ aliked_components()
-    torch.testing.assert_close(ours, nn.functional.normalize(theirs, dim=1), rtol=0, atol=2e-5)
-
-
-def test_alikeds_components_are_orthonormal_and_these() -> None:
-    """Features are stored under a name that does not change with them."""
-    components = aliked_components()
-    torch.testing.assert_close(components.T @ components, torch.eye(64), rtol=0, atol=2e-4)
-    assert hashlib.sha256(components.numpy().astype("<f2").tobytes()).hexdigest()[:8] == "92001fbf"
 
 
 def test_xfeat_keypoints_are_the_peaks_of_the_keypoint_map(
@@ -242,7 +221,7 @@ def test_edgepoint2_finds_nothing_at_the_border(edgepoint2: EdgePoint2Extractor)
     assert (view.features.keypoints < np.array([330, 250]) - 4.4).all()
 
 
-@pytest.mark.parametrize(("name", "dimension"), [("aliked", 64), ("xfeat", 64), ("edgepoint2", 64)])
+@pytest.mark.parametrize(("name", "dimension"), [("aliked", 128), ("xfeat", 64), ("edgepoint2", 64)])
 def test_any_photograph_gives_well_formed_features(name: str, dimension: int, request: pytest.FixtureRequest) -> None:
     extractor: FeatureExtractor = request.getfixturevalue(name)
     blank = np.full((64, 300, 3), 127, np.uint8)

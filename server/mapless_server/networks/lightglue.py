@@ -30,7 +30,6 @@ from torch import Tensor, nn
 from torch.nn.functional import log_softmax, logsigmoid, scaled_dot_product_attention
 
 from .checkpoint import load_strictly
-from .local_features import aliked_components
 
 if TYPE_CHECKING:  # needed for SuperPoint's only
     from transformers import LightGlueConfig
@@ -223,16 +222,12 @@ def load_lightglue(features: str, weights: Path) -> tuple[LightGlue, str]:
     """Loads the LightGlue for features "aliked" or "superpoint" with the authors' weights.
 
     Returns it and their SHA-256. The safetensors file has the names of the authors' checkpoint for ALIKED, those of
-    transformers for SuperPoint. That for ALIKED takes the `aliked_components`. ValueError if there is no LightGlue for
-    these features; CheckpointError if the weights do not fit.
+    transformers for SuperPoint. ValueError if there is no LightGlue for these features; CheckpointError if the weights
+    do not fit.
     """
     if features == "aliked":
         network = LightGlue(input_dim=128)
-        sha256 = load_strictly(network, weights, optional={})
-        first = network.input_proj
-        assert isinstance(first, nn.Linear)
-        first.weight = nn.Parameter(first.weight.detach() @ aliked_components())
-        return network, sha256
+        return network, load_strictly(network, weights, optional={})
     if features == "superpoint":
         return load_superpoint_lightglue(weights)
     raise ValueError(f"there is no LightGlue for features {features!r}: only for aliked and superpoint")

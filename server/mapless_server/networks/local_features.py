@@ -7,19 +7,16 @@ where the weights do not fit, and ImportError where the network's package is not
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cache, partial
-from importlib.resources import files
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import numpy as np
-import torch
 
 from .checkpoint import load_strictly
 
 if TYPE_CHECKING:  # each package is needed for its own networks only
     from kornia.feature import ALIKED
     from kornia.feature.xfeat import XFeatModel
+    from torch import nn
     from transformers import SuperPointConfig, SuperPointForKeypointDetection
 
     from .edgepoint2 import EdgePoint2
@@ -28,31 +25,13 @@ DERIVED = {"dkd.hw_grid": None}
 """Computed by kornia, so not in the file of ALIKED's authors."""
 
 
-@cache
-def aliked_components() -> torch.Tensor:
-    """The principal components (128, 64) of ALIKED's descriptors, orthonormal to the rounding of float16.
-
-    Descriptors are stored as their products with these, in half of the bytes; the components times such a product are
-    the descriptor again, to a tenth of its square. They are those of 50 photographs of rendered rooms (server/research,
-    measured once).
-    """
-    with files(__package__).joinpath("aliked.npz").open("rb") as file, np.load(file) as arrays:
-        return torch.from_numpy(arrays["components"].astype(np.float32))
-
-
 def load_aliked(weights: Path, max_keypoints: int = 2048) -> tuple[ALIKED, str]:
-    """Loads ALIKED n16, with its weights' SHA-256; it finds the `max_keypoints` strongest maxima, however weak.
-
-    The last layer of its descriptors gives their `aliked_components`.
-    """
+    """Loads ALIKED n16, with its weights' SHA-256; it finds the `max_keypoints` strongest maxima, however weak."""
     from kornia.feature import ALIKED
 
     # A threshold of 0 lets kornia take the strongest maxima. With one it takes any if none is above it.
     network = ALIKED("aliked-n16", max_num_keypoints=max_keypoints, detection_threshold=0.0)
-    sha256 = load_strictly(network, weights, optional=DERIVED)
-    last = network.desc_head.get_parameter("agg_weights")
-    network.desc_head.agg_weights = torch.nn.Parameter(last.detach() @ aliked_components())
-    return network, sha256
+    return network, load_strictly(network, weights, optional=DERIVED)
 
 
 def load_xfeat(weights: Path) -> tuple[XFeatModel, str]:
@@ -81,7 +60,7 @@ def load_superpoint(
     return network, load_strictly(network, weights, optional={})
 
 
-LOADERS: Mapping[str, Callable[[Path], tuple[torch.nn.Module, str]]] = {
+LOADERS: Mapping[str, Callable[[Path], tuple[nn.Module, str]]] = {
     "aliked": load_aliked,
     "xfeat": load_xfeat,
     **{f"edgepoint2-{variant}": partial(load_edgepoint2, variant) for variant in ("s64", "m64", "l64", "e64")},

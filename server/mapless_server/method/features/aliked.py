@@ -44,7 +44,7 @@ class AlikedExtractor:
         self._network, sha256 = load_aliked(weights, self.options.max_keypoints)
         self._device = torch.device(device)
         self._network.to(self._device).eval()
-        self.name = self.options.label("aliked-n16-64d", sha256)
+        self.name = self.options.label("aliked-n16", sha256)
 
     @torch.inference_mode()
     def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
@@ -57,7 +57,7 @@ class AlikedExtractor:
         order = torch.argsort(scores, descending=True, stable=True)
         found, dispersities = found[order], dispersities[order]
         if not len(found):
-            dimension = self._network.desc_head.get_parameter("agg_weights").shape[2]
+            dimension = self._network.desc_head.sf_conv.in_channels
             return view_of(reduced_camera, np.empty((0, 2)), np.empty((0, dimension), np.float32), array_of(scores))
         descriptors = describe(self._network.desc_head, maps, found)
         last_pixel = np.array([reduced.shape[1] - 1, reduced.shape[0] - 1])

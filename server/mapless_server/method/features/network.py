@@ -30,7 +30,7 @@ class LearnedOptions:
         check_bounds(self, "min_score", at_least=0, below=1)
 
     def label(self, extractor: str, weights_sha256: str) -> str:
-        """The name under which features are stored, e.g. "aliked-n16-64d-2048-1024px-0.01-c2ab3d81"."""
+        """The name under which features are stored, e.g. "aliked-n16-2048-1024px-0.01-c2ab3d81"."""
         return f"{extractor}-{self.max_keypoints}-{self.max_side_px}px-{self.min_score:g}-{weights_sha256[:8]}"
 
 
