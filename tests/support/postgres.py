@@ -4,7 +4,6 @@ Each test gets a schema of its own, which costs milliseconds where a database co
 """
 
 import atexit
-import ctypes
 import os
 import pwd
 import shutil
@@ -15,7 +14,6 @@ import time
 from functools import cache
 from itertools import count
 from pathlib import Path
-from typing import Any
 
 import psycopg
 import pytest
@@ -25,7 +23,6 @@ from mapless_tools.load.driving import free_port
 USER = "mapless"
 START_LIMIT_S = 30.0
 _UNPRIVILEGED = ("postgres", "nobody")
-_PR_SET_PDEATHSIG = 1
 _SETTINGS = {
     "listen_addresses": "127.0.0.1",
     "unix_socket_directories": "",
@@ -91,12 +88,10 @@ class Cluster:
         settings = [f"--{name}={value}" for name, value in self._settings.items()]
         with (self._folder / "log").open("ab") as log:
             self._server = subprocess.Popen(
-                [self._programs / "postgres", "-D", self._data, *settings],
+                [*self._as_user(), str(self._programs / "postgres"), "-D", str(self._data), *settings],
                 stdout=log,
                 stderr=log,
                 cwd=self._folder,
-                preexec_fn=_end_with_parent,
-                **self._as_user(),
             )
         give_up = time.monotonic() + START_LIMIT_S
         while not self.lets_in():
@@ -132,13 +127,18 @@ class Cluster:
         return folder
 
     def _run(self, program: str, *arguments: str) -> None:
-        command = [str(self._programs / program), "-D", str(self._data), *arguments]
-        subprocess.run(command, check=True, capture_output=True, cwd=self._folder, timeout=60, **self._as_user())
+        command = [*self._as_user(), str(self._programs / program), "-D", str(self._data), *arguments]
+        subprocess.run(command, check=True, capture_output=True, cwd=self._folder, timeout=60)
 
-    def _as_user(self) -> dict[str, Any]:
-        if self._user is None:
-            return {}
-        return {"user": self._user.pw_uid, "group": self._user.pw_gid, "extra_groups": []}
+    def _as_user(self) -> list[str]:
+        """What starts a program that ends with its parent, even by SIGKILL, and is not root's.
+
+        A program does it, not Popen's `user` and `preexec_fn`: with these Python forks, and gRPC's handlers of a fork
+        sometimes abort the child before it becomes the program.
+        """
+        user = self._user
+        of_user = [f"--reuid={user.pw_uid}", f"--regid={user.pw_gid}", "--clear-groups"] if user is not None else []
+        return ["setpriv", "--pdeathsig=QUIT", *of_user]
 
 
 @cache
@@ -158,11 +158,6 @@ def require() -> None:
         pytest.skip("needs PostgreSQL: Debian's package `postgresql`")
     if os.geteuid() == 0 and not any(map(_has_user, _UNPRIVILEGED)):
         pytest.skip("PostgreSQL does not run as root, and there is no other user")
-
-
-def _end_with_parent() -> None:
-    """In the new process: makes it end with its parent, even by SIGKILL."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGQUIT)
 
 
 def _has_user(name: str) -> bool:
