@@ -22,6 +22,7 @@ from mapless_server.method.perturbation import moved, rotation_vector
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.pose_problem import AdjustOptions
 from mapless_server.method.priors.known import PosePrior, Priors
+from mapless_server.method.readings import sampson_px
 from mapless_server.method.rejection import Advice, IntrinsicsParameter, Rejection, RejectionReason
 from mapless_server.method.results import Support
 from mapless_server.method.structure import StructureOptions
@@ -37,7 +38,6 @@ from mapless_server.method.two_view.matches import TwoViewMatches
 from mapless_server.method.two_view.solve import solve_two_view
 from mapless_server.method.uncertainty.dispersion import UncertaintyOptions
 from mapless_server.method.views import Features, Matches, PosedView, View
-from mapless_tools.ingest.check.errors import sampson_px
 
 TRUE = RigidTransform(rotation_from_vector([0.1, -0.15, 0.05]), np.array([0.3, -0.1, -4.2]))
 CENTRES = ((-1.2, 0.1, -4.0), (1.0, -0.2, -4.4), (0.2, 0.5, -3.6))

@@ -14,10 +14,10 @@ from support.bags import BASE_FROM_CAMERA, at, image, info, odometry, transforms
 
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.method.features import SiftExtractor
+from mapless_server.method.readings import Verdict, implausible_depth
 from mapless_server.method.views import View
 from mapless_tools.dataset import Dataset, Frame
-from mapless_tools.ingest.check import check_frames, implausible_depth
-from mapless_tools.ingest.check.verdict import Verdict
+from mapless_tools.ingest.check import check_frames
 from mapless_tools.ingest.formats import KeyframeOptions, ReadOptions, read_dataset
 
 pytestmark = pytest.mark.realdata

@@ -36,5 +36,6 @@ answer, hints                the answer of the method; what would help after a r
 coarse/                      query and references reconstructed together, up to scale
 pipeline, alternatives       a query between the stages; poses where the stages have no points
 localize                     the stages in order
+readings/                    (ours) whether photographs fit their poses; which mistake in the data explains it if not
 groups/                      several photographs posed together
 """

@@ -12,6 +12,7 @@ from mapless import MaplessError
 from mapless.names import check_id
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, image_size
+from mapless_server.method.readings import implausible_depth
 from mapless_server.scenes.plausibility import another_unit, contradictions
 from mapless_server.serve.signals import terminable
 from mapless_server.settings import Settings
@@ -22,7 +23,7 @@ from mapless_tools.dataset import MAX_NAME_LENGTH, Dataset, Frame, Refusal
 from mapless_tools.output_files import check_writable, write_json
 from mapless_tools.progress import progress_bars
 
-from .check import check_frames, implausible_depth
+from .check import check_frames
 from .existing import NO_METRES, KnownReferences, WrongUnit, open_scene
 from .formats import ReadOptions, read_dataset
 from .metres import MetreOptions, in_metres

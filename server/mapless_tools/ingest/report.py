@@ -6,10 +6,9 @@ from typing import Any
 
 from rich.console import Console
 
+from mapless_server.method.readings import Verdict
 from mapless_tools.dataset import Dataset, Frame, Refusal
 from mapless_tools.output_files import finite
-
-from .check import Verdict
 
 WRONG_POSES = "nothing is stored while the poses do not fit the photographs; --skip-check stores them all the same"
 SHOWN = 20

@@ -11,15 +11,15 @@ from dataclasses import dataclass, field
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.features import FeatureExtractor, SiftExtractor
+from mapless_server.method.readings import MatchedPair, Pair, Verdict, consistent_matches, judge
 from mapless_server.method.views import PosedView
 from mapless_server.settings import available_cores
 from mapless_tools.dataset import Frame
 from mapless_tools.progress import Progress
 
-from .errors import MatchedPair, Pair, consistent_matches, more_pairs, pairs_by_order, pairs_by_pose
-from .verdict import Verdict, implausible_depth, judge
+from .pairs import more_pairs, pairs_by_order, pairs_by_pose
 
-__all__ = ["Verdict", "check_frames", "implausible_depth"]
+__all__ = ["check_frames"]
 
 
 MAX_SUSPECTED = 12

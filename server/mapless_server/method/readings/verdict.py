@@ -1,0 +1,78 @@
+"""The verdict on a scene's poses by epipolar errors: right, wrong as a whole and why, or single wrong ones."""
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .depth import median_depth
+from .errors import THRESHOLD_PX, MatchedPair, PairError, Views, errors_of, summary
+from .explanation import explain
+
+_WRONG_SHARE = 0.4  # more bad pairs than one photograph in five could make
+_SUSPECT_SHARE = 0.6
+_SUSPECT_PAIRS = 2
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The verdict on all pairs; medians and shares are NaN without pairs.
+
+    Suspects do not fit their neighbours although the scene as a whole does; or they are what the explanation concerns,
+    if not all. The explanation is the likely mistake if the scene as a whole is wrong, `explained_px` the median error
+    after its correction. The median depth of photographed points is in the unit of the poses; None if unknown, or the
+    scene is wrong.
+    """
+
+    pairs: tuple[PairError, ...]
+    unmatched_count: int
+    median_px: float
+    bad_share: float
+    threshold_px: float
+    suspects: tuple[int, ...] = ()
+    explanation: str = ""
+    explained_px: float = math.nan
+    median_depth: float | None = None
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there were any pairs to judge by."""
+        return bool(self.pairs)
+
+    @property
+    def is_wrong(self) -> bool:
+        """Whether the scene as a whole does not fit: more pairs are bad than single photographs can explain."""
+        return self.is_known and self.bad_share > _WRONG_SHARE
+
+
+def judge(views: Views, matched: Sequence[MatchedPair], unmatched_count: int = 0) -> Verdict:
+    """Judges the matched pairs; `unmatched_count` pairs have too few matches."""
+    errors = errors_of(views, matched)
+    if not errors:
+        return Verdict((), unmatched_count, math.nan, math.nan, THRESHOLD_PX)
+    median_px, bad_share = summary(errors)
+    threshold_px = float(np.median([error.threshold_px for error in errors]))
+    verdict = Verdict(tuple(errors), unmatched_count, median_px, bad_share, threshold_px)
+    if verdict.is_wrong:
+        found = explain(views, matched, median_px)
+        verdict = replace(verdict, explanation=found.text, explained_px=found.error_px, suspects=found.photographs)
+    else:
+        verdict = replace(verdict, median_depth=median_depth(views, matched))
+    return verdict if verdict.explanation else replace(verdict, suspects=suspects_of(errors))
+
+
+def suspects_of(errors: Sequence[PairError]) -> tuple[int, ...]:
+    """Photographs almost all of whose pairs are bad, the worst first; its pairs then do not count against others."""
+    left = list(errors)
+    suspects: list[int] = []
+    while True:
+        total = Counter(i for error in left for i in error.pair)
+        bad = Counter(i for error in left if error.is_bad for i in error.pair)
+        doubtful = [i for i in bad if bad[i] >= _SUSPECT_PAIRS and bad[i] >= _SUSPECT_SHARE * total[i]]
+        if not doubtful:
+            return tuple(suspects)
+        worst = max(doubtful, key=lambda i: (bad[i] / total[i], bad[i], -i))
+        suspects.append(worst)
+        left = [error for error in left if worst not in error.pair]
