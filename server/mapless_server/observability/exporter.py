@@ -1,7 +1,8 @@
 """The port of metrics and probes: HTTP in its own threads, so that it answers while the event loop is busy.
 
 "/metrics" is the registry. "/ready", for probes without gRPC, is 200 while the server serves, and 503 before, after,
-and when the heartbeat of event loop and queue is older than `READY_LIMIT_S`. "/live" is 503 when it is older than
+and when the heartbeat of event loop and queue is older than `READY_LIMIT_S`. "/ready?store" is 503 also while the store
+is away, for load balancers that have servers with another store. "/live" is 503 when the heartbeat is older than
 `LIVE_LIMIT_S`: the server hangs, and its supervisor should restart it.
 
 The server of prometheus_client starts a thread for every connection and waits for its request without a limit, so that
@@ -22,11 +23,13 @@ from collections.abc import Iterable
 from contextlib import suppress
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qs
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
 from prometheus_client import CollectorRegistry, make_wsgi_app
 
 from .metrics import Metrics
+from .store_probe import StoreProbe
 
 if TYPE_CHECKING:
     from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
@@ -47,10 +50,15 @@ _POLL_S = 0.2
 class MetricsServer:
     """Serves a registry and the probes until it is closed."""
 
-    def __init__(self, registry: CollectorRegistry, host: str, port: int, state: Metrics) -> None:
-        """Begins to listen and to serve; port 0 for any free one. OSError if the address cannot be listened on."""
+    def __init__(
+        self, registry: CollectorRegistry, host: str, port: int, state: Metrics, store_probe: StoreProbe | None = None
+    ) -> None:
+        """Begins to listen and to serve; port 0 for any free one. OSError if the address cannot be listened on.
+
+        Without a probe of the store, "/ready?store" is as "/ready".
+        """
         self._server = _HttpServer(host, port)
-        self._server.set_app(_application(registry, state))
+        self._server.set_app(_application(registry, state, store_probe))
         self.port: int = self._server.server_port
         self._thread = threading.Thread(target=self._server.serve_forever, args=(_POLL_S,), name="metrics", daemon=True)
         self._thread.start()
@@ -63,23 +71,28 @@ class MetricsServer:
         self._server.server_close()
 
 
-def _application(registry: CollectorRegistry, state: Metrics) -> WSGIApplication:
+def _application(registry: CollectorRegistry, state: Metrics, store_probe: StoreProbe | None) -> WSGIApplication:
     metrics: WSGIApplication = make_wsgi_app(registry)
 
     def beats_within(limit_s: float) -> bool:
         beaten_s = state.beaten_s
         return beaten_s is None or time.monotonic() - beaten_s < limit_s
 
+    def why_not_ready(asks_for_store: bool) -> str:
+        if not beats_within(READY_LIMIT_S):
+            return "hanging"
+        if not state.is_serving:
+            return "not serving"
+        return store_probe.fault() if asks_for_store and store_probe is not None else ""
+
     def answer(environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
         path = environ["PATH_INFO"]
         if path == "/metrics":
             return metrics(environ, start_response)
         if path == "/ready":
-            if not beats_within(READY_LIMIT_S):
-                return _text(start_response, HTTPStatus.SERVICE_UNAVAILABLE, "hanging")
-            if state.is_serving:
-                return _text(start_response, HTTPStatus.OK, "serving")
-            return _text(start_response, HTTPStatus.SERVICE_UNAVAILABLE, "not serving")
+            fault = why_not_ready("store" in parse_qs(environ.get("QUERY_STRING", ""), keep_blank_values=True))
+            status = HTTPStatus.SERVICE_UNAVAILABLE if fault else HTTPStatus.OK
+            return _text(start_response, status, fault or "serving")
         if path == "/live":
             if beats_within(LIVE_LIMIT_S):
                 return _text(start_response, HTTPStatus.OK, "alive")

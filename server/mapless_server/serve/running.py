@@ -18,6 +18,7 @@ from mapless_server.observability.event_loop import watch_event_loop
 from mapless_server.observability.exporter import MetricsServer
 from mapless_server.observability.metrics import Metrics
 from mapless_server.observability.scraped import gpu_memory
+from mapless_server.observability.store_probe import StoreProbe
 from mapless_server.scheduling import Fatal
 from mapless_server.security import SecurityError
 from mapless_server.security.protection import Protection
@@ -243,14 +244,15 @@ def _serve_metrics(
     if not settings.metrics:
         return ""
     try:
-        exporter = MetricsServer(metrics.registry, settings.metrics_host, settings.metrics_port, metrics)
+        host, port = settings.metrics_host, settings.metrics_port
+        exporter = MetricsServer(metrics.registry, host, port, metrics, StoreProbe(store.check))
     except OSError as error:
-        address = f"{settings.metrics_host}:{settings.metrics_port}"
-        raise StartupError(f"cannot serve metrics on {address}: {error.strerror or error}") from error
+        where = f"{settings.metrics_host}:{settings.metrics_port}"
+        raise StartupError(f"cannot serve metrics on {where}: {error.strerror or error}") from error
     stack.push_async_callback(asyncio.to_thread, exporter.close)
-    address = f"{settings.metrics_host}:{exporter.port}"
-    log.info("metrics on http://%s/metrics", address)
-    return address
+    where = f"{settings.metrics_host}:{exporter.port}"
+    log.info("metrics on http://%s/metrics", where)
+    return where
 
 
 def _observe_engine(engine: QueueEngine, metrics: Metrics) -> None:

@@ -103,6 +103,10 @@ class Database(Protocol):
         """
         ...
 
+    def check(self) -> None:
+        """Raises Unavailable if the database is away: it cannot be read, or others keep it from being written."""
+        ...
+
     def lift_limits(self, connection: Connection) -> None:
         """Lifts the time limits of a transaction that no caller waits for."""
         ...

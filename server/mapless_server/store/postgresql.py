@@ -13,14 +13,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url
+from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url, select
 from sqlalchemy.exc import ArgumentError, DBAPIError
 
 from mapless_server.errors import RequestError
 
 from .database import DamagedPages, StoreError, disk_full, is_damage, translating, unavailable
 from .migrations import migrate, read_version
-from .tables import SCHEMA_VERSION
+from .tables import SCHEMA_VERSION, store_version
 
 DRIVER = "postgresql+psycopg"
 CONNECTIONS_KEPT = 4
@@ -109,6 +109,11 @@ class PostgresqlDatabase:
         """Implements Database."""
         with translating(_translated), self._writing_engine.begin() as connection:
             yield connection
+
+    def check(self) -> None:
+        """Implements Database."""
+        with self.read() as connection:
+            connection.scalar(select(store_version.c.schema_version))
 
     def lift_limits(self, connection: Connection) -> None:
         """Implements Database."""

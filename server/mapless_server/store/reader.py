@@ -14,7 +14,7 @@ from mapless_server.method.cache import LruCache
 from mapless_server.security import SceneKey
 
 from . import queries, rows, tables
-from .database import DamagedPages, Database, unless_damaged
+from .database import DamagedPages, Database, unavailable, unless_damaged
 from .queries import read_changes
 from .records import DescribedReference, ReferenceRecord, SceneAttributes, SceneChanges, SceneRecord, SceneSnapshot
 
@@ -105,6 +105,12 @@ class StoreReader:
             raise
         finally:
             self._state = object()
+
+    def check(self) -> None:
+        """Raises RequestError while the store is away: calls that touch a scene would fail."""
+        self.database.check()
+        if self.write_fault == "STORE_UNAVAILABLE" and not self.database.is_shared:
+            raise unavailable("the store's disk fails")
 
     @observed
     def get_scene(self, scene_key: SceneKey) -> SceneRecord:

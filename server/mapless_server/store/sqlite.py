@@ -18,7 +18,7 @@ from types import ModuleType
 from typing import Any
 from urllib.parse import quote
 
-from sqlalchemy import URL, Connection, Engine, create_engine, event
+from sqlalchemy import URL, Connection, Engine, create_engine, event, select
 from sqlalchemy.exc import DBAPIError
 
 from mapless_server.errors import FailedPrecondition, RequestError, Unavailable
@@ -27,13 +27,15 @@ from .database import RETRY_AFTER_S, DamagedPages, StoreError, disk_full, is_dam
 from .folder_lock import FolderLock
 from .migrations import migrate, read_version
 from .reserve import Reserve
-from .tables import SCHEMA_VERSION
+from .tables import SCHEMA_VERSION, store_version
 
 logger = logging.getLogger(__name__)
 
 DATABASE_FILE = "mapless.sqlite3"
 BUSY_TIMEOUT_MS = 5000
 """How long a connection waits for another's lock. The server's own writers queue before; this is for other programs."""
+CHECK_TIMEOUT_MS = 2000
+"""How long a check waits for another program's lock: less than who asks waits for the check."""
 FREE_SPACE_TIMEOUT_MS = 100
 """Waiting for readers of the journal; a backup reads for longer, and is not waited for."""
 JOURNAL_KEPT_BYTES = 8 * 2**20
@@ -199,6 +201,26 @@ class SqliteDatabase:
             raise FailedPrecondition("the store can only be read", reason="STORE_READ_ONLY")
         with translating(_translated), self._write_lock, self._writing_engine.begin() as connection:
             yield connection
+
+    def check(self) -> None:
+        """Implements Database; a file that was removed is away, too, although SQLite goes on reading what it held."""
+        with self.read() as connection:
+            connection.scalar(select(store_version.c.schema_version))
+        if self.only_reads:
+            return
+        if not Path(self.name).is_file():
+            raise unavailable("the store's file is gone")
+        if not self._write_lock.acquire(blocking=False):
+            return  # a change of our own is being written
+        try:
+            with translating(_translated), self._writing_engine.connect() as connection:
+                _execute(connection, f"PRAGMA busy_timeout={CHECK_TIMEOUT_MS}")
+                try:
+                    connection.begin().rollback()
+                finally:
+                    _execute(connection, f"PRAGMA busy_timeout={BUSY_TIMEOUT_MS}")
+        finally:
+            self._write_lock.release()
 
     def lift_limits(self, connection: Connection) -> None:
         """Implements Database."""
