@@ -105,6 +105,7 @@ class Diagnostics:
         retrieval: descriptor that chose the references; empty if they were used as given; "pose-prior" if the
             photograph was tracked.
         captured: whether the server keeps the call for a time, including the photograph.
+        processor_s: processor time of the server's own threads for this photograph, seconds.
     """
 
     request_id: str
@@ -123,6 +124,7 @@ class Diagnostics:
     server_version: str
     retrieval: str = ""
     captured: bool = False
+    processor_s: float = 0.0
 
     @property
     def is_tracked(self) -> bool:

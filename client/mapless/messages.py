@@ -98,7 +98,11 @@ def _debug(message: pb.Debug, path: str) -> Debug:
 
 def _diagnostics(message: pb.Diagnostics, path: str) -> Diagnostics:
     stage_s = {timing.stage: _seconds(timing.duration) for timing in message.stages}
-    times = {"queue_s": _seconds(message.queue_duration), "total_s": _seconds(message.total_duration)}
+    times = {
+        "queue_s": _seconds(message.queue_duration),
+        "total_s": _seconds(message.total_duration),
+        "processor_s": _seconds(message.processor_duration),
+    }
     return read(Diagnostics, message, path, stage_s=stage_s, **times)
 
 

@@ -42,6 +42,7 @@ from mapless_server.scheduling import (
     StageResult,
     Step,
     WorkQueueOptions,
+    count_helper,
 )
 
 
@@ -71,6 +72,31 @@ class TestResults:
         assert before_s <= first.queued_s
         assert second.queued_s == first.end_s  # nothing lies between two stages
         assert toy.observer.batches[-1] == ("then", 3)
+
+    async def test_a_record_has_the_processor_time_of_all_threads(self) -> None:
+        """An equal share for each job of a batch: waiting costs nothing, a helping thread counts."""
+
+        def compute(jobs: Sequence[Job]) -> list[StageResult]:
+            if jobs[0].step.stage == "first":
+                time.sleep(0.05)
+                return [then(job) for job in jobs]
+            until_s = time.thread_time() + 0.06
+            while time.thread_time() < until_s:
+                pass
+            count_helper(0.09)
+            return [Done(None) for _ in jobs]
+
+        async with Toy(compute) as toy:
+            others = await toy.waiting(["x", "y"])
+            job = Job(Flow("t", "c"), Step("first", "toy", "b", "z"), time.monotonic() + FAR_S, 1)
+            running = asyncio.ensure_future(toy.queue.run(job))
+            await until(lambda: toy.queue.load("then").waiting == 3)
+            toy.gate.set()
+            await running
+            await outcomes(others)
+        waited, computed = job.records
+        assert waited.processor_s < 0.03
+        assert 0.05 <= computed.processor_s < 0.065
 
     async def test_a_batchs_output_is_taken_up_by_as_many_threads_at_once(self) -> None:
         """One notification, work for two."""

@@ -43,6 +43,9 @@ def test_leaves_one_out(folder: Path, tmp_path: Path) -> None:
     for query in figures["per_query"]:
         assert query["name"] not in query["references"], "no query is its own reference"
         assert len(query["references"]) == 8
+        assert 0 < query["claimed_68_m"] < query["claimed_95_m"]
+        assert 0 < query["trust"] <= 1
+        assert query["processor_ms"] > 0
 
 
 @pytest.mark.parametrize(

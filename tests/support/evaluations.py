@@ -3,6 +3,7 @@
 import math
 from typing import Any
 
+from mapless import Accuracy
 from mapless_tools.evaluate.metrics import QueryResult
 
 
@@ -17,7 +18,7 @@ def query_result(
         name=name,
         translation_error=translation,
         rotation_error_deg=math.inf if missed else rotation_deg,
-        position_68=None if missed else 0.01,
+        accuracy=None if missed else Accuracy(0.01, 0.02, 0.1, 0.2, calibrated=False),
         inlier_count=0 if missed else inliers[0],
         match_count=0 if missed else inliers[1],
         rejection="LOW_OVERLAP" if missed else "",

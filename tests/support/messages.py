@@ -28,7 +28,13 @@ def essence(answer: pb.LocalizeResponse, with_stages: bool = False) -> bytes:
     """All of an answer but its times and the name of the call; with the names of its stages where that is asked for."""
     kept = pb.LocalizeResponse()
     kept.CopyFrom(answer)
-    for name in ("request_id", "queue_duration", "total_duration", *([] if with_stages else ["stages"])):
+    for name in (
+        "request_id",
+        "queue_duration",
+        "total_duration",
+        "processor_duration",
+        *([] if with_stages else ["stages"]),
+    ):
         kept.diagnostics.ClearField(name)
     for stage in kept.diagnostics.stages:
         stage.ClearField("duration")

@@ -3,7 +3,7 @@
 import io
 import json
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 from support.evaluations import query_result
 
+from mapless import IntrinsicsCheck
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_tools.bench.report import BenchResult, BenchScene, Figures, Latency, as_json, markdown, met
 from mapless_tools.charts import INK, figure_of, inline_svg, new_axes, plot, use_logarithms
@@ -134,6 +135,20 @@ class TestReport:
         assert content["median_translation_m"] == pytest.approx(0.015)
         assert content["per_query"][0]["translation_m"] == 0.01
         assert content["ground_truth"] == "survey"
+
+    def test_json_has_each_photographs_claims_and_costs(self) -> None:
+        check = IntrinsicsCheck("K1", 0.0, 0.2, 0.01, 0.02, conflict=True, used=False)
+        costly = replace(result(0.015), trust=0.9, processor_ms=250.0)
+        accused = replace(MISSED, intrinsics_checks=(check,), processor_ms=4000.0)
+        content = to_json(evaluation(costly, accused))
+        right, lost = content["per_query"]
+        assert (right["claimed_68_m"], right["claimed_95_m"]) == (0.01, 0.02)
+        assert (right["claimed_68_deg"], right["claimed_95_deg"]) == (0.1, 0.2)
+        assert (right["calibration"], right["trust"], right["processor_ms"]) == ("GENERIC", 0.9, 250.0)
+        assert (lost["claimed_95_m"], lost["trust"]) == (None, None)
+        assert lost["intrinsics_checks"] == [asdict(check)]
+        assert (content["claimed_68_held"], content["claimed_95_held"]) == (0.0, 1.0)
+        assert content["processor_ms"] == {"mean": 2125.0, "localized": 250.0, "rejected": 4000.0}
 
     def test_features_are_those_of_every_answer(self) -> None:
         """Where stronger features answered some queries, and their stages are one sum for people."""

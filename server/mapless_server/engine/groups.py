@@ -26,12 +26,14 @@ MIN_FRAMES, MAX_FRAMES = 2, 16
 class GroupResult:
     """The results of a group's photographs, each localized alone, in the order of the queries.
 
-    `queued_s` is the time that each waited before its computation began, `seconds` that of the computation.
+    `queued_s` is the time that each waited before its computation began, `seconds` that of the computation, and
+    `processor_s` the processor time that it took.
     """
 
     results: tuple[Result, ...]
     queued_s: tuple[float, ...]
     seconds: tuple[float, ...]
+    processor_s: tuple[float, ...]
 
 
 class PhotoGroup:
@@ -72,7 +74,8 @@ class PhotoGroup:
         results, seconds = zip(*(self._done[i] for i in range(len(self._queries))), strict=True)
         first = (next(iter(records), None) for records in self.records)
         queued_s = tuple(0.0 if it is None else it.start_s - it.queued_s for it in first)
-        return GroupResult(results, queued_s, seconds)
+        processor_s = tuple(sum(it.processor_s for it in records) for records in self.records)
+        return GroupResult(results, queued_s, seconds, processor_s)
 
     async def _work(self) -> None:
         """Localizes waiting photographs until none waits or the queue has room for fewer concurrent ones."""

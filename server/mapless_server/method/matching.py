@@ -1,5 +1,6 @@
 """How two photographs are matched: options of each kind of features, nearest neighbours, and what a network offers."""
 
+import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -7,6 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
 import numpy as np
+
+from mapless_server.scheduling import count_helper
 
 from .choices import EDGEPOINT2
 from .nearest import mutual_matches
@@ -152,14 +155,19 @@ class SharedThreads:
                 deque(rest, 0)
                 raise
 
-        helpers = [self._pool.submit(work) for _ in range(min(self.threads, len(items)) - 1)]
+        def help_out() -> float:
+            begin_s = time.thread_time()
+            work()
+            return time.thread_time() - begin_s
+
+        helpers = [self._pool.submit(help_out) for _ in range(min(self.threads, len(items)) - 1)]
         try:
             work()
         finally:
             running = [it for it in helpers if not it.cancel()]
             wait(running)
         for helper in running:
-            helper.result()
+            count_helper(helper.result())
         return [results[i] for i in range(len(items))]
 
     def close(self) -> None:

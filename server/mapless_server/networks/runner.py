@@ -1,6 +1,7 @@
 """A loaded network on a device, run by one thread, in the precision and with the kernels that suit the device."""
 
 import threading
+import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,6 +12,8 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 from torch.torch_version import TorchVersion
+
+from mapless_server.scheduling import count_helper
 
 from .blocks import Attention
 from .encoder import PATCH_PX
@@ -158,7 +161,13 @@ class NetworkRunner:
         return self._run(self._reconstruct_scenes, tokens, grid, mapped, poses, posed, metric)
 
     def _run(self, work: Callable[..., T], *arguments: Any) -> T:
-        return self._thread.submit(self._without_gradients, work, *arguments).result()
+        result, seconds = self._thread.submit(self._timed, work, *arguments).result()
+        count_helper(seconds)
+        return result
+
+    def _timed(self, work: Callable[..., T], *arguments: Any) -> tuple[T, float]:
+        begin_s = time.thread_time()
+        return self._without_gradients(work, *arguments), time.thread_time() - begin_s
 
     def _without_gradients(self, work: Callable[..., T], *arguments: Any) -> T:
         # Not inference_mode: for its tensors torch.compile would compile everything a second time.

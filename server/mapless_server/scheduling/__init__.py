@@ -40,6 +40,7 @@ from .jobs import (
     StageResult,
     Step,
 )
+from .processor import count_helper, processor_s
 from .work_queue import ComputeItem, Failure, Fatal, ItemList, WorkQueue, compute_items
 
 __all__ = [
@@ -68,4 +69,6 @@ __all__ = [
     "WorkQueue",
     "WorkQueueOptions",
     "compute_items",
+    "count_helper",
+    "processor_s",
 ]

@@ -154,6 +154,7 @@ class StageRecord:
         end_s: when it left the stage.
         batch: number of its batch; 0 if it was not computed.
         jobs: size of its batch; 0 if it was not computed.
+        processor_s: its share of the processor time that the batch took, see `processor`.
     """
 
     stage: str
@@ -162,6 +163,7 @@ class StageRecord:
     end_s: float
     batch: int
     jobs: int
+    processor_s: float = 0.0
 
     @property
     def waited_s(self) -> float:

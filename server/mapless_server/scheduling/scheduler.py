@@ -205,8 +205,11 @@ class Scheduler:
             lane.long.add(batch.number)
         return batch
 
-    def finish(self, batch: Batch, results: Sequence[StageResult], now_s: float) -> None:
-        """Handles the results of a batch: each of its jobs ends or continues, unless it has ended meanwhile."""
+    def finish(self, batch: Batch, results: Sequence[StageResult], now_s: float, processor_s: float = 0.0) -> None:
+        """Handles the results of a batch: each of its jobs ends or continues, unless it has ended meanwhile.
+
+        The batch took `processor_s` of processor time.
+        """
         stage, seconds = batch.stage, now_s - batch.start_s
         lane = self._lanes[stage.lane]
         lane.free += 1
@@ -229,7 +232,8 @@ class Scheduler:
             job.unusual_s = 0.0
             job.is_computed = False
             times_s = (job.waits_since_s, batch.start_s, now_s)
-            job.records.append(StageRecord(stage.name, *times_s, batch.number, len(batch.jobs)))
+            spent_s = processor_s / len(batch.jobs)
+            job.records.append(StageRecord(stage.name, *times_s, batch.number, len(batch.jobs), spent_s))
             if job.is_over:
                 continue
             if isinstance(result, Next):

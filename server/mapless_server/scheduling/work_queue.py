@@ -14,6 +14,7 @@ from typing import Any, Generic, TypeVar
 
 from .admission import WorkQueueOptions
 from .jobs import Batch, Done, Ending, Flow, Job, Next, Observer, Quota, Stage, StageLoad, StageResult, Step
+from .processor import processor_s
 from .scheduler import Scheduler
 
 log = logging.getLogger(__name__)
@@ -296,10 +297,12 @@ class WorkQueue:
         assert self._loop is not None
         try:
             while (batch := self._next_batch(lane)) is not None:
+                begin_s = processor_s()
                 results = self._compute_batch(batch.stage, batch.jobs)
+                spent_s = processor_s() - begin_s
                 with self._changing():
                     self._computing.discard(batch)
-                    self._scheduler.finish(batch, results, time.monotonic())
+                    self._scheduler.finish(batch, results, time.monotonic(), spent_s)
                     self._notify(lane)
                 # An idle thread must not keep photographs and tensors alive.
                 del batch, results

@@ -108,6 +108,8 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
             response.diagnostics.request_id = call.request_id
             response.diagnostics.queue_duration.FromNanoseconds(round(1e9 * sum(it.waited_s for it in records)))
             response.diagnostics.total_duration.FromNanoseconds(round(1e9 * (time.monotonic() - call.arrived_s)))
+            processor_s = sum(it.processor_s for it in records)
+            response.diagnostics.processor_duration.FromNanoseconds(round(1e9 * processor_s))
             return response
 
         def give_coarse(result: Result) -> None:

@@ -79,9 +79,11 @@ def run_figures(run: Run) -> dict[str, Any]:
         "p90_translation_cm": finite(100 * summary.p90_translation),
         **{f"recall_{name}": share for name, share in summary.recall.items()},
         "claimed_68_held": summary.claim_held,
+        "claimed_95_held": summary.claim_95_held,
         "latency_p50_ms": summary.latency_p50_ms,
         "latency_p95_ms": summary.latency_p95_ms,
         "latency_first_ms": summary.latency_first_ms,
+        "processor_ms": summary.processor_ms,
         "backend": run.results[0].backend,
         "features": " ".join(summary.features),
     }
@@ -125,7 +127,7 @@ def _paper(tables: Benchmark) -> dict[str, Any]:
 
 def _query(run: Run, index: int) -> dict[str, Any]:
     result = run.results[index]
-    pose = result.pose or (None,) * 7
+    pose, claimed = result.pose or (None,) * 7, result.accuracy
     return {
         "scene": run.scene.place.name,
         "setting": setting_name(run.split.setting),
@@ -133,11 +135,16 @@ def _query(run: Run, index: int) -> dict[str, Any]:
         "query": result.name,
         "translation_cm": finite(100 * result.translation_error),
         "rotation_deg": finite(result.rotation_error_deg),
-        "claimed_68_cm": None if result.position_68 is None else 100 * result.position_68,
+        "claimed_68_cm": 100 * claimed.position_68_m if claimed else None,
+        "claimed_95_cm": 100 * claimed.position_95_m if claimed else None,
+        "claimed_68_deg": claimed.rotation_68_deg if claimed else None,
+        "claimed_95_deg": claimed.rotation_95_deg if claimed else None,
+        "trust": result.trust,
         "inliers": result.inlier_count,
         "matches": result.match_count,
         "rejection": result.rejection,
         "latency_ms": round(result.latency_ms, 1),
+        "processor_ms": round(result.processor_ms, 1),
         **dict(zip(("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"), pose, strict=True)),
         "references": " ".join(result.references),
     }

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mapless import Accuracy, IntrinsicsCheck
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
 
 RECALL_BARS = {"1cm_1deg": (0.01, 1.0), "5cm_5deg": (0.05, 5.0), "25cm_2deg": (0.25, 2.0)}
@@ -18,9 +19,10 @@ class QueryResult:
     """The result of one query; a rejected one has infinite errors, counts of 0, and no pose.
 
     Lengths are in the dataset's unit; `reference_distance` is the median distance from the true camera centre to those
-    of its references. `position_68` is the claimed radius, None without one. The latency is measured by the client,
-    `stage_ms` in the server. The best reference has the most inliers. The pose is the answered world_from_camera: x y z
-    and the quaternion x y z w.
+    of its references. The accuracy has the claimed radii, positions in the dataset's unit; None without a pose, or for
+    a pose without radii, as is trust. Intrinsics checks are those of the answer, or of the rejection. The latency is
+    measured by the client, `stage_ms` and `processor_ms` in the server. The best reference has the most inliers. The
+    pose is the answered world_from_camera: x y z and the quaternion x y z w.
     """
 
     name: str
@@ -28,7 +30,6 @@ class QueryResult:
     translation_error: float
     rotation_error_deg: float
     reference_distance: float
-    position_68: float | None
     inlier_count: int
     match_count: int
     rejection: str
@@ -39,6 +40,10 @@ class QueryResult:
     features: str
     best_reference: str = ""
     pose: tuple[float, ...] | None = None
+    accuracy: Accuracy | None = None
+    trust: float | None = None
+    intrinsics_checks: tuple[IntrinsicsCheck, ...] = ()
+    processor_ms: float = 0.0
 
     @property
     def localized(self) -> bool:
@@ -51,8 +56,10 @@ class Summary:
     """All queries together. Medians, p90 and recall are over all queries, infinite if too many were rejected.
 
     Translations are in the dataset's unit; `median_relative` is over the distance to the query's references.
-    `claim_held` is the share of claimed 68 % radii that held, None if nothing was claimed. p50 and p95 are without the
-    first call, which has empty caches, if there are more. Several `features` have answers if stronger ones are tried.
+    `claim_held` and `claim_95_held` are the shares of claimed radii of positions that held, None if nothing was
+    claimed. p50 and p95 are without the first call, which has empty caches, if there are more; the processor times are
+    means over all, over localized and over rejected queries, None without any. Several `features` have answers if
+    stronger ones are tried.
     """
 
     query_count: int
@@ -63,9 +70,13 @@ class Summary:
     median_relative: float
     recall: Mapping[str, float]
     claim_held: float | None
+    claim_95_held: float | None
     latency_p50_ms: float
     latency_p95_ms: float
     latency_first_ms: float
+    processor_ms: float
+    processor_localized_ms: float | None
+    processor_rejected_ms: float | None
     stage_share: Mapping[str, float]
     rejections: Mapping[str, int]
     features: Mapping[str, int]
@@ -83,7 +94,7 @@ def summarize(results: Sequence[QueryResult]) -> Summary:
     """The summary of at least one result."""
     translations = [r.translation_error for r in results]
     rotations = [r.rotation_error_deg for r in results]
-    claims = [r.translation_error <= r.position_68 for r in results if r.position_68 is not None]
+    claims = [(r.translation_error, r.accuracy) for r in results if r.accuracy is not None]
     latencies = [r.latency_ms for r in results]
     steady = latencies[1:] or latencies
     relative = [r.translation_error / r.reference_distance if r.reference_distance > 0 else math.inf for r in results]
@@ -98,14 +109,22 @@ def summarize(results: Sequence[QueryResult]) -> Summary:
             name: sum(t <= metres and d <= degrees for t, d in zip(translations, rotations, strict=True)) / len(results)
             for name, (metres, degrees) in RECALL_BARS.items()
         },
-        claim_held=sum(claims) / len(claims) if claims else None,
+        claim_held=_mean([error <= claimed.position_68_m for error, claimed in claims]),
+        claim_95_held=_mean([error <= claimed.position_95_m for error, claimed in claims]),
         latency_p50_ms=quantile(steady, 0.5),
         latency_p95_ms=quantile(steady, 0.95),
         latency_first_ms=latencies[0],
+        processor_ms=sum(r.processor_ms for r in results) / len(results),
+        processor_localized_ms=_mean([r.processor_ms for r in results if r.localized]),
+        processor_rejected_ms=_mean([r.processor_ms for r in results if not r.localized]),
         stage_share=stage_share(results),
         rejections=dict(Counter(r.rejection for r in results if not r.localized).most_common()),
         features=dict(Counter(r.features for r in results).most_common()),
     )
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return sum(values) / len(values) if values else None
 
 
 def quantile(values: Sequence[float], share: float) -> float:

@@ -52,8 +52,8 @@ class WorstQuery:
                 f"{100 * result.translation_error:.1f} cm, {result.rotation_error_deg:.2f}° off; "
                 f"{result.inlier_count} inliers of {result.match_count} matches with all references"
             )
-            if result.position_68 is not None:
-                outcome += f"; claimed within {100 * result.position_68:.1f} cm (68 %)"
+            if result.accuracy is not None:
+                outcome += f"; claimed within {100 * result.accuracy.position_68_m:.1f} cm (68 %)"
         else:
             outcome = f"not localized, {result.rejection}: {result.message}"
         if not self.reference:

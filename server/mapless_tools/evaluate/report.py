@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 from rich.console import Console
@@ -52,7 +53,13 @@ def to_json(evaluation: Evaluation) -> dict[str, Any]:
         "recall": dict(summary.recall) if metric else dict.fromkeys(summary.recall),
         "relative": _relative(evaluation, summary),
         "claimed_68_held": summary.claim_held,
+        "claimed_95_held": summary.claim_95_held,
         "latency_ms": {"p50": summary.latency_p50_ms, "p95": summary.latency_p95_ms, "first": summary.latency_first_ms},
+        "processor_ms": {
+            "mean": summary.processor_ms,
+            "localized": summary.processor_localized_ms,
+            "rejected": summary.processor_rejected_ms,
+        },
         "stage_share": dict(summary.stage_share),
         "rejections": dict(summary.rejections),
         "rules": [*RULES] if metric else [*RULES, SCALE_FREE],
@@ -71,6 +78,7 @@ def print_report(evaluation: Evaluation, console: Console) -> None:
         **_accuracy_rows(evaluation, summary),
         "latency": f"p50 {summary.latency_p50_ms:.0f} ms, p95 {summary.latency_p95_ms:.0f} ms, "
         f"first call {summary.latency_first_ms:.0f} ms",
+        "processor time": _processor_time(summary),
         "time by stage": format_stages(summary.stage_share),
         "rejected": ", ".join(f"{count} {reason}" for reason, count in summary.rejections.items()) or "none",
         "method": f"{options.variant}, scale {options.scale_strategy}; {evaluation.results[0].backend}, "
@@ -118,6 +126,13 @@ def _format_features(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{name} {count}" for name, count in counts.items())
 
 
+def _processor_time(summary: Summary) -> str:
+    text = f"{summary.processor_ms:.0f} ms a query, in the mean"
+    if summary.processor_localized_ms is not None and summary.processor_rejected_ms is not None:
+        text += f"; localized {summary.processor_localized_ms:.0f} ms, rejected {summary.processor_rejected_ms:.0f} ms"
+    return text
+
+
 def _accuracy_rows(evaluation: Evaluation, summary: Summary) -> dict[str, str]:
     metric = evaluation.dataset.metric
     of_radius = summary.median_translation / evaluation.trajectory_radius if evaluation.trajectory_radius else math.inf
@@ -132,8 +147,9 @@ def _accuracy_rows(evaluation: Evaluation, summary: Summary) -> dict[str, str]:
         rows["recall"] = ", ".join(
             f"{name.replace('_', ' ')} {100 * share:.0f} %" for name, share in summary.recall.items()
         )
-    if summary.claim_held is not None:
-        rows["claimed 68 % radius held"] = f"{100 * summary.claim_held:.0f} % of localized queries"
+    if summary.claim_held is not None and summary.claim_95_held is not None:
+        shares = f"{100 * summary.claim_held:.0f} and {100 * summary.claim_95_held:.0f} %"
+        rows["claimed 68 and 95 % radii held"] = f"{shares} of localized queries"
     return rows
 
 
@@ -152,19 +168,26 @@ def _relative(evaluation: Evaluation, summary: Summary) -> dict[str, Any]:
 
 
 def _query(result: QueryResult, metric: bool) -> dict[str, Any]:
-    unit = "m" if metric else "units"
+    unit, claimed = "m" if metric else "units", result.accuracy
     return {
         "name": result.name,
         "localized": result.localized,
         f"translation_{unit}": finite(result.translation_error),
         "rotation_deg": finite(result.rotation_error_deg),
-        f"claimed_68_{unit}": result.position_68,
+        f"claimed_68_{unit}": claimed.position_68_m if claimed else None,
+        f"claimed_95_{unit}": claimed.position_95_m if claimed else None,
+        "claimed_68_deg": claimed.rotation_68_deg if claimed else None,
+        "claimed_95_deg": claimed.rotation_95_deg if claimed else None,
+        "calibration": claimed.calibration if claimed else None,
+        "trust": result.trust,
+        "intrinsics_checks": [asdict(check) for check in result.intrinsics_checks],
         f"reference_distance_{unit}": result.reference_distance,
         "inliers": result.inlier_count,
         "matches": result.match_count,
         "rejection": None if result.localized else {"reason": result.rejection, "message": result.message},
         "features": result.features,
         "latency_ms": result.latency_ms,
+        "processor_ms": result.processor_ms,
         "stage_ms": dict(result.stage_ms),
         "references": list(result.references),
     }

@@ -123,7 +123,6 @@ def _result(
         translation_error=errors[0],
         rotation_error_deg=errors[1],
         reference_distance=float(np.median(distances)) if distances else math.inf,
-        position_68=found.accuracy.position_68_m if found and found.accuracy else None,
         inlier_count=found.inlier_count if found else 0,
         match_count=found.match_count if found else 0,
         rejection="" if isinstance(answer, LocalizationResult) else answer.reason,
@@ -134,6 +133,10 @@ def _result(
         features=diagnostics.features,
         best_reference=max(uses, key=lambda name: uses[name].inlier_count, default="") if found else "",
         pose=_numbers(found.world_from_camera) if found else None,
+        accuracy=found.accuracy if found else None,
+        trust=found.trust if found else None,
+        intrinsics_checks=answer.intrinsics_checks,
+        processor_ms=1000 * diagnostics.processor_s,
     )
 
 

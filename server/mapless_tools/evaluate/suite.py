@@ -14,7 +14,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from mapless import Client, MaplessError
+from mapless import Accuracy, Client, IntrinsicsCheck, MaplessError
 from mapless_server import __version__
 from mapless_server.networks.weights import CATALOGUE
 from mapless_server.networks.weights.folder import Status, look_up, recorded
@@ -231,8 +231,11 @@ def _result(line: dict[str, Any]) -> QueryResult:
         raise KeyError("another version's line")
     infinite = ("translation_error", "rotation_error_deg", "reference_distance")
     line |= {name: math.inf for name in infinite if line[name] is None}
-    pose = None if line["pose"] is None else tuple(line["pose"])
-    return QueryResult(**line | {"references": tuple(line["references"]), "pose": pose})
+    line["references"] = tuple(line["references"])
+    line["pose"] = None if line["pose"] is None else tuple(line["pose"])
+    line["accuracy"] = None if line["accuracy"] is None else Accuracy(**line["accuracy"])
+    line["intrinsics_checks"] = tuple(IntrinsicsCheck(**check) for check in line["intrinsics_checks"])
+    return QueryResult(**line)
 
 
 def _runs_of(scene: SceneWork, setup: RunSetup) -> list[Run]:

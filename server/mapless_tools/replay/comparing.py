@@ -86,7 +86,14 @@ def _essence(response: Any) -> Any:
     copy = type(response)()
     copy.CopyFrom(response)
     for diagnostics in diagnostics_of(copy):
-        for name in ("request_id", "queue_duration", "total_duration", "server_version", "captured"):
+        for name in (
+            "request_id",
+            "queue_duration",
+            "total_duration",
+            "processor_duration",
+            "server_version",
+            "captured",
+        ):
             diagnostics.ClearField(name)
         kept = [it.stage for it in diagnostics.stages if it.stage != DESCRIBE and not it.stage.endswith(UNFINISHED)]
         del diagnostics.stages[:]

@@ -237,6 +237,7 @@ def _reports(
         report = pb.ImageReport(diagnostics=diagnostics_to_message(result, query.options))
         report.diagnostics.queue_duration.FromNanoseconds(round(1e9 * group.queued_s[i]))
         report.diagnostics.total_duration.FromNanoseconds(round(1e9 * group.seconds[i]))
+        report.diagnostics.processor_duration.FromNanoseconds(round(1e9 * group.processor_s[i]))
         if isinstance(alone.outcome, Rejection):
             report.alone.CopyFrom(rejection_to_message(alone.outcome))
         report.prior_checks.extend(map(check_to_message, checks.get(i, ())))
