@@ -204,7 +204,6 @@ class SceneDatabase:
             translation_error=error[0],
             rotation_error_deg=error[1],
             reference_distance=float(np.median(distances)),
-            position_68=None,
             inlier_count=inliers,
             match_count=len(x_in_image),
             rejection="FEW_INLIERS" if lost else "",
