@@ -2,6 +2,8 @@
 
 from importlib.util import find_spec
 
+from mapless_command.installation import how_to_install
+
 _EXTRA_OF = {
     "huggingface_hub": "networks",
     "jinja2": "tools",
@@ -27,7 +29,7 @@ def install_hint(error: ImportError) -> str:
     package = error.name.partition(".")[0]
     is_absent = isinstance(error, ModuleNotFoundError) and error.name == package
     what = f"the Python package {package} is not installed" if is_absent else str(error)
-    return f"{what}: pip install 'mapless[{_EXTRA_OF.get(package, 'server')}]'"
+    return f"{what}: {how_to_install(_EXTRA_OF.get(package, 'server'))}"
 
 
 def missing_package(extra: str) -> str:

@@ -83,27 +83,34 @@ def test_the_wheel_holds_exactly_the_files_of_the_packages(source: Path, wheel: 
             assert files <= packaged, package.name
 
 
-def test_the_client_alone_needs_neither_server_nor_torch(install: Callable[[str], Path]) -> None:
+def command(programs: Path, extra: str, wheel: Path) -> str:
+    """What installs an extra into an environment of uv's, which has no pip."""
+    return f"uv pip install --python {programs / 'python'} 'mapless[{extra}] @ {wheel.as_uri()}'"
+
+
+def test_the_client_alone_needs_neither_server_nor_torch(install: Callable[[str], Path], wheel: Path) -> None:
     programs = install("")
     run(programs / "mapless", "--help")
     installed = json.loads(run(*UV, "pip", "list", "-q", "--format=json", "-p", programs.parent))
     needed = {"googleapis-common-protos", "grpcio", "mapless", "numpy", "protobuf", "typing-extensions"}
     assert {it["name"] for it in installed} == needed
     message = run(programs / "mapless-server", "serve", code=1)
-    assert message == "mapless-server: the Python package typer is not installed: pip install 'mapless[server]'\n"
+    expected = "the Python package typer is not installed"
+    assert message == f"mapless-server: {expected}: {command(programs, 'server', wheel)}\n"
 
 
-def test_a_server_without_tools_names_their_extra(install: Callable[[str], Path], tmp_path: Path) -> None:
+def test_a_server_without_tools_names_their_extra(install: Callable[[str], Path], wheel: Path, tmp_path: Path) -> None:
     programs = install("[server]")
-    command = programs / "mapless-server"
+    server = programs / "mapless-server"
     for arguments in (["--help"], ["serve", "--help"], ["store", "--help"], ["token", "--help"], ["weights", "list"]):
-        run(command, *arguments)
-    message = run(command, "evaluate", "folder", code=2)
-    assert message == "mapless-server: evaluate needs the Python package jinja2: pip install 'mapless[tools]'\n"
+        run(server, *arguments)
+    message = run(server, "evaluate", "folder", code=2)
+    expected = f"evaluate needs the Python package jinja2: {command(programs, 'tools', wheel)}"
+    assert message == f"mapless-server: {expected}\n"
     flags = ["--port", "0", "--no-metrics", "--data-dir", str(tmp_path / "data")]
     with (tmp_path / "log").open("w") as log:
         process = subprocess.Popen(
-            [command, "serve", *flags], stdout=subprocess.PIPE, stderr=log, text=True, env=environment()
+            [server, "serve", *flags], stdout=subprocess.PIPE, stderr=log, text=True, env=environment()
         )
     try:
         address = Program(process, tmp_path).address
@@ -113,10 +120,12 @@ def test_a_server_without_tools_names_their_extra(install: Callable[[str], Path]
         process.communicate(timeout=LIMIT_S)
 
 
-def test_tools_run_with_their_extra(install: Callable[[str], Path], tmp_path: Path) -> None:
-    command = install("[server,tools]") / "mapless-server"
+def test_tools_run_with_their_extra(install: Callable[[str], Path], wheel: Path, tmp_path: Path) -> None:
+    programs = install("[server,tools]")
+    server = programs / "mapless-server"
     for name in ("import", "export", "audit", "evaluate", "calibrate", "replay", "load", "bench", "demo"):
-        run(command, name, "--help")
-    assert "is not a folder" in run(command, "import", tmp_path / "absent", "scene", code=2)
-    message = run(command, "view", "scene", code=2)
-    assert message == "mapless-server: view needs the Python package viser: pip install 'mapless[view]'\n"
+        run(server, name, "--help")
+    assert "is not a folder" in run(server, "import", tmp_path / "absent", "scene", code=2)
+    message = run(server, "view", "scene", code=2)
+    expected = f"view needs the Python package viser: {command(programs, 'view', wheel)}"
+    assert message == f"mapless-server: {expected}\n"

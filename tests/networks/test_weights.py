@@ -14,6 +14,7 @@ import pytest
 from support.safetensors_files import safetensors
 from support.weights_files import CONTENT, entry_of, names_in, sha256
 
+from mapless_command.installation import how_to_install
 from mapless_server.networks.weights import (
     CATALOGUE,
     CheckpointError,
@@ -270,11 +271,11 @@ def test_without_torch_the_reason_for_no_comparison_is_given(
         monkeypatch.setitem(sys.modules, module, None)
     reason = add(named(name), file, folder, unofficial=True).not_compared
     assert reason is not None
-    assert "pip install 'mapless[" in reason
+    assert how_to_install("networks") in reason
 
 
 def test_missing_converters_are_reported_before_a_download(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(FetchError, match=r"cannot be converted: .* torch is not installed: pip install"):
+    with pytest.raises(FetchError, match=r"cannot be converted: .* torch is not installed: .*pip.* install"):
         install.require_converter(named("aliked"))
     install.require_converter(named("pi3"))

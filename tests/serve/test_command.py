@@ -8,6 +8,7 @@ import typer.main
 from support.programs import printed
 from typer.testing import CliRunner
 
+from mapless_command.installation import how_to_install
 from mapless_server import extras
 from mapless_server.extras import install_hint
 from mapless_server.settings import Settings, bounds_text, default_text
@@ -72,7 +73,7 @@ def test_a_tool_without_its_packages_says_what_to_install(name: str, monkeypatch
     ended = CliRunner().invoke(commands.app, [name, *TOOLS[name]])
     extra = name if name in ("view", "gateway") else "tools"
     assert ended.exit_code == 2
-    assert ended.stderr == f"mapless-server: {name} needs the Python package absent: pip install 'mapless[{extra}]'\n"
+    assert ended.stderr == f"mapless-server: {name} needs the Python package absent: {how_to_install(extra)}\n"
 
 
 def test_every_command_either_serves_or_needs_an_extra() -> None:
@@ -107,15 +108,15 @@ def test_every_extra_brings_its_packages() -> None:
     [
         (
             ModuleNotFoundError("No module named 'transformers'", name="transformers"),
-            "the Python package transformers is not installed: pip install 'mapless[superpoint]'",
+            f"the Python package transformers is not installed: {how_to_install('superpoint')}",
         ),
         (
             ModuleNotFoundError("No module named 'kornia.feature.xfeat'", name="kornia.feature.xfeat"),
-            "No module named 'kornia.feature.xfeat': pip install 'mapless[networks]'",
+            f"No module named 'kornia.feature.xfeat': {how_to_install('networks')}",
         ),
         (
             ModuleNotFoundError("No module named 'scipy'", name="scipy"),
-            "the Python package scipy is not installed: pip install 'mapless[server]'",
+            f"the Python package scipy is not installed: {how_to_install('server')}",
         ),
         (ImportError("libGL.so.1: cannot open"), "libGL.so.1: cannot open"),
     ],

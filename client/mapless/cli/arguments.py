@@ -13,6 +13,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NoReturn
 
+from mapless_command.installation import how_to_install
+
 from ..client import Client
 from ..options import ConnectOptions
 from ..shortcut import ADDRESS_VARIABLE, TOKEN_VARIABLE, default_address
@@ -133,7 +135,7 @@ def _completion(client: Client, arguments: argparse.Namespace) -> int:
     try:
         import shtab
     except ImportError:
-        raise ValueError("completion needs the Python package shtab: pip install 'mapless[completion]'") from None
+        raise ValueError(f"completion needs the Python package shtab: {how_to_install('completion')}") from None
     parser = make_parser()
     for action in [it for one in all_parsers(parser) for it in one._actions if it.type is Path]:
         vars(action)["complete"] = shtab.FILE

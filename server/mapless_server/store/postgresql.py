@@ -16,6 +16,7 @@ from typing import Any
 from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url, select
 from sqlalchemy.exc import ArgumentError, DBAPIError
 
+from mapless_command.installation import how_to_install
 from mapless_server.errors import RequestError
 
 from .database import DamagedPages, StoreError, disk_full, is_damage, translating, unavailable
@@ -169,7 +170,7 @@ def _create_engine(url: URL, cursors_are_binary: bool = True) -> Engine:
         import psycopg
         from psycopg.pq import Format
     except ImportError:
-        raise StoreError("PostgreSQL needs psycopg: pip install 'mapless[postgres]'") from None
+        raise StoreError(f"PostgreSQL needs psycopg: {how_to_install('postgres')}") from None
 
     # In text format, bytes would be sent as hexadecimal digits, twice as long and slow to parse.
     wire_format = Format.BINARY if cursors_are_binary else Format.TEXT

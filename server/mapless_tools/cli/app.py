@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
+from mapless_command.installation import how_to_install
 from mapless_server import __version__
 from mapless_server.extras import missing_package
 from mapless_server.serve.command import fail, serve_command
@@ -62,7 +63,7 @@ def _add_tool(
 
 def _require(extra: str, command: str) -> None:
     if package := missing_package(extra):
-        fail(f"{command} needs the Python package {package}: pip install 'mapless[{extra}]'")
+        fail(f"{command} needs the Python package {package}: {how_to_install(extra)}")
 
 
 class _ServeCommand(TyperCommand):
