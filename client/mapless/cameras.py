@@ -11,9 +11,10 @@ import numpy as np
 
 from . import wire
 from .geometry import Array, Camera, RigidTransform
-from .json_input import read_json, read_message, shown
+from .json_input import is_inline, read_json, read_message, shown
 from .lenses import DEFAULT_LENS_MODEL, lens_from_coefficients
 from .pixels import size_of_image
+from .text_files import read_text, without_mark
 from .v1 import geometry_pb2
 from .wire import FieldError
 
@@ -37,7 +38,7 @@ def read_camera(source: str | Path, photo: str | Path | None = None) -> Camera:
         ValueError: the source is not a valid camera; the message names the file and the field.
     """
     text = str(source)
-    if text.lstrip().startswith("{") or "," not in text or Path(text).is_file():
+    if is_inline(text) or "," not in text or Path(text).is_file():
         if Path(text).name == FOLDER_FILE:
             return _listed_camera(text, photo)
         message = geometry_pb2.CameraIntrinsics()
@@ -74,15 +75,15 @@ def read_pose(source: str | Path) -> RigidTransform:
     ValueError, for what is no valid pose, names the file and the field; OSError, if the file cannot be read.
     """
     text = str(source)
-    is_inline = text.lstrip().startswith(("{", "["))
-    content = text if is_inline else Path(text).read_text("utf-8-sig", errors="replace")
+    is_text = is_inline(text)
+    content = without_mark(text) if is_text else read_text(Path(text))
     if content.lstrip().startswith("["):
-        return _pose_from_matrix(content, "pose" if is_inline else text)
+        return _pose_from_matrix(content, "pose" if is_text else text)
     if (pose := _pose_of_answer(content)) is not None:
         try:
             return read_pose(json.dumps(pose))
         except ValueError as error:
-            raise ValueError(str(error) if is_inline else f"{text}: {error}") from None
+            raise ValueError(str(error) if is_text else f"{text}: {error}") from None
     required = ("rotation", "translation_m")
     return read_message(str(source), geometry_pb2.RigidTransform(), required, wire.transform_from_message, "pose")
 
@@ -117,8 +118,9 @@ def read_cameras(file: str | Path) -> dict[Path, Camera]:
     the file cannot be read. ValueError if the file has another form; the message names the frame and the field.
     """
     path = Path(file)
+    text = read_text(path)
     try:
-        content = read_json(path.read_bytes())
+        content = read_json(text)
         frames = content.get("frames") if isinstance(content, dict) else None
         if not isinstance(frames, list):
             raise ValueError("has no list `frames`")

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
 
+from .text_files import read_text, without_mark
 from .wire import FieldError, joined
 
 M = TypeVar("M", bound=Message)
@@ -25,10 +26,11 @@ def read_message(source: str, message: M, required: Sequence[str], convert: Call
     messages. ValueError, if it is not JSON, or a field is unknown, missing or wrong, names the file and the field;
     OSError if the file cannot be read.
     """
-    is_text = source.lstrip().startswith(("{", "["))
+    is_text = is_inline(source)
     name = what if is_text else source
+    text = without_mark(source) if is_text else read_text(Path(source))
     try:
-        content = read_json(source if is_text else Path(source).read_bytes())
+        content = read_json(text)
         written: dict[str, str] = {}
         _fill(message, content, "", "", written)
         if missing := [field for field in required if field not in written]:
@@ -42,15 +44,17 @@ def read_message(source: str, message: M, required: Sequence[str], convert: Call
         raise ValueError(f"{name}: {error}") from None
 
 
-def read_json(text: str | bytes) -> Any:
+def is_inline(source: str) -> bool:
+    """Whether an argument is JSON itself, not the name of a file."""
+    return without_mark(source).lstrip().startswith(("{", "["))
+
+
+def read_json(text: str) -> Any:
     """Parses JSON that names no field twice; ValueError if it is something else."""
     try:
-        decoded = text.decode("utf-8-sig") if isinstance(text, bytes) else text
-        if not decoded.strip():
+        if not text.strip():
             raise ValueError("is empty")
-        return json.loads(decoded, object_pairs_hook=_without_repeats)
-    except UnicodeDecodeError:
-        raise ValueError("is not a text file") from None
+        return json.loads(text, object_pairs_hook=_without_repeats)
     except json.JSONDecodeError as error:
         raise ValueError(f"is not JSON: {error.msg} in line {error.lineno}, column {error.colno}") from None
     except RecursionError:

@@ -44,8 +44,13 @@ class Connection:
     def options(self) -> ConnectOptions:
         """The options in the client's form; ValueError if they do not fit together or a file cannot be read."""
         from mapless import ConnectOptions
+        from mapless.text_files import decode_text
 
-        token = _read(self.token_file).decode("utf-8") if self.token_file else os.environ.get(CLIENT_TOKEN_VARIABLE)
+        token = (
+            decode_text(_read(self.token_file), str(self.token_file))
+            if self.token_file
+            else os.environ.get(CLIENT_TOKEN_VARIABLE)
+        )
         return ConnectOptions(
             timeout_s=60.0,
             upload_timeout_s=600.0,

@@ -14,6 +14,7 @@ from mapless.cameras import with_slashes
 from mapless.geodesy import Datum
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless.scenes import Vector, unit_vector
+from mapless.text_files import read_text
 
 MAX_NAME_LENGTH = 128
 SPLITS = ("", "train", "test")
@@ -87,9 +88,11 @@ def read_place(file: Path, content: Mapping[str, Any]) -> tuple[Datum | None, Ve
 def read_json(file: Path) -> Any:
     """Reads a JSON file; ValueError, naming it, if it cannot be read or is not JSON."""
     try:
-        return json.loads(file.read_text(encoding="utf-8"))
+        text = read_text(file)
     except OSError as error:
         raise ValueError(f"{file} cannot be read: {error.strerror}") from error
+    try:
+        return json.loads(text)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{file} is not JSON: {error}") from error
 

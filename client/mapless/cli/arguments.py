@@ -18,6 +18,7 @@ from mapless_command.installation import how_to_install
 from ..client import Client
 from ..options import ConnectOptions
 from ..shortcut import ADDRESS_VARIABLE, TOKEN_VARIABLE, default_address
+from ..text_files import read_text
 from . import commands, doctor, localize
 
 DESCRIPTION = """\
@@ -166,7 +167,7 @@ def _add_doctor(groups: argparse._SubParsersAction[_Command]) -> None:
 def connect_options(arguments: argparse.Namespace) -> ConnectOptions:
     """Options of the connection; raises OSError or ValueError for wrong flags or files."""
     # Not a flag of its own: all users of the machine can read a command line.
-    token = arguments.token_file.read_text() if arguments.token_file else os.environ.get(TOKEN_VARIABLE)
+    token = read_text(arguments.token_file) if arguments.token_file else os.environ.get(TOKEN_VARIABLE)
     return ConnectOptions(
         timeout_s=arguments.timeout,
         tls=bool(arguments.tls or arguments.ca or arguments.cert),

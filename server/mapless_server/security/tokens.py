@@ -18,6 +18,8 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from mapless.text_files import decode_text
+
 from .access import Token, Tokens, sha256_of
 from .reloading import SecurityError, read_file
 
@@ -31,9 +33,11 @@ _FILE_MODE = 0o600
 def read_tokens(path: Path) -> Tokens:
     """Reads the file of tokens; SecurityError if it cannot be read or is malformed."""
     try:
-        return Tokens.model_validate_json(read_file(path))
+        return Tokens.model_validate_json(decode_text(read_file(path), str(path)))
     except ValidationError as error:
         raise SecurityError(f"{path}: {_describe(error)}") from None
+    except ValueError as error:
+        raise SecurityError(str(error)) from None
 
 
 def create_token(path: Path, name: str, tenant: str, role: str, expires: datetime | None) -> str:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
+from mapless.text_files import numbered_lines
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, decode_image, image_size
 from mapless_server.method.features import FeatureExtractor
@@ -121,10 +122,12 @@ def read_pairs(file: Path, dataset: Dataset, folder: Path) -> Pairs:
     frames = _by_name(dataset, folder)
     pairs: dict[str, list[Frame]] = {}
     try:
-        lines = file.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"{file} cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    for number, line in enumerate(lines, start=1):
+        lines = list(numbered_lines(file))
+    except OSError as error:
+        raise UsageError(f"{file} cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+    for number, line in lines:
         names = line.split()
         if not names:
             continue

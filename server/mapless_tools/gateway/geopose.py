@@ -25,7 +25,7 @@ from mapless_server.images import ImageLimits
 from mapless_server.images.decode import image_size
 from mapless_tools.ingest.formats.colmap.cameras import PARAMETERS, ColmapCamera
 
-from .guard import Failure, check_json
+from .guard import Failure, checked_json
 from .messages import CameraParameters, CameraReading, GeolocationReading, Request, Response
 
 MEDIA_TYPE = "application/vnd.oscp+json;version=2.0"
@@ -90,7 +90,7 @@ def read(body: bytes, datum: Datum) -> Photograph:
 
 def read_request(body: bytes) -> Request:
     """Reads the request of a body; Failure names what is wrong, and where."""
-    check_json(body)
+    body = bytes(checked_json(body))
     try:
         return Request.model_validate_json(body)
     except ValidationError as error:

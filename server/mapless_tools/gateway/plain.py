@@ -8,9 +8,10 @@ from starlette.datastructures import Headers, UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 
 from mapless.names import scene_name
+from mapless.text_files import decode_text
 from mapless.v1 import localization_service_pb2 as pb
 
-from .guard import Failure, check_json
+from .guard import Failure, checked_json
 
 FIELDS = ("image", "intrinsics", "scene", "request")
 _MAX_PART_BYTES = 2**20
@@ -58,10 +59,9 @@ async def _parts(headers: Headers, body: AsyncGenerator[bytes, None]) -> dict[st
 
 
 def _parse(text: bytes, message: Any, field: str) -> None:
-    check_json(text, field)
     try:
-        Parse(text, message)
-    except (ParseError, UnicodeDecodeError, RecursionError) as error:
+        Parse(decode_text(bytes(checked_json(text, field)), "the file"), message)
+    except (ParseError, ValueError, RecursionError) as error:
         raise Failure(f"is not the JSON of a {message.DESCRIPTOR.name}: {str(error)[:300]}", field=field) from None
 
 

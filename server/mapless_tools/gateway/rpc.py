@@ -26,7 +26,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from mapless.v1 import localization_service_pb2, reference_service_pb2
 
-from .guard import Failure, check_json
+from .guard import Failure, checked_json
 
 _PASSED_METADATA = ("authorization", "x-client-id", "x-mapless-scene", "x-request-id")
 _CONTENT_TYPES = ("application/grpc-web", "application/connect+", "application/proto", "application/json")
@@ -51,8 +51,7 @@ class _JsonCodec:
         self.name, self.encode, self._decode = codec.name, codec.encode, codec.decode
 
     def decode(self, data: bytes | bytearray, message_class: type[Any]) -> Any:
-        check_json(data)
-        return self._decode(data, message_class)
+        return self._decode(checked_json(data), message_class)
 
 
 def rpc_application(connect: Connect, max_message_bytes: int) -> ASGIApp:

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from mapless.geometry import MAX_COORDINATE_M, Array, Similarity
 from mapless.scenes import unit_vector
+from mapless.text_files import numbered_lines
 from mapless_server.scenes.plausibility import typical_down
 from mapless_tools.dataset import Dataset, Frame, finite_numbers
 
@@ -147,10 +148,10 @@ def read_positions(file: Path) -> dict[str, Array]:
     A first line without numbers is a heading. ValueError names a malformed line.
     """
     try:
-        rows = list(csv.reader(file.read_text(encoding="utf-8-sig").splitlines()))
+        rows = list(csv.reader(line for _, line in numbered_lines(file)))
     except OSError as error:
         raise ValueError(f"{file} cannot be read: {error.strerror}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
+    except csv.Error as error:
         raise ValueError(f"{file} is not CSV: {error}") from error
     found: dict[str, Array] = {}
     for number, row in enumerate(rows, 1):

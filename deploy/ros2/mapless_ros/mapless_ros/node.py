@@ -22,6 +22,7 @@ from std_srvs.srv import Trigger
 import mapless
 import mapless.ros
 from mapless.geometry import RigidTransform
+from mapless.text_files import read_text
 
 PARAMETERS: dict[str, Any] = {
     "address": "localhost:50051",
@@ -105,7 +106,7 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
             max_attempts=1,  # for an image that failed there is a newer one
             tls=self._given["tls"] or bool(ca),
             root_certificates=Path(ca).read_bytes() if ca else None,
-            token=Path(token_file).read_text("utf-8").strip() if token_file else None,
+            token=read_text(Path(token_file)).strip() if token_file else None,
             client_id=self.get_name(),
         )
 

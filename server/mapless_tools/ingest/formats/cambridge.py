@@ -13,7 +13,7 @@ from mapless.geometry import Camera, RigidTransform
 from mapless.lenses import RadialTangential
 from mapless_tools.dataset import Dataset, finite_numbers
 
-from .collecting import Collector, ReadOptions, from_corner, natural_order, read_text, rotation_of, size_of
+from .collecting import Collector, ReadOptions, filled_lines, from_corner, natural_order, rotation_of, size_of
 
 SPLIT_FILES = {"train": "dataset_train.txt", "test": "dataset_test.txt"}
 RECONSTRUCTION = "reconstruction.nvm"
@@ -60,9 +60,18 @@ def _stem(image: str) -> str:
 
 
 def _pose_lines(file: Path) -> Iterator[list[str]]:
-    for line in read_text(file).splitlines()[_HEADER_LINES:]:
-        if line.strip():
+    for number, line in filled_lines(file):
+        # Files that people write may have no header.
+        if number > _HEADER_LINES or _is_pose(line.split()):
             yield line.split()
+
+
+def _is_pose(words: list[str]) -> bool:
+    try:
+        finite_numbers(words[1:], "pose", (7,))
+    except ValueError:
+        return False
+    return True
 
 
 def _world_from_camera(words: list[str]) -> RigidTransform:
@@ -72,11 +81,10 @@ def _world_from_camera(words: list[str]) -> RigidTransform:
 
 def _lenses(file: Path) -> dict[str, tuple[float, float]]:
     """Focal length and radial distortion k of each image."""
-    lines = enumerate(read_text(file).splitlines(), 1)
-    _, first = next(lines, (0, ""))
+    filled = filled_lines(file)
+    number, first = next(filled, (1, ""))
     if not first.startswith("NVM_V3"):
-        raise ValueError(f"{file}:1: expected NVM_V3, found {first[:60]!r}")
-    filled = ((number, line) for number, line in lines if line.strip())
+        raise ValueError(f"{file}:{number}: expected NVM_V3, found {first[:60]!r}")
     number, line = next(filled, (0, ""))
     try:
         count = int(line)
@@ -93,4 +101,7 @@ def _lenses(file: Path) -> dict[str, tuple[float, float]]:
         except ValueError as error:
             raise ValueError(f"{file}:{number}: {error}; {count} cameras are announced") from error
         lenses[_stem(words[0])] = float(values[0]), float(values[8])
+    number, line = next(filled, (number, ""))
+    if len(line.split()) > 10:  # cameras are followed by a number of points
+        raise ValueError(f"{file}:{number}: another camera, {count} are announced")
     return lenses

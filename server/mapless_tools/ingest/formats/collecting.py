@@ -14,6 +14,7 @@ import numpy as np
 
 from mapless.cameras import MAX_SIDE_PX
 from mapless.geometry import MAX_COORDINATE_M, Array, Camera, Quaternion, RigidTransform
+from mapless.text_files import numbered_lines
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, image_size
 from mapless_tools.bags.options import BagOptions
@@ -179,14 +180,22 @@ def size_of(file: Path) -> tuple[int, int]:
         raise ValueError(f"image: {file} cannot be read: {error.strerror}") from error
 
 
-def read_text(file: Path) -> str:
-    """Reads a text file; ValueError, naming it, if it cannot be read."""
+def text_lines(file: Path) -> Iterator[tuple[int, str]]:
+    """Yields number and text of the lines of a file of any size; ValueError, naming it, if it cannot be read."""
     try:
-        return file.read_text(encoding="utf-8")
+        yield from numbered_lines(file)
     except OSError as error:
         raise ValueError(f"{file} cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{file} is not text: {error}") from error
+
+
+def filled_lines(file: Path) -> Iterator[tuple[int, str]]:
+    """Yields those of `text_lines` that are neither empty nor comments."""
+    return ((number, line) for number, line in text_lines(file) if line.strip() and not line.lstrip().startswith("#"))
+
+
+def read_words(file: Path) -> list[str]:
+    """The words of a text file; ValueError, naming it, if it cannot be read."""
+    return [word for _, line in text_lines(file) for word in line.split()]
 
 
 def rotation_of(quaternion: Array, what: str) -> Array:

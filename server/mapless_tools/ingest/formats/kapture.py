@@ -21,7 +21,7 @@ from typing import Any
 from mapless.geometry import RigidTransform
 from mapless_tools.dataset import Dataset, finite_numbers, read_place
 
-from .collecting import Collector, ReadOptions, read_text, rotation_of
+from .collecting import Collector, ReadOptions, filled_lines, rotation_of, text_lines
 from .colmap.cameras import PARAMETERS, ColmapCamera
 
 PROPERTIES = "# mapless: "
@@ -67,7 +67,7 @@ def read(path: Path, options: ReadOptions) -> Dataset:
 
 def _properties(file: Path) -> dict[str, Any]:
     """Properties of the scene in our own exports; ValueError for another version of the format."""
-    lines = read_text(file).splitlines()
+    lines = [line for _, line in text_lines(file)]
     version = re.match(r"#\s*kapture format:\s*(\S+)", lines[0]) if lines else None
     if version is not None and not version[1].startswith("1."):
         raise ValueError(f"{file}:1: kapture format {version[1]} is not known, only 1.x")
@@ -158,9 +158,8 @@ def _whole(text: str, what: str) -> int:
 
 def _rows(file: Path, least: int) -> Iterator[tuple[str, list[str]]]:
     """Yields rows of a table with their position; ValueError if it cannot be read or a row is too short."""
-    for number, line in enumerate(read_text(file).splitlines(), 1):
-        if line.strip() and not line.startswith("#"):
-            words = [word.strip() for word in line.split(",")]
-            if len(words) < least:
-                raise ValueError(f"{file}:{number}: expected at least {least} values with commas, found {len(words)}")
-            yield f"{file.name}:{number}", words
+    for number, line in filled_lines(file):
+        words = [word.strip() for word in line.split(",")]
+        if len(words) < least:
+            raise ValueError(f"{file}:{number}: expected at least {least} values with commas, found {len(words)}")
+        yield f"{file.name}:{number}", words

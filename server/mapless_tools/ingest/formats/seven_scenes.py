@@ -16,7 +16,17 @@ from pathlib import Path
 from mapless.geometry import Camera, RigidTransform
 from mapless_tools.dataset import Dataset, finite_numbers, named
 
-from .collecting import Collector, Intrinsics, ReadOptions, check_camera, from_corner, read_text, rotation_of, size_of
+from .collecting import (
+    Collector,
+    Intrinsics,
+    ReadOptions,
+    check_camera,
+    filled_lines,
+    from_corner,
+    read_words,
+    rotation_of,
+    size_of,
+)
 from .colmap import Model, find_model, read_model
 
 GROUND_TRUTH = "SfM pseudo ground truth (COLMAP)"
@@ -75,10 +85,8 @@ def find_ground_truth(path: Path, scene: str) -> PosesBySplit:
 def _read_lines(files: list[Path]) -> dict[str, tuple[str, ...]]:
     lines: dict[str, tuple[str, ...]] = {}
     for file in files:
-        for number, line in enumerate(read_text(file).splitlines(), 1):
+        for number, line in filled_lines(file):
             words = line.split()
-            if not words:
-                continue
             if len(words) != 9:
                 raise ValueError(
                     f"{file}:{number}: expected a path, qw qx qy qz tx ty tz and a focal length, found {len(words)} "
@@ -146,7 +154,7 @@ def read_pose(file: Path) -> RigidTransform:
     if not file.is_file():
         raise ValueError(f"pose: there is no file {file}")
     with named(f"pose: {file.name}"):
-        return RigidTransform.from_matrix(finite_numbers(read_text(file).split(), "pose", (16,)).reshape(4, 4))
+        return RigidTransform.from_matrix(finite_numbers(read_words(file), "pose", (16,)).reshape(4, 4))
 
 
 def _splits(path: Path) -> dict[str, str]:
@@ -162,12 +170,11 @@ def _splits(path: Path) -> dict[str, str]:
 
 
 def _sequences(file: Path) -> Iterator[str]:
-    for number, line in enumerate(read_text(file).splitlines(), 1):
-        if line.strip():
-            found = re.fullmatch(r"seq(?:uence)?[-_ ]?(\d+)", line.strip(), re.IGNORECASE)
-            if found is None:
-                raise ValueError(f"{file}:{number}: expected a line like sequence1, found {line.strip()[:60]!r}")
-            yield f"seq-{int(found[1]):02d}"
+    for number, line in filled_lines(file):
+        found = re.fullmatch(r"seq(?:uence)?[-_ ]?(\d+)", line.strip(), re.IGNORECASE)
+        if found is None:
+            raise ValueError(f"{file}:{number}: expected a line like sequence1, found {line.strip()[:60]!r}")
+        yield f"seq-{int(found[1]):02d}"
 
 
 def _intrinsics_note(given: Intrinsics | None) -> str:

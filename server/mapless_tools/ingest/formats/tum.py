@@ -17,7 +17,7 @@ from mapless.lenses import RadialTangential
 from mapless_tools.bags.trajectory import Trajectory
 from mapless_tools.dataset import Dataset, finite_numbers, named
 
-from .collecting import Collector, ReadOptions, read_text, size_of
+from .collecting import Collector, ReadOptions, filled_lines, size_of
 
 MAX_GAP_S = 0.02
 """A frame without a pose this near, before and after, is refused: a hand-held camera moves centimetres in that time."""
@@ -74,8 +74,7 @@ def _lens(path: Path) -> Camera:
 
 
 def _lines(file: Path) -> list[tuple[int, list[str]]]:
-    numbered = enumerate(read_text(file).splitlines(), 1)
-    return [(number, line.split()) for number, line in numbered if line.strip() and not line.startswith("#")]
+    return [(number, line.split()) for number, line in filled_lines(file)]
 
 
 def _row(file: Path, number: int, words: list[str]) -> Array:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from mapless_tools.dataset import Dataset, finite_numbers, named
 
-from .collecting import Collector, Intrinsics, ReadOptions, check_camera, read_text, size_of
+from .collecting import Collector, Intrinsics, ReadOptions, check_camera, filled_lines, size_of
 from .seven_scenes import GROUND_TRUTH, find_ground_truth, read_pose
 
 _LINE = re.compile(r"sequence\d+\s+\[frames=\d+\]\s+\[start=(\d+)\s*;\s*end=(\d+)\]")
@@ -51,7 +51,7 @@ def read(path: Path, options: ReadOptions) -> Dataset:
 
 
 def _intrinsics(file: Path) -> tuple[tuple[int, int], Intrinsics]:
-    lines = (line.partition("=") for line in read_text(file).splitlines())
+    lines = (line.partition("=") for _, line in filled_lines(file))
     values = {key.strip(): value for key, _, value in lines}
     fields = ("m_colorWidth", "m_colorHeight", "m_calibrationColorIntrinsic")
     for field in fields:
@@ -68,8 +68,10 @@ def _queries(file: Path) -> range:
     """Numbers of the frames of the first sequence; empty if there is no split."""
     if not file.is_file():
         return range(0)
-    first = next((line for line in read_text(file).splitlines() if line.strip()), "")
+    number, first = next(filled_lines(file), (1, ""))
     found = _LINE.match(first.strip())
     if found is None:
-        raise ValueError(f"{file}:1: expected sequence0 [frames=N] [start=A ; end=B], found {first.strip()[:80]!r}")
+        raise ValueError(
+            f"{file}:{number}: expected sequence0 [frames=N] [start=A ; end=B], found {first.strip()[:80]!r}"
+        )
     return range(int(found[1]), int(found[2]) + 1)

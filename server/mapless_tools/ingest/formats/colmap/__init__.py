@@ -16,19 +16,23 @@ from mapless.cameras import with_slashes
 from mapless.geometry import Array, Camera, Quaternion, RigidTransform
 from mapless_tools.dataset import Dataset
 
-from ..collecting import Collector, ReadOptions, natural_order, read_text
+from ..collecting import Collector, ReadOptions, natural_order, text_lines
 from .cameras import ColmapCamera
-from .files import ImageRecord, read_cameras, read_images
+from .files import ImageRecord, announced, read_cameras, read_images
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Cameras by COLMAP's id, images by name, and names that occur twice, each with the reason."""
+    """Cameras by COLMAP's id, images by name, and names that occur twice, each with the reason.
+
+    `notes` say where the counts in the files' comments are not those of their lines.
+    """
 
     file: Path
     cameras: Mapping[int | str, ColmapCamera]
     images: Mapping[str, ImageRecord]
     refused: Sequence[tuple[str, str]]
+    notes: Sequence[str] = ()
 
     def camera_and_pose(self, name: str) -> tuple[Camera, RigidTransform]:
         """Camera and world_from_camera of an image; ValueError if they cannot be used."""
@@ -75,7 +79,15 @@ def read_model(folder: Path) -> Model:
             refused.append((record.name, f"{images_file}: image {record.image_id}: its name occurs twice"))
         else:
             images[record.name] = record
-    return Model(images_file, cameras, images, refused)
+    notes: list[str] = []
+    if ending == ".txt":
+        counted = ((cameras_file, len(cameras)), (images_file, len(images) + len(refused)))
+        notes = [
+            f"warning: {file} announces {number} in its comments, and holds {count}: is a part missing?"
+            for file, count in counted
+            if (number := announced(file)) not in (None, count)
+        ]
+    return Model(images_file, cameras, images, refused, notes)
 
 
 def _numbered(folder: Path) -> list[Path]:
@@ -114,8 +126,11 @@ def read(path: Path, options: ReadOptions) -> Dataset:
     images = _images_folder(path, folders[0], model, options.images)
     collector = Collector(images)
     queries = folders[0] / "list_test.txt"  # hloc's name
-    lines = read_text(queries).splitlines() if queries.is_file() else []
-    tests = {line.strip() for line in lines} - {""}  # one a line: COLMAP's names may have spaces
+    lines = text_lines(queries) if queries.is_file() else ()
+    tests = {line.strip() for _, line in lines} - {""}  # one a line: COLMAP's names may have spaces
+    if unknown := sorted(tests - set(model.images)):
+        collector.notes.append(f"{len(unknown)} names of {queries} are no images of the model, such as {unknown[0]}")
+    collector.notes += model.notes
     for name in sorted(model.images, key=natural_order):
         with collector.attempt(name):
             camera, pose = model.camera_and_pose(name)

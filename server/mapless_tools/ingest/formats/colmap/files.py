@@ -6,17 +6,21 @@ binary ones are mapped, text is read by the line.
 """
 
 import mmap
+import re
 import struct
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from mapless_tools.dataset import named
 
+from ..collecting import filled_lines, text_lines
 from .cameras import MODEL_NAMES, PARAMETERS, ColmapCamera
 
 _POINT_BYTES = 24  # x, y, point3D_id of an observation
 _MAX_NAME_BYTES = 4096
+_ANNOUNCED = re.compile(r"\s*#\s*Number of (?:images|cameras):\s*(\d+)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -114,7 +118,8 @@ class _Cursor:
 
 
 def _cameras_txt(file: Path) -> Iterator[ColmapCamera]:
-    for place, line in _lines(file):
+    for number, line in filled_lines(file):
+        place = f"{file}:{number}"
         words = line.split()
         if len(words) < 4 or words[1] not in PARAMETERS:
             raise ValueError(f"{place}: expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS, found {line.strip()[:80]!r}")
@@ -128,7 +133,11 @@ def _cameras_txt(file: Path) -> Iterator[ColmapCamera]:
 
 def _images_txt(file: Path) -> Iterator[ImageRecord]:
     """Reads images.txt: a line for an image, then one for its observations, which may be empty."""
-    for place, line in _lines(file, skipped_after=1):
+    lines = text_lines(file)
+    for number, line in lines:
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        place = f"{file}:{number}"
         words = line.split(maxsplit=9)  # a name may have spaces
         if len(words) != 10:
             raise ValueError(
@@ -136,19 +145,39 @@ def _images_txt(file: Path) -> Iterator[ImageRecord]:
             )
         with named(place):
             yield ImageRecord(int(words[0]), [float(w) for w in words[1:8]], int(words[8]), words[9].rstrip())
+        number, line = next(lines, (number, ""))
+        _check_observations(line, f"{file}:{number}", number - 1)
 
 
-def _lines(file: Path, skipped_after: int = 0) -> Iterator[tuple[str, str]]:
-    """Yields lines that are neither empty nor comments, with their position; skips this many lines after each."""
+def _check_observations(line: str, place: str, image_line: int) -> None:
+    """Raises ValueError if a line is not the points of an image, such as where the empty lines were left out."""
+    words = line.split()
     try:
-        with file.open(encoding="utf-8") as stream:
-            numbered = enumerate(stream, 1)
-            for number, line in numbered:
-                if line.strip() and not line.startswith("#"):
-                    yield f"{file}:{number}", line
-                    for _ in range(skipped_after):
-                        next(numbered, None)
-    except OSError as error:
-        raise ValueError(f"{file} cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{file} is not text: {error}") from error
+        if len(words) % 3:
+            raise ValueError
+        deque(map(int, words[2::3]), maxlen=0)
+        deque(map(float, words[:2]), maxlen=0)
+    except ValueError:
+        found = "ten words that are an image" if _is_image(line) else f"{len(words)} words"
+        raise ValueError(
+            f"{place}: expected the points of the image of line {image_line}, X Y POINT3D_ID for each, or an empty "
+            f"line; found {found}: {line.strip()[:80]!r}"
+        ) from None
+
+
+def _is_image(line: str) -> bool:
+    words = line.split(maxsplit=9)
+    try:
+        return len(words) == 10 and len([float(w) for w in words[:9]]) == 9
+    except ValueError:
+        return False
+
+
+def announced(file: Path) -> int | None:
+    """The number of images or cameras that a text file's comments announce; None if they do not."""
+    for _, line in text_lines(file):
+        if not line.lstrip().startswith("#"):
+            return None
+        if found := _ANNOUNCED.match(line):
+            return int(found[1][:18])
+    return None
