@@ -1,16 +1,15 @@
 """Options and settings of all tests."""
 
-import os
 import zlib
 
 import pytest
 from hypothesis import settings
+from support.users import leave_the_users_environment
 
 # Machines are shared: how long an example takes says nothing of the code.
 settings.register_profile("shared", deadline=None)
 settings.load_profile("shared")
-# Servers that tests start as processes begin without the seconds of computing that make first answers fast.
-os.environ.setdefault("MAPLESS_WARM_UP", "false")
+leave_the_users_environment()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

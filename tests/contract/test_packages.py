@@ -1,7 +1,6 @@
 """The package as others install it: built, put into empty environments, with each of its extras."""
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from support.programs import Program
+from support.users import registry_environment
 from support.waiting import LIMIT_S
 
 ROOT = Path(__file__).parents[2]
@@ -24,7 +24,7 @@ pytestmark = [pytest.mark.nightly, pytest.mark.timeout(600)]
 
 def environment() -> dict[str, str]:
     """The variables of this process without this checkout's paths and settings."""
-    return {name: it for name, it in os.environ.items() if not name.startswith(("MAPLESS_", "PYTHON"))}
+    return {name: it for name, it in registry_environment().items() if not name.startswith(("MAPLESS_", "PYTHON"))}
 
 
 def run(*command: str | Path, code: int = 0) -> str:

@@ -16,7 +16,7 @@ from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.views import PosedView, View
 from mapless_server.serve.assembly import make_tiers
-from mapless_server.settings import Settings, default_weights_dir
+from mapless_server.settings import Settings
 from mapless_tools.dataset import Dataset
 
 pytestmark = [pytest.mark.realdata, pytest.mark.timeout(300)]
@@ -31,11 +31,9 @@ QUERIES = (18, 125, 99)
 @pytest.fixture(scope="module")
 def tiers(tmp_path_factory: pytest.TempPathFactory) -> tuple[Tier, ...]:
     pytest.importorskip("torch")
-    weights = Path(os.environ.get("TEST_WEIGHTS") or default_weights_dir())
+    weights = Path(os.environ.get("TEST_WEIGHTS", "nowhere"))
     if not (weights / "aliked-n16.safetensors").is_file():
-        pytest.skip(
-            f"needs `mapless-server weights fetch aliked`; {weights} has none (TEST_WEIGHTS names another place)"
-        )
+        pytest.skip(f"needs `mapless-server weights fetch aliked`; {weights} has none (TEST_WEIGHTS names the folder)")
     # Without those of EdgePoint2, which would be the cheap ones.
     folder = tmp_path_factory.mktemp("data")
     (folder / "aliked-n16.safetensors").symlink_to(weights / "aliked-n16.safetensors")
@@ -58,7 +56,7 @@ def test_light_glue_localizes_what_nearest_neighbours_reject(
 ) -> None:
     """Five photographs of a room with white walls; from one of the others next to no matches pass the ratio test."""
     pytest.importorskip("kornia")
-    weights = Path(os.environ.get("TEST_WEIGHTS") or default_weights_dir())
+    weights = Path(os.environ.get("TEST_WEIGHTS", "nowhere"))
     for name in ("aliked-n16", "aliked-lightglue"):
         if not (weights / f"{name}.safetensors").is_file():
             pytest.skip(f"needs `mapless-server weights fetch aliked aliked-lightglue`; {weights} has no {name}")

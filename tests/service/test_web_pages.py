@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from support.chromium import Page, browsing, needs_chromium
 from support.corner import CAMERA, photograph, pose
 from support.gateways import running_gateway
+from support.users import registry_environment
 
 from mapless import Client, ConnectOptions, LocalizationResult, NewReference
 from mapless.geometry import Array, Camera, Quaternion, RigidTransform, rotation_from_vector
@@ -39,14 +40,15 @@ START_M = np.array([0.0, 1.6, 0.0])
 @pytest.fixture(scope="module")
 def pages() -> Path:
     """The folder of the built pages."""
-    npm = shutil.which("npm")
+    npm, environment = shutil.which("npm"), registry_environment()
+    output: dict[str, Any] = {"capture_output": True, "text": True}
     if npm is None:
         pytest.skip("needs npm to build the pages")
     if not (WEB / "node_modules").is_dir():
-        installed = subprocess.run([npm, "install", "--no-audit", "--no-fund"], cwd=WEB, capture_output=True, text=True)
+        installed = subprocess.run([npm, "install", "--no-audit", "--no-fund"], cwd=WEB, env=environment, **output)
         if installed.returncode:
             pytest.skip(f"npm could not install: {installed.stderr[-300:]}")
-    built = subprocess.run([npm, "run", "build"], cwd=WEB, capture_output=True, text=True)
+    built = subprocess.run([npm, "run", "build"], cwd=WEB, env=environment, **output)
     assert built.returncode == 0, built.stdout + built.stderr
     return WEB / "dist"
 
