@@ -28,7 +28,7 @@ from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
-from mapless_server.method.views import View, view_of
+from mapless_server.method.views import Ignored, View, view_of
 from mapless_server.scenes import ANYWHERE, Narrowing, Sphere
 from mapless_server.scheduling import Flow
 from mapless_server.security import SceneKey
@@ -48,7 +48,7 @@ class UprightSift:
 
     name: str = "upright-sift"
 
-    def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
+    def extract(self, image: NDArray[np.uint8], camera: Camera, ignored: Ignored | None = None) -> View:
         sift = cv2.SIFT.create(nfeatures=1024, contrastThreshold=0.02, enable_precise_upscale=True)
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         upright = [cv2.KeyPoint(it.pt[0], it.pt[1], it.size, 0.0, it.response, it.octave) for it in sift.detect(grey)]
@@ -64,8 +64,8 @@ class Blind(UprightSift):
     name: str = "blind"
     is_blind: bool = False
 
-    def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
-        view = super().extract(image, camera)
+    def extract(self, image: NDArray[np.uint8], camera: Camera, ignored: Ignored | None = None) -> View:
+        view = super().extract(image, camera, ignored)
         if not self.is_blind:
             return view
         chance = np.random.default_rng(int(image.sum(dtype=np.int64)))

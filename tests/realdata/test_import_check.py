@@ -14,8 +14,12 @@ from support.bags import BASE_FROM_CAMERA, at, image, info, odometry, transforms
 
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.method.features import SiftExtractor
+<<<<<<< HEAD
 from mapless_server.method.readings import Verdict, implausible_depth
 from mapless_server.method.views import View
+=======
+from mapless_server.method.views import Ignored, View
+>>>>>>> dc84b1cf (Masks can be given with references, queries, images of rigs and of sequences: keypoints near ignored pixels are not found, the strongest of the others are kept; stored with the reference)
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.ingest.check import check_frames
 from mapless_tools.ingest.formats import KeyframeOptions, ReadOptions, read_dataset
@@ -37,7 +41,7 @@ class ExtractedOnce:
     def __init__(self) -> None:
         self._views: dict[tuple[bytes, str], View] = {}
 
-    def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
+    def extract(self, image: NDArray[np.uint8], camera: Camera, ignored: Ignored | None = None) -> View:
         key = sha256(image.tobytes()).digest(), repr(camera)
         if key not in self._views:
             self._views[key] = SiftExtractor().extract(image, camera)

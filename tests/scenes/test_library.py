@@ -19,7 +19,7 @@ from mapless.geometry import Camera
 from mapless_server.errors import DataLoss, NotFound, RequestError
 from mapless_server.images import ImageLimits
 from mapless_server.method.options import StageContext
-from mapless_server.method.views import View
+from mapless_server.method.views import Ignored, View
 from mapless_server.scenes.library import STORED_IMAGES, FeaturesMissing, Loaded, ReferenceLibrary, load_usable
 from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, Store
@@ -139,10 +139,10 @@ class TestDescribing:
         self, store: CountingStore, caplog: pytest.LogCaptureFixture
     ) -> None:
         class Picky(StandInExtractor):
-            def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
+            def extract(self, image: NDArray[np.uint8], camera: Camera, ignored: Ignored | None = None) -> View:
                 if np.array_equal(image, PIXELS["r1"]):
                     raise ValueError("not this one")
-                return super().extract(image, camera)
+                return super().extract(image, camera, ignored)
 
         new, library = Picky("new"), ReferenceLibrary(store)
         for _ in range(3):

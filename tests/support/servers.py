@@ -29,7 +29,7 @@ from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.results import MetricScale, PoseStage, ScaleStage
-from mapless_server.method.views import Features, PosedView, View
+from mapless_server.method.views import Features, Ignored, PosedView, View
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling import Abandoned
 from mapless_server.security import RateLimiter
@@ -56,7 +56,7 @@ class StandInExtractor:
     name: str = "stand-in"
     seen: list[NDArray[np.uint8]] = field(default_factory=list)
 
-    def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
+    def extract(self, image: NDArray[np.uint8], camera: Camera, ignored: Ignored | None = None) -> View:
         self.seen.append(image)
         y, x = np.unravel_index(image.sum(axis=2).argmax(), image.shape[:2])
         count = int(image.any())

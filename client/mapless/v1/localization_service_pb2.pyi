@@ -163,7 +163,7 @@ SCALE_STAGE_TRAJECTORY: ScaleStage
 SCALE_STAGE_NETWORK: ScaleStage
 
 class LocalizeRequest(_message.Message):
-    __slots__ = ("scene", "references", "image", "intrinsics", "position_prior", "options", "capture_time", "session_from_camera", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior", "intrinsics_uncertainty")
+    __slots__ = ("scene", "references", "image", "intrinsics", "position_prior", "options", "capture_time", "session_from_camera", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior", "intrinsics_uncertainty", "mask")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     REFERENCES_FIELD_NUMBER: _ClassVar[int]
     IMAGE_FIELD_NUMBER: _ClassVar[int]
@@ -177,6 +177,7 @@ class LocalizeRequest(_message.Message):
     GRAVITY_PRIOR_FIELD_NUMBER: _ClassVar[int]
     POSE_PRIOR_FIELD_NUMBER: _ClassVar[int]
     INTRINSICS_UNCERTAINTY_FIELD_NUMBER: _ClassVar[int]
+    MASK_FIELD_NUMBER: _ClassVar[int]
     scene: str
     references: _containers.RepeatedScalarFieldContainer[str]
     image: bytes
@@ -190,7 +191,8 @@ class LocalizeRequest(_message.Message):
     gravity_prior: GravityPrior
     pose_prior: PosePrior
     intrinsics_uncertainty: IntrinsicsUncertainty
-    def __init__(self, scene: _Optional[str] = ..., references: _Optional[_Iterable[str]] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ..., intrinsics_uncertainty: _Optional[_Union[IntrinsicsUncertainty, _Mapping]] = ...) -> None: ...
+    mask: bytes
+    def __init__(self, scene: _Optional[str] = ..., references: _Optional[_Iterable[str]] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ..., intrinsics_uncertainty: _Optional[_Union[IntrinsicsUncertainty, _Mapping]] = ..., mask: _Optional[bytes] = ...) -> None: ...
 
 class IntrinsicsUncertainty(_message.Message):
     __slots__ = ("focal_sigma_px", "principal_sigma_px", "k1_sigma")
@@ -575,7 +577,7 @@ class LocalizeRigRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., images: _Optional[_Iterable[_Union[RigImage, _Mapping]]] = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_rig: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ...) -> None: ...
 
 class RigImage(_message.Message):
-    __slots__ = ("image", "intrinsics", "rig_from_camera", "references", "position_prior", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior")
+    __slots__ = ("image", "intrinsics", "rig_from_camera", "references", "position_prior", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior", "mask")
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     INTRINSICS_FIELD_NUMBER: _ClassVar[int]
     RIG_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
@@ -585,6 +587,7 @@ class RigImage(_message.Message):
     GEO_POSITION_PRIOR_FIELD_NUMBER: _ClassVar[int]
     GRAVITY_PRIOR_FIELD_NUMBER: _ClassVar[int]
     POSE_PRIOR_FIELD_NUMBER: _ClassVar[int]
+    MASK_FIELD_NUMBER: _ClassVar[int]
     image: bytes
     intrinsics: _geometry_pb2.CameraIntrinsics
     rig_from_camera: _geometry_pb2.RigidTransform
@@ -594,7 +597,8 @@ class RigImage(_message.Message):
     geo_position_prior: GeoPositionPrior
     gravity_prior: GravityPrior
     pose_prior: PosePrior
-    def __init__(self, image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., rig_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., references: _Optional[_Iterable[str]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ...) -> None: ...
+    mask: bytes
+    def __init__(self, image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., rig_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., references: _Optional[_Iterable[str]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ..., mask: _Optional[bytes] = ...) -> None: ...
 
 class LocalizeRigResponse(_message.Message):
     __slots__ = ("localization", "rejection", "images", "capture_time", "session_from_rig")
@@ -661,7 +665,7 @@ class LocalizeSequenceRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., frames: _Optional[_Iterable[_Union[SequenceFrame, _Mapping]]] = ..., estimate_session_scale: bool = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ...) -> None: ...
 
 class SequenceFrame(_message.Message):
-    __slots__ = ("image", "intrinsics", "session_from_camera", "capture_time", "references", "position_prior", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior")
+    __slots__ = ("image", "intrinsics", "session_from_camera", "capture_time", "references", "position_prior", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior", "mask")
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     INTRINSICS_FIELD_NUMBER: _ClassVar[int]
     SESSION_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
@@ -672,6 +676,7 @@ class SequenceFrame(_message.Message):
     GEO_POSITION_PRIOR_FIELD_NUMBER: _ClassVar[int]
     GRAVITY_PRIOR_FIELD_NUMBER: _ClassVar[int]
     POSE_PRIOR_FIELD_NUMBER: _ClassVar[int]
+    MASK_FIELD_NUMBER: _ClassVar[int]
     image: bytes
     intrinsics: _geometry_pb2.CameraIntrinsics
     session_from_camera: _geometry_pb2.RigidTransform
@@ -682,7 +687,8 @@ class SequenceFrame(_message.Message):
     geo_position_prior: GeoPositionPrior
     gravity_prior: GravityPrior
     pose_prior: PosePrior
-    def __init__(self, image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., references: _Optional[_Iterable[str]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ...) -> None: ...
+    mask: bytes
+    def __init__(self, image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., references: _Optional[_Iterable[str]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ..., mask: _Optional[bytes] = ...) -> None: ...
 
 class LocalizeSequenceResponse(_message.Message):
     __slots__ = ("localization", "rejection", "images")

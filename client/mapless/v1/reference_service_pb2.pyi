@@ -99,7 +99,7 @@ class SceneCalibration(_message.Message):
     def __init__(self, position_factor_68: _Optional[float] = ..., position_factor_95: _Optional[float] = ..., rotation_factor_68: _Optional[float] = ..., rotation_factor_95: _Optional[float] = ..., query_count: _Optional[int] = ..., features: _Optional[str] = ..., backend: _Optional[str] = ..., variant: _Optional[_Union[_localization_service_pb2.Variant, str]] = ..., server_version: _Optional[str] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ...) -> None: ...
 
 class Reference(_message.Message):
-    __slots__ = ("name", "image", "intrinsics", "world_from_camera", "create_time", "image_sha256", "feature_count")
+    __slots__ = ("name", "image", "intrinsics", "world_from_camera", "create_time", "image_sha256", "feature_count", "mask", "mask_sha256")
     NAME_FIELD_NUMBER: _ClassVar[int]
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     INTRINSICS_FIELD_NUMBER: _ClassVar[int]
@@ -107,6 +107,8 @@ class Reference(_message.Message):
     CREATE_TIME_FIELD_NUMBER: _ClassVar[int]
     IMAGE_SHA256_FIELD_NUMBER: _ClassVar[int]
     FEATURE_COUNT_FIELD_NUMBER: _ClassVar[int]
+    MASK_FIELD_NUMBER: _ClassVar[int]
+    MASK_SHA256_FIELD_NUMBER: _ClassVar[int]
     name: str
     image: bytes
     intrinsics: _geometry_pb2.CameraIntrinsics
@@ -114,7 +116,9 @@ class Reference(_message.Message):
     create_time: _timestamp_pb2.Timestamp
     image_sha256: str
     feature_count: int
-    def __init__(self, name: _Optional[str] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., image_sha256: _Optional[str] = ..., feature_count: _Optional[int] = ...) -> None: ...
+    mask: bytes
+    mask_sha256: str
+    def __init__(self, name: _Optional[str] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., image_sha256: _Optional[str] = ..., feature_count: _Optional[int] = ..., mask: _Optional[bytes] = ..., mask_sha256: _Optional[str] = ...) -> None: ...
 
 class CreateSceneRequest(_message.Message):
     __slots__ = ("scene_id", "datum", "down_in_world", "arbitrary_unit")
@@ -267,20 +271,22 @@ class DeleteReferenceResponse(_message.Message):
     def __init__(self) -> None: ...
 
 class RetrieveReferencesRequest(_message.Message):
-    __slots__ = ("scene", "image", "intrinsics", "count", "position_prior", "heading_prior")
+    __slots__ = ("scene", "image", "intrinsics", "count", "position_prior", "heading_prior", "mask")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     INTRINSICS_FIELD_NUMBER: _ClassVar[int]
     COUNT_FIELD_NUMBER: _ClassVar[int]
     POSITION_PRIOR_FIELD_NUMBER: _ClassVar[int]
     HEADING_PRIOR_FIELD_NUMBER: _ClassVar[int]
+    MASK_FIELD_NUMBER: _ClassVar[int]
     scene: str
     image: bytes
     intrinsics: _geometry_pb2.CameraIntrinsics
     count: int
     position_prior: _localization_service_pb2.PositionPrior
     heading_prior: _localization_service_pb2.HeadingPrior
-    def __init__(self, scene: _Optional[str] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., count: _Optional[int] = ..., position_prior: _Optional[_Union[_localization_service_pb2.PositionPrior, _Mapping]] = ..., heading_prior: _Optional[_Union[_localization_service_pb2.HeadingPrior, _Mapping]] = ...) -> None: ...
+    mask: bytes
+    def __init__(self, scene: _Optional[str] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., count: _Optional[int] = ..., position_prior: _Optional[_Union[_localization_service_pb2.PositionPrior, _Mapping]] = ..., heading_prior: _Optional[_Union[_localization_service_pb2.HeadingPrior, _Mapping]] = ..., mask: _Optional[bytes] = ...) -> None: ...
 
 class RetrieveReferencesResponse(_message.Message):
     __slots__ = ("references", "retrieval", "store_generation")

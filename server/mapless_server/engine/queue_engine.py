@@ -127,7 +127,7 @@ class QueueEngine:
         if on_coarse is not None:
             loop = asyncio.get_running_loop()
             run = replace(run, on_coarse=lambda result: loop.call_soon_threadsafe(on_coarse, result))
-        size_bytes = 0 if query.is_part else len(query.photo.image)  # which `hold` counts
+        size_bytes = 0 if query.is_part else query.photo.size_bytes  # which `hold` counts
         return Job(caller.flow, run.first_step, caller.deadline_s, size_bytes)
 
     async def run(self, job: Job) -> Result:
@@ -140,7 +140,7 @@ class QueueEngine:
         """Reserves the memory of a group's photographs for its whole call, however many of them are queued."""
         with ExitStack() as stack:
             with _as_request_errors():
-                size_bytes = sum(len(query.photo.image) for query in queries)
+                size_bytes = sum(query.photo.size_bytes for query in queries)
                 stack.enter_context(self.queue.hold(caller.flow, size_bytes))
             yield
 
@@ -153,7 +153,7 @@ class QueueEngine:
 
     async def describe(self, photos: Sequence[Photo], caller: Caller) -> list[Description]:
         """Computes features and descriptors of photographs, in order."""
-        size_bytes = sum(len(photo.image) for photo in photos)
+        size_bytes = sum(photo.size_bytes for photo in photos)
         return await self._each(DESCRIBE, photos, self.references.describe, caller, size_bytes)
 
     async def retrieve(
@@ -165,7 +165,7 @@ class QueueEngine:
             views = QueryViews(photo, self.options.image_limits)
             return self.references.choose(scene_key, views, Selection(count, narrowing), StageContext(check))
 
-        (choice,) = await self._each(RETRIEVE, [photo], choose, caller, len(photo.image))
+        (choice,) = await self._each(RETRIEVE, [photo], choose, caller, photo.size_bytes)
         return choice
 
     async def audit(

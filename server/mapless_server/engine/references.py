@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from mapless.names import reference_name
-from mapless_server.errors import DataLoss, NotFound
+from mapless_server.errors import DataLoss, InvalidArgument, NotFound
 from mapless_server.images import ImageLimits
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import StageContext
@@ -62,13 +62,20 @@ class References:
         return Choice(tuple(ranked), self._descriptor.name, entries.generation)
 
     def describe(self, photo: Photo, check: Callable[[], None]) -> Description:
-        """Computes all that the store keeps of a photograph, every tier's features; InvalidArgument if it is bad."""
+        """Computes all that the store keeps of a photograph, every tier's features.
+
+        InvalidArgument if it is bad, or its mask ignores all of it.
+        """
         decoded, context = QueryViews(photo, self._limits), StageContext(check)
         views = {it.name: decoded.view(it, context) for it in self._extractors}
         vector = self._descriptor.describe(views[self._extractors[0].name])
         # A batch is held in memory until it is stored, so without its pixels.
         without_pixels = {name: replace(view, photograph=None) for name, view in views.items()}
-        return Description(without_pixels, {self._descriptor.name: vector})
+        share = decoded.ignored_share(context)
+        if share == 1:
+            message = "the mask ignores the whole image: 0 means ignore, every other value use"
+            raise InvalidArgument(message, reason="MASK_IGNORES_ALL", field=photo.mask_field)
+        return Description(without_pixels, {self._descriptor.name: vector}, share)
 
     def auditor(self, scene_key: SceneKey, named: Sequence[str] = ()) -> SceneAuditor:
         """Makes an auditor of a scene's references; the caller named those in `named`."""

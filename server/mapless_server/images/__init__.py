@@ -1,8 +1,9 @@
-"""Decodes photographs of untrusted callers; rejects them by their headers, before memory is allocated for them.
+"""Decodes photographs and masks of untrusted callers; rejects them by their headers, before memory is allocated.
 
 Imports only `mapless_server.errors`. Begin with `decode`.
 """
 
 from .decode import ImageLimits, decode_image, image_size
+from .masks import check_mask, decode_mask
 
-__all__ = ["ImageLimits", "decode_image", "image_size"]
+__all__ = ["ImageLimits", "check_mask", "decode_image", "decode_mask", "image_size"]

@@ -83,3 +83,15 @@ def _most_data_bytes(data: bytes) -> int:
     row_bytes = (width * depth * _CHANNELS.get(colour, 4) + 7) // 8
     # Interlaced rows come in seven parts, each with its own filter byte and padding, and stored blocks have headers.
     return int((row_bytes + 16) * height * 9 // 8 + _DATA_SLACK_BYTES)
+
+
+def png_chunk_names(data: bytes) -> frozenset[bytes]:
+    """Names of a PNG's chunks, up to the first that is cut off, and of the first 100,000 only."""
+    position, names = len(_SIGNATURE), set()
+    for _ in range(_MAX_CHUNKS):
+        if position + 12 > len(data):
+            break
+        (length,) = struct.unpack_from(">I", data, position)
+        names.add(data[position + 4 : position + 8])
+        position += 12 + length
+    return frozenset(names)

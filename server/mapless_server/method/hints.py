@@ -36,6 +36,10 @@ MANY_MATCHES = 100
 """So many with one reference are not chance; if they have no common pose, intrinsics or poses are wrong."""
 
 
+MUCH_IGNORED = 0.5
+"""Share of a photograph that masks seldom ignore: vehicles, grippers and people take less, inverted ones more."""
+
+
 @dataclass(frozen=True)
 class _Case:
     """The numbers that a hint follows from.
@@ -87,6 +91,9 @@ def hinted(answer: Answer, query: View, references: Sequence[PosedView], has_pri
         has_prior,
     )
     advice, message = _advice(case)
+    share = query.photograph.ignored_share if query.photograph else 0.0
+    if share >= MUCH_IGNORED or (share > 0 and case.features < FEW_FEATURES):
+        message += f" The mask ignores {_percent(share)} of the image: 0 means ignore, every other value use."
     hint = Hint(_STAGES[rejection.reason] if references else "", advice, message, case.best)
     return replace(answer, outcome=replace(rejection, hint=hint))
 
@@ -160,6 +167,10 @@ def _of_overlap(case: _Case) -> tuple[Advice, str]:
         Advice.LOOK_AT_REFERENCE,
         f"Point the camera at what the best reference shows, or add references from nearer: {shared}.",
     )
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if share >= 0.01 else "less than 1 %"
 
 
 def _retake(case: _Case) -> str:

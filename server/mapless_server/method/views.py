@@ -17,6 +17,14 @@ from mapless.lenses import Distortion, Fisheye, RadialTangential, lens_model_of
 Matches = NDArray[np.int32]
 """(M, 2): keypoint indices in the first and in the second of two views."""
 
+Ignored = NDArray[np.bool_]
+"""(H, W): pixels of an image that show nothing of the place, by the mask that was given with it."""
+
+
+def nothing_ignored() -> Ignored | None:
+    """`Photograph.read_ignored` of a photograph without a mask."""
+    return None
+
 
 @dataclass(frozen=True, eq=False)
 class Features:
@@ -90,16 +98,24 @@ class Photograph:
         identify: function that returns `sha256`; called only where something is cached by it.
         camera: camera in pixels of the image, with its lens distortion.
         read: function that returns the pixels, (H, W, 3) uint8 RGB, of the camera's size.
+        read_ignored: function that returns the ignored pixels, of the same size; None if all are used.
     """
 
     identify: Callable[[], str]
     camera: Camera
     read: Callable[[], NDArray[np.uint8]]
+    read_ignored: Callable[[], Ignored | None] = nothing_ignored
 
     @cached_property
     def sha256(self) -> str:
-        """Hash of the encoded image, hexadecimal; key for caches of anything computed from the pixels."""
+        """Hash of the encoded image, hexadecimal; key for caches of what is computed from the pixels without a mask."""
         return self.identify()
+
+    @property
+    def ignored_share(self) -> float:
+        """Share of the pixels that the mask ignores, 0 to 1."""
+        ignored = self.read_ignored()
+        return 0.0 if ignored is None else float(ignored.mean())
 
 
 @dataclass(frozen=True, eq=False)

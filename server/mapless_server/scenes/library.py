@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from mapless.names import reference_name
 from mapless_server.errors import AlreadyExists, DataLoss, InvalidArgument, RequestError
-from mapless_server.images import ImageLimits, decode_image
+from mapless_server.images import ImageLimits, decode_image, decode_mask
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import StageContext
-from mapless_server.method.views import Photograph, PosedView, View
+from mapless_server.method.views import Ignored, Photograph, PosedView, View
 from mapless_server.security import SceneKey
 from mapless_server.store import DescribedReference, ReferenceRecord, SceneAttributes, Store
 
@@ -163,13 +163,14 @@ class ReferenceLibrary:
     def _describe(self, record: ReferenceRecord, extractor: FeatureExtractor) -> None:
         # Another thread may have finished between reading the store and taking the lock.
         if not self._store.has_features(record.key, extractor.name):
-            view = extractor.extract(self._pixels(record), record.camera)
+            view = extractor.extract(self._pixels(record), record.camera, self._ignored(record))
             with suppress(AlreadyExists):  # another server on the same store was faster
                 self._store.add_features(record.key, extractor.name, view)
 
     def _posed_view(self, reference: DescribedReference) -> PosedView:
         record, view = reference.record, reference.view
-        photograph = Photograph(lambda: record.image_sha256, record.camera, partial(self._pixels, record))
+        read = partial(self._pixels, record), partial(self._ignored, record)
+        photograph = Photograph(lambda: record.image_sha256, record.camera, *read)
         return PosedView(
             record.key,
             reference_name(record.scene_id, record.reference_id),
@@ -184,6 +185,16 @@ class ReferenceLibrary:
             return decode_image(data, STORED_IMAGES)
         except InvalidArgument as error:
             raise DataLoss(f"the photograph of reference {record.reference_id!r} cannot be read: {error}") from error
+
+    def _ignored(self, record: ReferenceRecord) -> Ignored | None:
+        """Reads the ignored pixels; None if all are used. Raises as `_pixels`."""
+        if not record.mask_sha256:
+            return None
+        data = self._store.read_mask_of(record.key)
+        try:
+            return decode_mask(data, (record.camera.width_px, record.camera.height_px), STORED_IMAGES)
+        except InvalidArgument as error:
+            raise DataLoss(f"the mask of reference {record.reference_id!r} cannot be read: {error}") from error
 
 
 def load_usable(

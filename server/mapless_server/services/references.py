@@ -45,6 +45,7 @@ from .messages.references import (
     changes_from_message,
     choice_to_message,
     coverage_to_message,
+    nearly_ignored,
     reference_to_message,
     scene_to_message,
 )
@@ -192,9 +193,12 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
     async def GetReference(self, request: pb.GetReferenceRequest, call: Call) -> pb.GetReferenceResponse:
         """Implements ReferenceService.GetReference."""
         key, reference_id = reference_key_from_name(request.name, "name", call.principal.tenant)
-        message = reference_to_message(await self._stored(self._store.get_reference, key, reference_id))
+        record = await self._stored(self._store.get_reference, key, reference_id)
+        message = reference_to_message(record)
         if request.include_image:
-            message.image = await self._stored(self._store.read_image, key, reference_id)
+            message.image = await self._stored(self._store.read_image_of, record.key)
+            if record.mask_sha256:
+                message.mask = await self._stored(self._store.read_mask_of, record.key)
         return pb.GetReferenceResponse(reference=message)
 
     async def ListReferences(self, request: pb.ListReferencesRequest, call: Call) -> pb.ListReferencesResponse:
@@ -292,13 +296,22 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         call.note(scene=scene_key, references=len(drafts))
         described = await self._engine().describe([photo for _, photo, _ in drafts], call.caller)
         references = [
-            NewReference(reference_id, photo.image, photo.camera, world_from_camera, found.views, found.descriptors)
+            NewReference(
+                reference_id,
+                photo.image,
+                photo.camera,
+                world_from_camera,
+                found.views,
+                found.descriptors,
+                photo.mask,
+            )
             for (reference_id, photo, world_from_camera), found in zip(drafts, described, strict=True)
         ]
         records = await self._stored(self._store.add_references, scene_key, references)
         if blank := [record.reference_id for record in records if not record.feature_count]:
             call.note(references_without_features=blank[:MAX_NOTED])
-        return records, warnings
+        shares = {it.reference_id: found.ignored_share for it, found in zip(records, described, strict=True)}
+        return records, warnings + nearly_ignored(shares)
 
     async def _stored(self, operation: Callable[..., T], *arguments: object) -> T:
         """Runs an operation of the store in a thread; raises Unavailable while the server starts."""

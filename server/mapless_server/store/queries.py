@@ -22,6 +22,7 @@ from .tables import (
     features,
     global_descriptor,
     image,
+    mask,
     reference,
     removed_reference,
     scene,
@@ -195,6 +196,16 @@ def find_image(connection: Connection, key: str) -> Row[Any]:
     statement: Select[Any] = (
         select(reference.c.reference_id, reference.c.image_sha256, image.c.data)
         .outerjoin(image, image.c.reference_key == reference.c.key)
+        .where(_exists(key))
+    )
+    return _one(connection, statement, _reference_deleted)
+
+
+def find_mask(connection: Connection, key: str) -> Row[Any]:
+    """Columns `reference_id`, `mask_sha256` and `mask` of a reference; raises NotFound if it was deleted."""
+    statement: Select[Any] = (
+        select(reference.c.reference_id, reference.c.mask_sha256, mask.c.data.label("mask"))
+        .outerjoin(mask, mask.c.reference_key == reference.c.key)
         .where(_exists(key))
     )
     return _one(connection, statement, _reference_deleted)

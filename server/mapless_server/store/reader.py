@@ -189,6 +189,19 @@ class StoreReader:
             return _read_image(connection, key)
 
     @observed
+    def read_mask_of(self, key: str) -> bytes:
+        """Reads the mask's bytes as they were added, by the reference's key; empty if it has none.
+
+        NotFound if the reference was deleted; DataLoss if the bytes are damaged.
+        """
+        with self.database.read() as connection:
+            row = unless_damaged(connection, lambda: queries.find_mask(connection, key), lambda: None)
+            if row is None:
+                reference_id = queries.find_by_key(connection, key, tables.reference.c.reference_id).reference_id
+                raise rows.data_loss(reference_id, "mask")
+            return rows.mask(row)
+
+    @observed
     def list_references(self, scene_key: SceneKey, limit: int, after: str = "") -> list[ReferenceRecord]:
         """At most `limit` references of a scene, ordered by id, with ids greater than `after`.
 

@@ -156,6 +156,7 @@ class NewReference:
         views: processed camera and features (float32 arrays) by the name of the extractor, "sift-2048-1024px-0.02". At
             least one; the features of the first are counted.
         descriptors: global descriptors (D,) by name; stored as float16.
+        mask: the bytes of its mask's file, unchanged; empty for none.
     """
 
     reference_id: str
@@ -164,6 +165,7 @@ class NewReference:
     world_from_camera: RigidTransform
     views: Mapping[str, View]
     descriptors: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    mask: bytes = b""
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,6 +181,7 @@ class ReferenceRecord:
         image_sha256: hash of the image's bytes, hexadecimal.
         feature_count: number of features that the first extractor found when it was added.
         create_time: when it was created, UTC.
+        mask_sha256: hash of its mask's bytes, hexadecimal; empty without a mask.
     """
 
     scene_key: SceneKey
@@ -189,6 +192,7 @@ class ReferenceRecord:
     image_sha256: str
     feature_count: int
     create_time: datetime
+    mask_sha256: str = ""
 
     @property
     def scene_id(self) -> str:

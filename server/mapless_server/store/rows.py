@@ -108,6 +108,7 @@ def new_record(scene_key: SceneKey, new: NewReference, create_time: datetime) ->
         image_sha256=hashlib.sha256(new.image).hexdigest(),
         feature_count=len(next(iter(new.views.values())).features),
         create_time=create_time,
+        mask_sha256=hashlib.sha256(new.mask).hexdigest() if new.mask else "",
     )
 
 
@@ -123,6 +124,7 @@ def reference_row(record: ReferenceRecord) -> dict[str, Any]:
         "image_sha256": record.image_sha256,
         "feature_count": record.feature_count,
         "create_time_us": time_us(record.create_time),
+        "mask_sha256": record.mask_sha256 or None,
     }
 
 
@@ -141,6 +143,7 @@ def reference_record(row: Row[Any]) -> ReferenceRecord:
         image_sha256=row.image_sha256,
         feature_count=row.feature_count,
         create_time=time_of(row.create_time_us),
+        mask_sha256=row.mask_sha256 or "",
     )
 
 
@@ -213,6 +216,14 @@ def image(row: Row[Any]) -> bytes:
     data: object = row.data
     if not isinstance(data, bytes) or hashlib.sha256(data).hexdigest() != row.image_sha256:
         raise data_loss(row.reference_id, "image")
+    return data
+
+
+def mask(row: Row[Any]) -> bytes:
+    """Reads the mask of a row of `queries.find_mask`, empty for none; raises DataLoss if it is damaged or missing."""
+    data: object = b"" if row.mask is None else row.mask
+    if not isinstance(data, bytes) or (hashlib.sha256(data).hexdigest() if data else None) != row.mask_sha256:
+        raise data_loss(row.reference_id, "mask")
     return data
 
 

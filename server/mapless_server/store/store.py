@@ -198,10 +198,12 @@ class Store(StoreReader):
         # Encoding takes milliseconds per reference, so it is done before other writers have to wait.
         records = [rows.new_record(scene_key, new, now) for new in references]
         reference_rows = [rows.reference_row(record) for record in records]
-        image_rows, features_rows, descriptor_rows = [], [], []
+        image_rows, mask_rows, features_rows, descriptor_rows = [], [], [], []
         for record, new in zip(records, references, strict=True):
             image_rows.append({"reference_key": record.key, "data": new.image})
             features_rows += [rows.features_row(record.key, *described) for described in new.views.items()]
+            if new.mask:
+                mask_rows.append({"reference_key": record.key, "data": new.mask})
             descriptor_rows += [rows.descriptor_row(record.key, *named) for named in new.descriptors.items()]
         with self.changing() as connection:
             generation = queries.begin_change(connection, scene_key, len(records))
@@ -209,6 +211,8 @@ class Store(StoreReader):
             connection.execute(insert(tables.reference), [row | {"generation": generation} for row in reference_rows])
             connection.execute(insert(tables.image), image_rows)
             connection.execute(insert(tables.features), features_rows)
+            if mask_rows:
+                connection.execute(insert(tables.mask), mask_rows)
             if descriptor_rows:
                 connection.execute(insert(tables.global_descriptor), descriptor_rows)
         return records

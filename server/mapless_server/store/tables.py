@@ -15,7 +15,7 @@ from sqlalchemy import (
     text,
 )
 
-SCHEMA_VERSION = 7
+SCHEMA_VERSION = 8
 
 metadata = MetaData()
 
@@ -75,6 +75,7 @@ reference = Table(
     Column("create_time_us", BigInteger, nullable=False),
     # Of the scene when this reference was added or got its latest global descriptor.
     Column("generation", BigInteger, nullable=False, server_default=_NONE_YET),
+    Column("mask_sha256", _Sha256),  # null without a mask
     UniqueConstraint("scene_id", "reference_id"),
     Index("reference_by_generation", "scene_id", "generation"),
 )
@@ -88,9 +89,16 @@ removed_reference = Table(
     Column("reference_key", _Key, primary_key=True),
 )
 
-# Images and features have tables of their own, so that listing references does not read their bytes.
+# Images, masks and features have tables of their own, so that listing references does not read their bytes.
 image = Table(
     "image",
+    metadata,
+    Column("reference_key", _Key, ForeignKey("reference.key", ondelete="CASCADE"), primary_key=True),
+    Column("data", LargeBinary, nullable=False),
+)
+
+mask = Table(
+    "mask",
     metadata,
     Column("reference_key", _Key, ForeignKey("reference.key", ondelete="CASCADE"), primary_key=True),
     Column("data", LargeBinary, nullable=False),

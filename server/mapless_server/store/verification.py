@@ -16,7 +16,7 @@ from . import codec, queries, rows
 from .database import is_damage, unless_damaged
 from .migrations import read_version
 from .queries import is_detached
-from .tables import features, global_descriptor, image, reference, scene
+from .tables import features, global_descriptor, image, mask, reference, scene
 
 BLOBS_AT_A_TIME = 16
 """Images are megabytes each."""
@@ -68,6 +68,9 @@ def verify(connection: Connection, on_progress: Progress = ignore_progress) -> V
         checks += [_check_descriptors, _check_counts]
     if version >= 3:
         checks.append(_check_attributes)
+    if version >= 8:
+        tables.append(mask)
+        checks.append(_check_masks)
     counts = {it.name: unless_damaged(connection, partial(_count, connection, it), lambda: 0) for it in tables}
     faults: list[str] = []
     for check in checks:
@@ -117,6 +120,21 @@ def _check_references(connection: Connection, counts: dict[str, int], on_progres
         if not row.feature_sets:
             yield f"{name}: it has no features"
     yield from _orphans(connection, image)
+
+
+def _check_masks(connection: Connection, counts: dict[str, int], on_progress: Progress) -> Iterator[str]:
+    column = reference.c
+    statement: Select[Any] = (
+        select(column.key, column.scene_id, column.reference_id, column.mask_sha256, mask.c.data.label("mask"))
+        .outerjoin(mask, mask.c.reference_key == column.key)
+        .where(column.mask_sha256.is_not(None) | mask.c.data.is_not(None))
+    )
+    for name, row in _stream(connection, statement, "masks", counts[mask.name], on_progress):
+        if row is None:
+            yield f"{name}: mask, on damaged pages"
+            continue
+        yield from _fault(name, "mask", rows.mask, row)
+    yield from _orphans(connection, mask)
 
 
 def _check_features(connection: Connection, counts: dict[str, int], on_progress: Progress) -> Iterator[str]:

@@ -23,7 +23,7 @@ from mapless_server.engine.stages import Method
 from mapless_server.method.answer import Answer
 from mapless_server.method.pipeline import Coarse, Pipeline, Prepared
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.views import Features, View
+from mapless_server.method.views import Features, Ignored, View
 from mapless_server.observability.logs import configure_logging
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security import RateLimiter
@@ -43,7 +43,7 @@ class BlindExtractor:
 
     name = "blind"
 
-    def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
+    def extract(self, image: NDArray[np.uint8], camera: Camera, ignored: Ignored | None = None) -> View:
         """A view without features."""
         nothing = Features(np.zeros((0, 2), np.float32), np.zeros((0, 4), np.float32), np.zeros(0, np.float32))
         return View(camera.pinhole(), nothing)

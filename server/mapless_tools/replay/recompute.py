@@ -38,12 +38,12 @@ from mapless_server.engine.query import (
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.stages import Method, QueryStages
 from mapless_server.errors import DataLoss
-from mapless_server.images import decode_image
+from mapless_server.images import decode_image, decode_mask
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.localize import refine
 from mapless_server.method.options import StageContext
 from mapless_server.method.pipeline import coarse_answer
-from mapless_server.method.views import Photograph, PosedView, View
+from mapless_server.method.views import Ignored, Photograph, PosedView, View
 from mapless_server.observability.metrics import Metrics
 from mapless_server.rpc import Call
 from mapless_server.scenes import Choice, Selection
@@ -97,6 +97,13 @@ class Blobs:
         """A reference's photograph, (H, W, 3) RGB; DamagedCapture if it is missing or damaged."""
         return decode_image(self._read(tenant, reference.image_sha256), STORED_IMAGES)
 
+    def ignored(self, tenant: str, reference: CapturedReference) -> Ignored | None:
+        """The ignored pixels of a reference's photograph; None for none. DamagedCapture as `pixels`."""
+        if not reference.mask_sha256:
+            return None
+        size = reference.camera.width_px, reference.camera.height_px
+        return decode_mask(self._read(tenant, reference.mask_sha256), size, STORED_IMAGES)
+
     def _read_view(self, tenant: str, reference: CapturedReference, extractor: FeatureExtractor) -> View:
         if extractor.name in reference.views:
             data = self._read(tenant, reference.views[extractor.name])
@@ -105,7 +112,8 @@ class Blobs:
             except codec.Damaged:  # its bytes are as written, so it is the form that is unknown
                 self.found_anew.add(reference.key)
         # As a store returns them, rounded: with the captured ones alike, the answer is the same bit for bit.
-        data = codec.encode_view(extractor.extract(self.pixels(tenant, reference), reference.camera))
+        found = extractor.extract(self.pixels(tenant, reference), reference.camera, self.ignored(tenant, reference))
+        data = codec.encode_view(found)
         return codec.decode_view("", data, codec.sha256_for("", data))
 
     def _read(self, tenant: str, sha256: str) -> bytes:
@@ -169,8 +177,8 @@ class RecordedSource:
     def _posed_view(self, reference: CapturedReference, extractor: FeatureExtractor, scene_key: SceneKey) -> PosedView:
         tenant = self.call.tenant
         view = self.blobs.view(tenant, reference, extractor)
-        read = partial(self.blobs.pixels, tenant, reference)
-        photograph = Photograph(lambda: reference.image_sha256, reference.camera, read)
+        read = partial(self.blobs.pixels, tenant, reference), partial(self.blobs.ignored, tenant, reference)
+        photograph = Photograph(lambda: reference.image_sha256, reference.camera, *read)
         name = reference_name(scene_id_of(scene_key), reference.reference_id)
         return PosedView(reference.key, name, replace(view, photograph=photograph), reference.world_from_camera)
 

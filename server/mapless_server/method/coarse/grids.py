@@ -19,7 +19,7 @@ from mapless.geometry import Array, Camera
 from mapless_server.networks.encoder import PATCH_PX
 
 from ..options import check_bounds
-from ..views import undistort_pixels
+from ..views import Ignored, undistort_pixels
 
 PIXEL_LIMIT = 37 * 28 * PATCH_PX**2
 """Of 518x392."""
@@ -217,6 +217,14 @@ class Layout:
         box = shown[top : top + height, left : left + width]
         box[:] = _covered(self.source, self.ideal.resized(width, height))[1] if self.undistorts else True
         return None if shown.all() else shown
+
+    def shown_without(self, ignored: Ignored | None) -> NDArray[np.bool_] | None:
+        """Which pixels (H, W) of the picture show the photograph and nothing ignored; None if all do."""
+        if ignored is None:
+            return self.shown
+        painted = self.picture(np.repeat(ignored[:, :, None] * np.uint8(255), 3, axis=2))
+        clear = np.asarray(painted[:, :, 0] == 0, bool)
+        return clear if self.shown is None else clear & self.shown
 
     def picture(self, photograph: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Makes the picture (3, H, W), 0 to 1, of a photograph (H, W, 3) RGB, filled with the mean of the shown pixels.

@@ -199,7 +199,7 @@ class NetworkReconstructor:
     def _outcome(self, scene: _Scene, output: NetworkOutput, index: int) -> Outcome:
         points, logits, poses = (tensor[index].float() for tensor in vars(output).values())
         *layouts, of_query = (view.layout for view in scene.views)
-        parts = points, _without_filling(logits.sigmoid(), layouts), poses
+        parts = points, _without_filling(logits.sigmoid(), scene.views[:-1]), poses
         flat = torch.cat([part.reshape(-1) for part in parts]).cpu().numpy()  # in one transfer
         if not np.isfinite(flat).all():
             log.warning("%s: the network's output is not finite", self.name)
@@ -269,12 +269,13 @@ def _photograph(view: View, name: str) -> Photograph:
     return view.photograph
 
 
-def _without_filling(confidence: Tensor, layouts: Sequence[Layout]) -> Tensor:
-    """Confidence (K, H, W), set to 0 at pixels that do not show the photograph."""
-    if all(layout.shown is None for layout in layouts):
+def _without_filling(confidence: Tensor, views: Sequence[_LaidOut]) -> Tensor:
+    """Confidence (K, H, W), set to 0 at pixels that do not show the photograph, or that its mask ignores."""
+    parts = [it.layout.shown_without(it.photograph.read_ignored()) for it in views]
+    if all(part is None for part in parts):
         return confidence
     everywhere = np.ones(confidence.shape[1:], bool)
-    shown = np.stack([everywhere if layout.shown is None else layout.shown for layout in layouts])
+    shown = np.stack([everywhere if part is None else part for part in parts])
     return torch.where(_on_device(torch.from_numpy(shown), confidence.device), confidence, 0.0)
 
 

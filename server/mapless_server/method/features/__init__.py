@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Camera
 
 from ..choices import EDGEPOINT2, FEATURES
-from ..views import View
+from ..views import Ignored, View
 from .sift import SiftExtractor, SiftOptions
 
 __all__ = [
@@ -37,12 +37,13 @@ class FeatureExtractor(Protocol):
         """Identifies the extractor and everything that changes its output."""
         ...
 
-    def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
+    def extract(self, image: NDArray[np.uint8], camera: Camera, ignored: Ignored | None = None) -> View:
         """Finds the features of a photograph.
 
         Args:
             image: (H, W, 3) uint8, RGB, as stored in the file.
             camera: the photograph's camera, of the same size.
+            ignored: pixels of the image, at any size, near which no feature is found, see `masks`; None for none.
 
         Returns:
             The view of the photograph, possibly without keypoints (of a blank wall).

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from kornia.feature.aliked.aliked import ALIKED, SDDH, DeformableConv2d, InputPadder, ResBlock
+from kornia.feature.aliked.aliked import ALIKED, DKD, SDDH, DeformableConv2d, InputPadder, ResBlock
 from numpy.typing import NDArray
 from torch import nn
 from torch.nn.functional import conv2d, embedding_bag, grid_sample, normalize
@@ -14,11 +14,14 @@ from torch.nn.functional import conv2d, embedding_bag, grid_sample, normalize
 from mapless.geometry import Camera
 from mapless_server.networks.local_features import load_aliked
 
-from ..views import View, reduce_image, view_of
+from ..views import Ignored, View, reduce_image, view_of
+from .masks import are_usable, usable_pixels
 from .network import LearnedOptions, array_of, image_tensor
 
 _CORNERS = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]])
 """Pixels around a position, x and y, from the first."""
+
+_UNLIMITED = 2**31
 
 _AT_ONCE = 256
 """Keypoints that are described at once, with 20 MB."""
@@ -44,23 +47,31 @@ class AlikedExtractor:
         self._network, sha256 = load_aliked(weights, self.options.max_keypoints)
         self._device = torch.device(device)
         self._network.to(self._device).eval()
+        # Above the threshold, however many: with a mask the strongest are chosen after it.
+        radius, threshold = self._network.nms_radius, max(self.options.min_score, 1e-9)
+        self._all_maxima = DKD(radius, top_k=0, scores_th=threshold, n_limit=_UNLIMITED).to(self._device)
         self.name = self.options.label("aliked-n16", sha256)
 
     @torch.inference_mode()
-    def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
+    def extract(self, image: NDArray[np.uint8], camera: Camera, ignored: Ignored | None = None) -> View:
         """See FeatureExtractor.extract; the strongest keypoint first."""
         reduced, reduced_camera = reduce_image(image, camera, self.options.max_side_px)
         maps = find_maps(self._network, image_tensor(reduced, self._device))
-        found, scores, dispersities = (parts[0] for parts in self._network.dkd(maps.scores))
+        detector = self._network.dkd if ignored is None else self._all_maxima
+        found, scores, dispersities = (parts[0] for parts in detector(maps.scores))
+        last_pixel = np.array([reduced.shape[1] - 1, reduced.shape[0] - 1])
         good = scores > self.options.min_score
+        if ignored is not None:
+            usable = usable_pixels(ignored, reduced.shape[1], reduced.shape[0])
+            allowed = are_usable(usable, (array_of(found).astype(np.float64) + 1) / 2 * last_pixel)
+            good &= torch.from_numpy(allowed).to(good.device)
         found, scores, dispersities = found[good], scores[good], dispersities[good]
-        order = torch.argsort(scores, descending=True, stable=True)
+        order = torch.argsort(scores, descending=True, stable=True)[: self.options.max_keypoints]
         found, dispersities = found[order], dispersities[order]
         if not len(found):
             dimension = self._network.desc_head.sf_conv.in_channels
             return view_of(reduced_camera, np.empty((0, 2)), np.empty((0, dimension), np.float32), array_of(scores))
         descriptors = describe(self._network.desc_head, maps, found)
-        last_pixel = np.array([reduced.shape[1] - 1, reduced.shape[0] - 1])
         pixels = (array_of(found).astype(np.float64) + 1) / 2 * last_pixel
         return view_of(reduced_camera, pixels, array_of(descriptors), self._peak_sizes_px(dispersities))
 

@@ -13,8 +13,9 @@ from mapless.geometry import Camera
 from mapless_server.networks.edgepoint2 import DESCRIPTOR_STEP_PX, fuse
 from mapless_server.networks.local_features import load_edgepoint2
 
-from ..views import View, reduce_image, view_of
-from .network import LearnedOptions, array_of, image_tensor, peaks, strict_maxima
+from ..views import Ignored, View, reduce_image, view_of
+from .masks import usable_pixels
+from .network import LearnedOptions, among_usable, array_of, image_tensor, peaks, strict_maxima
 
 WINDOW_PX = 5
 """Side of the window in which a keypoint is the strongest pixel."""
@@ -54,7 +55,7 @@ class EdgePoint2Extractor:
         self.name = self.options.label(f"edgepoint2-{variant}", sha256)
 
     @torch.inference_mode()
-    def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
+    def extract(self, image: NDArray[np.uint8], camera: Camera, ignored: Ignored | None = None) -> View:
         """See FeatureExtractor.extract; the strongest keypoint first."""
         grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
         reduced, reduced_camera = reduce_image(grey, camera, self.options.max_side_px)
@@ -63,6 +64,8 @@ class EdgePoint2Extractor:
         margin = BORDER_PX - WINDOW_PX // 2
         inner = logits[margin:-margin, margin:-margin]
         pixels = strict_maxima(inner, WINDOW_PX, _logit(self.options.min_score)) + margin
+        if ignored is not None:
+            pixels = among_usable(pixels, usable_pixels(ignored, reduced.shape[1], reduced.shape[0]))
         order = torch.argsort(logits[pixels[:, 1], pixels[:, 0]], descending=True, stable=True)
         pixels = pixels[order[: self.options.max_keypoints]]
         offsets, curvatures = peaks(logits, pixels)

@@ -62,6 +62,12 @@ def strict_maxima(scores: torch.Tensor, window_px: int, threshold: float) -> tor
     return ((inner > others.clamp_(min=threshold)).nonzero() + margin).flip(1)
 
 
+def among_usable(pixels: torch.Tensor, usable: NDArray[np.bool_]) -> torch.Tensor:
+    """Those of whole pixels (N, 2), x and y, that are usable, (H, W)."""
+    chosen = torch.from_numpy(usable).to(pixels.device)[pixels[:, 1], pixels[:, 0]]
+    return pixels[chosen]
+
+
 def _on_both_sides(x: torch.Tensor, margin: int, axis: int) -> torch.Tensor:
     """Largest of the `margin` numbers before and the `margin` after each that has so many, along an axis."""
     count = x.shape[axis] - 2 * margin

@@ -1,5 +1,6 @@
 """SIFT features: no weights, no torch; the default where there are no weights."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -9,7 +10,8 @@ from numpy.typing import NDArray
 from mapless.geometry import Camera
 
 from ..options import check_bounds
-from ..views import View, reduce_image, view_of
+from ..views import Ignored, View, reduce_image, view_of
+from .masks import are_usable, usable_pixels
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class SiftExtractor:
         options = self.options
         return f"sift-{options.max_keypoints}-{options.max_side_px}px-{options.contrast_threshold:g}"
 
-    def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
+    def extract(self, image: NDArray[np.uint8], camera: Camera, ignored: Ignored | None = None) -> View:
         """See FeatureExtractor.extract."""
         grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
         reduced, reduced_camera = reduce_image(grey, camera, self.options.max_side_px)
@@ -54,7 +56,11 @@ class SiftExtractor:
             contrastThreshold=self.options.contrast_threshold,
             enable_precise_upscale=True,
         )
-        found, raw = sift.detectAndCompute(reduced, None)
+        if ignored is None:
+            found, raw = sift.detectAndCompute(reduced, None)
+        else:
+            usable = usable_pixels(ignored, reduced.shape[1], reduced.shape[0])
+            found, raw = self._described(sift, reduced, usable)
         if not found:
             return view_of(reduced_camera, np.empty((0, 2)), np.empty((0, 128), np.uint8), np.empty(0, np.float32))
         # OpenCV keeps ties of the weakest keypoint, so it may return more than asked for.
@@ -65,3 +71,17 @@ class SiftExtractor:
             raw.astype(np.uint8),  # whole numbers
             np.array([k.size for k in found], np.float32),
         )
+
+    def _described(
+        self, sift: cv2.SIFT, image: NDArray[np.uint8], usable: NDArray[np.bool_]
+    ) -> tuple[Sequence[cv2.KeyPoint], NDArray[np.float32]]:
+        """The strongest keypoints in usable pixels, and their descriptors.
+
+        OpenCV applies a mask of its own to the strongest keypoints of the whole image, of which few may be left.
+        """
+        sift.setNFeatures(0)
+        found = sift.detect(image, None)
+        allowed = are_usable(usable, np.array([k.pt for k in found]))
+        strengths = np.array([k.response for k in found])[allowed]
+        strongest = np.sort(np.argsort(-strengths, kind="stable")[: self.options.max_keypoints])
+        return sift.compute(image, [found[i] for i in np.flatnonzero(allowed)[strongest]])

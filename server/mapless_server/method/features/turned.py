@@ -9,12 +9,16 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Camera
 
-from ..views import View, view_of
+from ..views import Ignored, View, view_of
 from . import FeatureExtractor
 
 
 def extract_turned(
-    extractor: FeatureExtractor, image: NDArray[np.uint8], camera: Camera, clockwise_quarter_turns: int
+    extractor: FeatureExtractor,
+    image: NDArray[np.uint8],
+    camera: Camera,
+    clockwise_quarter_turns: int,
+    ignored: Ignored | None = None,
 ) -> View:
     """Finds the features of a photograph in its turned raster.
 
@@ -23,6 +27,7 @@ def extract_turned(
         image: (H, W, 3) uint8, RGB, as stored in the file.
         camera: the photograph's camera, of the same size.
         clockwise_quarter_turns: by which the raster is turned, 0 to 3.
+        ignored: ignored pixels of the image as it is stored, see FeatureExtractor.extract.
 
     Returns:
         The view that the extractor gives, in pixels of the raster that is not turned; only its descriptors are those of
@@ -32,7 +37,8 @@ def extract_turned(
     width, height = sides[::-1] if clockwise_quarter_turns % 2 else sides
     # Distortion is not the extractor's to remove: it belongs to the raster that is not turned.
     plain = Camera(width, height, float(max(sides)), float(max(sides)), (width - 1) / 2, (height - 1) / 2)
-    found = extractor.extract(np.ascontiguousarray(np.rot90(image, -clockwise_quarter_turns)), plain)
+    turned = None if ignored is None else np.rot90(ignored, -clockwise_quarter_turns)
+    found = extractor.extract(np.ascontiguousarray(np.rot90(image, -clockwise_quarter_turns)), plain, turned)
     size = found.camera.width_px, found.camera.height_px
     pixels = found.features.keypoints
     for _ in range(clockwise_quarter_turns):  # back: what is right was up, and what is down was right

@@ -11,8 +11,9 @@ from torch.nn.functional import log_softmax, normalize, pixel_shuffle
 from mapless.geometry import Camera
 from mapless_server.networks.local_features import load_xfeat
 
-from ..views import View, reduce_image, view_of
-from .network import LearnedOptions, array_of, image_tensor, peak_offsets, strict_maxima
+from ..views import Ignored, View, reduce_image, view_of
+from .masks import usable_pixels
+from .network import LearnedOptions, among_usable, array_of, image_tensor, peak_offsets, strict_maxima
 
 MULTIPLE_PX = 32
 """Sides of the images that the network takes."""
@@ -49,7 +50,7 @@ class XfeatExtractor:
         self.name = self.options.label("xfeat", sha256)
 
     @torch.inference_mode()
-    def extract(self, image: NDArray[np.uint8], camera: Camera) -> View:
+    def extract(self, image: NDArray[np.uint8], camera: Camera, ignored: Ignored | None = None) -> View:
         """See FeatureExtractor.extract; the strongest keypoint first."""
         reduced, reduced_camera = reduce_image(image, camera, self.options.max_side_px, MULTIPLE_PX)
         feature_map, logits, reliability = self._network(image_tensor(reduced, self._device))
@@ -57,6 +58,8 @@ class XfeatExtractor:
         log_heat = pixel_shuffle(log_softmax(logits, dim=1)[:, :-1], 8)[0, 0]
         heat = log_heat.exp()
         pixels = strict_maxima(heat, WINDOW_PX, self.options.min_score)
+        if ignored is not None:
+            pixels = among_usable(pixels, usable_pixels(ignored, width, height))
         weight = InterpolateSparse2d("bilinear")(reliability, pixels[None], height, width)[0, :, 0]
         scores = heat[pixels[:, 1], pixels[:, 0]] * weight
         pixels = pixels[torch.argsort(scores, descending=True, stable=True)[: self.options.max_keypoints]]

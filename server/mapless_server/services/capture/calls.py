@@ -57,7 +57,8 @@ class CapturedReference:
     """A reference that a photograph was compared with; its pose is metric, its camera in pixels of its photograph.
 
     Its id is unique within its scene; its key is never used again, so that a reference that replaces it has another.
-    The photograph's blob is named by its SHA-256, the blobs of its features by name of the extractor.
+    The blobs of the photograph and its mask, which may be empty for none, are named by their SHA-256, the blobs of its
+    features by name of the extractor.
     """
 
     reference_id: str
@@ -66,6 +67,12 @@ class CapturedReference:
     world_from_camera: RigidTransform
     image_sha256: str
     views: Mapping[str, str]
+    mask_sha256: str = ""
+
+    @property
+    def blobs(self) -> tuple[str, ...]:
+        """Names of its blobs."""
+        return (self.image_sha256, *self.views.values(), *filter(None, [self.mask_sha256]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +128,7 @@ class CapturedCall:
     def blobs(self) -> frozenset[str]:
         """Names of the blobs that the call needs."""
         references = [it for part in self.parts for it in part.references]
-        return frozenset(name for it in references for name in (it.image_sha256, *it.views.values()))
+        return frozenset(name for it in references for name in it.blobs)
 
 
 def encode_call(call: CapturedCall) -> bytes:
@@ -220,6 +227,7 @@ def _reference_to_dict(reference: CapturedReference) -> dict[str, Any]:
         "key": reference.key,
         "image": reference.image_sha256,
         "views": dict(reference.views),
+        **({"mask": reference.mask_sha256} if reference.mask_sha256 else {}),
         **json.loads(codec.encode_geometry(reference.camera, reference.world_from_camera)),
     }
 
@@ -229,7 +237,8 @@ def _reference_of(content: Mapping[str, Any]) -> CapturedReference:
     camera, world_from_camera = codec.decode_geometry("", geometry, codec.sha256_for("", geometry))
     views = {_text(name): _text(blob) for name, blob in content["views"].items()}
     reference_id, key, image = check_id(content["reference_id"]), _text(content["key"]), _text(content["image"])
-    return CapturedReference(reference_id, key, camera, world_from_camera, image, views)
+    mask = _text(content.get("mask", ""))
+    return CapturedReference(reference_id, key, camera, world_from_camera, image, views, mask)
 
 
 def _text(value: object) -> str:

@@ -1,7 +1,7 @@
 """Reads the references that a photograph was compared with from the store, after its call has been answered."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from mapless.names import parse_reference_name
@@ -82,7 +82,9 @@ class Collector:
         if not used.used <= known.keys():
             raise ReferencesDeleted
         for record in known.values():
-            self._image(record, blobs)
+            self._file(record, record.image_sha256, self._store.read_image_of, blobs)
+            if record.mask_sha256:
+                self._file(record, record.mask_sha256, self._store.read_mask_of, blobs)
         references = [
             CapturedReference(
                 it.reference_id,
@@ -91,6 +93,7 @@ class Collector:
                 it.world_from_camera,
                 it.image_sha256,
                 {name: self._views[key, name] for name in extractors if (key, name) in self._views},
+                it.mask_sha256,
             )
             for key, it in known.items()
         ]
@@ -129,11 +132,10 @@ class Collector:
         for record in (*(it.record for it in snapshot.references), *snapshot.undescribed):
             self._records[record.key] = record
 
-    def _image(self, record: ReferenceRecord, blobs: dict[str, bytes]) -> None:
-        name = record.image_sha256
+    def _file(self, record: ReferenceRecord, name: str, read: Callable[[str], bytes], blobs: dict[str, bytes]) -> None:
         if name in blobs or self._folder.has_blob(tenant_of(record.scene_key), name):
             return
         try:
-            blobs[name] = self._store.read_image_of(record.key)
+            blobs[name] = read(record.key)
         except NotFound:
             raise ReferencesDeleted from None

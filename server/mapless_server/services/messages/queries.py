@@ -23,7 +23,7 @@ from mapless.wire import FieldError, camera_from_message, joined, transform_from
 from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.photos import Photo
 from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Query
-from mapless_server.images import ImageLimits, image_size
+from mapless_server.images import ImageLimits, check_mask, image_size
 from mapless_server.method.options import IntrinsicsSigma, LocalizeOptions
 from mapless_server.method.priors.known import (
     NO_PRIORS,
@@ -94,8 +94,8 @@ def reference_ids_from_names(names_given: Sequence[str], scene_id: str, most: in
 def photo_from_message(message: Any, path: str, limits: ImageLimits) -> Photo:
     """Reads the photograph of a message's `image` and `intrinsics`; reads only the image's header, so it is fast.
 
-    FieldError if the intrinsics are missing, out of range, or of another size than the image; InvalidArgument if the
-    image is refused by its header.
+    Also reads its `mask`. FieldError if the intrinsics are missing, out of range, or of another size than the image;
+    InvalidArgument if the image or the mask is refused by its header.
     """
     if not message.HasField("intrinsics"):
         raise FieldError(joined(path, "intrinsics"), "is required")
@@ -116,7 +116,11 @@ def photo_from_message(message: Any, path: str, limits: ImageLimits) -> Photo:
             f"must show the image: with {coefficients} only {100 * share:.0f} % of its pixels have a ray "
             f"({100 * MIN_SEEN_SHARE:.0f} are needed)",
         )
-    return Photo(image, camera, joined(path, "image"))
+    mask = b""
+    if message.HasField("mask"):
+        mask = message.mask
+        check_mask(mask, (width_px, height_px), limits, joined(path, "mask"))
+    return Photo(image, camera, joined(path, "image"), mask)
 
 
 MIN_SEEN_SHARE = 0.1

@@ -2,7 +2,7 @@
 
 import base64
 import binascii
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from mapless import names, wire
@@ -78,9 +78,27 @@ def reference_to_message(reference: ReferenceRecord) -> pb.Reference:
         world_from_camera=wire.transform_to_message(reference.world_from_camera),
         image_sha256=reference.image_sha256,
         feature_count=reference.feature_count,
+        mask_sha256=reference.mask_sha256,
     )
     message.create_time.FromDatetime(reference.create_time)
     return message
+
+
+MUCH_IGNORED = 0.8
+"""A mask that ignores a larger share of a reference is most likely inverted."""
+
+
+def nearly_ignored(shares: Mapping[str, float]) -> list[str]:
+    """Warning about new references whose masks ignore nearly everything, from the share that each ignores; or none."""
+    much = {reference_id: share for reference_id, share in shares.items() if share > MUCH_IGNORED}
+    if not much:
+        return []
+    first, share = next(iter(much.items()))
+    others = f", and those of {len(much) - 1} more ignore as much" if len(much) > 1 else ""
+    return [
+        f"the mask of reference {first!r} ignores {100 * share:.0f} % of its image{others}: 0 means ignore, every "
+        "other value use; is it inverted?"
+    ]
 
 
 def choice_to_message(choice: Choice, scene_id: str) -> pb.RetrieveReferencesResponse:
