@@ -25,6 +25,7 @@ from torch import Tensor, nn  # noqa: E402
 
 from mapless_server.method.features.aliked import AlikedExtractor, Maps, describe, find_maps  # noqa: E402
 from mapless_server.method.features.edgepoint2 import SIZE_OF_WIDTH, EdgePoint2Extractor  # noqa: E402
+from mapless_server.method.features.masks import MARGIN_PX  # noqa: E402
 from mapless_server.method.features.network import (  # noqa: E402
     LearnedOptions,
     image_tensor,
@@ -232,6 +233,22 @@ def test_any_photograph_gives_well_formed_features(name: str, dimension: int, re
         assert view.camera.distortion is None
         assert_is_well_formed(view.features, dimension)
         assert len(view.features) <= 300
+
+
+@pytest.mark.parametrize("name", ["aliked", "xfeat", "edgepoint2"])
+def test_a_mask_leaves_the_strongest_keypoints_beside_it(name: str, request: pytest.FixtureRequest) -> None:
+    extractor: FeatureExtractor = request.getfixturevalue(name)
+    image, camera = textured(320, 256, seed=4), replace(CAMERA, height_px=256)
+    whole = extractor.extract(image, camera).features
+    ignored = np.zeros((512, 640), bool)  # of the image before it was reduced
+    ignored[:, :320] = True
+    masked = extractor.extract(image, camera, ignored).features
+    assert masked.keypoints[:, 0].min() > 159 + MARGIN_PX - 1
+    beside = {tuple(it) for it in whole.keypoints if it[0] > 159 + MARGIN_PX + 1}
+    assert len(beside) > 10
+    assert beside.issubset({tuple(it) for it in masked.keypoints})
+    nothing = extractor.extract(image, camera, np.ones((256, 320), bool)).features
+    assert len(nothing) == 0
 
 
 @pytest.mark.parametrize("extractor", [AlikedExtractor, XfeatExtractor])

@@ -14,12 +14,8 @@ from support.bags import BASE_FROM_CAMERA, at, image, info, odometry, transforms
 
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.method.features import SiftExtractor
-<<<<<<< HEAD
 from mapless_server.method.readings import Verdict, implausible_depth
-from mapless_server.method.views import View
-=======
 from mapless_server.method.views import Ignored, View
->>>>>>> dc84b1cf (Masks can be given with references, queries, images of rigs and of sequences: keypoints near ignored pixels are not found, the strongest of the others are kept; stored with the reference)
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.ingest.check import check_frames
 from mapless_tools.ingest.formats import KeyframeOptions, ReadOptions, read_dataset

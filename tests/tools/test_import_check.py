@@ -11,13 +11,8 @@ from support.images import encode
 from support.posed_views import planted
 from support.scenes import CAMERA
 
-<<<<<<< HEAD
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
-from mapless_server.method.views import PosedView, View
-=======
-from mapless.geometry import Camera, Quaternion, RigidTransform, rotation_from_vector
 from mapless_server.method.views import Ignored, PosedView, View
->>>>>>> dc84b1cf (Masks can be given with references, queries, images of rigs and of sequences: keypoints near ignored pixels are not found, the strongest of the others are kept; stored with the reference)
 from mapless_tools.dataset import Frame
 from mapless_tools.ingest.check import check_frames
 from mapless_tools.ingest.check.pairs import more_pairs, pairs_by_order, pairs_by_pose

@@ -84,4 +84,5 @@ class SiftExtractor:
         allowed = are_usable(usable, np.array([k.pt for k in found]))
         strengths = np.array([k.response for k in found])[allowed]
         strongest = np.sort(np.argsort(-strengths, kind="stable")[: self.options.max_keypoints])
-        return sift.compute(image, [found[i] for i in np.flatnonzero(allowed)[strongest]])
+        kept, descriptors = sift.compute(image, [found[i] for i in np.flatnonzero(allowed)[strongest]])
+        return kept, np.asarray(descriptors, np.float32)
