@@ -53,6 +53,6 @@ def test_a_damaged_or_lost_mask_is_named(tmp_path: Path, statement: str) -> None
     with folder.open() as store:
         key = filled(store)["masked"]
     folder.execute(statement)
-    assert faults_of(folder) == ["office/masked: mask"] or "masked" in str(faults_of(folder))
+    assert faults_of(folder) == ("tenant 'default', scene 'office', reference 'masked': mask",)
     with folder.open() as store, pytest.raises(DataLoss, match=r"'masked' is damaged in the store \(mask\)"):
         store.read_mask_of(key)
