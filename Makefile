@@ -3,8 +3,9 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
-# On its own first, so that a build for this machine's device can be chosen (TORCH="torch --index-url ...").
-TORCH  ?= torch==2.13.0
+# On its own first, so that a build for this machine's device can be chosen (TORCH="torch==2.13.0 --index-url ...").
+TORCH_VERSION := 2.13.0
+TORCH  ?= torch==$(TORCH_VERSION)
 # An old generator, so that robots are free in their protobuf and grpcio versions (1.71.2 emits code for protobuf >= 5.29).
 # It pins an old protobuf itself, hence its own environment.
 PROTO_TOOLS := grpcio-tools==1.71.2 setuptools==80.9.0
@@ -14,7 +15,8 @@ PROTO_VENV  := $(VENV)/proto-tools
 # processes compiles all that it imports: a server takes 3.0 s of processor time to start instead of 1.3.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup test nightly weights lint format proto released demo bench bench-turns bench-gpu load load-ray fuzz docs clean
+.PHONY: help setup lock test nightly weights lint format proto released demo bench bench-turns bench-gpu load load-ray fuzz \
+    docs clean
 
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -23,18 +25,23 @@ help:  ## List the targets
 # a folder of its own.
 KAPTURE := kapture==1.1.12 numpy-quaternion==2024.0.13
 
-# uv installs in seconds what takes pip minutes.
+# uv installs in seconds what takes pip minutes. All versions are those of the lock.
 INSTALL = $(BIN)/python .ci/uv.py pip install --quiet
+LOCKED  = --constraint requirements.lock
 
-$(VENV)/.installed: pyproject.toml
+$(VENV)/.installed: pyproject.toml requirements.lock
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check uv
-	$(INSTALL) $(TORCH)
-	$(INSTALL) --editable '.[server,tools,networks,otel,postgres,ray,view,gateway,dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check $(LOCKED) uv
+	$(INSTALL) $(LOCKED) $(TORCH)
+	$(INSTALL) $(LOCKED) --editable '.[server,tools,networks,otel,postgres,ray,view,gateway,dev]'
 	$(INSTALL) --no-deps --target $(VENV)/kapture $(KAPTURE)
 	touch $@
 
 setup: $(VENV)/.installed  ## Create .venv with everything
+
+lock: $(VENV)/.installed  ## Write the versions of all packages anew after a change of pyproject.toml; UPGRADE=1 for the newest
+	$(BIN)/python .ci/lock.py $(TORCH_VERSION) $(if $(UPGRADE),--upgrade)
+	cd client/web && npm install --package-lock-only --ignore-scripts --no-audit --no-fund
 
 # The matrices are small: threads gain nothing, and wait for one another where cores are shared. Not so the full networks.
 THREADS ?= 1
@@ -98,7 +105,7 @@ load-ray: setup  ## Measure replicas on Ray Serve, on this machine: half an hour
 	$(BIN)/python -m mapless_tools.load_ray $(or $(PART),all) $(if $(DATA),--data '$(DATA)') $(ARGS)
 
 $(VENV)/.docs: $(VENV)/.installed
-	$(INSTALL) --editable '.[docs]'
+	$(INSTALL) $(LOCKED) --editable '.[docs]'
 	touch $@
 
 docs: $(VENV)/.docs  ## Build the documentation as a site in build/docs; a broken link is an error

@@ -45,7 +45,7 @@ def pages() -> Path:
     if npm is None:
         pytest.skip("needs npm to build the pages")
     if not (WEB / "node_modules").is_dir():
-        installed = subprocess.run([npm, "install", "--no-audit", "--no-fund"], cwd=WEB, env=environment, **output)
+        installed = subprocess.run([npm, "ci", "--no-audit", "--no-fund"], cwd=WEB, env=environment, **output)
         if installed.returncode:
             pytest.skip(f"npm could not install: {installed.stderr[-300:]}")
     built = subprocess.run([npm, "run", "build"], cwd=WEB, env=environment, **output)
