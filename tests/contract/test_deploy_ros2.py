@@ -35,6 +35,9 @@ class StandInNode:
     def get_name(self) -> str:
         return self.name
 
+    def resolve_topic_name(self, topic: str) -> str:
+        return "/front/image_rect/compressed"
+
     def get_clock(self) -> Any:
         return SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=at(5.0)))
 
@@ -152,6 +155,7 @@ def test_the_node_publishes_pose_transform_and_diagnostics(
             assert node.logged == ["no camera_info yet"]
             assert not trigger(None, response).success
             node.callbacks["visual_localization/camera_info_0"](info(CAMERA))
+            assert node.logged[-1] == "the camera is K and D of CameraInfo (parameter rectified: False)"
             assert trigger(None, response).success
             node.callbacks["visual_localization/image_0"](shot(1.0))
             wait_until(lambda: poses)

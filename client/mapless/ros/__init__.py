@@ -9,6 +9,7 @@ ROS (REP 103) has bodies with x forward, y left and z up, and cameras twice: `ca
 image is the optical frame. The world is the scene's; for ROS it should have z up (REP 105's `map`).
 """
 
+from .camera_infos import CameraInfos, rectified_differs, says_rectified
 from .cameras import RosCamera, camera_from_info
 from .images import pixels_from_image
 from .localizer import Localizer, LocalizerOptions, Outcome
@@ -16,6 +17,7 @@ from .messages import Messages
 from .poses import pose_of_body, stamp_ns_of, transform_from_message, transform_from_pose
 
 __all__ = [
+    "CameraInfos",
     "Localizer",
     "LocalizerOptions",
     "Messages",
@@ -24,6 +26,8 @@ __all__ = [
     "camera_from_info",
     "pixels_from_image",
     "pose_of_body",
+    "rectified_differs",
+    "says_rectified",
     "stamp_ns_of",
     "transform_from_message",
     "transform_from_pose",

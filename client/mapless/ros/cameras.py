@@ -46,7 +46,9 @@ def camera_from_info(message: Any, rectified: bool = False) -> RosCamera:
     coefficient is a `plumb_bob`; images of other ones are undistorted to a pinhole, cropped to the lens's field.
     ValueError if the camera is not calibrated, its lens is unknown, or its image is binned or cropped.
     """
-    name, matrix, columns = ("p", list(message.p), 4) if rectified else ("k", list(message.k), 3)
+    # Drivers of rectified images without a lens often leave P empty: it is K then.
+    has_p = any(message.p) or any(message.d)
+    name, matrix, columns = ("p", list(message.p), 4) if rectified and has_p else ("k", list(message.k), 3)
     focal_x, focal_y, principal_x, principal_y = (float(matrix[i]) for i in (0, columns + 1, 2, columns + 2))
     if not (0 < focal_x < np.inf and 0 < focal_y < np.inf and np.isfinite([principal_x, principal_y]).all()):
         raise ValueError(

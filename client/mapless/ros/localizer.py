@@ -242,7 +242,7 @@ class Localizer:
             return None
         try:
             return self._lookup(self._options.odom_frame, body, stamp_ns)
-        except LookupError:
+        except (LookupError, ValueError):  # odometry that is lost has null poses
             return None
 
     def _prior(

@@ -16,9 +16,10 @@ class BagOptions:
     """Which topics and frames of a recording are used; empty for unambiguous ones. Each field is a flag.
 
     Poses of /tf are in `world_frame`, by default the root of its tree. `body_frame` is the frame whose poses a topic
-    without child_frame_id has, by default the root of the camera's static frames. An image is used if there are poses
-    within `max_pose_gap_s` before and after it. At 10 Hz there is one every 0.1 s; between two of them a robot that
-    accelerates by 2 m/s2 is off a straight line by 2.5 mm.
+    without child_frame_id has, by default the root of the camera's static frames. `rectified` says whether P of
+    CameraInfo is the camera of the images, or K and D; by default the topic's name does. An image is used if there are
+    poses within `max_pose_gap_s` before and after it. At 10 Hz there is one every 0.1 s; between two of them a robot
+    that accelerates by 2 m/s2 is off a straight line by 2.5 mm.
     """
 
     image_topic: Annotated[str, typer.Option(help="Of a recording: topic of the images, where there are several.")] = ""
@@ -30,6 +31,13 @@ class BagOptions:
     body_frame: Annotated[
         str, typer.Option(help="Of a recording: frame whose poses a topic has that does not name it.")
     ] = ""
+    rectified: Annotated[
+        bool | None,
+        typer.Option(
+            "--rectified/--no-rectified",
+            help="Of a recording: its images are undistorted, P of CameraInfo is theirs; default: by the topic's name.",
+        ),
+    ] = None
     body_from_camera: Annotated[
         str, typer.Option(help="Of a recording without /tf_static: the camera's pose on the body, JSON or a file.")
     ] = ""

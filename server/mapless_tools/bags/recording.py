@@ -6,6 +6,7 @@ those in the recording: many recordings have no definitions, or unreadable ones 
 
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -25,8 +26,21 @@ _HINTS = (
 """What to say after a message of the library that has a text."""
 
 
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """A message with its topic and time of recording; None if it is damaged. `where` is for error messages."""
+
+    topic: str
+    time_ns: int
+    message: Any
+    where: str
+
+
 class Recording:
-    """A recording, open until its block ends; `types` and `counts` are each topic's type and number of messages."""
+    """A recording, open until its block ends; `types` and `counts` are each topic's type and number of messages.
+
+    Bad messages among good ones are skipped: `skipped` has the reason of each by its place, for each topic.
+    """
 
     def __init__(self, path: Path) -> None:
         """Opens a recording; raises ValueError, with the file's name, if it cannot be opened."""
@@ -38,6 +52,7 @@ class Recording:
             connections = [it for it in self._reader.connections if it.msgcount]
             self._connections = connections
         self.types = {it.topic: it.msgtype for it in connections}
+        self.skipped: dict[str, dict[str, str]] = {}
         self.counts = {name: sum(it.msgcount for it in connections if it.topic == name) for name in self.types}
 
     def __enter__(self) -> "Recording":
@@ -52,8 +67,26 @@ class Recording:
         """Topics whose messages have one of these types."""
         return sorted(name for name, kind in self.types.items() if kind in types)
 
-    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
-        """Yields topic, time of recording (ns) and message in that order; ValueError names what is damaged."""
+    def skip(self, recorded: Recorded, reason: str) -> None:
+        """Counts a message that cannot be used; the same one may be read, and skipped, several times."""
+        self.skipped.setdefault(recorded.topic, {})[recorded.where] = reason
+
+    def skipped_lines(self) -> list[str]:
+        """A line for each topic of which messages were skipped."""
+        found = []
+        for topic, reasons in self.skipped.items():
+            where, reason = next(iter(reasons.items()))
+            found.append(
+                f"{len(reasons)} of {self.counts[topic]} messages of {topic} cannot be used and are skipped, the "
+                f"first: {where}: {reason}"
+            )
+        return found
+
+    def messages(self, topics: Collection[str]) -> Iterator[Recorded]:
+        """Yields messages in the order of recording, damaged ones, too, which are skipped by this.
+
+        ValueError names what is wrong with the file.
+        """
         connections = [it for it in self._connections if it.topic in topics]
         if not connections:
             return
@@ -69,9 +102,14 @@ class Recording:
             connection, time_ns, data = found
             seen[connection.topic] += 1
             where = f"message {seen[connection.topic]} of {connection.topic}, recorded at {seconds(time_ns)}"
-            with self._named(where):
+            try:
                 message = self.typestore.deserialize_cdr(data, connection.msgtype)
-            yield connection.topic, time_ns, message
+            except Exception as error:  # of any kind, as `_named` says
+                damaged = Recorded(connection.topic, time_ns, None, where)
+                self.skip(damaged, f"damaged: {str(error).rstrip('.') or type(error).__name__}")
+                yield damaged
+                continue
+            yield Recorded(connection.topic, time_ns, message, where)
         for topic in topics:
             if seen[topic] < self.counts.get(topic, 0):
                 raise ValueError(
@@ -90,18 +128,26 @@ class Recording:
             raise ValueError(f"{self.path} cannot be read{place}: {what}{hint}") from error
 
 
-def stamp_of(message: Any, previous_ns: int | None, what: str) -> int:
-    """Stamp of a message's header, nanoseconds; ValueError, naming `what` it is, without one or if time jumps back."""
+class Unusable(Exception):
+    """A message cannot be used, and may be skipped; the message is the reason."""
+
+
+def stamp_of(message: Any) -> int:
+    """Stamp of a message's header, nanoseconds; Unusable without one."""
     stamp_ns = int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)
     if not stamp_ns:
-        raise ValueError(f"{what} has no time: header.stamp is 0")
-    if previous_ns is not None and stamp_ns < previous_ns - MAX_JUMP_BACK_NS:
+        raise Unusable("it has no time: header.stamp is 0")
+    return stamp_ns
+
+
+def check_order(stamp_ns: int, previous_ns: int, where: str) -> None:
+    """Raises ValueError, naming where it is, if time jumps back."""
+    if stamp_ns < previous_ns - MAX_JUMP_BACK_NS:
         back_s = (previous_ns - stamp_ns) / 1e9
         raise ValueError(
-            f"{what}: time jumps back by {back_s:.3f} s, from {seconds(previous_ns)} to {seconds(stamp_ns)}; cut the "
+            f"{where}: time jumps back by {back_s:.3f} s, from {seconds(previous_ns)} to {seconds(stamp_ns)}; cut the "
             "recording there"
         )
-    return stamp_ns
 
 
 def seconds(time_ns: int) -> str:

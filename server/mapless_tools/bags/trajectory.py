@@ -13,10 +13,11 @@ from mapless.geometry import RigidTransform
 class Trajectory:
     """Poses at times, and interpolated between them: positions linearly, rotations along the shortest arc."""
 
-    def __init__(self, table: ArrayLike, max_gap_s: float) -> None:
+    def __init__(self, table: ArrayLike, max_gap_s: float, lost_s: ArrayLike = ()) -> None:
         """Reads rows of time (seconds), position and quaternion x y z w, in any order; of equal times the first counts.
 
-        `max_gap_s` is the largest time to the poses before and after. Raises ValueError for fewer than two poses.
+        `max_gap_s` is the largest time to the poses before and after. Between two poses with one of the times `lost_s`
+        between them there is none. Raises ValueError for fewer than two poses.
         """
         rows = np.asarray(table, float).reshape(-1, 8)
         _, order = np.unique(rows[:, 0], return_index=True)
@@ -24,6 +25,7 @@ class Trajectory:
         if len(rows) < 2:
             raise ValueError("holds fewer than two poses")
         self._max_gap_s = max_gap_s
+        self._lost_s = np.sort(np.asarray(lost_s, float))
         self._time_s: NDArray[np.float64] = rows[:, 0]
         self._position = rows[:, 1:4]
         self._slerp = Slerp(self._time_s, Rotation.from_quat(rows[:, 4:]))
@@ -38,6 +40,10 @@ class Trajectory:
         if gap_s > self._max_gap_s:
             limit = f"{1000 * self._max_gap_s:g} ms"
             raise ValueError(f"pose: there is none within {limit} before and after, only {1000 * gap_s:.0f}")
+        if np.searchsorted(self._lost_s, self._time_s[before], "right") < np.searchsorted(
+            self._lost_s, self._time_s[after]
+        ):
+            raise ValueError("pose: tracking was lost at that time")
         span_s = self._time_s[after] - self._time_s[before]
         share = (time_s - self._time_s[before]) / span_s if span_s else 0.0
         position = (1 - share) * self._position[before] + share * self._position[after]

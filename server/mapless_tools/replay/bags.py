@@ -18,18 +18,10 @@ from mapless.geometry import RigidTransform, rotation_angle_deg
 from mapless.ros import Localizer, LocalizerOptions, Messages, Outcome, RosCamera
 from mapless.ros.localizer import FAILED, LOCALIZED
 from mapless.ros.messages import DIAGNOSTICS_TYPE, POSE_TYPE, TF_TYPE
+from mapless_tools.bags.images import Images, open_images
 from mapless_tools.bags.options import BagOptions
 from mapless_tools.bags.recording import Recording
-from mapless_tools.bags.source import (
-    POSES,
-    STATIC_TF_TOPIC,
-    TF_TOPIC,
-    Images,
-    Poses,
-    open_images,
-    open_poses,
-    static_tree,
-)
+from mapless_tools.bags.source import POSES, STATIC_TF_TOPIC, TF_TOPIC, Poses, open_poses, static_tree
 from mapless_tools.bags.trajectory import FrameTree
 from mapless_tools.progress import Progress
 
@@ -43,8 +35,8 @@ class BagReport:
     """The results of a recording's images, as far as it was read.
 
     Images are counted as localized, or by the reason that their diagnostics begin with. Distances are of localized
-    poses from the recording's own in the same map frame, radii the 95 % ones of the positions. `stopped` says why it
-    ended early.
+    poses from the recording's own in the same map frame, radii the 95 % ones of the positions. `notes`
+    say which camera was used and which messages were skipped, `stopped` why it ended early.
     """
 
     images: int = 0
@@ -53,6 +45,7 @@ class BagReport:
     apart_deg: list[float] = field(default_factory=list)
     radii_cm: list[float] = field(default_factory=list)
     server_s: list[float] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     stopped: str = ""
 
     def add(self, outcome: Outcome) -> None:
@@ -74,7 +67,7 @@ class BagReport:
         if self.apart_cm:
             apart_cm, apart_deg = np.median(self.apart_cm), np.median(self.apart_deg)
             lines.append(f"median distance from the recording's own poses {apart_cm:.2f} cm, {apart_deg:.3f} degrees")
-        return [*lines, *([f"ended early: {self.stopped}"] if self.stopped else [])]
+        return [*lines, *self.notes, *([f"ended early: {self.stopped}"] if self.stopped else [])]
 
 
 def replay_bag(
@@ -97,9 +90,9 @@ def replay_bag(
         raise ValueError(f"{out} exists already")
     with ExitStack() as stack:
         recording = stack.enter_context(Recording(path))
-        images = open_images(recording, bag)
-        ros_camera = images.camera if camera is None else RosCamera(camera)
-        if ros_camera is None:
+        images = open_images(recording, bag, with_camera=camera is None)
+        given = None if camera is None else RosCamera(camera)
+        if given is None and images.infos is None:
             raise ValueError(f"{path} has no CameraInfo for the images of {images.topic}; give --camera")
         poses = _poses(images, bag)
         tree = static_tree(images, bag) if poses is None else poses.tree
@@ -117,7 +110,7 @@ def replay_bag(
                 if options.rate_hz and not localizer.is_due(stamp_ns):
                     continue
                 message.header.frame_id = images.frame  # tf needs a name
-                outcome = localizer.localize(message, ros_camera)
+                outcome = localizer.localize(message, given or images.camera(stamp_ns))
                 report.add(outcome)
                 writer.write(time_ns, outcome, tree, images)
                 _compare(report, outcome, poses, options, images)
@@ -128,6 +121,7 @@ def replay_bag(
             report.stopped = str(error)
         except KeyboardInterrupt:
             report.stopped = "interrupted"
+        report.notes = [line for line in (images.camera_line, *recording.skipped_lines()) if line]
     return report
 
 
@@ -187,7 +181,10 @@ class _Output:
 
     def copy_static(self, images: Images) -> None:
         """Writes the recording's /tf_static, at the time of the first image."""
-        for topic, _, message in images.recording.messages([STATIC_TF_TOPIC]):
+        for it in images.recording.messages([STATIC_TF_TOPIC]):
+            if it.message is None:
+                continue
+            topic, message = it.topic, it.message
             if topic not in self._connections:
                 self._connections[topic] = self._writer.add_connection(topic, TF_TYPE, typestore=self._types)
             self._put(topic, images.begin_ns, message)

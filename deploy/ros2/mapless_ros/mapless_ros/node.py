@@ -47,6 +47,10 @@ PARAMETERS: dict[str, Any] = {
 }
 """Names and defaults; what they mean is in the package's README."""
 
+IMAGE_TOPIC = "visual_localization/image_0"
+CAMERA_INFOS_KEPT = 100
+"""A few seconds of a camera whose CameraInfo changes with the focus, longer than an image waits for its call."""
+
 
 class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
     """Keeps the newest image, and a thread that localizes it."""
@@ -74,7 +78,8 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
         self._messages = mapless.ros.Messages()
         self._pose = self.create_publisher(PoseWithCovarianceStamped, "visual_localization/pose", 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._camera: mapless.ros.RosCamera | None = None
+        self._cameras = mapless.ros.CameraInfos(self._given["rectified"], CAMERA_INFOS_KEPT)
+        self._is_camera_said = False
         self._image: Any = None
         self._edge: tuple[str, RigidTransform] | None = None
         self._is_triggered = self._is_closed = False
@@ -82,7 +87,7 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
         kind = CompressedImage if self._given["compressed"] else Image
         sensor = qos_profile_sensor_data
         self.create_subscription(CameraInfo, "visual_localization/camera_info_0", self._on_camera, sensor)
-        self.create_subscription(kind, "visual_localization/image_0", self._on_image, sensor)
+        self.create_subscription(kind, IMAGE_TOPIC, self._on_image, sensor)
         self.create_subscription(PoseWithCovarianceStamped, "/initialpose", self._on_guess, 1)
         self.create_service(Trigger, "visual_localization/trigger_localization", self._on_trigger)
         if self._given["publish_tf"]:
@@ -111,15 +116,27 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
         )
 
     def _on_camera(self, message: Any) -> None:
-        if self._camera is not None:
-            return
         try:
-            self._camera = mapless.ros.camera_from_info(message, self._given["rectified"])
+            self._cameras.add(message, self.get_clock().now().nanoseconds)
         except ValueError as error:
             self.get_logger().error(str(error), throttle_duration_sec=10.0)
             return
-        if self._camera.undistortion is not None:
+        if not self._is_camera_said:
+            self._is_camera_said = True
+            self._say_camera(message)
+
+    def _say_camera(self, message: Any) -> None:
+        """Logs which camera of CameraInfo is used, and warns where the topic's name says that it is the other."""
+        topic, rectified = self.resolve_topic_name(IMAGE_TOPIC), self._given["rectified"]
+        camera = self._cameras.at(mapless.ros.stamp_ns_of(message.header.stamp))
+        if camera is not None and camera.undistortion is not None:
             self.get_logger().info("the lens is rational_polynomial: images are undistorted to a pinhole")
+        used = "P" if rectified else "K and D"
+        self.get_logger().info(f"the camera is {used} of CameraInfo (parameter rectified: {rectified})")
+        if not rectified and mapless.ros.says_rectified(topic) and mapless.ros.rectified_differs(message):
+            self.get_logger().warning(
+                f"the name {topic} says that images are rectified, but K and D are used: set the parameter rectified"
+            )
 
     def _on_image(self, message: Any) -> None:
         stamp_ns = mapless.ros.stamp_ns_of(message.header.stamp)
@@ -140,7 +157,7 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
     def _on_trigger(self, request: Any, response: Any) -> Any:
         with self._changed:
             self._is_triggered = True
-        response.success = self._camera is not None
+        response.success = self._is_camera_said
         response.message = "the next image is localized" if response.success else "no usable camera_info has come yet"
         return response
 
@@ -151,12 +168,13 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
                 if self._is_closed:
                     return
                 message, self._image = self._image, None
-            if self._camera is None:
+            camera = self._cameras.at(mapless.ros.stamp_ns_of(message.header.stamp))
+            if camera is None:
                 self.get_logger().warning("no camera_info yet", throttle_duration_sec=5.0)
                 continue
             with self._changed:
                 self._is_triggered = False
-            outcome = self._localizer.localize(message, self._camera)
+            outcome = self._localizer.localize(message, camera)
             if not self._is_closed:
                 self._publish(outcome)
 

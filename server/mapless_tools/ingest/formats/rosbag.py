@@ -7,7 +7,7 @@ the camera by /tf_static. The recording is read twice, as a stream: what stays i
 """
 
 import atexit
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -37,19 +37,19 @@ def fits(path: Path) -> bool:
 
 def read(path: Path, options: ReadOptions) -> Dataset:
     """Reads the recording; see `read_dataset`."""
+    from mapless_tools.bags.images import open_images
     from mapless_tools.bags.recording import Recording
-    from mapless_tools.bags.source import open_images, open_poses
+    from mapless_tools.bags.source import open_poses
 
     with Recording(path) as recording:
-        images = open_images(recording, options.bag)
+        images = open_images(recording, options.bag, with_camera=options.intrinsics is None)
         poses = open_poses(images, options.bag)
         folder = TemporaryDirectory(prefix="mapless-keyframes-")
         atexit.register(folder.cleanup)
         collector = Collector(Path(folder.name))
-        camera = images.camera if options.intrinsics is None else None
-        if camera is None and options.intrinsics is None:
+        if images.infos is None and options.intrinsics is None:
             raise ValueError(f"{path} has no CameraInfo for the images of {images.topic}; give --intrinsics")
-        found, unposed = 0, _Unposed(collector)
+        found, unposed, is_undistorted = 0, _Unposed(collector), False
 
         def posed() -> Iterator[tuple[int, Any, RigidTransform]]:
             nonlocal found
@@ -65,19 +65,28 @@ def read(path: Path, options: ReadOptions) -> Dataset:
                 yield stamp_ns, message, pose
 
         prefix = images.topic.strip("/")
-        for stamp_ns, message, pose in keyframes(posed(), options.keyframes):
+
+        def refuse(stamp_ns: int, reason: str) -> None:
             with collector.attempt(f"{images.topic} at {images.time_s(stamp_ns):.3f} s"):
-                known = camera or _given(options.intrinsics, message)
+                raise ValueError(reason)
+
+        for stamp_ns, message, pose in keyframes(posed(), options.keyframes, refuse):
+            with collector.attempt(f"{images.topic} at {images.time_s(stamp_ns):.3f} s"):
+                known = _given(options.intrinsics, message) if options.intrinsics else images.camera(stamp_ns)
+                is_undistorted = is_undistorted or known.undistortion is not None
                 photo = known.photo(message, lossless=True)
                 name = image_name(str(stamp_ns), photo)
                 (collector.folder / name).write_bytes(photo)
                 collector.add(name, known.camera, pose, name=f"{prefix}/{stamp_ns}")
         unposed.end()
+    skipped = recording.skipped_lines()
     collector.notes.append(
         f"{len(collector.frames)} keyframes of {found} images on {images.topic} (frame {images.frame}, "
-        f"{images.camera_topic if camera else '--intrinsics'}), poses of {poses.topic} in frame {poses.world}"
+        f"{images.camera_topic or '--intrinsics'}), poses of {poses.topic} in frame {poses.world}"
     )
-    if camera is not None and camera.undistortion is not None:
+    collector.notes += [images.camera_line] if images.camera_line else []
+    collector.notes += skipped
+    if is_undistorted:
         collector.notes.append(
             "the lens is rational_polynomial, which mapless does not have: images are undistorted to a pinhole"
         )
@@ -111,9 +120,12 @@ class _Unposed:
 
 
 def keyframes(
-    images: Iterator[tuple[int, Any, RigidTransform]], options: KeyframeOptions
+    images: Iterator[tuple[int, Any, RigidTransform]], options: KeyframeOptions, refuse: Callable[[int, str], None]
 ) -> Iterator[tuple[int, Any, RigidTransform]]:
-    """Yields the images, with time and pose, that are far enough from the last keyframe and the sharpest nearby."""
+    """Yields the images, with time and pose, that are far enough from the last keyframe and the sharpest nearby.
+
+    Calls `refuse`, with time and reason, for images that cannot be decoded and would have been candidates.
+    """
     if 0 in (options.distance_m, options.angle_deg):
         yield from images
         return
@@ -128,21 +140,23 @@ def keyframes(
             last, best, begin = best[2], None, None
         if best is None and last is not None and not _is_far(last, pose, options):
             continue
+        try:
+            sharpness = sharpness_of(image[1])
+        except ValueError as error:
+            refuse(image[0], str(error))
+            continue
         if best is None:
             begin, sharpest, count = pose, -1.0, 0
         count += 1
-        if (sharpness := sharpness_of(image[1])) > sharpest or best is None:
+        if sharpness > sharpest:
             best, sharpest = image, sharpness
     if best is not None:
         yield best
 
 
 def sharpness_of(message: Any) -> float:
-    """Variance of the Laplacian of an image at half its size; 0 if it cannot be decoded."""
-    try:
-        pixels = pixels_from_image(message)
-    except ValueError:
-        return 0.0
+    """Variance of the Laplacian of an image at half its size; ValueError if it cannot be decoded."""
+    pixels = pixels_from_image(message)
     grey = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
     half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     return float(cv2.Laplacian(half, cv2.CV_32F).var())
@@ -154,8 +168,7 @@ def _is_far(before: RigidTransform, now: RigidTransform, options: KeyframeOption
     return is_away or rotation_angle_deg(moved.rotation) >= share * options.angle_deg
 
 
-def _given(intrinsics: Intrinsics | None, message: Any) -> RosCamera:
+def _given(intrinsics: Intrinsics, message: Any) -> RosCamera:
     """The camera that the user gives, for an image of this size."""
-    assert intrinsics is not None
     height, width = pixels_from_image(message).shape[:2]
     return RosCamera(intrinsics.camera(width, height))

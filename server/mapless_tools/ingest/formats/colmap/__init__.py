@@ -83,7 +83,7 @@ def read_model(folder: Path) -> Model:
     if ending == ".txt":
         counted = ((cameras_file, len(cameras)), (images_file, len(images) + len(refused)))
         notes = [
-            f"warning: {file} announces {number} in its comments, and holds {count}: is a part missing?"
+            f"{file} announces {number} in its comments, and holds {count}: is a part missing?"
             for file, count in counted
             if (number := announced(file)) not in (None, count)
         ]
