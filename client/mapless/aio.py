@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from contextlib import suppress
 from types import TracebackType
 from typing import Any, TypeVar
 
@@ -27,10 +28,10 @@ class Client(Connection):
     """
 
     def __init__(self, address: str, options: ConnectOptions | None = None) -> None:
-        """Makes a client; the first call connects, and fails if the server cannot be reached.
+        """Makes a client; the first call connects, and is repeated until its deadline while the server is away.
 
         Args:
-            address: "host:port".
+            address: "host:port", or "host1:port,host2:port": see `mapless.Client`.
             options: how to connect.
 
         Raises:
@@ -38,7 +39,8 @@ class Client(Connection):
         """
         asyncio.get_running_loop()
         options = options or ConnectOptions()
-        super().__init__(address, options, options.aio_channel(address))
+        super().__init__(address, options, options.aio_channel)
+        self._closed = asyncio.Event()
 
     async def __aenter__(self) -> Client:
         return self
@@ -50,7 +52,9 @@ class Client(Connection):
 
     async def close(self) -> None:
         """Ends the connection; calls still running are cancelled."""
-        await self._channel.close()
+        self._closed.set()
+        for server in self._servers.all:
+            await server.channel.close()
 
     is_serving = health.is_serving
 
@@ -80,4 +84,6 @@ class Client(Connection):
         return await asyncio.to_thread(function, *arguments)
 
     async def _pause(self, duration_s: float, error: MaplessError) -> None:
-        await asyncio.sleep(duration_s)
+        with suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(self._closed.wait(), duration_s)
+            raise error

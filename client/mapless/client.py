@@ -63,14 +63,18 @@ class Client(Connection):
     """
 
     def __init__(self, address: str, options: ConnectOptions | None = None) -> None:
-        """Makes a client; the first call connects, and fails if the server cannot be reached.
+        """Makes a client; the first call connects.
+
+        A call outlives a restart of the server: it is repeated until its deadline, 30 s unless the options or
+        `timeout_s` say otherwise, while the server is away or stops, and if it is lost during the answer.
 
         Args:
-            address: "host:port".
+            address: "host:port"; or "host1:port,host2:port" of servers that share a store, which take turns, and of
+                which one that is away is passed over.
             options: how to connect.
         """
         options = options or ConnectOptions()
-        super().__init__(address, options, options.channel(address))
+        super().__init__(address, options, options.channel)
         self._closed = threading.Event()
 
     def __enter__(self) -> Client:
@@ -84,7 +88,8 @@ class Client(Connection):
     def close(self) -> None:
         """Ends the connection; calls still running fail."""
         self._closed.set()
-        self._channel.close()
+        for server in self._servers.all:
+            server.channel.close()
 
     is_serving = _blocking(health.is_serving)
 

@@ -4,7 +4,9 @@ The calls of `mapless.calls` are coroutines on a `Connection`. `aio.Client` is o
 blocking `Client` blocks wherever the other waits, so that its coroutines end without ever waiting.
 
 gRPC's own retries are not used. They ignore RetryInfo, so they cannot distinguish a server at its limit (retry in 3 s)
-from a message over the limit (never retry), and they repeat a creation without checking who created what then exists.
+from a message over the limit (never retry), they repeat a creation without checking who created what then exists, and
+they end after five attempts. Nor does `wait_for_ready` replace them: a call that has been sent is lost with its server
+all the same, and one that waits for a connection cannot say why there is none.
 """
 
 from __future__ import annotations
@@ -20,20 +22,15 @@ from inspect import isawaitable, isfunction, signature
 from typing import Any, TypeVar
 
 import grpc
-from google.protobuf import wrappers_pb2
 from google.protobuf.message import Message
 
 from . import names
-from .errors import DeadlineExceeded, Internal, MaplessError, from_rpc_error
-from .options import ConnectOptions, explained, is_unreached
-from .v1.localization_service_pb2_grpc import LocalizationServiceStub
-from .v1.reference_service_pb2_grpc import ReferenceServiceStub
+from .addresses import addresses_of
+from .errors import DeadlineExceeded, Internal, MaplessError, from_rpc_error, is_misconfigured, is_unconnected
+from .options import ConnectOptions
+from .reaching import explained
+from .servers import Server, Servers
 from .wire import FieldError
-
-# grpc.health.v1 in protobuf's own messages, which saves a dependency: the request has the service's name in field 1,
-# empty for the whole server, and the answer an enum in field 1.
-_WRAPPERS: Any = wrappers_pb2  # the module is not annotated
-HealthRequest, _HealthResponse = _WRAPPERS.StringValue, _WRAPPERS.UInt32Value
 
 SCENE_KEY = "x-mapless-scene"
 _FIELDS = ("scene", "name", "scene_id")
@@ -48,7 +45,10 @@ MALFORMED_ANSWER = "MALFORMED_ANSWER"
 _JITTER = 0.2  # relative, of our own pauses, as in gRPC
 _LOST = frozenset({"UNAVAILABLE", "CANCELLED"})
 """Codes of a lost server or connection. The client does not wait for calls that it cancels, so CANCELLED comes from a
-load balancer whose server disappeared during the answer."""
+load balancer, or a server that stops, in the middle of the answer."""
+_FEW_ATTEMPTS = 4
+"""After so many, in about 1.4 s, it is examined why no connection is made; what is wrong with certificates or protocol,
+and the answer of a health check, are not waited for any longer."""
 _LATENESS = 0.25  # relative, added to the server's RetryInfo at random: many refused clients retry, but none earlier
 
 
@@ -87,19 +87,12 @@ class Connection:
                 shown: Any = call
                 shown.__signature__ = signature(call).replace(parameters=[first.replace(name="self"), *others])
 
-    def __init__(self, address: str, options: ConnectOptions, channel: Any) -> None:
+    def __init__(self, address: str, options: ConnectOptions, make_channel: Callable[[str], Any]) -> None:
+        """Makes a channel for each address; ValueError if the address is none."""
         self.options = options
         self.address = address
-        self._channel = channel
-        self._methods = {
-            **vars(LocalizationServiceStub(channel)),
-            **vars(ReferenceServiceStub(channel)),
-            "Check": channel.unary_unary(
-                "/grpc.health.v1.Health/Check",
-                request_serializer=HealthRequest.SerializeToString,
-                response_deserializer=_HealthResponse.FromString,
-            ),
-        }
+        addresses = addresses_of(address)
+        self._servers = Servers(addresses, [*map(make_channel, addresses)])
         self._deadline_s = math.inf
 
     def acting_for(self: C, token: str | None, client_id: str = "") -> C:
@@ -119,12 +112,16 @@ class Connection:
         timeout_s: float | None = None,
         *,
         is_upload: bool = False,
+        is_check: bool = False,
         on_repeat: Callable[[Connection, MaplessError], Awaitable[T]] | None = None,
     ) -> T:
         """Makes a call with retries; returns what `read` makes of its response.
 
-        It is repeated if the server is UNAVAILABLE or lost, or RESOURCE_EXHAUSTED with RetryInfo; never if the pause
-        would exceed the deadline. Attempts are counted, except those that the server's RetryInfo requests.
+        It is repeated until the deadline if the server is away, UNAVAILABLE or lost during the answer, or
+        RESOURCE_EXHAUSTED with RetryInfo; at another server, if there are several. The pause doubles from
+        `initial_backoff_s` to `max_backoff_s`, or is what RetryInfo requests, which must not exceed the deadline.
+        Options may limit the number of attempts, except of those that RetryInfo requests, and the time in which the
+        first connection must be made. An error of certificates or protocol is raised after four attempts.
 
         Args:
             method: name of the method, "GetScene"; no two services have one of the same name.
@@ -133,11 +130,12 @@ class Connection:
             timeout_s: deadline in seconds for all attempts, pauses and calls of `on_repeat`; None for the default.
                 ValueError if it is not above 0.
             is_upload: whether the default is `upload_timeout_s`.
+            is_check: whether the call asks how the server is now: at most four attempts.
             on_repeat: for calls that change something. An earlier attempt may have succeeded although its answer was
                 lost; then a retry fails with ALREADY_EXISTS or NOT_FOUND. Given a connection with the call's deadline
                 and that error, it determines who made the change, and returns the lost result or raises the error.
         """
-        retries = _Retries(self, method, timeout_s, is_upload)
+        retries = Retries(self, method, timeout_s, is_upload, _FEW_ATTEMPTS if is_check else None)
         while True:
             try:
                 response = await self._response(method, request, retries.left_s())
@@ -174,7 +172,7 @@ class Connection:
         `is_final` of an answer distinguishes them. A call that fails after its early answer is retried like any other,
         and then only the final answer is yielded. The stream is cancelled when the caller stops reading.
         """
-        retries, had_early = _Retries(self, method, timeout_s), False
+        retries, had_early = Retries(self, method, timeout_s), False
         while True:
             final = None
             try:
@@ -199,38 +197,58 @@ class Connection:
 
     async def _response(self, method: str, request: Message, timeout_s: float) -> Any:
         """Makes one attempt of a call."""
+        server = self._servers.next(self._now_s())
         try:
-            started = self._start(method, request, timeout_s)
-            return await started if isawaitable(started) else started
+            started = self._start(server, method, request, timeout_s)
+            response = await started if isawaitable(started) else started
         except grpc.RpcError as error:
-            raise await self._explained(error) from error
+            raise self._failed(server, error) from error
+        self._answered(server)
+        return response
 
     async def _responses(self, method: str, request: Message, timeout_s: float) -> AsyncGenerator[Any, None]:
         """Makes one attempt of a call that is answered by a stream."""
-        started = None
+        server, started = self._servers.next(self._now_s()), None
         try:
-            started = self._start(method, request, timeout_s)
+            started = self._start(server, method, request, timeout_s)
             if isinstance(started, AsyncIterable):
                 async for response in started:
+                    self._answered(server)
                     yield response
             else:
                 for response in started:
+                    self._answered(server)
                     yield response
         except grpc.RpcError as error:
-            raise await self._explained(error) from error
+            raise self._failed(server, error) from error
         finally:
             if started is not None:
                 started.cancel()
 
-    def _start(self, method: str, request: Message, timeout_s: float) -> Any:
+    def _start(self, server: Server, method: str, request: Message, timeout_s: float) -> Any:
         metadata = self.options.metadata() + scene_metadata(request)
-        return self._methods[method](request, timeout=timeout_s, metadata=metadata)
+        return server.methods[method](request, timeout=timeout_s, metadata=metadata)
 
-    async def _explained(self, error: grpc.RpcError) -> MaplessError:
+    def _answered(self, server: Server) -> None:
+        self._servers.were_reached = True
+        server.lost_until_s = -math.inf
+
+    def _failed(self, server: Server, error: grpc.RpcError) -> MaplessError:
         failure = from_rpc_error(error)
-        if is_unreached(failure):
-            return await self.unblocked(explained, failure, self.address, self.options)
+        failure.address = server.address
+        self._servers.were_reached |= not is_unconnected(failure) and failure.code != "DEADLINE_EXCEEDED"
+        if failure.code in _LOST:
+            server.lost_until_s = self._now_s() + self.options.max_reconnect_s
         return failure
+
+    async def _explained(self, error: MaplessError) -> MaplessError:
+        """An error that says more about why no server is reached; the error itself where nothing more is known."""
+        if not is_unconnected(error) or not error.address:
+            return error
+        better: MaplessError = await self.unblocked(explained, error, error.address, self.options)
+        if better is not error:
+            better.address, better.__cause__ = error.address, error.__cause__
+        return better
 
     async def unblocked(self, function: Callable[..., T], *arguments: Any) -> T:
         """Calls a function that may wait for a file or the network: asyncio's client in another thread."""
@@ -259,44 +277,75 @@ def _reading(method: str, response: Any) -> Iterator[None]:
         raise Internal("INTERNAL", message, reason=MALFORMED_ANSWER, field=field_path, request_id=request_id) from error
 
 
-class _Retries:
+class Retries:
     """The attempts of one call: the time left to each, and the pauses between them.
 
     `may_be_done` says whether an attempt whose answer was lost may have succeeded.
     """
 
-    def __init__(self, connection: Connection, method: str, timeout_s: float | None, is_upload: bool = False) -> None:
+    def __init__(
+        self,
+        connection: Connection,
+        method: str,
+        timeout_s: float | None,
+        is_upload: bool = False,
+        most: int | None = None,
+    ) -> None:
+        options, now_s = connection.options, connection._now_s()
         if timeout_s is None:
-            timeout_s = connection.options.upload_timeout_s if is_upload else connection.options.timeout_s
+            timeout_s = options.upload_timeout_s if is_upload else options.timeout_s
         if not timeout_s > 0:
             raise ValueError(f"timeout_s must be above 0, is {timeout_s:g}")
         self._connection = connection
-        self.deadline_s = min(connection._now_s() + timeout_s, connection._deadline_s)
+        self.deadline_s = min(now_s + timeout_s, connection._deadline_s)
         if not self.left_s():
             raise DeadlineExceeded("DEADLINE_EXCEEDED", f"no time left for {method}")
         self.may_be_done = False
+        self._most = math.inf if options.max_attempts is None else options.max_attempts
+        self._most_of_lost = min(self._most, math.inf if most is None else most)
+        self._connect_until_s = min(self.deadline_s, now_s + options.connect_timeout_s)
         self._count = 0
+        self._last: MaplessError | None = None
 
     def left_s(self) -> float:
+        """Seconds left to the next attempt."""
         return max(self.deadline_s - self._connection._now_s(), 0.0)
 
     async def pause_after(self, error: MaplessError) -> None:
         """Pauses before the next attempt; raises the error of the last one if a retry would not help or is too late."""
         self._count += 1
-        options, pause_s = self._connection.options, self._pause_s(error)
-        is_last = self._count >= options.max_attempts and (error.retry_after_s is None or options.max_attempts == 1)
-        if pause_s is None or is_last or pause_s >= self.left_s():
-            raise error
+        if error.code == "DEADLINE_EXCEEDED" and self._last is not None and not error.request_id:
+            error.message += f"; before that: {self._last.message}"
+            error.args = (f"{error.reason}: {error.message}",)
+        self._last = error
+        if self._count == _FEW_ATTEMPTS:
+            error = await self._connection._explained(error)
+        pause_s = self._pause_s(error)
+        if pause_s is None or self._is_last(error) or pause_s >= self.left_s():
+            raise await self._connection._explained(error)
         self.may_be_done |= error.code in _LOST
         await self._connection._pause(pause_s, error)
 
+    def _is_last(self, error: MaplessError) -> bool:
+        """Whether no further attempt is made, whatever the time."""
+        if self._count >= _FEW_ATTEMPTS and is_misconfigured(error):
+            return True
+        if error.retry_after_s is not None:  # the server has asked for another
+            return self._most == 1
+        return self._count >= self._most_of_lost
+
     def _pause_s(self, error: MaplessError) -> float | None:
         """Seconds to wait after this many attempts; None if a retry would not help."""
-        options, uniform, requested_s = self._connection.options, self._connection._uniform, error.retry_after_s
-        backoff_s = min(options.initial_backoff_s * 2.0 ** min(self._count - 1, 30), options.max_backoff_s)
-        backoff_s *= uniform(1 - _JITTER, 1 + _JITTER)
+        connection, requested_s = self._connection, error.retry_after_s
+        options, uniform = connection.options, connection._uniform
         if error.code in _LOST and (requested_s is None or self._count == 1):
-            return backoff_s  # the first retry is early: another server of the same name may be available
+            # With RetryInfo, too, the first retry is early: another server of the same name may be available.
+            backoff_s = min(options.initial_backoff_s * 2.0 ** min(self._count - 1, 30), options.max_backoff_s)
+            is_new = is_unconnected(error) and not connection._servers.were_reached
+            left_s = (self._connect_until_s if is_new else self.deadline_s) - connection._now_s()
+            # A server that returns shortly before the deadline is found, too.
+            backoff_s = max(min(backoff_s, left_s / 2), options.initial_backoff_s) * uniform(1 - _JITTER, 1 + _JITTER)
+            return backoff_s if backoff_s < left_s else None
         if error.code in {"UNAVAILABLE", "RESOURCE_EXHAUSTED"} and requested_s is not None:
             return max(options.initial_backoff_s, requested_s * uniform(1, 1 + _LATENESS))
         return None

@@ -4,17 +4,19 @@ import re
 from typing import Any, TypeVar
 from urllib.parse import unquote
 
-import grpc
 from google.protobuf.message import DecodeError, Message
 from google.rpc import error_details_pb2, status_pb2
 
 _DETAILS_KEY = "grpc-status-details-bin"
 _NO_TIME = "Deadline Exceeded"
-_NOT_CONNECTED = "connections to all backends failing"
+_NOT_CONNECTED = ("connections to all backends failing", "failed to connect to all addresses")
+_UNRESOLVED = re.compile(r"(?:errors resolving|DNS resolution failed for) (\S+?):? .*", re.DOTALL)
 REFUSED = "no server listens there"
-_NOT_CONNECTED_BECAUSE = {
-    "Socket closed": "the server closes the connection at once; if it uses TLS, give --tls or --ca FILE (Python: tls, "
-    "root_certificates), and --cert if it requires a client certificate",
+USES_TLS = "the server uses TLS; give --tls or --ca FILE (Python: tls, root_certificates)"
+_MISCONFIGURED = {
+    "Failed to create security handshaker": "the given certificates are unusable; they must be PEM",
+    "missing selected ALPN property": "the server, or what ends TLS in front of it, does not offer HTTP/2 (ALPN h2), "
+    "which gRPC requires; let nginx, HAProxy or the load balancer offer h2 at that port",
     "WRONG_VERSION_NUMBER": "the server does not use TLS",
     "Expected SETTINGS frame": "what answers there does not speak gRPC (HTTP/2); it may be the port of the metrics",
     "certificate has expired": "the server's certificate has expired, or the clock of this machine is fast",
@@ -24,9 +26,20 @@ _NOT_CONNECTED_BECAUSE = {
     "certificate with --ca FILE (Python: root_certificates)",
     "self signed certificate": "the server's certificate is self-signed; give it with --ca FILE (Python: "
     "root_certificates)",
-    "Failed to create security handshaker": "the given certificates are unusable; they must be PEM",
+    "HTTP proxy returned response code 407": "the proxy requires a user and a password: http://user:password@host:port",
+}
+"""What another attempt does not change, by a sign in gRPC's text."""
+_NOT_CONNECTED_BECAUSE = _MISCONFIGURED | {
+    "HTTP proxy returned response code": "the proxy refuses or does not reach the server",
+    "Socket closed": "the server closes the connection at once; if it uses TLS, give --tls or --ca FILE (Python: tls, "
+    "root_certificates), and --cert if it requires a client certificate",
     "Connection refused": f"{REFUSED} (connection refused)",
 }
+_BROKEN = re.compile(
+    r"RST_STREAM with error code [02]\b|Stream removed|Connection reset|Broken pipe|Socket closed|Transport closed|"
+    r"GOAWAY|http2 header with status: 50\d"
+)
+"""In the text of a status INTERNAL or UNKNOWN that gRPC made of a connection that broke, or of a proxy's answer."""
 _ADDRESS = re.compile(r"ipv[46]:(\S+): ")
 Detail = TypeVar("Detail", bound=Message)
 
@@ -42,6 +55,7 @@ class MaplessError(Exception):
         retry_after_s: seconds after which the server requests a retry, or None.
         request_id: identifies the call in the server's log; empty if the call did not reach it.
         resource: the scene or reference that does not exist or exists already, "scenes/{scene}"; else empty.
+        address: the server's, as it was given; of several, that of the last attempt; empty for errors of no attempt.
     """
 
     def __init__(
@@ -64,6 +78,7 @@ class MaplessError(Exception):
         self.retry_after_s = retry_after_s
         self.request_id = request_id
         self.resource = resource
+        self.address = ""
 
 
 class InvalidArgument(MaplessError):
@@ -99,7 +114,10 @@ class DeadlineExceeded(MaplessError):
 
 
 class Unavailable(MaplessError):
-    """The server cannot be reached, starts, drains, or went away during the answer; all retries failed."""
+    """The server cannot be reached, starts, drains, or went away during the answer; all retries failed.
+
+    Also the error of a connection that breaks during the answer, which gRPC may call INTERNAL, UNKNOWN or CANCELLED.
+    """
 
 
 class DataLoss(MaplessError):
@@ -131,10 +149,12 @@ def from_rpc_error(error: Any) -> MaplessError:
     retry = _detail(status, error_details_pb2.RetryInfo())
     request = _detail(status, error_details_pb2.RequestInfo())
     resource = _detail(status, error_details_pb2.ResourceInfo())
-    code: grpc.StatusCode = error.code()
-    failure = _BY_CODE.get(code.name, MaplessError)(
-        code.name,
-        _message(error.details() or ""),
+    code, details = error.code().name, error.details() or ""
+    if code in ("INTERNAL", "UNKNOWN") and "x-request-id" not in metadata and _BROKEN.search(details):
+        code, details = "UNAVAILABLE", f"the connection broke before the answer: {details}"
+    failure = _BY_CODE.get(code, MaplessError)(
+        code,
+        _message(details),
         reason=info.reason if info else "",
         field=(info.metadata.get("field") if info else None),
         retry_after_s=retry.retry_delay.ToNanoseconds() / 1e9 if retry else None,
@@ -145,14 +165,28 @@ def from_rpc_error(error: Any) -> MaplessError:
     return failure
 
 
+def is_unconnected(error: MaplessError) -> bool:
+    """Whether no connection could be made, so that the call has reached no server."""
+    return error.code == "UNAVAILABLE" and error.message.startswith("cannot connect")
+
+
+def is_misconfigured(error: MaplessError) -> bool:
+    """Whether no connection could be made for a reason that another attempt does not change, such as a certificate."""
+    return is_unconnected(error) and any(it in error.message for it in (USES_TLS, *_MISCONFIGURED.values()))
+
+
 def _message(details: str) -> str:
     """The message of an error: why a connection failed, in plain words where the cause is known, else gRPC's text."""
     if details == _NO_TIME:
         return "no answer in time"
+    if unresolved := _UNRESOLVED.fullmatch(details):
+        return f"cannot connect to {unresolved[1]}: the name cannot be resolved"
     if not details.startswith(_NOT_CONNECTED):
         return details
     reason = details.rpartition("last error: ")[2]
     known = next((words for sign, words in _NOT_CONNECTED_BECAUSE.items() if sign in reason), "")
+    if status := re.search(r"HTTP proxy returned response code (\d+)", reason):
+        known += f" (HTTP {status[1]})"
     address = _ADDRESS.search(reason)
     where = unquote(address[1]) if address else ""
     if where.endswith(":443") and "Connection refused" in reason:

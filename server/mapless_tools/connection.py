@@ -22,6 +22,9 @@ from mapless_server.settings import CLIENT_TOKEN_VARIABLE, Settings
 if TYPE_CHECKING:
     from mapless import Client, ConnectOptions
 
+CONNECT_S = 2.0
+"""A command that finds no server ends soon; one that has begun outlives a restart of its server."""
+
 Scene = Annotated[str, typer.Argument(help="Id of the scene.")]
 
 
@@ -30,7 +33,11 @@ class Connection:
     """Where a server is and how to connect; each field is a flag of the commands that connect."""
 
     address: Annotated[
-        str, typer.Option(help="host:port of the server; default: one is started on the store of the settings.")
+        str,
+        typer.Option(
+            help="host:port of the server, or host1:port,host2:port of several that share a store; default: one is "
+            "started on the store of the settings."
+        ),
     ] = ""
     tls: Annotated[bool, typer.Option("--tls", help="Encrypt; --ca and --cert imply it.")] = False
     ca: Annotated[Path | None, typer.Option(help="Certificate that signed the server's, PEM.")] = None
@@ -54,6 +61,7 @@ class Connection:
         return ConnectOptions(
             timeout_s=60.0,
             upload_timeout_s=600.0,
+            connect_timeout_s=CONNECT_S,
             tls=self.tls or self.ca is not None or self.cert is not None,
             root_certificates=_read(self.ca) if self.ca else None,
             client_certificate=_read(self.cert) if self.cert else None,
@@ -112,7 +120,7 @@ def reachable(
     """
     from mapless import ConnectOptions
 
-    from .child import child_server
+    from .child import ATTEMPTS, child_server
 
     options = connection.options()
     if connection.address:
@@ -123,8 +131,9 @@ def reachable(
             "the settings ask for TLS or tokens, so a server cannot be started just for this; start it, and give its "
             "--address"
         )
-    if options.tls or options.token is not None:
-        options = ConnectOptions(timeout_s=options.timeout_s, upload_timeout_s=options.upload_timeout_s)
+    options = ConnectOptions(
+        timeout_s=options.timeout_s, upload_timeout_s=options.upload_timeout_s, max_attempts=ATTEMPTS
+    )
     with child_server(settings.database_url or settings.data_dir, environment=environment) as server:
         yield server.address, options
 

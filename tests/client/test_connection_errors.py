@@ -12,7 +12,7 @@ from support.certificates import authority, signed
 
 from mapless import Client, ConnectOptions, MaplessError, Unavailable
 from mapless.errors import REFUSED, _message
-from mapless.options import explained
+from mapless.reaching import explained
 
 OURS, ANOTHER = authority(), authority("another")
 CERTIFICATE = signed(OURS, "server")
@@ -37,7 +37,7 @@ def addresses() -> Iterator[dict[str, str]]:
 @pytest.mark.parametrize(
     ("kind", "certificates", "expected"),
     [
-        ("tls", None, "if it uses TLS"),
+        ("tls", None, "the server uses TLS; give --tls"),
         ("tls", ANOTHER.certificate_pem, "is not signed by a known authority"),
         ("tls", b"no certificate", "must be PEM"),
         ("plain", OURS.certificate_pem, "does not use TLS"),
@@ -62,7 +62,7 @@ def test_localhost_says_what_is_wrong_where_the_server_is(
     """Nothing listens at its IPv6 address, which gRPC reports as often as the other."""
     address = addresses["tls"].replace("127.0.0.1", "localhost")
     options = ConnectOptions(tls=certificates is not None, root_certificates=certificates, max_attempts=1)
-    expected = "is not signed by a known authority" if certificates else "if it uses TLS"
+    expected = "is not signed by a known authority" if certificates else "the server uses TLS; give --tls"
     for _ in range(4):
         with Client(address, options) as client, pytest.raises(MaplessError) as caught:
             client.is_serving()
@@ -82,13 +82,13 @@ def test_a_hidden_reason_is_found(addresses: dict[str, str], monkeypatch: pytest
     has_two_addresses(monkeypatch, host, int(port))
     reported = MaplessError("UNAVAILABLE", f"cannot connect to [::1]:{port}: {REFUSED} (connection refused)")
     shown = explained(reported, f"localhost:{port}", ConnectOptions())
-    assert shown.message.startswith(f"cannot connect to {addresses['tls']}: the server closes the connection")
+    assert shown.message.startswith(f"cannot connect to {addresses['tls']}: the server uses TLS")
     nowhere = addresses["nobody"].rpartition(":")[2]
     assert explained(reported, f"localhost:{nowhere}", ConnectOptions()) is reported
     assert explained(reported, f"[::1]:{port}", ConnectOptions()) is reported
 
 
-@pytest.mark.parametrize(("kind", "expected"), [("tls", "the server closes the connection"), ("nobody", REFUSED)])
+@pytest.mark.parametrize(("kind", "expected"), [("tls", "the server uses TLS"), ("nobody", REFUSED)])
 def test_an_address_without_a_route_hides_nothing(
     addresses: dict[str, str], monkeypatch: pytest.MonkeyPatch, kind: str, expected: str
 ) -> None:

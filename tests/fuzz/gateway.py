@@ -71,7 +71,13 @@ class _Client:
 
 
 class _Channel:
-    """A channel whose calls answer at once."""
+    """A channel whose calls answer at once, and the client that has it."""
+
+    def channel(self) -> _Channel:
+        return self
+
+    async def passed(self, method: str, begin: Any, timeout_s: float | None, *, can_repeat: bool) -> Any:
+        return await begin(self, timeout_s)
 
     def unary_unary(self, path: str, *, request_serializer: Any, response_deserializer: Any) -> Any:
         async def call(request: Any, **_: Any) -> Any:

@@ -232,7 +232,7 @@ class Played(Connection):
     def __init__(
         self, ask: Callable[[Connection], Any], outcomes: list[Any], options: ConnectOptions, dice: float = 0.5
     ) -> None:
-        super().__init__("", options, _CHANNEL)
+        super().__init__("localhost:1", options, lambda _: _CHANNEL)
         self.tries: list[float] = []
         self.calls: list[tuple[str, Any]] = []
         self.pauses: list[float] = []

@@ -4,13 +4,12 @@ import json
 import struct
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from mapless import Client, ConnectOptions, Datum, aio
+from mapless import Client, ConnectOptions, Datum
 from mapless.geometry import Quaternion
 from support.servers import RunningServer, make_scene, serving
 
@@ -18,6 +17,7 @@ pytest.importorskip("starlette", reason="needs the extra gateway")
 pytest.importorskip("connectrpc", reason="needs connectrpc, which needs Python 3.11")
 
 from mapless_tools.gateway.app import GatewayOptions, gateway
+from mapless_tools.gateway.client import ServerClient
 from mapless_tools.gateway.rpc import rpc_application
 from support.asgi import Answer, requested
 
@@ -87,15 +87,6 @@ class Asked:
 
 @asynccontextmanager
 async def gateway_of(address: str, connect: ConnectOptions | None = None, **options: Any) -> AsyncIterator[Asked]:
-    client = aio.Client(address, replace(connect or ConnectOptions(), max_attempts=1))
-    chosen = GatewayOptions(**{"scene": "hall"} | options)
-    channels: list[Any] = []
-
-    def channel() -> Any:
-        channels.append(client.options.aio_channel(address))
-        return channels[0]
-
-    yield Asked(gateway(lambda: client, chosen, rpc_application(channel, chosen.guard.max_body_bytes)))
-    for each in channels:
-        await each.close()
+    client, chosen = ServerClient(address, connect), GatewayOptions(**{"scene": "hall"} | options)
+    yield Asked(gateway(lambda: client, chosen, rpc_application(lambda: client, chosen.guard.max_body_bytes)))
     await client.close()

@@ -1,6 +1,7 @@
 """The health check: whether the server takes calls."""
 
-from ..connection import Connection, HealthRequest
+from ..connection import Connection
+from ..servers import HealthRequest
 
 SERVICES = ("mapless.v1.LocalizationService", "mapless.v1.ReferenceService")
 """Services with a state of their own: a server whose store cannot be written still answers queries."""
@@ -8,11 +9,13 @@ _SERVING = 1
 
 
 async def is_serving(connection: Connection, service: str = "", *, timeout_s: float | None = None) -> bool:
-    """Returns whether the server takes calls: False while it starts or drains. Raises an error if it cannot be reached.
+    """Returns whether the server takes calls: False while it starts or drains.
+
+    Raises an error if it cannot be reached, after four attempts in about 1.4 s, not at the deadline.
 
     Args:
         service: one of `SERVICES`; empty for the whole server.
         timeout_s: deadline of the call.
     """
     request = HealthRequest(value=service)
-    return await connection.call("Check", request, lambda it: bool(it.value == _SERVING), timeout_s)
+    return await connection.call("Check", request, lambda it: bool(it.value == _SERVING), timeout_s, is_check=True)

@@ -48,6 +48,7 @@ _COUNT_DEFAULT = "(default: the server's)"
 _COMMON_DEFAULTS: dict[str, Any] = {
     "json": None,
     "timeout": 30.0,
+    "connect_timeout": 2.0,
     "tls": False,
     "ca": None,
     "cert": None,
@@ -170,6 +171,7 @@ def connect_options(arguments: argparse.Namespace) -> ConnectOptions:
     token = read_text(arguments.token_file) if arguments.token_file else os.environ.get(TOKEN_VARIABLE)
     return ConnectOptions(
         timeout_s=arguments.timeout,
+        connect_timeout_s=arguments.connect_timeout,
         tls=bool(arguments.tls or arguments.ca or arguments.cert),
         root_certificates=arguments.ca.read_bytes() if arguments.ca else None,
         client_certificate=arguments.cert.read_bytes() if arguments.cert else None,
@@ -186,8 +188,24 @@ def _add_common(parser: argparse.ArgumentParser) -> None:
     def add(flag: str, **options: Any) -> None:
         group.add_argument(flag, default=argparse.SUPPRESS, **options)
 
-    add("--address", help=f"of the server (default: that in {ADDRESS_VARIABLE}, or localhost:50051)")
-    add("--timeout", type=float, help=f"of a call, seconds (default: {_COMMON_DEFAULTS['timeout']:g})")
+    add(
+        "--address",
+        help="host:port of the server, or host1:port,host2:port of several that share a store "
+        f"(default: that in {ADDRESS_VARIABLE}, or localhost:50051)",
+    )
+    add(
+        "--timeout",
+        type=float,
+        help="of a call, seconds; until then it is repeated while the server is away, stops or is lost "
+        f"(default: {_COMMON_DEFAULTS['timeout']:g})",
+    )
+    add(
+        "--connect-timeout",
+        type=float,
+        metavar="SECONDS",
+        help="in which a server must be reached for the first time; scripts that outlive a restart give more "
+        f"(default: {_COMMON_DEFAULTS['connect_timeout']:g})",
+    )
     add("--tls", action="store_true", help="encrypt; --ca and --cert imply it")
     add("--ca", type=Path, metavar="FILE", help="certificate that signed the server's, PEM (default: the system's)")
     add("--cert", type=Path, metavar="FILE", help="the client's certificate, PEM, if the server requires one")

@@ -2,7 +2,6 @@
 
 import argparse
 import socket
-import ssl
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -11,10 +10,13 @@ from importlib.metadata import version
 import grpc
 import numpy as np
 
+from ..addresses import addresses_of, host_and_port, is_loopback
 from ..answers import Rejected
 from ..client import Client
 from ..errors import DeadlineExceeded, MaplessError, from_rpc_error
-from ..options import connection_fault, explained, host_and_port
+from ..options import ConnectOptions
+from ..proxies import Proxy, proxy_of
+from ..reaching import connection_fault, speaks_tls
 from ..results import Reference
 from ..v1 import reference_service_pb2 as pb
 from ..v1.reference_service_pb2_grpc import ReferenceServiceStub
@@ -25,23 +27,26 @@ OK, WRONG, NOTE, SKIPPED = "ok", "wrong", "note", "skipped"
 
 _CALL_LIMIT_S = 10.0
 _QUERY_LIMIT_S = 30.0
-_CONNECT_LIMIT_S = 3.0
+_PROXY_LIMIT_S = 3.0
 _MAX_OFFSET_S = 5.0
 """Of two clocks. Certificates and tokens expire, and times of captures are compared, by minutes at the least."""
 _MAX_ERROR = 0.05
 """Of a reference's photograph, which is matched with itself, from its stored pose; metres or units."""
 _TIME_KEY, _VERSION_KEY = "x-mapless-time", "x-mapless-version"
-_LOOPBACK = ("127.", "::1")
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of a check: `state` is "ok", "wrong", "note" or "skipped"; `advice` what to do, or empty."""
+    """Result of a check: `state` is "ok", "wrong", "note" or "skipped"; `advice` what to do, or empty.
+
+    `address` is that of the server.
+    """
 
     check: str
     state: str
     message: str = ""
     advice: str = ""
+    address: str = ""
 
 
 @dataclass
@@ -56,14 +61,27 @@ class _Session:
 
 
 def run(client: Client, arguments: argparse.Namespace) -> int:
-    """Makes all checks and prints their findings."""
+    """Makes all checks of each address, and prints their findings."""
     options = replace(client.options, timeout_s=min(client.options.timeout_s, _CALL_LIMIT_S), max_attempts=1)
+    addresses = addresses_of(arguments.address)
     findings: list[Finding] = []
-    with Client(arguments.address, options) as own:
-        session = _Session(own, arguments.scene)
+    text: list[str] = []
+    for address in addresses:
+        found = _examined(address, options, arguments.scene)
+        findings += found
+        text += ["", address][not text :] if len(addresses) > 1 else []
+        text += [line for it in found for line in _lines(it)]
+    show(arguments, findings, text)
+    return EXIT_FAILED if any(it.state == WRONG for it in findings) else 0
+
+
+def _examined(address: str, options: ConnectOptions, scene: str | None) -> list[Finding]:
+    findings: list[Finding] = []
+    with Client(address, options) as own:
+        session = _Session(own, scene)
         for check, (examine, _) in _CHECKS.items():
             if any(it.state == WRONG and _CHECKS[it.check][1] for it in findings):
-                findings.append(Finding(check, SKIPPED))
+                findings.append(Finding(check, SKIPPED, address=address))
                 continue
             try:
                 with suggesting(own):
@@ -71,9 +89,8 @@ def run(client: Client, arguments: argparse.Namespace) -> int:
             except MaplessError as error:
                 where = f"the server's log has more, under {error.request_id}" if error.request_id else ""
                 state, message, advice = WRONG, str(error), _ADVICE.get(error.reason, where)
-            findings.append(Finding(check, state, message, advice))
-    show(arguments, findings, [line for it in findings for line in _lines(it)])
-    return EXIT_FAILED if any(it.state == WRONG for it in findings) else 0
+            findings.append(Finding(check, state, message, advice, address))
+    return findings
 
 
 def _lines(it: Finding) -> list[str]:
@@ -87,6 +104,8 @@ _Result = tuple[str, str, str]
 def _check_address(session: _Session) -> _Result:
     """Resolves the host's name and connects to each of its addresses."""
     host, port = host_and_port(session.client.address)
+    if proxy := proxy_of(session.client.address):
+        return _of_proxy(proxy)
     if not host:
         return NOTE, f"{session.client.address} has a form of gRPC's own, which is not examined", ""
     try:
@@ -103,6 +122,18 @@ def _check_address(session: _Session) -> _Result:
     return WRONG, f"nothing answers at {session.client.address} ({refused})", advice
 
 
+def _of_proxy(proxy: Proxy) -> _Result:
+    """Connects to the proxy, which resolves the server's name and connects to it."""
+    advice = f"no_proxy=HOST exempts the server's host, an empty {proxy.variable} all"
+    host, port = host_and_port(proxy.address)
+    try:
+        socket.create_connection((host, port), _PROXY_LIMIT_S).close()
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        return WRONG, f"calls go through {proxy}, and that cannot be reached: {reason}", advice
+    return NOTE, f"calls go through {proxy}", advice
+
+
 def _check_protocol(session: _Session) -> _Result:
     """Makes a gRPC call, encrypted or not as the options say."""
     tls = session.client.options.tls
@@ -113,20 +144,22 @@ def _check_protocol(session: _Session) -> _Result:
     except MaplessError as error:
         if error.code != "UNAVAILABLE" or not error.message.startswith("cannot connect"):
             raise
-        failed = explained(error, session.client.address, session.client.options).message.partition(": ")[2]
-        speaks_tls = _speaks_tls(session.client.address)
-        if speaks_tls and not tls:
+        failed = error.message.partition(": ")[2]
+        if proxy_of(session.client.address):
+            return WRONG, error.message, "no_proxy=HOST exempts the server's host from the proxy"
+        is_known = bool(host_and_port(session.client.address)[0])
+        has_tls = is_known and speaks_tls(session.client.address)
+        if has_tls and not tls:
             advice = "give --tls, or --ca FILE with the authority's certificate"
             return WRONG, "the server uses TLS, and --tls is not given", advice
-        if tls and not speaks_tls and "SETTINGS" not in failed:
+        if tls and is_known and not has_tls and "SETTINGS" not in failed:
             advice = "leave out --tls, --ca and --cert, or give the server a certificate"
             return WRONG, "the server does not use TLS", advice
         advice = "give --cert and --key where the server requires a client certificate" if "closes" in failed else ""
         return WRONG, failed, advice
-    host, _ = host_and_port(session.client.address)
     if tls:
         return OK, "gRPC, encrypted, and the server's certificate is valid", ""
-    if session.client.options.token is None or host == "localhost" or host.startswith(_LOOPBACK):
+    if session.client.options.token is None or is_loopback(session.client.address):
         return OK, "gRPC, not encrypted", ""
     advice = "serve with TLS (settings tls_certificate and tls_key)"
     return NOTE, "gRPC, not encrypted: the token is sent in clear text", advice
@@ -213,22 +246,6 @@ def _check_query(session: _Session) -> _Result:
         message = f"{what} was localized {error:.3f} {unit} from its stored pose, {took}"
         return NOTE, message, f"mapless-server audit {scene}"
     return OK, f"{what} was localized {took}, {error:.3f} {unit} from its stored pose", ""
-
-
-def _speaks_tls(address: str) -> bool:
-    """Whether the server answers a TLS handshake with a certificate, valid or not."""
-    host, port = host_and_port(address)
-    context = ssl.create_default_context()
-    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-    context.set_alpn_protocols(["h2"])
-    try:
-        with (
-            socket.create_connection((host, port), _CONNECT_LIMIT_S) as raw,
-            context.wrap_socket(raw, server_hostname=host) as secure,
-        ):
-            return secure.version() is not None
-    except OSError:
-        return False
 
 
 _CHECKS: dict[str, tuple[Callable[[_Session], _Result], bool]] = {

@@ -7,6 +7,7 @@ import json
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from typing import Any
 from urllib.parse import urlsplit
 
 from opentelemetry.context import Context
@@ -17,6 +18,7 @@ from opentelemetry.sdk.trace.export import BatchSpanProcessor, SpanExporter
 from opentelemetry.trace import Span, SpanKind, Status, StatusCode, set_span_in_context
 from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapPropagator
 
+from mapless.proxies import is_exempt
 from mapless_server import __version__
 from mapless_server.scheduling import StageRecord
 
@@ -43,7 +45,10 @@ def make_otlp_tracer(endpoint: str) -> "OtlpTracer":
     if address.scheme not in ("http", "https") or not address.hostname:
         raise ValueError(f"otlp_endpoint must be http://host:port or https://host:port, not {endpoint!r}")
     is_insecure = address.scheme == "http"
-    return OtlpTracer(OTLPSpanExporter(endpoint=endpoint, insecure=is_insecure, timeout=EXPORT_LIMIT_S))
+    options: Any = (("grpc.enable_http_proxy", int(not is_exempt(address.netloc))),)
+    return OtlpTracer(
+        OTLPSpanExporter(endpoint=endpoint, insecure=is_insecure, timeout=EXPORT_LIMIT_S, channel_options=options)
+    )
 
 
 class OtlpTracer:

@@ -11,8 +11,8 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from mapless import Client, LocalizationResult, Rejected
-from mapless_tools.child import child_server
+from mapless import Client, ConnectOptions, LocalizationResult, Rejected
+from mapless_tools.child import ATTEMPTS, child_server
 from mapless_tools.evaluate.metrics import pose_error
 
 from . import picture
@@ -51,7 +51,7 @@ def run_demo(data: Path | None, output: Path, console: Console | None = None) ->
     with (
         tempfile.TemporaryDirectory(prefix="mapless-demo-") as data_dir,
         child_server(Path(data_dir)) as server,
-        Client(server.address) as client,
+        Client(server.address, ConnectOptions(max_attempts=ATTEMPTS)) as client,
     ):
         console.print(f"server: own process at {server.address}")
         client.create_scene(SCENE)

@@ -1,7 +1,8 @@
 """Converts browsers' calls (gRPC-Web and Connect, by the library connectrpc) to gRPC calls of the server.
 
 Messages are passed on unchanged, with fields that this version does not know; so are deadlines, cancellation, tokens,
-and errors with their details. Each call has its caller's own token, never the gateway's.
+and errors with their details. Each call has its caller's own token, never the gateway's. Calls outlive a restart of the
+server, except for streams, whose callers begin again.
 """
 
 from collections.abc import AsyncIterator, Callable
@@ -26,6 +27,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from mapless.v1 import localization_service_pb2, reference_service_pb2
 
+from .client import ServerClient
 from .guard import Failure, checked_json
 
 _PASSED_METADATA = ("authorization", "x-client-id", "x-mapless-scene", "x-request-id")
@@ -36,7 +38,9 @@ _SERVICES: tuple[ServiceDescriptor, ...] = (
     *localization_service_pb2.DESCRIPTOR.services_by_name.values(),
     *reference_service_pb2.DESCRIPTOR.services_by_name.values(),
 )
-Connect = Callable[[], grpc.aio.Channel]
+Connect = Callable[[], ServerClient]
+_CHANGING = ("Create", "BatchCreate", "Delete")
+"""Begin the names of methods that are not repeated if their answer was lost: the caller knows what it has stored."""
 
 
 class _Application(ConnectASGIApplication[None]):
@@ -55,13 +59,13 @@ class _JsonCodec:
 
 
 def rpc_application(connect: Connect, max_message_bytes: int) -> ASGIApp:
-    """Serves the interface's methods at gRPC's paths; `connect` makes the channel, once the event loop runs."""
-    channel: list[grpc.aio.Channel] = []
+    """Serves the interface's methods at gRPC's paths; `connect` makes the client, once the event loop runs."""
+    client: list[ServerClient] = []
 
-    def connected() -> grpc.aio.Channel:
-        if not channel:
-            channel.append(connect())
-        return channel[0]
+    def connected() -> ServerClient:
+        if not client:
+            client.append(connect())
+        return client[0]
 
     def endpoints(_: None) -> dict[str, Any]:
         return {
@@ -104,23 +108,30 @@ def _endpoint(connected: Connect, service: ServiceDescriptor, method: MethodDesc
     request_type, response_type = GetMessageClass(method.input_type), GetMessageClass(method.output_type)
     path = f"/{service.full_name}/{method.name}"
 
-    def begin(make: Callable[..., Any], request: Any, context: RequestContext[Any, Any]) -> Any:
+    def begin(
+        make: Callable[..., Any], request: Any, context: RequestContext[Any, Any], timeout_s: float | None
+    ) -> Any:
         call = make(
             path, request_serializer=request_type.SerializeToString, response_deserializer=response_type.FromString
         )
         given = context.request_headers
         metadata = tuple((name, given[name]) for name in _PASSED_METADATA if name in given)
-        timeout_s = None if context.timeout_ms is None else max(context.timeout_ms, 0) / 1000
         return call(request, timeout=timeout_s, metadata=metadata)
 
     async def unary(request: Any, context: RequestContext[Any, Any]) -> Any:
+        can_repeat = not method.name.startswith(_CHANGING)
         try:
-            return await begin(connected().unary_unary, request, context)
+            return await connected().passed(
+                method.name,
+                lambda channel, left_s: begin(channel.unary_unary, request, context, left_s),
+                _timeout_s(context),
+                can_repeat=can_repeat,
+            )
         except grpc.aio.AioRpcError as error:
             raise _error(error, context) from None
 
     async def stream(request: Any, context: RequestContext[Any, Any]) -> AsyncIterator[Any]:
-        call = begin(connected().unary_stream, request, context)
+        call = begin(connected().channel().unary_stream, request, context, _timeout_s(context))
         try:
             async for message in call:
                 yield message
@@ -138,6 +149,11 @@ def _endpoint(connected: Connect, service: ServiceDescriptor, method: MethodDesc
         stream_type=StreamType.SERVER_STREAM if method.server_streaming else StreamType.UNARY,
     )
     return Endpoint.server_stream(info, stream) if method.server_streaming else Endpoint.unary(info, unary)
+
+
+def _timeout_s(context: RequestContext[Any, Any]) -> float | None:
+    """The caller's deadline; None for the server's default."""
+    return None if context.timeout_ms is None else max(context.timeout_ms, 1) / 1000
 
 
 def _error(error: grpc.aio.AioRpcError, context: RequestContext[Any, Any]) -> ConnectError:

@@ -1,5 +1,6 @@
 """The gateway's process: from options to a server that listens, and its end."""
 
+import math
 import socket
 import sys
 from dataclasses import dataclass, replace
@@ -8,10 +9,11 @@ from pathlib import Path
 
 import uvicorn
 
-from mapless import Client, ConnectOptions, Unauthenticated, aio
+from mapless import Client, ConnectOptions, Unauthenticated
 from mapless_server.security import is_loopback
 
 from .app import GatewayOptions, gateway
+from .client import ServerClient
 
 _GRACE_S = 10
 
@@ -55,16 +57,16 @@ def run(server: str, connect: ConnectOptions, options: GatewayOptions, binding: 
     """
     if not (binding.is_loopback or binding.insecure):
         _check_tokens(server, replace(connect, token=None))
-    # A caller that waits tries again itself, when the server says; the gateway does not hold its photograph meanwhile.
-    once = replace(connect, max_attempts=1)
+    # Its callers have the limit of time; the server may start after it.
+    connect = replace(connect, connect_timeout_s=math.inf)
     rpc = None
     if find_spec("connectrpc") is not None:
         from .rpc import rpc_application
 
-        rpc = rpc_application(lambda: once.aio_channel(server), options.guard.max_body_bytes)
+        rpc = rpc_application(lambda: ServerClient(server, connect), options.guard.max_body_bytes)
     else:
         print("gRPC-Web is not served: connectrpc is not installed, which needs Python 3.11", file=sys.stderr)
-    application = gateway(lambda: aio.Client(server, once), options, rpc)
+    application = gateway(lambda: ServerClient(server, connect), options, rpc)
     config = uvicorn.Config(
         application,
         log_level="warning",

@@ -1,7 +1,7 @@
 """Stores references through a server: several concurrent messages, each stored completely or not at all.
 
-Only the references that are being sent are in memory. The client waits for a busy server, and stores nothing twice
-where the answer to a message was lost; the references of a rejected message are sent one by one.
+Only the references that are being sent are in memory. The client waits for a server that is busy or away, and stores
+nothing twice where the answer to a message was lost; the references of a rejected message are sent one by one.
 """
 
 from __future__ import annotations
@@ -12,10 +12,9 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from typing import NoReturn
 
-from mapless import Client, NewReference, Reference, errors
+from mapless import Client, NewReference, errors
 from mapless_server.errors import InvalidArgument as BadImage
 from mapless_server.images import image_size
 from mapless_tools.dataset import Frame, Refusal
@@ -27,8 +26,6 @@ from .report import ALREADY_THERE, ImportReport
 
 BATCH_COUNT = 8
 """References a message: progress shows, and little is sent again when one is refused."""
-AWAY_S = 60.0
-"""For a server that cannot be reached: a restart takes seconds."""
 STORE_FULL = "STORE_FULL"
 _REQUEST = re.compile(r"requests\[\d+\]")
 Item = tuple[NewReference, Stored]
@@ -110,7 +107,7 @@ class Uploader:
         if self._stop.is_set():
             raise _Stopped
         try:
-            stored = self._stored([new for new, _ in items])
+            stored = self._client.add_references(self._report.scene, [new for new, _ in items])
         except errors.ResourceExhausted as error:
             if error.reason == STORE_FULL:
                 self._end(f"{error.message}: free space, then import again")
@@ -127,16 +124,6 @@ class Uploader:
             with self._lock:
                 self._report.added += [it.reference_id for it in stored]
                 self._report.blank += [it.reference_id for it in stored if not it.feature_count]
-
-    def _stored(self, new: Sequence[NewReference]) -> list[Reference]:
-        """Stores a message; waits for a server that is away."""
-        give_up_s = time.monotonic() + AWAY_S
-        while time.monotonic() < give_up_s:
-            with suppress(errors.Unavailable):
-                return self._client.add_references(self._report.scene, new)
-            if self._stop.wait(0.5):
-                raise _Stopped
-        return self._client.add_references(self._report.scene, new)
 
     def _one_by_one(self, items: Sequence[Item], error: errors.MaplessError) -> None:
         """Sends the references of a rejected message one by one, and refuses one that is rejected alone."""

@@ -14,6 +14,8 @@ from typing import TypeVar
 
 from prometheus_client.parser import text_string_to_metric_families
 
+from mapless.addresses import is_loopback
+
 TIMEOUT_S = 30.0  # one late scrape on a busy machine must not end a soak
 LOCALIZE = "Localize"
 LOOP_LAG = "mapless_event_loop_lag_seconds"
@@ -88,8 +90,9 @@ class Reconciliation:
 
 def read_metrics(address: str) -> Scrape | None:
     """Reads the server's metrics; None if it serves no metrics, OSError if it does not answer."""
+    proxies = urllib.request.ProxyHandler({} if is_loopback(address) else None)
     try:
-        with urllib.request.urlopen(f"http://{address}/metrics", timeout=TIMEOUT_S) as response:
+        with urllib.request.build_opener(proxies).open(f"http://{address}/metrics", timeout=TIMEOUT_S) as response:
             return parse_metrics(response.read().decode())
     except urllib.error.URLError as error:
         if isinstance(error.reason, ConnectionRefusedError):

@@ -1,6 +1,7 @@
 """Queries, and receiving them as they are answered, by WatchQueries; connects again when needed."""
 
 import hashlib
+import itertools
 import logging
 import threading
 from collections.abc import Callable
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless import ConnectOptions, MaplessError, wire
+from mapless.addresses import addresses_of
 from mapless.answers import LocalizationResult, Rejected
 from mapless.errors import from_rpc_error
 from mapless.geometry import Array, Camera, RigidTransform, resized_pixel
@@ -97,10 +99,10 @@ class Feed:
         report: Callable[[str, bool], None],
     ) -> None:
         """Watches a scene: `show` is called with queries, `report` with the state and whether queries will come."""
-        self._channel = options.channel(address)
+        self._channels = [options.channel(it) for it in addresses_of(address)]
+        self._stubs = itertools.cycle(map(LocalizationServiceStub, self._channels))
         self._metadata = options.metadata()
         self._request = pb.WatchQueriesRequest(scene=scene_name(scene))
-        self._stub = LocalizationServiceStub(self._channel)
         self._show, self._report = show, report
         self.own: set[bytes] = set()
         """SHA-256 of photographs that the viewer localizes itself; the next query of each is not shown."""
@@ -112,7 +114,8 @@ class Feed:
     def close(self) -> None:
         """Ends the watching."""
         self._closing.set()
-        self._channel.close()
+        for channel in self._channels:
+            channel.close()
         self._thread.join(5.0)
 
     def _run(self) -> None:
@@ -133,7 +136,7 @@ class Feed:
             self._closing.wait(RETRY_S)
 
     def _watch(self) -> None:
-        call = self._stub.WatchQueries(self._request, metadata=self._metadata)
+        call = next(self._stubs).WatchQueries(self._request, metadata=self._metadata)
         call.initial_metadata()
         if call.is_active():
             self._report("live", True)
