@@ -5,11 +5,12 @@ from contextlib import aclosing
 from types import SimpleNamespace
 from typing import Any
 
+import grpc
 import pytest
 from google.protobuf import empty_pb2
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.clients import Played
+from support.clients import _CHANNEL, Played
 
 from mapless.client import Client, _iterated
 from mapless.connection import Connection
@@ -22,8 +23,10 @@ from mapless.errors import (
     NotFound,
     ResourceExhausted,
     Unavailable,
+    from_rpc_error,
 )
 from mapless.options import ConnectOptions
+from mapless.servers import Servers
 from mapless.wire import FieldError
 
 Empty: Any = empty_pb2.Empty  # type: ignore[attr-defined]
@@ -45,6 +48,74 @@ def test_pauses_double_up_to_the_longest_and_are_counted() -> None:
     assert played.result is UNAVAILABLE
     assert len(played.tries) == 6
     assert played.pauses == pytest.approx([0.2, 0.4, 0.8, 1.0, 1.0])
+
+
+def test_a_call_is_repeated_until_shortly_before_its_deadline() -> None:
+    played = Played(asking(timeout_s=30.0), [UNAVAILABLE], ConnectOptions())
+    assert played.result is UNAVAILABLE
+    assert 30 - 1.5 < played.took_s <= 31  # an attempt takes a second
+    assert max(played.pauses) <= 2.0
+
+
+def absent(reason: str) -> MaplessError:
+    return Unavailable("UNAVAILABLE", f"cannot connect to 127.0.0.1:1: {reason}")
+
+
+def test_a_first_connection_has_a_time_of_its_own() -> None:
+    options = ConnectOptions(connect_timeout_s=6.0)
+    missing = absent("no server listens there (connection refused)")
+    assert Played(asking(timeout_s=30.0), [missing], options).took_s < 7
+    stopped = Played(asking(timeout_s=30.0), [UNAVAILABLE], options)  # it was reached
+    assert stopped.took_s > 25
+
+
+@pytest.mark.parametrize("reason", ["the server does not use TLS", "the server's certificate is for another name"])
+def test_what_another_attempt_does_not_change_ends_soon(reason: str) -> None:
+    assert len(Played(asking(timeout_s=30.0), [absent(reason)], ConnectOptions()).tries) == 4
+
+
+def test_a_check_asks_how_the_server_is_now() -> None:
+    assert len(Played(asking(timeout_s=30.0, is_check=True), [UNAVAILABLE], ConnectOptions()).tries) == 4
+
+
+def test_an_attempt_without_answer_names_the_error_before() -> None:
+    late = DeadlineExceeded("DEADLINE_EXCEEDED", "no answer in time")
+    error = Played(asking(timeout_s=30.0), [UNAVAILABLE, late], ConnectOptions()).result
+    assert str(error) == "DEADLINE_EXCEEDED: no answer in time; before that: gone"
+
+
+def broken(code: grpc.StatusCode, details: str, *trailers: tuple[str, str]) -> Any:
+    return SimpleNamespace(code=lambda: code, details=lambda: details, trailing_metadata=lambda: trailers)
+
+
+@pytest.mark.parametrize(
+    ("details", "is_lost"),
+    [
+        ("Received RST_STREAM with error code 2", True),
+        ("Received RST_STREAM with error code 0", True),
+        ("Received RST_STREAM with error code 1", False),
+        ("Stream removed", True),
+        ("recvmsg:Connection reset by peer", True),
+        ("Received http2 header with status: 500", True),
+        ("internal error, id=7", False),
+        ("Exception iterating responses", False),
+    ],
+)
+def test_a_broken_connection_is_no_fault_of_the_server(details: str, is_lost: bool) -> None:
+    for code in (grpc.StatusCode.INTERNAL, grpc.StatusCode.UNKNOWN):
+        assert (from_rpc_error(broken(code, details)).code == "UNAVAILABLE") is is_lost
+        assert from_rpc_error(broken(code, details, ("x-request-id", "7"))).code == code.name
+
+
+def test_servers_take_turns_and_a_lost_one_is_passed_over() -> None:
+    servers = Servers("abc", [_CHANNEL] * 3)
+    assert [servers.next(0.0).address for _ in range(4)] == ["a", "b", "c", "a"]
+    servers.all[1].lost_until_s = 2.0
+    assert [servers.next(1.0).address for _ in range(3)] == ["c", "c", "a"]
+    assert {servers.next(2.0).address for _ in range(3)} == {"a", "b", "c"}
+    for server, until_s in zip(servers.all, (9.0, 8.0, 7.0), strict=True):
+        server.lost_until_s = until_s
+    assert {servers.next(3.0).address for _ in range(3)} == {"c"}
 
 
 def test_all_attempts_share_one_deadline() -> None:

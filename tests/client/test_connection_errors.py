@@ -72,7 +72,10 @@ def test_localhost_says_what_is_wrong_where_the_server_is(
 
 def has_two_addresses(monkeypatch: pytest.MonkeyPatch, host: str, port: int) -> None:
     """Every name: IPv6's loopback, and this."""
-    found = [(socket.AF_INET6, 0, 0, "", ("::1", port, 0, 0)), (socket.AF_INET, 0, 0, "", (host, port))]
+    found = [
+        (socket.AF_INET6, socket.SOCK_STREAM, 0, "", ("::1", port, 0, 0)),
+        (socket.AF_INET, socket.SOCK_STREAM, 0, "", (host, port)),
+    ]
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
 
 

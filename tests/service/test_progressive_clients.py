@@ -36,7 +36,7 @@ from mapless.v1.localization_service_pb2_grpc import (
     add_LocalizationServiceServicer_to_server,
 )
 
-FAST = ConnectOptions(timeout_s=20.0, initial_backoff_s=0.01, max_backoff_s=0.02)
+FAST = ConnectOptions(max_attempts=4, timeout_s=20.0, initial_backoff_s=0.01, max_backoff_s=0.02)
 LIMIT_S = 20.0
 
 Attempt = tuple[Sequence[pb.LocalizeProgressivelyResponse], grpc.Status | None]

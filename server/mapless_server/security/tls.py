@@ -3,6 +3,7 @@
 Open connections are not affected by a change; new ones get the new certificate.
 """
 
+import logging
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,9 +13,20 @@ from pathlib import Path
 import grpc
 from cryptography import x509
 from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.hazmat.primitives.asymmetric import dsa, ec, ed448, ed25519, rsa
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_private_key
+from cryptography.x509.oid import PublicKeyAlgorithmOID
+
+from mapless.pem import without_marks
 
 from .reloading import Reloading, SecurityError, read_file
+
+log = logging.getLogger(__name__)
+
+_CURVES = ("secp256r1", "secp384r1")
+_LEAST_RSA_BITS, _USUAL_RSA_BITS = 1024, 2048
+"""gRPC's TLS takes 1024 bits, OpenSSL with its usual level of security 2048 and more."""
+_USABLE = "make a key on the curve P-256 (openssl ecparam -name prime256v1 -genkey) or of RSA with 2048 bits or more"
 
 
 @dataclass(frozen=True)
@@ -51,12 +63,13 @@ class TlsMaterial:
 def read_material(files: TlsFiles) -> TlsMaterial:
     """Reads the contents of the files.
 
-    SecurityError if a file is missing or not PEM, the key is not the certificate's, or the certificate is not valid
-    now.
+    SecurityError if a file is missing or not PEM, the key is not the certificate's or of a kind that gRPC's clients do
+    not take, or the certificate is not valid now. Byte order marks are left out.
     """
-    certificate, key = read_file(files.certificate), read_file(files.key)
-    client_ca = read_file(files.client_ca) if files.client_ca else None
+    certificate, key = (without_marks(read_file(it)) for it in (files.certificate, files.key))
+    client_ca = without_marks(read_file(files.client_ca)) if files.client_ca else None
     own = _certificates(certificate, files.certificate)[0]
+    _check_kind(own, files.certificate)
     if _public_key_of(key, files.key) != _certified_key(own, files.certificate):
         raise SecurityError(f"the key {files.key} is not that of the first certificate in {files.certificate}")
     _check_time(own, files.certificate)
@@ -112,6 +125,42 @@ def _certificates(data: bytes, path: Path) -> Sequence[x509.Certificate]:
         return x509.load_pem_x509_certificates(data)
     except ValueError as error:
         raise SecurityError(f"{path} holds no certificate in PEM form") from error
+
+
+def _check_kind(certificate: x509.Certificate, path: Path) -> None:
+    """Raises SecurityError for a kind of key with which nobody can connect; warns of what only some clients take.
+
+    gRPC's TLS is BoringSSL: its clients verify signatures on P-256 and P-384 and of RSA, and its servers cannot load
+    others but P-521 and Ed25519.
+    """
+    try:
+        key = certificate.public_key()
+    except (ValueError, UnsupportedAlgorithm) as error:
+        raise SecurityError(f"the certificate {path} is for a key of an unknown kind; {_USABLE}") from error
+    kinds = {ed25519.Ed25519PublicKey: "Ed25519", ed448.Ed448PublicKey: "Ed448", dsa.DSAPublicKey: "DSA"}
+    kind = next((name for each, name in kinds.items() if isinstance(key, each)), "")
+    if isinstance(key, ec.EllipticCurvePublicKey) and key.curve.name not in _CURVES:
+        kind = f"the curve {key.curve.name}"
+    if isinstance(key, rsa.RSAPublicKey):
+        if certificate.public_key_algorithm_oid == PublicKeyAlgorithmOID.RSASSA_PSS:
+            kind = "RSASSA-PSS"
+        elif key.key_size < _LEAST_RSA_BITS:
+            kind = f"RSA with {key.key_size} bits"
+        elif key.key_size < _USUAL_RSA_BITS:
+            log.warning("the key of the certificate %s has %d bits: some clients refuse it", path, key.key_size)
+    if kind:
+        raise SecurityError(
+            f"the key of the certificate {path} is of a kind that clients of gRPC do not accept ({kind}); {_USABLE}"
+        )
+    if not _has_names(certificate):
+        log.warning("the certificate %s has no subjectAltName: Go's clients and browsers refuse it", path)
+
+
+def _has_names(certificate: x509.Certificate) -> bool:
+    try:
+        return bool(list(certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value))
+    except (x509.ExtensionNotFound, ValueError):
+        return False
 
 
 def _check_time(certificate: x509.Certificate, path: Path) -> None:

@@ -1,7 +1,9 @@
 """A running server: opens its parts in order, and closes them in reverse order at the end of its block."""
 
 import asyncio
+import errno
 import logging
+import socket
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
@@ -67,7 +69,7 @@ class GrpcServer:
                 return int(self._server.add_insecure_port(address))
             return int(self._server.add_secure_port(address, credentials))
         except RuntimeError as error:
-            raise AddressTaken(f"cannot listen on {address}: in use, or not an address of ours") from error
+            raise AddressTaken(f"cannot listen on {address}: {_why_not(address, credentials)}") from error
 
     async def start(self) -> None:
         """Accepts calls."""
@@ -82,6 +84,30 @@ class GrpcServer:
         await self._server.stop(0)
 
 
+def _why_not(address: str, credentials: grpc.ServerCredentials | None) -> str:
+    """Why gRPC cannot listen on an address, which it says in its own log only: the address is tried once more."""
+    host, _, port = address.rpartition(":")
+    try:
+        found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    except OSError:
+        return f"the name {host} cannot be resolved"
+    for family, *_, endpoint in found:
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            try:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(endpoint)
+                probe.listen(1)
+            except OSError as error:
+                if error.errno == errno.EADDRINUSE:
+                    return "in use by another program"
+                if error.errno == errno.EADDRNOTAVAIL:
+                    return "not an address of this machine"
+                return error.strerror or str(error)
+    return (
+        "gRPC refuses it" if credentials is None else "the address is free; gRPC cannot use the certificate or its key"
+    )
+
+
 def _options(settings: Settings) -> list[tuple[str, int]]:
     max_message_bytes = settings.max_message_mib * 2**20
     return [
@@ -91,11 +117,11 @@ def _options(settings: Settings) -> list[tuple[str, int]]:
         ("grpc.so_reuseport", 0),
         ("grpc.max_concurrent_streams", MAX_CALLS_PER_CONNECTION),
         ("grpc.max_metadata_size", 16 * 1024),
-        # Clients may ping every 30 s, but only while they have a call.
-        ("grpc.http2.min_ping_interval_without_data_ms", 30_000),
+        # Clients may ping every 10 s, the least that gRPC's own allow, with a call or without; a ping may be early.
+        ("grpc.http2.min_ping_interval_without_data_ms", 5_000),
         ("grpc.http2.max_ping_strikes", 2),
-        ("grpc.keepalive_permit_without_calls", 0),
-        # Detects clients that vanished, so that their queries are not computed.
+        ("grpc.keepalive_permit_without_calls", 1),
+        # Detects clients that vanished, so that their queries are not computed, and their connections end.
         ("grpc.keepalive_time_ms", 60_000),
         ("grpc.keepalive_timeout_ms", 20_000),
         ("grpc.max_connection_idle_ms", 15 * 60_000),

@@ -10,6 +10,7 @@ from pathlib import Path
 import uvicorn
 
 from mapless import Client, ConnectOptions, Unauthenticated
+from mapless.pem import without_marks
 from mapless_server.security import is_loopback
 
 from .app import GatewayOptions, gateway
@@ -37,6 +38,8 @@ class Binding:
         for file in (self.certificate, self.key):
             if file is not None and not file.is_file():
                 raise ValueError(f"{file} is no file")
+            if file is not None and without_marks(data := file.read_bytes()) != data:
+                raise ValueError(f"{file} has a byte order mark or is UTF-16: save it as ASCII")
         if self.certificate is None and not self.insecure and not self.is_loopback:
             raise ValueError(
                 f"on {self.host} photographs and tokens would pass in clear: give --tls-certificate and --tls-key, "
