@@ -84,8 +84,11 @@ def test_an_attempt_without_answer_names_the_error_before() -> None:
     assert str(error) == "DEADLINE_EXCEEDED: no answer in time; before that: gone"
 
 
-def broken(code: grpc.StatusCode, details: str, *trailers: tuple[str, str]) -> Any:
-    return SimpleNamespace(code=lambda: code, details=lambda: details, trailing_metadata=lambda: trailers)
+class Broken(grpc.RpcError):  # type: ignore[misc]
+    """A status as gRPC raises it."""
+
+    def __init__(self, status: grpc.StatusCode, text: str, *trailers: tuple[str, str]) -> None:
+        self.code, self.details, self.trailing_metadata = lambda: status, lambda: text, lambda: trailers
 
 
 @pytest.mark.parametrize(
@@ -103,8 +106,8 @@ def broken(code: grpc.StatusCode, details: str, *trailers: tuple[str, str]) -> A
 )
 def test_a_broken_connection_is_no_fault_of_the_server(details: str, is_lost: bool) -> None:
     for code in (grpc.StatusCode.INTERNAL, grpc.StatusCode.UNKNOWN):
-        assert (from_rpc_error(broken(code, details)).code == "UNAVAILABLE") is is_lost
-        assert from_rpc_error(broken(code, details, ("x-request-id", "7"))).code == code.name
+        assert (from_rpc_error(Broken(code, details)).code == "UNAVAILABLE") is is_lost
+        assert from_rpc_error(Broken(code, details, ("x-request-id", "7"))).code == code.name
 
 
 def test_servers_take_turns_and_a_lost_one_is_passed_over() -> None:

@@ -73,8 +73,7 @@ def calling(
     assert not failed
 
 
-@pytest.mark.parametrize("connect", [Client, awaiting], ids=["blocking", "asyncio"])
-@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize(("how", "connect"), [(signal.SIGTERM, awaiting), (signal.SIGKILL, Client)])
 def test_no_call_fails_while_the_only_server_is_away(tmp_path: Path, how: signal.Signals, connect: Connect) -> None:
     port = free_port()
     with ExitStack() as stack:
