@@ -323,7 +323,7 @@ class Retries:
         pause_s = self._pause_s(error)
         if pause_s is None or self._is_last(error) or pause_s >= self.left_s():
             raise await self._connection._explained(error)
-        self.may_be_done |= error.code in _LOST
+        self.may_be_done |= error.code in _LOST and not is_unconnected(error)  # what was never sent is not done
         await self._connection._pause(pause_s, error)
 
     def _is_last(self, error: MaplessError) -> bool:

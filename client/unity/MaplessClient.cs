@@ -114,25 +114,45 @@ namespace Mapless
         private const int BatchBytes = 8 * 1024 * 1024;
         private const int MaxMessageBytes = 32 * 1024 * 1024;
 
-        private readonly GrpcChannel channel;
-        private readonly CallInvoker invoker;
+        private const double FirstPauseS = 0.2;
+        private const double MaxPauseS = 2;
+        private const double LostS = 2;
+        private const int CheckAttempts = 4;
+        private const double Same = 1e-9; // metres, degrees: errors of rounding where the server normalizes
+
+        private sealed class Server
+        {
+            public GrpcChannel Channel;
+            public CallInvoker Invoker;
+            public long LostUntil; // ticks; those that were lost a moment ago are passed over
+        }
+
+        private readonly List<Server> servers = new List<Server>();
         private readonly Metadata headers = new Metadata();
+        private readonly Random random = new Random();
+        private int turns = -1;
 
         /// <summary>Does not connect yet.</summary>
-        /// <param name="address">"https://host:50051", or "http://..." for a server without TLS.</param>
+        /// <param name="address">
+        /// "https://host:50051", or "http://..." for a server without TLS; "https://host1:50051,https://host2:50051" of several
+        /// that share a store: calls take turns, and pass over a server that is away.
+        /// </param>
         /// <param name="token">Sent to the server, if it requires one. Only over https.</param>
         /// <param name="clientId">Which device this is; the server is fair between them.</param>
-        /// <param name="handler">Handler of HTTP/2; YetAnotherHttpHandler if null.</param>
+        /// <param name="handler">Handler of HTTP/2, of all servers; a YetAnotherHttpHandler for each if null.</param>
         public MaplessClient(string address, string token = null, string clientId = null, HttpMessageHandler handler = null)
         {
-            channel = GrpcChannel.ForAddress(address, new GrpcChannelOptions
+            foreach (string one in address.Split(','))
             {
-                HttpHandler = handler ?? new YetAnotherHttpHandler { Http2Only = true },
-                DisposeHttpClient = true,
-                MaxReceiveMessageSize = MaxMessageBytes,
-                MaxSendMessageSize = MaxMessageBytes,
-            });
-            invoker = channel.CreateCallInvoker();
+                var channel = GrpcChannel.ForAddress(one.Trim(), new GrpcChannelOptions
+                {
+                    HttpHandler = handler ?? new YetAnotherHttpHandler { Http2Only = true },
+                    DisposeHttpClient = true,
+                    MaxReceiveMessageSize = MaxMessageBytes,
+                    MaxSendMessageSize = MaxMessageBytes,
+                });
+                servers.Add(new Server { Channel = channel, Invoker = channel.CreateCallInvoker() });
+            }
             if (token != null)
             {
                 headers.Add("authorization", "Bearer " + token);
@@ -152,10 +172,13 @@ namespace Mapless
         /// are the raster's, x right, y up, z forward; SensorPose makes it from the pose of Unity's camera.
         /// </param>
         /// <param name="captureTime">When that was; echoed.</param>
-        /// <param name="timeout">Deadline of the call; without it a lost server would block for ever.</param>
+        /// <param name="timeout">
+        /// Deadline of the call, until which it is repeated while the server is away, stops or is lost during the answer.
+        /// </param>
         /// <param name="cancellation">Ends the call earlier, on the server, too.</param>
         /// <exception cref="RpcException">
-        /// Unavailable and ResourceExhausted: try again later, with a newer photograph. Others say what is wrong.
+        /// Unavailable (until the deadline) and ResourceExhausted: try again later, with a newer photograph. Others say what
+        /// is wrong.
         /// </exception>
         public async Task<MaplessAnswer> LocalizeAsync(
             string scene,
@@ -195,20 +218,38 @@ namespace Mapless
             TimeSpan timeout,
             CancellationToken cancellation = default)
         {
-            CallOptions options = OptionsOf(request.Scene, timeout, cancellation);
-            using (var call = invoker.AsyncServerStreamingCall(LocalizeProgressivelyMethod, null, options, request))
+            var attempts = new Attempts(this, timeout, cancellation);
+            bool hadCoarse = false;
+            while (true)
             {
-                while (await call.ResponseStream.MoveNext(cancellation).ConfigureAwait(true))
+                Server server = NextServer();
+                CallOptions options = OptionsOf(request.Scene, attempts.Deadline, cancellation);
+                try
                 {
-                    LocalizeProgressivelyResponse message = call.ResponseStream.Current;
-                    if (message.IsFinal)
+                    using (var call = server.Invoker.AsyncServerStreamingCall(LocalizeProgressivelyMethod, null, options, request))
                     {
-                        return message.Answer;
+                        while (await call.ResponseStream.MoveNext(cancellation).ConfigureAwait(true))
+                        {
+                            LocalizeProgressivelyResponse message = call.ResponseStream.Current;
+                            if (message.IsFinal)
+                            {
+                                return message.Answer;
+                            }
+                            if (!hadCoarse)
+                            {
+                                hadCoarse = true;
+                                onCoarse?.Invoke(new MaplessAnswer(message.Answer));
+                            }
+                        }
                     }
-                    onCoarse?.Invoke(new MaplessAnswer(message.Answer));
                 }
+                catch (RpcException error) when (attempts.CanRepeat(server, error))
+                {
+                    await attempts.PauseAsync().ConfigureAwait(true);
+                    continue;
+                }
+                throw new RpcException(new Status(StatusCode.Internal, "the stream ended before the answer"));
             }
-            throw new RpcException(new Status(StatusCode.Internal, "the stream ended before the answer"));
         }
 
         /// <summary>Photographs of several cameras of one moment.</summary>
@@ -225,10 +266,11 @@ namespace Mapless
             return CallAsync(LocalizeSequenceMethod, request, request.Scene, timeout, cancellation);
         }
 
-        /// <summary>Whether the server takes calls; false while it starts or drains.</summary>
+        /// <summary>Whether the server takes calls now; false while it starts or drains. Four attempts, in 1.4 s.</summary>
         public async Task<bool> IsServingAsync(TimeSpan timeout, CancellationToken cancellation = default)
         {
-            var answer = await CallAsync(CheckMethod, new StringValue(), null, timeout, cancellation).ConfigureAwait(true);
+            var answer = await CallAsync(
+                CheckMethod, new StringValue(), null, timeout, cancellation, null, CheckAttempts).ConfigureAwait(true);
             return answer.Value == Serving;
         }
 
@@ -237,7 +279,12 @@ namespace Mapless
             CreateSceneRequest request, TimeSpan timeout, CancellationToken cancellation = default)
         {
             string scene = "scenes/" + request.SceneId;
-            return (await CallAsync(CreateSceneMethod, request, scene, timeout, cancellation).ConfigureAwait(true)).Scene;
+            Func<RpcException, TimeSpan, Task<CreateSceneResponse>> find = async (error, left) =>
+            {
+                Scene stored = await GetSceneAsync(scene, left, cancellation).ConfigureAwait(true);
+                return IsSame(request, stored) ? new CreateSceneResponse { Scene = stored } : null;
+            };
+            return (await CallAsync(CreateSceneMethod, request, scene, timeout, cancellation, find).ConfigureAwait(true)).Scene;
         }
 
         /// <summary>A scene, "scenes/hall".</summary>
@@ -273,14 +320,19 @@ namespace Mapless
         public Task DeleteSceneAsync(string scene, TimeSpan timeout, CancellationToken cancellation = default)
         {
             var request = new DeleteSceneRequest { Name = scene };
-            return CallAsync(DeleteSceneMethod, request, scene, timeout, cancellation);
+            return CallAsync(DeleteSceneMethod, request, scene, timeout, cancellation, Gone(new DeleteSceneResponse()));
         }
 
         /// <summary>Stores a photograph with its intrinsics and pose.</summary>
         public Task<CreateReferenceResponse> CreateReferenceAsync(
             CreateReferenceRequest request, TimeSpan timeout, CancellationToken cancellation = default)
         {
-            return CallAsync(CreateReferenceMethod, request, request.Scene, timeout, cancellation);
+            Func<RpcException, TimeSpan, Task<CreateReferenceResponse>> find = async (error, left) =>
+            {
+                Reference stored = await StoredAsync(request.Scene, request, left, cancellation).ConfigureAwait(true);
+                return stored == null ? null : new CreateReferenceResponse { Reference = stored };
+            };
+            return CallAsync(CreateReferenceMethod, request, request.Scene, timeout, cancellation, find);
         }
 
         /// <summary>Stores many, in messages of about 8 MB; each is stored whole or not at all.</summary>
@@ -306,7 +358,21 @@ namespace Mapless
                     || batch.CalculateSize() + left.Peek().CalculateSize() > BatchBytes;
                 if (isFull)
                 {
-                    var done = await CallAsync(BatchCreateReferencesMethod, batch, scene, timeout, cancellation)
+                    Func<RpcException, TimeSpan, Task<BatchCreateReferencesResponse>> find = async (error, remaining) =>
+                    {
+                        var found = new BatchCreateReferencesResponse();
+                        foreach (CreateReferenceRequest wanted in batch.Requests)
+                        {
+                            Reference one = await StoredAsync(scene, wanted, remaining, cancellation).ConfigureAwait(true);
+                            if (one == null)
+                            {
+                                return null;
+                            }
+                            found.References.Add(one);
+                        }
+                        return found;
+                    };
+                    var done = await CallAsync(BatchCreateReferencesMethod, batch, scene, timeout, cancellation, find)
                         .ConfigureAwait(true);
                     stored.AddRange(done.References);
                     onProgress?.Invoke(stored.Count);
@@ -346,7 +412,8 @@ namespace Mapless
         public Task DeleteReferenceAsync(string reference, TimeSpan timeout, CancellationToken cancellation = default)
         {
             var request = new DeleteReferenceRequest { Name = reference };
-            return CallAsync(DeleteReferenceMethod, request, SceneOf(reference), timeout, cancellation);
+            return CallAsync(
+                DeleteReferenceMethod, request, SceneOf(reference), timeout, cancellation, Gone(new DeleteReferenceResponse()));
         }
 
         /// <summary>The references that a photograph resembles.</summary>
@@ -370,23 +437,225 @@ namespace Mapless
             return CallAsync(CheckCoverageMethod, request, request.Scene, timeout, cancellation);
         }
 
+        /// <summary>
+        /// Makes a call, and repeats it until its deadline. Where the answer to a change was lost, find gets the error of the
+        /// next attempt and the time left: it returns the lost response, or null if the error is right.
+        /// </summary>
         private async Task<TResponse> CallAsync<TRequest, TResponse>(
             Method<TRequest, TResponse> method,
             TRequest request,
             string scene,
             TimeSpan timeout,
-            CancellationToken cancellation)
+            CancellationToken cancellation,
+            Func<RpcException, TimeSpan, Task<TResponse>> find = null,
+            int mostAttempts = int.MaxValue)
             where TRequest : class
             where TResponse : class
         {
-            CallOptions options = OptionsOf(scene, timeout, cancellation);
-            using (var call = invoker.AsyncUnaryCall(method, null, options, request))
+            var attempts = new Attempts(this, timeout, cancellation, mostAttempts);
+            while (true)
             {
-                return await call.ResponseAsync.ConfigureAwait(true);
+                Server server = NextServer();
+                CallOptions options = OptionsOf(scene, attempts.Deadline, cancellation);
+                RpcException failure;
+                try
+                {
+                    using (var call = server.Invoker.AsyncUnaryCall(method, null, options, request))
+                    {
+                        return await call.ResponseAsync.ConfigureAwait(true);
+                    }
+                }
+                catch (RpcException error)
+                {
+                    failure = error;
+                }
+                bool isConflict = failure.StatusCode == StatusCode.AlreadyExists || failure.StatusCode == StatusCode.NotFound;
+                if (isConflict && find != null && attempts.MayBeDone)
+                {
+                    TResponse found = await find(failure, attempts.Left).ConfigureAwait(true);
+                    if (found != null)
+                    {
+                        return found;
+                    }
+                }
+                if (!attempts.CanRepeat(server, failure))
+                {
+                    throw failure;
+                }
+                await attempts.PauseAsync().ConfigureAwait(true);
             }
         }
 
-        private CallOptions OptionsOf(string scene, TimeSpan timeout, CancellationToken cancellation)
+        private Server NextServer()
+        {
+            int first = (Interlocked.Increment(ref turns) & int.MaxValue) % servers.Count;
+            long now = DateTime.UtcNow.Ticks;
+            Server best = null;
+            for (int i = 0; i < servers.Count; i++)
+            {
+                Server one = servers[(first + i) % servers.Count];
+                if (best == null || Math.Max(one.LostUntil, now) < Math.Max(best.LostUntil, now))
+                {
+                    best = one;
+                }
+            }
+            return best;
+        }
+
+        /// <summary>The attempts of one call, which share its deadline.</summary>
+        private sealed class Attempts
+        {
+            private readonly MaplessClient client;
+            private readonly CancellationToken cancellation;
+            private readonly int most;
+            private int count;
+            private double pauseS;
+
+            public DateTime Deadline { get; }
+
+            /// <summary>Whether an attempt whose answer was lost may have been carried out.</summary>
+            public bool MayBeDone { get; private set; }
+
+            public TimeSpan Left => TimeSpan.FromSeconds(Math.Max((Deadline - DateTime.UtcNow).TotalSeconds, 0.001));
+
+            public Attempts(MaplessClient client, TimeSpan timeout, CancellationToken cancellation, int most = int.MaxValue)
+            {
+                this.client = client;
+                this.cancellation = cancellation;
+                this.most = most;
+                Deadline = DateTime.UtcNow + timeout;
+            }
+
+            /// <summary>Whether another attempt follows a failed one, after a pause.</summary>
+            public bool CanRepeat(Server server, RpcException error)
+            {
+                if (!IsLost(error) || cancellation.IsCancellationRequested || ++count >= most)
+                {
+                    return false;
+                }
+                server.LostUntil = DateTime.UtcNow.AddSeconds(LostS).Ticks;
+                double leftS = (Deadline - DateTime.UtcNow).TotalSeconds;
+                pauseS = Math.Min(FirstPauseS * Math.Pow(2, Math.Min(count - 1, 10)), MaxPauseS);
+                double jitter;
+                lock (client.random)
+                {
+                    jitter = 0.8 + 0.4 * client.random.NextDouble();
+                }
+                // A server that returns shortly before the deadline is found, too.
+                pauseS = Math.Max(Math.Min(pauseS, leftS / 2), FirstPauseS) * jitter;
+                MayBeDone |= pauseS < leftS;
+                return pauseS < leftS;
+            }
+
+            public Task PauseAsync()
+            {
+                return Task.Delay(TimeSpan.FromSeconds(pauseS), cancellation);
+            }
+
+            /// <summary>
+            /// Whether the server is away, stops, or was lost during the answer: also where gRPC has made another status of a
+            /// connection that broke. The server's own errors have its request id.
+            /// </summary>
+            private static bool IsLost(RpcException error)
+            {
+                switch (error.StatusCode)
+                {
+                    case StatusCode.Unavailable:
+                    case StatusCode.Cancelled:
+                        return true;
+                    case StatusCode.Internal:
+                    case StatusCode.Unknown:
+                        foreach (Metadata.Entry entry in error.Trailers)
+                        {
+                            if (entry.Key == "x-request-id")
+                            {
+                                return false;
+                            }
+                        }
+                        string[] signs =
+                        {
+                            "Error starting gRPC call", "Error reading next message", "RST_STREAM", "GOAWAY",
+                            "connection", "status code: 50",
+                        };
+                        return Array.Exists(signs, sign => error.Status.Detail.IndexOf(sign, StringComparison.Ordinal) >= 0);
+                    default:
+                        return false;
+                }
+            }
+        }
+
+        /// <summary>What was to be deleted is gone, by an attempt whose answer was lost.</summary>
+        private static Func<RpcException, TimeSpan, Task<TResponse>> Gone<TResponse>(TResponse response)
+            where TResponse : class
+        {
+            return (error, left) => Task.FromResult(error.StatusCode == StatusCode.NotFound ? response : null);
+        }
+
+        /// <summary>The stored reference if it is the one that was to be stored, else null.</summary>
+        private async Task<Reference> StoredAsync(
+            string scene, CreateReferenceRequest wanted, TimeSpan left, CancellationToken cancellation)
+        {
+            Reference stored = await GetReferenceAsync(scene + "/references/" + wanted.ReferenceId, false, left, cancellation)
+                .ConfigureAwait(true);
+            string sha256;
+            using (var hash = System.Security.Cryptography.SHA256.Create())
+            {
+                sha256 = BitConverter.ToString(hash.ComputeHash(wanted.Reference.Image.ToByteArray())).Replace("-", "");
+            }
+            bool isSame = string.Equals(sha256, stored.ImageSha256, StringComparison.OrdinalIgnoreCase)
+                && wanted.Reference.Intrinsics.Equals(stored.Intrinsics)
+                && IsSame(wanted.Reference.WorldFromCamera, stored.WorldFromCamera);
+            return isSame ? stored : null;
+        }
+
+        private static bool IsSame(CreateSceneRequest wanted, Scene stored)
+        {
+            return stored.Generation == 1 && stored.ArbitraryUnit == wanted.ArbitraryUnit
+                && IsSame(wanted.Datum, stored.Datum) && IsSame(wanted.DownInWorld, stored.DownInWorld);
+        }
+
+        private static bool IsSame(Datum wanted, Datum stored)
+        {
+            if (wanted == null || stored == null)
+            {
+                return wanted == stored;
+            }
+            var none = new V1.Quaternion { W = 1 };
+            return IsNear(wanted.LatitudeDeg, stored.LatitudeDeg) && IsNear(wanted.LongitudeDeg, stored.LongitudeDeg)
+                && IsNear(wanted.HeightM, stored.HeightM)
+                && IsSame(wanted.EnuFromWorld ?? none, stored.EnuFromWorld ?? none);
+        }
+
+        private static bool IsSame(V1.Vector3 wanted, V1.Vector3 stored)
+        {
+            if (wanted == null || stored == null)
+            {
+                return wanted == stored;
+            }
+            double w = Math.Sqrt(wanted.X * wanted.X + wanted.Y * wanted.Y + wanted.Z * wanted.Z);
+            double s = Math.Sqrt(stored.X * stored.X + stored.Y * stored.Y + stored.Z * stored.Z);
+            return IsNear(wanted.X / w, stored.X / s) && IsNear(wanted.Y / w, stored.Y / s) && IsNear(wanted.Z / w, stored.Z / s);
+        }
+
+        private static bool IsSame(RigidTransform wanted, RigidTransform stored)
+        {
+            V1.Vector3 w = wanted.TranslationM, s = stored.TranslationM;
+            return IsSame(wanted.Rotation, stored.Rotation) && IsNear(w.X, s.X) && IsNear(w.Y, s.Y) && IsNear(w.Z, s.Z);
+        }
+
+        private static bool IsSame(V1.Quaternion a, V1.Quaternion b)
+        {
+            double both = a.X * b.X + a.Y * b.Y + a.Z * b.Z + a.W * b.W;
+            double squares = (a.X * a.X + a.Y * a.Y + a.Z * a.Z + a.W * a.W) * (b.X * b.X + b.Y * b.Y + b.Z * b.Z + b.W * b.W);
+            return Math.Abs(both) > (1 - 1e-15) * Math.Sqrt(squares); // q and -q turn alike
+        }
+
+        private static bool IsNear(double a, double b)
+        {
+            return Math.Abs(a - b) <= Same;
+        }
+
+        private CallOptions OptionsOf(string scene, DateTime deadline, CancellationToken cancellation)
         {
             var ofCall = new Metadata();
             if (!string.IsNullOrEmpty(scene))
@@ -397,7 +666,7 @@ namespace Mapless
             {
                 ofCall.Add(header);
             }
-            return new CallOptions(ofCall, DateTime.UtcNow + timeout, cancellation);
+            return new CallOptions(ofCall, deadline, cancellation);
         }
 
         private static string SceneOf(string reference)
@@ -467,7 +736,10 @@ namespace Mapless
         /// <summary>Ends the connection; calls still running fail.</summary>
         public void Dispose()
         {
-            channel.Dispose();
+            foreach (Server server in servers)
+            {
+                server.Channel.Dispose();
+            }
         }
     }
 }

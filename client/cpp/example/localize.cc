@@ -21,6 +21,7 @@ void Print(const mapless::v1::LocalizeResponse& answer) {
 int Run(char** arguments) {
   mapless::ConnectOptions options;
   options.address = arguments[1];
+  options.connect_timeout = std::chrono::seconds(2);  // for a person, who may have mistyped it
   if (const char* token = std::getenv("MAPLESS_TOKEN")) options.token = token;
   if (const char* authority = std::getenv("MAPLESS_CA")) {
     options.tls = true;

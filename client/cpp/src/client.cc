@@ -9,77 +9,20 @@
 #include <grpcpp/generic/generic_stub.h>
 
 #include "mapless/client/wire.pb.h"
+#include "repeats.h"
+#include "servers.h"
 
 namespace mapless {
 namespace {
 
-constexpr int kReconnectMs = 200;
-constexpr int kMaxReconnectMs = 2'000;
-constexpr int kKeepaliveMs = 60'000;
-constexpr int kKeepaliveTimeoutMs = 10'000;
 constexpr int kPageSize = 1'000;
 constexpr char kHealth[] = "/grpc.health.v1.Health/Check";
 constexpr int kServing = 1;
-
-// Methods that change nothing, which gRPC may repeat.
-constexpr const char* kReading[] = {
-    "mapless.v1.LocalizationService", "Localize",         "mapless.v1.LocalizationService", "LocalizeProgressively",
-    "mapless.v1.LocalizationService", "LocalizeRig",      "mapless.v1.LocalizationService", "LocalizeSequence",
-    "mapless.v1.ReferenceService",    "GetScene",         "mapless.v1.ReferenceService",    "ListScenes",
-    "mapless.v1.ReferenceService",    "GetReference",     "mapless.v1.ReferenceService",    "ListReferences",
-    "mapless.v1.ReferenceService",    "RetrieveReferences", "mapless.v1.ReferenceService",  "AuditScene",
-    "mapless.v1.ReferenceService",    "CheckCoverage",    "grpc.health.v1.Health",          "Check",
-};
-
-std::string ServiceConfig(int max_attempts) {
-  std::string config = R"({"loadBalancingConfig": [{"round_robin": {}}])";
-  if (max_attempts > 1) {
-    config += R"(, "methodConfig": [{"name": [)";
-    for (std::size_t i = 0; i < std::size(kReading); i += 2) {
-      config += std::string(i ? ", " : "") + R"({"service": ")" + kReading[i] + R"(", "method": ")" + kReading[i + 1] + "\"}";
-    }
-    config += R"(], "retryPolicy": {"maxAttempts": )" + std::to_string(max_attempts) +
-              R"(, "initialBackoff": "0.2s", "maxBackoff": "2s", "backoffMultiplier": 2,)"
-              R"( "retryableStatusCodes": ["UNAVAILABLE"]}}])";
-  }
-  return config + "}";
-}
+// Of a health check, which asks how the server is now.
+constexpr int kCheckAttempts = 4;
 
 bool IsVisible(const std::string& text) {
   return !text.empty() && std::all_of(text.begin(), text.end(), [](char c) { return c > ' ' && c < '\x7f'; });
-}
-
-std::shared_ptr<grpc::Channel> Connect(const ConnectOptions& options) {
-  if (options.max_attempts < 1 || options.max_attempts > 5) throw std::invalid_argument("max_attempts must be 1 to 5");
-  if (options.max_message_mib < 1 || options.max_message_mib > 2047)
-    throw std::invalid_argument("max_message_mib must be 1 to 2047");
-  if (options.batch_count < 1 || !(options.batch_mib > 0)) throw std::invalid_argument("batches must not be empty");
-  if (options.address.find("://") != std::string::npos)
-    throw std::invalid_argument("an address is host:port, without scheme, is " + options.address);
-  // gRPC ends the program where metadata has anything else, such as the line break at the end of a token's file.
-  for (const auto& [name, value] : {std::pair("token", options.token), std::pair("client_id", options.client_id)})
-    if (!value.empty() && !IsVisible(value))
-      throw std::invalid_argument(std::string(name) + " must be visible ASCII characters, without spaces or line breaks");
-  const int max_bytes = options.max_message_mib << 20;
-  grpc::ChannelArguments arguments;
-  arguments.SetMaxSendMessageSize(max_bytes);
-  arguments.SetMaxReceiveMessageSize(max_bytes);
-  arguments.SetServiceConfigJSON(ServiceConfig(options.max_attempts));
-  arguments.SetInt(GRPC_ARG_INITIAL_RECONNECT_BACKOFF_MS, kReconnectMs);
-  arguments.SetInt(GRPC_ARG_MAX_RECONNECT_BACKOFF_MS, kMaxReconnectMs);
-  arguments.SetInt(GRPC_ARG_KEEPALIVE_TIME_MS, kKeepaliveMs);
-  arguments.SetInt(GRPC_ARG_KEEPALIVE_TIMEOUT_MS, kKeepaliveTimeoutMs);
-  // A call is only repeated while its message fits, by default 256 KiB: less than a photograph.
-  arguments.SetInt(GRPC_ARG_PER_RPC_RETRY_BUFFER_SIZE, max_bytes);
-  std::shared_ptr<grpc::ChannelCredentials> credentials = grpc::InsecureChannelCredentials();
-  if (options.tls) {
-    grpc::SslCredentialsOptions tls;
-    tls.pem_root_certs = options.root_certificates;
-    tls.pem_cert_chain = options.client_certificate;
-    tls.pem_private_key = options.client_key;
-    credentials = grpc::SslCredentials(tls);
-  }
-  return grpc::CreateCustomChannel(options.address, credentials, arguments);
 }
 
 // The scene of a request, "scenes/{scene}", for load balancers in front of several servers; empty where there is none.
@@ -97,7 +40,8 @@ std::string SceneOf(const google::protobuf::Message& request) {
   return "";
 }
 
-[[noreturn]] void Throw(const grpc::Status& status, const grpc::ClientContext& context) {
+[[noreturn]] void Throw(const grpc::Status& given, const grpc::ClientContext& context) {
+  const grpc::Status status = StatusOf(given, context);
   const auto& trailers = context.GetServerTrailingMetadata();
   const auto found = trailers.find("x-request-id");
   const std::string id = found == trailers.end() ? "" : std::string(found->second.data(), found->second.size());
@@ -110,6 +54,7 @@ std::string SceneOf(const google::protobuf::Message& request) {
     case grpc::StatusCode::FAILED_PRECONDITION: throw FailedPrecondition(status, id);
     case grpc::StatusCode::RESOURCE_EXHAUSTED: throw ResourceExhausted(status, id);
     case grpc::StatusCode::DEADLINE_EXCEEDED: throw DeadlineExceeded(status, id);
+    case grpc::StatusCode::CANCELLED:  // by a server that stops; the client cancels no call that is waited for
     case grpc::StatusCode::UNAVAILABLE: throw Unavailable(status, id);
     case grpc::StatusCode::DATA_LOSS: throw DataLoss(status, id);
     case grpc::StatusCode::INTERNAL: throw Internal(status, id);
@@ -167,98 +112,134 @@ Error::Error(const grpc::Status& status, const std::string& id)
   }
 }
 
-Client::Client(ConnectOptions options)
-    : options_(std::move(options)),
-      channel_(Connect(options_)),
-      localization_(v1::LocalizationService::NewStub(channel_)),
-      references_(v1::ReferenceService::NewStub(channel_)) {}
+Client::Client(ConnectOptions options) : options_(std::move(options)), servers_(std::make_unique<Servers>(options_)) {}
+Client::~Client() = default;
+Client::Client(Client&&) noexcept = default;
 
-void Client::Prepare(grpc::ClientContext& context, const google::protobuf::Message& request, Timeout timeout) const {
-  context.set_deadline(std::chrono::system_clock::now() + (timeout == Timeout{} ? options_.timeout : timeout));
+void Client::Prepare(grpc::ClientContext& context, const google::protobuf::Message& request,
+                     std::chrono::system_clock::time_point deadline) const {
+  context.set_deadline(deadline);
   if (!options_.token.empty()) context.AddMetadata("authorization", "Bearer " + options_.token);
   if (!options_.client_id.empty()) context.AddMetadata("x-client-id", options_.client_id);
   if (const std::string scene = SceneOf(request); IsVisible(scene)) context.AddMetadata("x-mapless-scene", scene);
 }
 
 template <class Stub, class Request, class Response>
-Response Client::Unary(Stub& stub, grpc::Status (Stub::*method)(grpc::ClientContext*, const Request&, Response*),
-                       const Request& request, Timeout timeout) const {
-  grpc::ClientContext context;
-  Prepare(context, request, timeout);
-  Response response;
-  const grpc::Status status = (stub.*method)(&context, request, &response);
-  if (!status.ok()) Throw(status, context);
-  return response;
+Response Client::Unary(grpc::Status (Stub::*method)(grpc::ClientContext*, const Request&, Response*), const Request& request,
+                       Timeout timeout, const std::function<bool(Response&, Timeout)>& find) const {
+  Attempts attempts(options_, *servers_, timeout);
+  while (true) {
+    Server& server = servers_->Next();
+    grpc::ClientContext context;
+    Prepare(context, request, attempts.Deadline());
+    Response response;
+    Stub* stub = server.Of(static_cast<const Stub*>(nullptr));
+    const grpc::Status status = (stub->*method)(&context, request, &response);
+    if (status.ok()) {
+      attempts.Answered(server);
+      return response;
+    }
+    const auto code = status.error_code();
+    const bool is_conflict = code == grpc::StatusCode::ALREADY_EXISTS || code == grpc::StatusCode::NOT_FOUND;
+    if (is_conflict && find && attempts.MayBeDone() && find(response, attempts.Left())) return response;
+    if (!attempts.Pause(server, status, context)) Throw(status, context);
+  }
 }
 
 bool Client::IsServing(Timeout timeout) const {
-  grpc::ClientContext context;
-  client::HealthCheckRequest request;
-  client::HealthCheckResponse response;
-  Prepare(context, request, timeout);
-  grpc::TemplatedGenericStub<client::HealthCheckRequest, client::HealthCheckResponse> stub(channel_);
-  std::promise<grpc::Status> ended;
-  stub.UnaryCall(&context, kHealth, grpc::StubOptions(), &request, &response,
-                 [&ended](grpc::Status status) { ended.set_value(std::move(status)); });
-  const grpc::Status status = ended.get_future().get();
-  if (!status.ok()) Throw(status, context);
-  return response.status() == kServing;
+  Attempts attempts(options_, *servers_, timeout, kCheckAttempts);
+  while (true) {
+    Server& server = servers_->Next();
+    grpc::ClientContext context;
+    client::HealthCheckRequest request;
+    client::HealthCheckResponse response;
+    Prepare(context, request, attempts.Deadline());
+    grpc::TemplatedGenericStub<client::HealthCheckRequest, client::HealthCheckResponse> stub(server.channel);
+    std::promise<grpc::Status> ended;
+    stub.UnaryCall(&context, kHealth, grpc::StubOptions(), &request, &response,
+                   [&ended](grpc::Status status) { ended.set_value(std::move(status)); });
+    const grpc::Status status = ended.get_future().get();
+    if (status.ok()) {
+      attempts.Answered(server);
+      return response.status() == kServing;
+    }
+    if (!attempts.Pause(server, status, context)) Throw(status, context);
+  }
 }
 
 using Localizing = v1::LocalizationService::Stub;
 using Referencing = v1::ReferenceService::Stub;
 
+// What was to be deleted is gone, by an attempt whose answer was lost. (Nothing to be deleted exists already.)
+template <class Response>
+const std::function<bool(Response&, Client::Timeout)> kGone = [](Response&, Client::Timeout) { return true; };
+
 v1::LocalizeResponse Client::Localize(const v1::LocalizeRequest& request, Timeout timeout) const {
-  return Unary(*localization_, &Localizing::Localize, request, timeout);
+  return Unary(&Localizing::Localize, request, timeout);
 }
 
 v1::LocalizeResponse Client::LocalizeProgressively(const v1::LocalizeRequest& request,
                                                    const std::function<void(const v1::LocalizeResponse&)>& on_coarse,
                                                    Timeout timeout) const {
-  grpc::ClientContext context;  // the call is cancelled where `on_coarse` throws
-  Prepare(context, request, timeout);
-  const auto reader = localization_->LocalizeProgressively(&context, request);
-  v1::LocalizeProgressivelyResponse message;
-  std::optional<v1::LocalizeResponse> answer;
-  try {
-    while (reader->Read(&message)) {
-      if (message.is_final()) {
-        answer = message.answer();
-      } else if (on_coarse) {
-        on_coarse(message.answer());
+  Attempts attempts(options_, *servers_, timeout);
+  bool had_coarse = false;
+  while (true) {
+    Server& server = servers_->Next();
+    grpc::ClientContext context;  // the call is cancelled where `on_coarse` throws
+    Prepare(context, request, attempts.Deadline());
+    const auto reader = server.localization->LocalizeProgressively(&context, request);
+    v1::LocalizeProgressivelyResponse message;
+    std::optional<v1::LocalizeResponse> answer;
+    try {
+      while (reader->Read(&message)) {
+        attempts.Answered(server);
+        if (message.is_final()) {
+          answer = message.answer();
+        } else if (on_coarse && !had_coarse) {
+          had_coarse = true;
+          on_coarse(message.answer());
+        }
       }
+    } catch (...) {
+      context.TryCancel();
+      reader->Finish();
+      throw;
     }
-  } catch (...) {
-    context.TryCancel();
-    reader->Finish();
-    throw;
+    const grpc::Status status = reader->Finish();
+    if (answer) return *answer;
+    if (status.ok()) Throw({grpc::StatusCode::INTERNAL, "the stream ended before the answer"}, context);
+    if (!attempts.Pause(server, status, context)) Throw(status, context);
   }
-  const grpc::Status status = reader->Finish();
-  if (answer) return *answer;
-  if (status.ok()) Throw({grpc::StatusCode::INTERNAL, "the stream ended before the answer"}, context);
-  Throw(status, context);
 }
 
 v1::LocalizeRigResponse Client::LocalizeRig(const v1::LocalizeRigRequest& request, Timeout timeout) const {
-  return Unary(*localization_, &Localizing::LocalizeRig, request, timeout);
+  return Unary(&Localizing::LocalizeRig, request, timeout);
 }
 
 v1::LocalizeSequenceResponse Client::LocalizeSequence(const v1::LocalizeSequenceRequest& request, Timeout timeout) const {
-  return Unary(*localization_, &Localizing::LocalizeSequence, request, timeout);
+  return Unary(&Localizing::LocalizeSequence, request, timeout);
 }
 
 v1::Scene Client::CreateScene(const v1::CreateSceneRequest& request, Timeout timeout) const {
-  return Unary(*references_, &Referencing::CreateScene, request, timeout).scene();
+  const std::function<bool(v1::CreateSceneResponse&, Timeout)> find = [&](v1::CreateSceneResponse& response, Timeout left) {
+    try {
+      *response.mutable_scene() = GetScene(request.scene_id(), left);
+    } catch (const NotFound&) {
+      return false;
+    }
+    return IsSame(request, response.scene());
+  };
+  return Unary(&Referencing::CreateScene, request, timeout, find).scene();
 }
 
 v1::Scene Client::GetScene(const std::string& scene, Timeout timeout) const {
   v1::GetSceneRequest request;
   request.set_name("scenes/" + scene);
-  return Unary(*references_, &Referencing::GetScene, request, timeout).scene();
+  return Unary(&Referencing::GetScene, request, timeout).scene();
 }
 
 v1::UpdateSceneResponse Client::UpdateScene(const v1::UpdateSceneRequest& request, Timeout timeout) const {
-  return Unary(*references_, &Referencing::UpdateScene, request, timeout);
+  return Unary(&Referencing::UpdateScene, request, timeout);
 }
 
 std::vector<v1::Scene> Client::ListScenes(Timeout timeout) const {
@@ -266,7 +247,7 @@ std::vector<v1::Scene> Client::ListScenes(Timeout timeout) const {
   v1::ListScenesRequest request;
   request.set_page_size(kPageSize);
   do {
-    const auto page = Unary(*references_, &Referencing::ListScenes, request, timeout);
+    const auto page = Unary(&Referencing::ListScenes, request, timeout);
     scenes.insert(scenes.end(), page.scenes().begin(), page.scenes().end());
     request.set_page_token(page.next_page_token());
   } while (!request.page_token().empty());
@@ -276,12 +257,30 @@ std::vector<v1::Scene> Client::ListScenes(Timeout timeout) const {
 void Client::DeleteScene(const std::string& scene, Timeout timeout) const {
   v1::DeleteSceneRequest request;
   request.set_name("scenes/" + scene);
-  Unary(*references_, &Referencing::DeleteScene, request, timeout);
+  Unary(&Referencing::DeleteScene, request, timeout, kGone<v1::DeleteSceneResponse>);
+}
+
+bool Client::Stored(const std::string& scene, const v1::CreateReferenceRequest& wanted, v1::Reference& stored,
+                    Timeout timeout) const {
+  v1::GetReferenceRequest request;
+  request.set_name(scene + "/references/" + wanted.reference_id());
+  request.set_include_image(true);
+  try {
+    stored = Unary(&Referencing::GetReference, request, timeout).reference();
+  } catch (const NotFound&) {
+    return false;
+  }
+  const bool is_same = IsSame(wanted.reference(), stored);
+  stored.clear_image();
+  return is_same;
 }
 
 v1::CreateReferenceResponse Client::CreateReference(const v1::CreateReferenceRequest& request, Timeout timeout) const {
-  return Unary(*references_, &Referencing::CreateReference, request,
-               timeout == Timeout{} ? options_.upload_timeout : timeout);
+  const std::function<bool(v1::CreateReferenceResponse&, Timeout)> find =
+      [&](v1::CreateReferenceResponse& response, Timeout left) {
+        return Stored(request.scene(), request, *response.mutable_reference(), left);
+      };
+  return Unary(&Referencing::CreateReference, request, timeout == Timeout{} ? options_.upload_timeout : timeout, find);
 }
 
 std::vector<v1::Reference> Client::AddReferences(const std::string& scene,
@@ -297,7 +296,13 @@ std::vector<v1::Reference> Client::AddReferences(const std::string& scene,
       *batch.add_requests() = *next++;
     } while (next != references.end() && batch.requests_size() < options_.batch_count &&
              bytes + static_cast<double>(next->ByteSizeLong()) <= options_.batch_mib * (1 << 20));
-    const auto done = Unary(*references_, &Referencing::BatchCreateReferences, batch, options_.upload_timeout);
+    const std::function<bool(v1::BatchCreateReferencesResponse&, Timeout)> find =
+        [&](v1::BatchCreateReferencesResponse& response, Timeout left) {
+          return std::all_of(batch.requests().begin(), batch.requests().end(), [&](const auto& it) {
+            return Stored(batch.scene(), it, *response.add_references(), left);
+          });
+        };
+    const auto done = Unary(&Referencing::BatchCreateReferences, batch, options_.upload_timeout, find);
     stored.insert(stored.end(), done.references().begin(), done.references().end());
     if (on_progress) on_progress(stored.size());
   }
@@ -309,7 +314,7 @@ v1::Reference Client::GetReference(const std::string& scene, const std::string& 
   v1::GetReferenceRequest request;
   request.set_name("scenes/" + scene + "/references/" + reference);
   request.set_include_image(include_image);
-  return Unary(*references_, &Referencing::GetReference, request, timeout).reference();
+  return Unary(&Referencing::GetReference, request, timeout).reference();
 }
 
 std::vector<v1::Reference> Client::ListReferences(const std::string& scene, Timeout timeout) const {
@@ -318,7 +323,7 @@ std::vector<v1::Reference> Client::ListReferences(const std::string& scene, Time
   request.set_scene("scenes/" + scene);
   request.set_page_size(kPageSize);
   do {
-    const auto page = Unary(*references_, &Referencing::ListReferences, request, timeout);
+    const auto page = Unary(&Referencing::ListReferences, request, timeout);
     references.insert(references.end(), page.references().begin(), page.references().end());
     request.set_page_token(page.next_page_token());
   } while (!request.page_token().empty());
@@ -328,20 +333,20 @@ std::vector<v1::Reference> Client::ListReferences(const std::string& scene, Time
 void Client::DeleteReference(const std::string& scene, const std::string& reference, Timeout timeout) const {
   v1::DeleteReferenceRequest request;
   request.set_name("scenes/" + scene + "/references/" + reference);
-  Unary(*references_, &Referencing::DeleteReference, request, timeout);
+  Unary(&Referencing::DeleteReference, request, timeout, kGone<v1::DeleteReferenceResponse>);
 }
 
 v1::RetrieveReferencesResponse Client::RetrieveReferences(const v1::RetrieveReferencesRequest& request,
                                                           Timeout timeout) const {
-  return Unary(*references_, &Referencing::RetrieveReferences, request, timeout);
+  return Unary(&Referencing::RetrieveReferences, request, timeout);
 }
 
 v1::AuditSceneResponse Client::AuditScene(const v1::AuditSceneRequest& request, Timeout timeout) const {
-  return Unary(*references_, &Referencing::AuditScene, request, timeout);
+  return Unary(&Referencing::AuditScene, request, timeout);
 }
 
 v1::CheckCoverageResponse Client::CheckCoverage(const v1::CheckCoverageRequest& request, Timeout timeout) const {
-  return Unary(*references_, &Referencing::CheckCoverage, request, timeout);
+  return Unary(&Referencing::CheckCoverage, request, timeout);
 }
 
 v1::CameraIntrinsics Pinhole(int width_px, int height_px, double focal_x_px, double focal_y_px, double principal_x_px,

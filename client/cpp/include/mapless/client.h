@@ -22,13 +22,16 @@ namespace mapless {
 
 // How to connect.
 struct ConnectOptions {
+  // "host:port"; "host1:port,host2:port" of several that share a store: calls take turns, and pass over one that is away.
   std::string address = "localhost:50051";
   // Deadline of a call, with its retries; each call can have another.
   std::chrono::milliseconds timeout{30'000};
+  // Until a server has been reached once, a call that finds none fails after this time; 0: at its deadline.
+  std::chrono::milliseconds connect_timeout{0};
   // Of one message of AddReferences, which returns when all features are computed.
   std::chrono::milliseconds upload_timeout{300'000};
-  // Attempts of a call that changes nothing while the server is UNAVAILABLE; 1 for no retries, 5 at most.
-  int max_attempts = 4;
+  // Attempts of a call while the server is away, UNAVAILABLE or lost during the answer; 1 for no retries, 0: until the deadline.
+  int max_attempts = 0;
   // Largest message sent or received; the server's own limit (32 by default) holds, too.
   int max_message_mib = 64;
   // Largest message of AddReferences, about, and the most references in one.
@@ -89,18 +92,21 @@ struct DataLoss : Error { using Error::Error; };
 // A fault of the server; its log has more under `request_id`.
 struct Internal : Error { using Error::Error; };
 
-// A connection to a server; use it from any thread. Connects with the first call. Every method throws Error. A `timeout` of zero
-// is that of the options.
+// A connection to a server; use it from any thread, and end it after its calls. Connects with the first call. Every method throws
+// Error. A `timeout` of zero is that of the options.
 //
-// Calls that change nothing are repeated while the server is UNAVAILABLE, by gRPC itself and within their deadline. Those that
-// create, update or delete are not: an answer that was lost would come back as ALREADY_EXISTS or NOT_FOUND.
+// A call outlives a restart of the server: it is repeated until its deadline, with a pause that doubles from 0.2 to 2 s. Where the
+// answer to a change was lost, what is stored is compared with what was to be stored, and is success if it is the same, as is the
+// absence of what was to be deleted. What another attempt does not change, such as a certificate, is thrown after four.
 class Client {
  public:
   using Timeout = std::chrono::milliseconds;
 
   explicit Client(ConnectOptions options);
+  ~Client();
+  Client(Client&&) noexcept;
 
-  // Whether the server takes calls; false while it starts or drains.
+  // Whether the server takes calls now; false while it starts or drains. Throws after four attempts, about 1.4 s, if it is away.
   bool IsServing(Timeout timeout = {}) const;
 
   v1::LocalizeResponse Localize(const v1::LocalizeRequest& request, Timeout timeout = {}) const;
@@ -134,15 +140,16 @@ class Client {
   v1::CheckCoverageResponse CheckCoverage(const v1::CheckCoverageRequest& request, Timeout timeout = {}) const;
 
  private:
+  // `find` fills the response of a change whose answer was lost, in the time left; false if the server's error is right.
   template <class Stub, class Request, class Response>
-  Response Unary(Stub& stub, grpc::Status (Stub::*method)(grpc::ClientContext*, const Request&, Response*),
-                 const Request& request, Timeout timeout) const;
-  void Prepare(grpc::ClientContext& context, const google::protobuf::Message& request, Timeout timeout) const;
+  Response Unary(grpc::Status (Stub::*method)(grpc::ClientContext*, const Request&, Response*), const Request& request,
+                 Timeout timeout, const std::function<bool(Response&, Timeout)>& find = nullptr) const;
+  bool Stored(const std::string& scene, const v1::CreateReferenceRequest& wanted, v1::Reference& stored, Timeout timeout) const;
+  void Prepare(grpc::ClientContext& context, const google::protobuf::Message& request,
+               std::chrono::system_clock::time_point deadline) const;
 
   ConnectOptions options_;
-  std::shared_ptr<grpc::Channel> channel_;
-  std::unique_ptr<v1::LocalizationService::Stub> localization_;
-  std::unique_ptr<v1::ReferenceService::Stub> references_;
+  std::unique_ptr<class Servers> servers_;
 };
 
 // A pinhole camera; (0, 0) is the centre of the top-left pixel.

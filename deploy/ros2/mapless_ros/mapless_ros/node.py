@@ -108,7 +108,6 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
         ca, token_file = self._given["ca"], self._given["token_file"]
         return mapless.ConnectOptions(
             timeout_s=self._given["timeout"],
-            max_attempts=1,  # for an image that failed there is a newer one
             tls=self._given["tls"] or bool(ca),
             root_certificates=Path(ca).read_bytes() if ca else None,
             token=read_text(Path(token_file)).strip() if token_file else None,
