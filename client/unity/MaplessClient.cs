@@ -412,8 +412,8 @@ namespace Mapless
         public Task DeleteReferenceAsync(string reference, TimeSpan timeout, CancellationToken cancellation = default)
         {
             var request = new DeleteReferenceRequest { Name = reference };
-            return CallAsync(
-                DeleteReferenceMethod, request, SceneOf(reference), timeout, cancellation, Gone(new DeleteReferenceResponse()));
+            var gone = Gone(new DeleteReferenceResponse());
+            return CallAsync(DeleteReferenceMethod, request, SceneOf(reference), timeout, cancellation, gone);
         }
 
         /// <summary>The references that a photograph resembles.</summary>
