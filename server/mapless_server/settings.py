@@ -106,8 +106,8 @@ class Settings(BaseModel):
     """Largest message, either way, MiB."""
     max_image_mib: int = Field(default=16, ge=1)
     """Largest image file, MiB."""
-    max_image_megapixels: float = Field(default=50.0, gt=0, le=268)
-    """Largest image, width times height."""
+    max_image_megapixels: float = Field(default=66.0, gt=0, le=268)
+    """Largest image, width times height; phones of "50 MP" have up to 50.4 million pixels, those of "64 MP" 64.5."""
     retrieval: str = Field(default=AUTO, json_schema_extra={"enum": [AUTO, "vlad", "megaloc"]})
     """Descriptors by which references are chosen; vlad is made of the local features."""
     retrieval_cache_mib: int = Field(default=1024, ge=1)

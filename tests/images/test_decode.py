@@ -77,17 +77,6 @@ def test_a_jpeg_may_lack_its_end_marker_and_nothing_else(interval: int, image: s
             assert np.array_equal(decoded, pixels), length
 
 
-@pytest.mark.parametrize("channels", [1, 3, 4])
-def test_12_bits_in_16_are_not_almost_black(channels: int) -> None:
-    """A channel of 16 bits keeps its high byte, but the high 8 of 12 where no value has more."""
-    deep = np.random.default_rng(3).integers(0, 2**12, (40, 50, channels)).astype(np.uint16)
-    shown = np.broadcast_to(deep[..., :3], (40, 50, 3))
-    deep = deep[..., 0] if channels == 1 else deep
-    assert np.array_equal(decode_image(encode(".png", deep), LIMITS), shown >> 4)
-    assert np.array_equal(decode_image(encode(".png", deep * 16), LIMITS), shown >> 4)
-    assert not decode_image(encode(".png", 0 * deep), LIMITS).any()
-
-
 @pytest.mark.parametrize("name", FILES)
 def test_truncation_at_every_length_is_refused(name: str) -> None:
     data = FILES[name]

@@ -8,14 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapless.deep_pixels import eight_bits
+
 JPEG_QUALITY = 90
 """A tenth of a PNG's bytes, with the same features."""
 
 PNG_COMPRESSION = 1
 """The fastest: others take several times as long, for a few per cent of the bytes."""
-
-CLIPPED_PERCENT = 0.1
-"""Of the pixels with 16 bits, at each end: hot pixels do not set the range."""
 
 _SIGNATURES = (b"\xff\xd8", b"\x89PNG\r\n\x1a\n", b"RIFF")
 
@@ -64,8 +63,8 @@ ENCODINGS: Mapping[str, _Encoding] = _encodings()
 def pixels_from_image(message: Any) -> NDArray[np.uint8]:
     """Pixels of a sensor_msgs/Image or CompressedImage: (H, W) grey, or (H, W, 3) BGR.
 
-    Values of 16 bits are stretched to 8: cameras use 10, 12 or all of them, and no message says how many. ValueError
-    for an unsupported encoding, fewer bytes than the size needs, or a file that cannot be decoded.
+    Values of 16 bits are stretched to 8, see `mapless.deep_pixels`. ValueError for an unsupported encoding, fewer bytes
+    than the size needs, or a file that cannot be decoded.
     """
     if not hasattr(message, "encoding"):
         return _decoded(message)
@@ -85,7 +84,8 @@ def pixels_from_image(message: Any) -> NDArray[np.uint8]:
         )
     values = np.ascontiguousarray(data[: rows * step].reshape(rows, step)[:, :row_bytes])
     if encoding.bytes_per_value == 2:
-        values = _eight_bits(values.view(">u2" if message.is_bigendian else "<u2"))
+        deep = values.view(">u2" if message.is_bigendian else "<u2")
+        values = eight_bits(deep if encoding.channels == 1 else deep.reshape(rows, width, encoding.channels))
     pixels = values if encoding.channels == 1 else values.reshape(rows, width, encoding.channels)
     return pixels if encoding.to_bgr is None else np.asarray(cv2.cvtColor(pixels, encoding.to_bgr), np.uint8)
 
@@ -124,10 +124,4 @@ def _decoded(message: Any) -> NDArray[np.uint8]:
     pixels = cv2.imdecode(np.frombuffer(_file(message), np.uint8), flags)
     if pixels is None:
         raise ValueError(f"a compressed image of format {message.format!r} cannot be decoded")
-    return _eight_bits(pixels) if pixels.dtype == np.uint16 else np.asarray(pixels, np.uint8)
-
-
-def _eight_bits(values: NDArray[Any]) -> NDArray[np.uint8]:
-    low, high = np.percentile(values, (CLIPPED_PERCENT, 100 - CLIPPED_PERCENT))
-    scaled = (values.astype(np.float32) - low) * (255 / max(high - low, 1.0))
-    return np.asarray(np.clip(scaled + 0.5, 0, 255), np.uint8)
+    return eight_bits(pixels) if pixels.dtype == np.uint16 else np.asarray(pixels, np.uint8)

@@ -16,15 +16,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapless.deep_pixels import eight_bits
 from mapless.pixels import JPEG_FRAMES, BadHeader, size_of_image
 from mapless_server.errors import InvalidArgument
 
 from .png_chunks import BadChunks, essential_png
 
-# IMREAD_UNCHANGED would also ignore the orientation, but keeps alpha and 16 bits. Asked for 8-bit colour, the decoder
-# keeps the high byte of 16, drops alpha, repeats grey and converts CMYK.
+# IMREAD_UNCHANGED would also ignore the orientation, but keeps alpha. Asked for colour, the decoder drops alpha,
+# repeats grey and converts CMYK.
 _DECODE_FLAGS = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
-# 12-bit data of cameras in 16-bit files: the high byte would be almost black.
+# The high byte of a PNG with 16 bits, which the decoder would keep, is almost black for cameras of 10 or 12.
 _DEEP_FLAGS = _DECODE_FLAGS | cv2.IMREAD_ANYDEPTH
 _PNG_DEPTH = 24  # position of the bits of a channel
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -43,7 +44,7 @@ class ImageLimits:
     """Limits of the images that are accepted; those of the sides are inclusive."""
 
     max_bytes: int = 16 * 2**20
-    max_pixels: int = 50_000_000
+    max_pixels: int = 66_000_000
     min_side_px: int = 32
     max_side_px: int = 16384
 
@@ -75,7 +76,7 @@ def image_size(data: bytes, limits: ImageLimits, field: str = "image") -> tuple[
     if max(width, height) > limits.max_side_px or width * height > limits.max_pixels:
         raise InvalidArgument(
             f"the image is {width}x{height} pixels; at most {limits.max_pixels} in all and {limits.max_side_px} a side "
-            "are accepted",
+            "are accepted: reduce it, by half for instance, and its intrinsics with it",
             reason="IMAGE_TOO_LARGE",
             field=field,
         )
@@ -84,6 +85,8 @@ def image_size(data: bytes, limits: ImageLimits, field: str = "image") -> tuple[
 
 def decode_image(data: bytes, limits: ImageLimits, field: str = "image") -> NDArray[np.uint8]:
     """Pixels of an image, (H, W, 3) RGB, as the file stores them: EXIF orientation is not applied.
+
+    Those of 16 bits are stretched to 8, see `mapless.deep_pixels`.
 
     InvalidArgument as of `image_size`, or if the decoder cannot read the file to its end.
     """
@@ -103,22 +106,20 @@ def decode_image(data: bytes, limits: ImageLimits, field: str = "image") -> NDAr
         raise InvalidArgument(
             "the image cannot be decoded: truncated or damaged", reason="IMAGE_UNDECODABLE", field=field
         )
-    if pixels.shape != (height, width, 3) or pixels.dtype != np.uint8:
+    if pixels.shape != (height, width, 3):
         raise InvalidArgument(
             f"the image decodes to {pixels.shape[1]}x{pixels.shape[0]} pixels, its header says {width}x{height}",
             reason="IMAGE_UNDECODABLE",
             field=field,
         )
-    if data.startswith(_PNG) and data[_PNG_DEPTH] == 16 and 0 < pixels.max() < 16:
-        deep: NDArray[np.uint16] = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), _DEEP_FLAGS), np.uint16)
-        pixels = deep >> 4
-    return np.asarray(pixels, np.uint8)
+    return eight_bits(pixels) if pixels.dtype == np.uint16 else np.asarray(pixels, np.uint8)
 
 
 def _decoded(data: bytes) -> NDArray[Any] | None:
     """The decoder's pixels; None if it cannot read the file."""
+    is_deep = data.startswith(_PNG) and data[_PNG_DEPTH] == 16
     try:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), _DECODE_FLAGS)
+        return cv2.imdecode(np.frombuffer(data, np.uint8), _DEEP_FLAGS if is_deep else _DECODE_FLAGS)
     except cv2.error:
         return None
 

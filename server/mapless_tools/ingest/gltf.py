@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from mapless import Client, LocalizationResult, MaplessError, Reference
 from mapless import Scene as KnownScene
 from mapless.geometry import Array, Quaternion, RigidTransform
+from mapless_server.errors import InvalidArgument
+from mapless_server.images import ImageLimits, decode_image
 from mapless_tools.output_files import whole_file
 from mapless_tools.progress import Progress
 from mapless_tools.view.scenery import Scenery, lay_out
@@ -45,6 +47,10 @@ class View:
     colours: NDArray[np.uint8] | None = None
 
 
+_LIMITS = ImageLimits(max_bytes=2**31, max_pixels=2**30, min_side_px=1, max_side_px=2**20)
+"""What a server stores has passed its own."""
+
+
 def export_gltf(client: Client, scene: str, folder: Path, progress: Progress) -> Export:
     """Writes SCENE.glb into a folder; see `export_scene`."""
     known = client.get_scene(scene)
@@ -53,9 +59,9 @@ def export_gltf(client: Client, scene: str, folder: Path, progress: Progress) ->
     def take(reference: Reference) -> View:
         if reference.image is None:
             return View(reference)
-        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        image: Any = cv2.imdecode(np.frombuffer(reference.image, np.uint8), flags)
-        if image is None:
+        try:
+            image = np.ascontiguousarray(decode_image(reference.image, _LIMITS)[..., ::-1])
+        except InvalidArgument:
             return View(reference)
         points = _points(client, scene, reference, image) if next(left, None) is not None else (None, None)
         return View(reference, _thumbnail(image), *points)
