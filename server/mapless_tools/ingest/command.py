@@ -83,7 +83,16 @@ def import_command(
     id_prefix: Annotated[str, typer.Option(help="Put before every id: for several folders in one scene.")] = "",
     parallel: Annotated[int, typer.Option(help="Messages in flight.")] = 3,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Read and check the poses, store nothing.")] = False,
-    skip_check: Annotated[bool, typer.Option("--skip-check", help="Do not compare photographs with poses.")] = False,
+    skip_check: Annotated[
+        bool, typer.Option("--skip-check", help="Do not compare photographs with poses, nor with the scene.")
+    ] = False,
+    align_to_scene: Annotated[
+        bool,
+        typer.Option(
+            "--align-to-scene",
+            help="Bring the photographs into the world of the scene's references, by a similarity that fits matches.",
+        ),
+    ] = False,
     report: Annotated[Path | None, typer.Option(help="JSON file for the whole report.")] = None,
     data_dir: DataDir = None,
     *,
@@ -117,6 +126,7 @@ def import_command(
             max_count=max_count,
             id_prefix=id_prefix,
             check=not skip_check,
+            align_to_scene=align_to_scene,
             parallel=parallel,
         )
         settings = _settings(data_dir, connection)

@@ -101,11 +101,13 @@ class WrongUnit(Exception):
     """References and their scene have different units."""
 
 
-def open_scene(client: Client, scene: str, dataset: Dataset, chosen: Sequence[Frame]) -> list[Reference]:
+def open_scene(
+    client: Client, scene: str, dataset: Dataset, chosen: Sequence[Frame], is_aligned: bool = False
+) -> list[Reference]:
     """Returns the references of a scene, which is created with the dataset's datum, down and unit if missing.
 
     A scene without references gets the dataset's unit. WrongUnit if its references are in metres and the dataset is
-    not, or vice versa.
+    not, or vice versa; unless it will be aligned with them, which gives their unit.
     """
     is_arbitrary = not dataset.metric
     try:
@@ -118,7 +120,11 @@ def open_scene(client: Client, scene: str, dataset: Dataset, chosen: Sequence[Fr
         return []
     there = client.get_scene(scene)
     existing = list(client.list_references(scene, page_size=1000))
-    if there.arbitrary_unit == is_arbitrary or (is_arbitrary and _share_positions(existing, chosen)):
+    if (
+        (existing and is_aligned)
+        or there.arbitrary_unit == is_arbitrary
+        or (is_arbitrary and _share_positions(existing, chosen))
+    ):
         return existing
     if not existing:
         client.update_scene(scene, arbitrary_unit=is_arbitrary)

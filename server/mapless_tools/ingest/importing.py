@@ -8,11 +8,11 @@ from pathlib import Path
 
 from rich.console import Console
 
-from mapless import MaplessError
+from mapless import Client, MaplessError, Reference
 from mapless.names import check_id
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, image_size
-from mapless_server.method.readings import implausible_depth
+from mapless_server.method.readings import Verdict, implausible_depth
 from mapless_server.scenes.plausibility import another_unit, contradictions
 from mapless_server.serve.signals import terminable
 from mapless_server.settings import Settings
@@ -21,13 +21,22 @@ from mapless_tools.child import ServerFailed
 from mapless_tools.connection import Connection, connected
 from mapless_tools.dataset import MAX_NAME_LENGTH, Dataset, Frame, Refusal
 from mapless_tools.output_files import check_writable, write_json
-from mapless_tools.progress import progress_bars
+from mapless_tools.progress import Progress, progress_bars
 
-from .check import check_frames
+from .check import check_frames, check_with_scene
 from .existing import NO_METRES, KnownReferences, WrongUnit, open_scene
 from .formats import ReadOptions, read_dataset
 from .metres import MetreOptions, in_metres
-from .report import WRONG_POSES, ImportReport, print_report, to_json, verdict_lines
+from .report import (
+    SAME_POSE,
+    WRONG_POSES,
+    WRONG_WORLD,
+    ImportReport,
+    not_aligned,
+    print_report,
+    to_json,
+    verdict_lines,
+)
 from .upload import Uploader
 
 
@@ -42,7 +51,8 @@ class ImportOptions:
         stride: every n-th frame is used.
         max_count: largest number of frames, evenly spread; None for all.
         id_prefix: prefix of every reference's id, for several folders in one scene.
-        check: whether to compare photographs with the poses first.
+        check: whether to compare photographs with the poses, and with the scene's references, first.
+        align_to_scene: whether to bring the frames into the world of the scene's references, by matches with them.
         parallel: number of messages in flight, 1 to 64; the server describes their photographs concurrently.
     """
 
@@ -54,6 +64,7 @@ class ImportOptions:
     max_count: int | None = None
     id_prefix: str = ""
     check: bool = True
+    align_to_scene: bool = False
     parallel: int = 3
 
     def __post_init__(self) -> None:
@@ -96,6 +107,7 @@ def run_import(
                 report.verdict = check_frames(frames, progress)
             for line in verdict_lines(report.verdict, frames):
                 _print(line)
+            leave_same_poses(report, report.verdict)
             if dataset.metric:
                 _warn(report, [implausible_depth(report.verdict.median_depth)])
         if connection is None:
@@ -104,7 +116,7 @@ def run_import(
         elif report.verdict is not None and report.verdict.is_wrong:
             report.stopped = WRONG_POSES
         else:
-            _store(report, options.parallel, settings, connection)
+            _store(report, options, settings, connection)
     return report.went_well
 
 
@@ -125,6 +137,13 @@ def read_frames(folder: Path, options: ImportOptions) -> tuple[Dataset, tuple[Fr
     return dataset, tuple(_prefixed(frame, options.id_prefix) for frame in frames)
 
 
+def leave_same_poses(report: ImportReport, verdict: Verdict) -> None:
+    """Refuses the frames whose pose several others have that show different things."""
+    for group in verdict.same_pose:
+        reason = SAME_POSE.format(count=len(group) - 1)
+        report.refused += [Refusal(report.chosen[i].name, reason) for i in group]
+
+
 def refuse_wrong_images(report: ImportReport) -> None:
     """Refuses the chosen frames whose image a server would reject by its header; for a dry run."""
     for frame in report.chosen:
@@ -139,21 +158,52 @@ def refuse_wrong_images(report: ImportReport) -> None:
             report.refused.append(Refusal(frame.name, f"{frame.image_path.name} {reason}"))
 
 
-def _store(report: ImportReport, parallel: int, settings: Settings, connection: Connection) -> None:
+def _store(report: ImportReport, options: ImportOptions, settings: Settings, connection: Connection) -> None:
     """Stores the chosen frames in the scene, which is created with the dataset's datum and down if missing."""
     try:
         with connected(connection, settings) as client, progress_bars() as progress:
-            existing = open_scene(client, report.scene, report.dataset, report.chosen)
+            existing = open_scene(client, report.scene, report.dataset, report.chosen, options.align_to_scene)
+            if (options.check or options.align_to_scene) and not _fits_scene(
+                report, options.align_to_scene, client, existing, progress
+            ):
+                return
             scene = client.get_scene(report.scene)
             poses = [frame.world_from_camera for frame in report.chosen]
             attributes = SceneAttributes(scene.datum, scene.down_in_world, arbitrary_unit=scene.arbitrary_unit)
             _warn(report, contradictions(poses, attributes))
             _warn(report, [another_unit([it.world_from_camera for it in existing], poses)])
-            Uploader(client, KnownReferences(existing), report, parallel, progress).run()
+            Uploader(client, KnownReferences(existing), report, options.parallel, progress).run()
     except WrongUnit as error:
         report.stopped = str(error)
     except (MaplessError, ServerFailed) as error:
         report.stopped = str(error)
+
+
+def _fits_scene(
+    report: ImportReport, is_to_align: bool, client: Client, existing: Sequence[Reference], progress: Progress
+) -> bool:
+    """Compares the chosen frames with the scene's references, and aligns them if asked; False stops the import."""
+    if not existing:
+        if is_to_align:
+            report.stopped = "--align-to-scene: the scene has no references yet"
+        return not is_to_align
+    verdict = report.scene_verdict = check_with_scene(client, report.scene, report.chosen, existing, progress)
+    for line in verdict.lines():
+        _print(line)
+    if not is_to_align:
+        if verdict.is_wrong:
+            report.stopped = WRONG_WORLD
+        return not verdict.is_wrong
+    found = verdict.alignment
+    if found is None or not found.is_unique:
+        report.stopped = not_aligned(found)
+        return False
+    _print(f"aligned to the scene ({found.median_px:.2f} px over {found.pair_count} pairs): {found.text}")
+    report.chosen = [
+        replace(frame, world_from_camera=found.world_from_other.transform_pose(frame.world_from_camera))
+        for frame in report.chosen
+    ]
+    return True
 
 
 def _attributes(dataset: Dataset) -> SceneAttributes:

@@ -4,14 +4,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
-from mapless_server.method.readings import Verdict
+from mapless.geometry import RigidTransform
+from mapless_server.method.readings import Alignment, Verdict, similarity_text
 from mapless_tools.dataset import Dataset, Frame, Refusal
 from mapless_tools.output_files import finite
 
+from .check import SceneVerdict
+
 WRONG_POSES = "nothing is stored while the poses do not fit the photographs; --skip-check stores them all the same"
-SHOWN = 20
+SAME_POSE = "has exactly the same pose as {count} others that show different things; --skip-check stores it"
+WRONG_WORLD = (
+    "nothing is stored while the photographs do not fit the scene's references; --align-to-scene aligns them, "
+    "--skip-check stores them all the same"
+)
+SHOWN, SHOWN_NAMES = 20, 5
+IDENTITY = 1e-9
 ALREADY_THERE = "already there"
 
 
@@ -22,13 +32,14 @@ class ImportReport:
     Of the chosen frames, `added` are the ids of stored references, `blank` those without local features, with which
     nothing can be matched; skipped ones exist already. Warnings are contradictions of poses, datum, direction of
     gravity and unit. `stopped` says why the import ended before its end. The verdict is None if there was no epipolar
-    check.
+    check, that with the scene's references if there were none.
     """
 
     scene: str
     dataset: Dataset
     chosen: Sequence[Frame]
     verdict: Verdict | None = None
+    scene_verdict: SceneVerdict | None = None
     warnings: list[str] = field(default_factory=list)
     added: list[str] = field(default_factory=list)
     blank: list[str] = field(default_factory=list)
@@ -56,9 +67,15 @@ class ImportReport:
 
 def verdict_lines(verdict: Verdict, frames: Sequence[Frame]) -> list[str]:
     """The result of the epipolar check, a sentence per line."""
+    lines = [f"warning: {same_pose_text(verdict, group, frames)}" for group in verdict.same_pose]
+    lines += [
+        f"warning: {frames[i].name} and {frames[j].name} are the same photograph, with poses that differ"
+        for i, j in verdict.same_photograph
+    ]
     if not verdict.is_known:
         return [
-            "warning: the poses could not be checked: none of the photographs that were compared have enough matches"
+            "warning: the poses could not be checked: none of the photographs that were compared have enough matches",
+            *lines,
         ]
     compared = {index for error in verdict.pairs for index in error.pair}
     errors = (
@@ -66,13 +83,12 @@ def verdict_lines(verdict: Verdict, frames: Sequence[Frame]) -> list[str]:
         f"{len(verdict.pairs)} pairs of neighbours among {len(compared)} of {len(frames)} photographs, "
         f"{100 * verdict.bad_share:.0f} % of them above {verdict.threshold_px:.1f} px"
     )
-    lines = [errors]
+    lines.insert(0, errors)
     if verdict.is_wrong:
         lines.append("warning: axes, intrinsics or poses are wrong: photographs of neighbours do not fit together")
         if verdict.explanation:
-            lines.append(
-                f"warning: most likely {verdict.explanation}; the error would then be {verdict.explained_px:.2f} px"
-            )
+            then = f"; the error would then be {verdict.explained_px:.2f} px" if verdict.explained_px >= 0 else ""
+            lines.append(f"warning: most likely {verdict.explanation}{then}")
         else:
             lines.append("warning: none of the usual mistakes explains it")
     lines += [
@@ -84,6 +100,35 @@ def verdict_lines(verdict: Verdict, frames: Sequence[Frame]) -> list[str]:
             f"warning: {verdict.unmatched_count} further pairs have too few matches: are positions and headings right?"
         )
     return lines
+
+
+def not_aligned(found: Alignment | None) -> str:
+    """Why frames cannot be aligned to a scene."""
+    if found is None:
+        return "--align-to-scene: too few photographs match those of the scene, or no similarity fits most of them"
+    return (
+        f"--align-to-scene: the matches do not determine one similarity: {100 * found.bad_share:.0f} % of "
+        f"{found.pair_count} pairs do not fit, the scale is known to {100 * found.scale_sigma:.2g} %, the rotation to "
+        f"{found.rotation_sigma_deg:.2g} degrees, the position to {100 * found.position_sigma:.2g} % of the extent"
+    )
+
+
+def same_pose_text(verdict: Verdict, group: Sequence[int], frames: Sequence[Frame]) -> str:
+    """One sentence about photographs of different things with the same pose."""
+    names = ", ".join(frames[i].name for i in group[:SHOWN_NAMES])
+    more = f" and {len(group) - SHOWN_NAMES} more" if len(group) > SHOWN_NAMES else ""
+    identity = (
+        "the identity: had tracking not begun?"
+        if is_identity(frames[group[0]].world_from_camera)
+        else "and one only can be right"
+    )
+    return f"{len(group)} references have exactly the same pose but show different things ({names}{more}): {identity}"
+
+
+def is_identity(pose: RigidTransform) -> bool:
+    """Whether a pose is the identity, as that of a tracker that has not begun; possibly in a format's other axes."""
+    axes = np.abs(pose.rotation)
+    return bool(np.abs(pose.translation).max() < IDENTITY and np.abs(axes - np.round(axes)).max() < IDENTITY)
 
 
 def print_report(report: ImportReport, console: Console) -> None:
@@ -132,7 +177,27 @@ def to_json(report: ImportReport) -> dict[str, Any]:
         "not_reached": report.untried_count,
         "stopped": report.stopped,
         "seconds": report.seconds,
+        "scene_check": None if report.scene_verdict is None else _scene_verdict_json(report.scene_verdict),
         "check": None if verdict is None else _verdict_json(verdict, report.chosen),
+    }
+
+
+def _scene_verdict_json(verdict: SceneVerdict) -> dict[str, Any]:
+    found = verdict.alignment
+    return {
+        "fitting": list(verdict.fitting),
+        "misfits": list(verdict.misfits),
+        "wrong": verdict.is_wrong,
+        "alignment": None
+        if found is None
+        else {
+            "unique": found.is_unique,
+            "scale": found.world_from_other.scale,
+            "rotation": found.world_from_other.rotation.tolist(),
+            "translation": found.world_from_other.translation.tolist(),
+            "text": similarity_text(found.world_from_other),
+            "median_px": finite(found.median_px),
+        },
     }
 
 
@@ -147,6 +212,8 @@ def _verdict_json(verdict: Verdict, frames: Sequence[Frame]) -> dict[str, Any]:
         "explanation": verdict.explanation,
         "explained_px": finite(verdict.explained_px),
         "suspects": [frames[i].name for i in verdict.suspects],
+        "same_pose": [[frames[i].name for i in group] for group in verdict.same_pose],
+        "same_photograph": [[frames[i].name for i in pair] for pair in verdict.same_photograph],
         "pairs": [
             {
                 "references": [frames[i].name for i in pair.pair],

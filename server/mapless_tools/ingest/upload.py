@@ -51,8 +51,9 @@ class Uploader:
         self._lock = threading.Lock()
 
     def run(self) -> None:
-        """Stores the report's chosen frames; an interruption stops it soon and is raised."""
-        frames = self._report.chosen
+        """Stores the chosen frames that are not refused already; an interruption stops it soon and is raised."""
+        refused = {it.frame for it in self._report.refused[len(self._report.dataset.refused) :]}
+        frames = [frame for frame in self._report.chosen if frame.name not in refused]
         batches = (frames[i : i + BATCH_COUNT] for i in range(0, len(frames), BATCH_COUNT))
         self._progress("storing references", 0, len(frames))
         start_s = time.monotonic()

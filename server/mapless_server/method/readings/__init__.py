@@ -1,22 +1,47 @@
 """Data that were read otherwise than they were meant: whether photographs fit their poses, and why not if not.
 
 Begin with `judge`: from posed views and the matches of pairs to a verdict, with the median error, the share of bad
-pairs, and the likely mistake. `errors` has the measure, `conventions` the mistakes with their corrections,
-`explanation` finds the one that makes the pairs fit, `depth` whether the unit is plausible.
+pairs, and the likely mistake. `errors` has the measure; `conventions`, `intrinsics` and `rounding` the mistakes with
+their corrections; `explanation` finds the one that makes the pairs fit. `repeats` finds poses and photographs that are
+given several times, `sessions` photographs in two worlds, `alignment` the similarity between these, `depth` whether the
+unit is plausible.
 """
 
+from .alignment import Alignment, align, similarity_text
+from .conventions import CONVENTIONS, RARE, STRANGE, USUAL, Convention
 from .depth import implausible_depth, median_depth
-from .errors import MatchedPair, Pair, PairError, Views, consistent_matches, errors_of, pair_error_px, sampson_px
+from .errors import (
+    MatchedPair,
+    Pair,
+    PairError,
+    Views,
+    consistent,
+    consistent_matches,
+    errors_of,
+    pair_error_px,
+    sampson_px,
+    summary,
+)
 from .explanation import Explanation, explain
-from .verdict import Verdict, judge, suspects_of
+from .repeats import same_poses
+from .verdict import WRONG_SHARE, Verdict, judge, suspects_of
 
 __all__ = [
+    "CONVENTIONS",
+    "RARE",
+    "STRANGE",
+    "USUAL",
+    "WRONG_SHARE",
+    "Alignment",
+    "Convention",
     "Explanation",
     "MatchedPair",
     "Pair",
     "PairError",
     "Verdict",
     "Views",
+    "align",
+    "consistent",
     "consistent_matches",
     "errors_of",
     "explain",
@@ -24,6 +49,9 @@ __all__ = [
     "judge",
     "median_depth",
     "pair_error_px",
+    "same_poses",
     "sampson_px",
+    "similarity_text",
+    "summary",
     "suspects_of",
 ]

@@ -8,10 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .depth import median_depth
-from .errors import THRESHOLD_PX, MatchedPair, PairError, Views, errors_of, summary
+from .errors import THRESHOLD_PX, MatchedPair, Pair, PairError, Views, errors_of, summary
 from .explanation import explain
+from .repeats import contradicting_groups, same_photographs
 
-_WRONG_SHARE = 0.4  # more bad pairs than one photograph in five could make
+WRONG_SHARE = 0.4
+"""More bad pairs than one photograph in five could make."""
+LEFT_SHARE = 0.25
+"""Of the pairs of a wrong scene, that are left without the suspects if these are the reason."""
 _SUSPECT_SHARE = 0.6
 _SUSPECT_PAIRS = 2
 
@@ -23,7 +27,8 @@ class Verdict:
     Suspects do not fit their neighbours although the scene as a whole does; or they are what the explanation concerns,
     if not all. The explanation is the likely mistake if the scene as a whole is wrong, `explained_px` the median error
     after its correction. The median depth of photographed points is in the unit of the poses; None if unknown, or the
-    scene is wrong.
+    scene is wrong. `same_pose` are groups of photographs of different things with exactly the same pose; their pairs
+    count in nothing else. `same_photograph` are pairs that are one photograph, with poses that differ.
     """
 
     pairs: tuple[PairError, ...]
@@ -35,6 +40,8 @@ class Verdict:
     explanation: str = ""
     explained_px: float = math.nan
     median_depth: float | None = None
+    same_pose: tuple[tuple[int, ...], ...] = ()
+    same_photograph: tuple[Pair, ...] = ()
 
     @property
     def is_known(self) -> bool:
@@ -44,23 +51,43 @@ class Verdict:
     @property
     def is_wrong(self) -> bool:
         """Whether the scene as a whole does not fit: more pairs are bad than single photographs can explain."""
-        return self.is_known and self.bad_share > _WRONG_SHARE
+        return self.is_known and self.bad_share > WRONG_SHARE
 
 
-def judge(views: Views, matched: Sequence[MatchedPair], unmatched_count: int = 0) -> Verdict:
-    """Judges the matched pairs; `unmatched_count` pairs have too few matches."""
+def judge(
+    views: Views, matched: Sequence[MatchedPair], unmatched_count: int = 0, unmatched: Sequence[Pair] = ()
+) -> Verdict:
+    """Judges the matched pairs; `unmatched_count` pairs, of which some may be named, have too few matches."""
     errors = errors_of(views, matched)
+    poses = {i: view.world_from_camera for i, view in views.items()}
+    groups = contradicting_groups(poses, errors, unmatched)
+    excluded = {i for group in groups for i in group}
+    matched = [item for item in matched if not excluded & set(item.pair)]
+    errors = [error for error in errors if not excluded & set(error.pair)]
+    verdict = Verdict((), unmatched_count, math.nan, math.nan, THRESHOLD_PX, same_pose=tuple(groups))
     if not errors:
-        return Verdict((), unmatched_count, math.nan, math.nan, THRESHOLD_PX)
+        return verdict
     median_px, bad_share = summary(errors)
     threshold_px = float(np.median([error.threshold_px for error in errors]))
-    verdict = Verdict(tuple(errors), unmatched_count, median_px, bad_share, threshold_px)
-    if verdict.is_wrong:
-        found = explain(views, matched, median_px)
-        verdict = replace(verdict, explanation=found.text, explained_px=found.error_px, suspects=found.photographs)
-    else:
-        verdict = replace(verdict, median_depth=median_depth(views, matched))
-    return verdict if verdict.explanation else replace(verdict, suspects=suspects_of(errors))
+    twins = tuple(same_photographs(views, matched))
+    verdict = replace(
+        verdict,
+        pairs=tuple(errors),
+        median_px=median_px,
+        bad_share=bad_share,
+        threshold_px=threshold_px,
+        same_photograph=twins,
+    )
+    if not verdict.is_wrong:
+        return replace(verdict, median_depth=median_depth(views, matched), suspects=suspects_of(errors))
+    found = explain(views, matched)
+    if found.text:
+        return replace(verdict, explanation=found.text, explained_px=found.error_px, suspects=found.photographs)
+    suspects = suspects_of(errors)
+    left = [error for error in errors if not set(suspects) & set(error.pair)]
+    # Where hardly anything is left that fits, nobody knows which photographs are wrong.
+    is_known = len(left) >= LEFT_SHARE * len(errors) and summary(left)[1] <= WRONG_SHARE
+    return replace(verdict, suspects=suspects if is_known else ())
 
 
 def suspects_of(errors: Sequence[PairError]) -> tuple[int, ...]:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
-from mapless_server.method.readings import Pair
+from mapless_server.method.readings import Pair, same_poses
 
 PAIR_COUNT = 24
 """Enough that a median over them is settled; their features take seconds."""
@@ -15,6 +15,8 @@ MAX_TURN_DEG = 40.0
 """Beyond it SIFT finds few matches, and the views may share nothing."""
 BASELINE_SHARE = 0.05
 """Of the scene's extent: neighbours in a video stand so close together that almost any pose would fit."""
+SAME_POSE_GROUPS, SAME_POSE_PAIRS = 6, 6
+"""Groups with the same pose that are compared, and pairs of each."""
 ORDER_STEPS = (1, 3, 10, 30)
 """How far apart in the folder's order photographs are compared if their poses do not show which are near."""
 
@@ -24,6 +26,20 @@ def pairs_by_pose(poses: Sequence[RigidTransform]) -> list[Pair]:
     near = _Neighbours(poses)
     rounds = (_partner_of_each(near, len(poses), rank) for rank in range(3))
     return _distinct(chain.from_iterable(rounds))
+
+
+def pairs_of_same_pose(poses: Sequence[RigidTransform]) -> list[Pair]:
+    """Pairs of photographs with exactly the same pose: some of each group, those that are furthest apart in the order.
+
+    Neighbours in the order may show the same although the camera moved.
+    """
+    pairs = []
+    for group in same_poses(dict(enumerate(poses)))[:SAME_POSE_GROUPS]:
+        half = (len(group) + 1) // 2
+        found = [(group[k], group[(k + half) % len(group)]) for k in range(len(group))]
+        spread = [found[int(k)] for k in np.linspace(0, len(found) - 1, min(len(found), SAME_POSE_PAIRS)).round()]
+        pairs += [(min(pair), max(pair)) for pair in spread]
+    return list(dict.fromkeys(pairs))
 
 
 def more_pairs(poses: Sequence[RigidTransform], reference: int, known: Sequence[Pair], count: int) -> list[Pair]:

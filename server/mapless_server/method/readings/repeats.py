@@ -1,0 +1,77 @@
+"""Poses and photographs that are given several times.
+
+References with exactly the same pose are photographs from one place: of a camera that stands still, or of a tracker
+that had not begun and gave the same pose, often the identity, to photographs of different things. The same photograph
+with two poses has at least one wrong one.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from mapless.geometry import RigidTransform, rotation_angle_deg
+
+from .errors import MatchedPair, Pair, PairError, Views
+
+OFF_FACTOR = 4.0
+"""Thresholds by which photographs of one place are off if they show different things: 12 px of 1024. A pose that is
+given to the next frames of a video, too, is off by less."""
+SAME_PX = 0.5
+"""Largest median distance of the matched keypoints of one photograph that was stored twice, as encoded anew."""
+SAME_COUNT_SHARE = 0.5
+"""Least share of the keypoints that such photographs match."""
+SAME_TURN_DEG, SAME_BASELINE_SHARE = 1.0, 0.25
+"""Differences of two poses of such a photograph that contradict each other; of the median distance of matched pairs. A
+camera that stands still takes nearly the same photograph at poses that differ by the tracking's noise."""
+
+
+def same_poses(poses: Mapping[int, RigidTransform]) -> list[tuple[int, ...]]:
+    """Groups of two and more photographs with exactly the same pose."""
+    groups: dict[tuple[float, ...], list[int]] = {}
+    for i, pose in poses.items():
+        numbers = np.concatenate([pose.rotation.ravel(), pose.translation])
+        groups.setdefault(tuple((np.round(numbers, 8) + 0.0).tolist()), []).append(i)
+    return [tuple(group) for group in groups.values() if len(group) > 1]
+
+
+def contradicting_groups(
+    poses: Mapping[int, RigidTransform], errors: Sequence[PairError], unmatched: Sequence[Pair] = ()
+) -> list[tuple[int, ...]]:
+    """Groups with exactly the same pose whose photographs show different things, by errors and pairs without matches.
+
+    A pair without matches alone contradicts nothing: light or season may have changed.
+    """
+    found = []
+    for group in same_poses(poses):
+        inside = [it for it in errors if set(it.pair) <= set(group)]
+        off = sum(it.error_px > OFF_FACTOR * it.threshold_px for it in inside)
+        missing = sum(set(pair) <= set(group) for pair in unmatched)
+        if off + missing > len(inside) - off and (off or (len(group) > 2 and missing > 1)):
+            found.append(group)
+    return found
+
+
+def same_photographs(views: Views, matched: Sequence[MatchedPair]) -> list[Pair]:
+    """Pairs that are one photograph, with poses that differ."""
+    baselines = [_difference(views, item.pair)[0] for item in matched]
+    typical = float(np.median([it for it in baselines if it > 0])) if any(baselines) else 0.0
+    found = []
+    for item in matched:
+        first, second = (views[i].view for i in item.pair)
+        if not first.has_camera_of(second) or len(item.matches) < SAME_COUNT_SHARE * min(
+            len(first.features), len(second.features)
+        ):
+            continue
+        ours, theirs = (view.features.keypoints[item.matches[:, side]] for side, view in enumerate((first, second)))
+        apart, turn_deg = _difference(views, item.pair)
+        is_other = turn_deg > SAME_TURN_DEG or apart > SAME_BASELINE_SHARE * typical
+        if is_other and np.median(np.linalg.norm(ours - theirs, axis=1)) < SAME_PX:
+            found.append(item.pair)
+    return found
+
+
+def _difference(views: Views, pair: Pair) -> tuple[float, float]:
+    """Distance of two cameras, in the poses' unit, and the angle between them, degrees."""
+    first, second = (views[i].world_from_camera for i in pair)
+    apart = float(np.linalg.norm(first.translation - second.translation))
+    return apart, rotation_angle_deg(first.rotation.T @ second.rotation)
