@@ -5,9 +5,7 @@ Values that clients omit or set to zero are taken as unknown.
 
 import base64
 import binascii
-import io
 import math
-import struct
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +13,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from PIL import ExifTags, Image
 from pydantic import ValidationError
 
 from mapless import Camera, Datum, GeoPositionPrior, IntrinsicsUncertainty, LocalizationResult, PosePrior, Priors
@@ -25,6 +22,7 @@ from mapless_server.images import ImageLimits
 from mapless_server.images.decode import image_size
 from mapless_tools.ingest.formats.colmap.cameras import PARAMETERS, ColmapCamera
 
+from .exif import focal_of
 from .guard import Failure, checked_json
 from .messages import CameraParameters, CameraReading, GeolocationReading, Request, Response
 
@@ -45,9 +43,6 @@ _MAX_SIGMA_M = 1e4
 _HEIGHTS_M = (-12_000, 100_000)
 """Of the interface's positions."""
 _UNKNOWN_MODEL = "UNKNOWN"
-_FILM_DIAGONAL_MM = math.hypot(36, 24)
-_EXIF_FOCAL_SIGMA = 0.03
-"""Relative: whole millimetres of a wide lens, and what cameras crop."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,17 +184,19 @@ def _camera_of(
     """Makes the camera of the parameters; without them, of the focal length in the file's EXIF."""
     model = given.model.upper() if given is not None else _UNKNOWN_MODEL
     if given is None or (model.startswith(_UNKNOWN_MODEL) and not given.modelParams):
-        film_mm = _film_focal_mm(image)
-        if film_mm is None:
+        try:
+            focal = focal_of(image, width_px, height_px)
+        except ValueError as error:
+            raise Failure(str(error), field=f"{where}.model") from None
+        if focal is None:
             raise Failure(
                 "the camera's intrinsics are needed: one of COLMAP's models and its parameters, or a file whose EXIF "
                 "has the focal length in 35 mm film",
                 field=f"{where}.model",
             )
-        focal_px = film_mm / _FILM_DIAGONAL_MM * math.hypot(width_px, height_px)
         centre = ((width_px - 1) / 2, (height_px - 1) / 2)
-        uncertainty = IntrinsicsUncertainty(focal_sigma_px=_EXIF_FOCAL_SIGMA * focal_px)
-        return Camera(width_px, height_px, focal_px, focal_px, *centre), uncertainty
+        uncertainty = IntrinsicsUncertainty(focal_sigma_px=focal.sigma_px)
+        return Camera(width_px, height_px, focal.focal_px, focal.focal_px, *centre), uncertainty
     if model not in PARAMETERS:
         raise Failure(f"is none of COLMAP's models: {given.model[:40]!a}", field=f"{where}.model")
     names = PARAMETERS[model]
@@ -212,16 +209,6 @@ def _camera_of(
         return ColmapCamera(1, model, width_px, height_px, given.modelParams).camera(), None
     except ValueError as error:
         raise Failure(str(error), field=where) from None
-
-
-def _film_focal_mm(image: bytes) -> float | None:
-    """The focal length in 35 mm film, if the file's EXIF has a plausible one."""
-    try:
-        with Image.open(io.BytesIO(image)) as opened:
-            value = float(opened.getexif().get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLengthIn35mmFilm, 0))
-    except (OSError, SyntaxError, ValueError, TypeError, KeyError, struct.error):  # damaged EXIF is as none
-        return None
-    return value if 5 <= value <= 1000 else None
 
 
 def _position_prior(

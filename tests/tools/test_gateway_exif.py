@@ -1,0 +1,73 @@
+"""Focal lengths by EXIF: zoom, crops in the camera, resized and cut files, and what is no focal length."""
+
+import io
+import math
+from typing import Any
+
+import pytest
+from PIL import ExifTags, Image
+from PIL.TiffImagePlugin import IFDRational
+
+from mapless_tools.gateway.exif import ExifFocal, focal_of
+
+DIAGONAL_MM = math.hypot(36, 24)
+WHOLE = 28 / DIAGONAL_MM * 500
+"""Of 28 mm, for a frame with a diagonal of 500 pixels: 400x300."""
+
+
+def found(size: tuple[int, int], maker: str = "", **tags: Any) -> ExifFocal | None:
+    exif = Image.Exif()
+    if maker:
+        exif[ExifTags.Base.Make] = maker
+    about = exif.get_ifd(ExifTags.IFD.Exif)
+    for name, value in tags.items():
+        about[ExifTags.Base[name]] = value
+    out = io.BytesIO()
+    Image.new("RGB", size).save(out, "JPEG", exif=exif)
+    return focal_of(out.getvalue(), *size)
+
+
+def px(size: tuple[int, int], maker: str = "", **tags: Any) -> float:
+    focal = found(size, maker, FocalLengthIn35mmFilm=28, **tags)
+    assert focal is not None
+    return focal.focal_px
+
+
+@pytest.mark.parametrize(
+    ("zoom", "factor"),
+    [(1.5, 1.5), (2.0, 2.0), (1.0, 1.0), (0.0, 1.0), (IFDRational(0, 0), 1.0), (0.5, 1.0), (1e4, 1.0)],
+)
+def test_digital_zoom_lengthens_the_focal_length(zoom: Any, factor: float) -> None:
+    assert px((400, 300), DigitalZoomRatio=zoom) == pytest.approx(factor * WHOLE)
+
+
+def test_the_zoom_of_makers_who_include_it_counts_once() -> None:
+    assert px((400, 300), "Apple", DigitalZoomRatio=2.0) == pytest.approx(WHOLE)
+
+
+@pytest.mark.parametrize("size", [(400, 225), (225, 400), (300, 300), (400, 200)])
+def test_a_crop_in_the_camera_keeps_the_frames_focal_length(size: tuple[int, int]) -> None:
+    focal = found(size, FocalLengthIn35mmFilm=28)
+    assert focal is not None
+    assert focal.focal_px == pytest.approx(WHOLE)
+    own_px = 28 / DIAGONAL_MM * math.hypot(*size)
+    assert focal.sigma_px > abs(focal.focal_px - own_px)  # a maker may mean the part
+
+
+@pytest.mark.parametrize("size", [(400, 300), (300, 400), (4000, 3000), (360, 240)])
+def test_whole_frames_of_any_size_have_their_own_diagonal(size: tuple[int, int]) -> None:
+    focal = found(size, FocalLengthIn35mmFilm=28, ExifImageWidth=4032, ExifImageHeight=2688 if size[0] == 360 else 3024)
+    assert focal is not None
+    assert focal.focal_px == pytest.approx(28 / DIAGONAL_MM * math.hypot(*size))
+    assert focal.sigma_px == pytest.approx(0.03 * focal.focal_px)
+
+
+def test_a_file_that_a_program_has_cut_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"300x300 pixels, by its EXIF the photograph had 4032x3024: it was cut"):
+        found((300, 300), FocalLengthIn35mmFilm=28, ExifImageWidth=4032, ExifImageHeight=3024)
+
+
+@pytest.mark.parametrize("film", [0, 1, 65535])
+def test_a_focal_length_that_is_none_is_not_used(film: int) -> None:
+    assert found((400, 300), FocalLengthIn35mmFilm=film) is None
+    assert found((400, 300)) is None
