@@ -84,7 +84,7 @@ def test_an_attempt_without_answer_names_the_error_before() -> None:
     assert str(error) == "DEADLINE_EXCEEDED: no answer in time; before that: gone"
 
 
-class Broken(grpc.RpcError):  # type: ignore[misc]
+class Broken(grpc.RpcError):
     """A status as gRPC raises it."""
 
     def __init__(self, status: grpc.StatusCode, text: str, *trailers: tuple[str, str]) -> None:

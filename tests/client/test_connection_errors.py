@@ -2,8 +2,12 @@
 
 import re
 import socket
+import ssl
+import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import grpc
@@ -53,6 +57,32 @@ def test_a_failed_connection_is_explained(
     assert caught.value.code == "UNAVAILABLE"
     assert caught.value.message.startswith(f"cannot connect to {addresses[kind]}: ")
     assert expected in caught.value.message
+
+
+@pytest.mark.parametrize("offered", [[], ["http/1.1"]], ids=["none", "HTTP/1.1"])
+def test_a_server_without_http_2_in_its_handshake_is_named(offered: list[str], tmp_path: Path) -> None:
+    """As nginx or a load balancer whose port is configured for HTTP/1."""
+    CERTIFICATE.write(tmp_path / "tls.pem", tmp_path / "tls.key")
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(tmp_path / "tls.pem", tmp_path / "tls.key")
+    if offered:
+        context.set_alpn_protocols(offered)
+    options = ConnectOptions(tls=True, root_certificates=OURS.certificate_pem, max_attempts=1)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def shake_hands() -> None:
+            with suppress(OSError), listening.accept()[0] as raw, context.wrap_socket(raw, server_side=True) as secure:
+                secure.recv(1)
+
+        thread = threading.Thread(target=shake_hands)
+        thread.start()
+        with (
+            Client(f"localhost:{listening.getsockname()[1]}", options) as client,
+            pytest.raises(MaplessError) as caught,
+        ):
+            client.get_scene("hall", timeout_s=20.0)
+    thread.join(20)
+    assert "does not offer HTTP/2 (ALPN h2)" in caught.value.message
 
 
 @pytest.mark.parametrize("certificates", [None, ANOTHER.certificate_pem])

@@ -1,20 +1,31 @@
 """TLS with real handshakes on loopback: which clients connect, and what changes with the files."""
 
 import asyncio
+import codecs
 import logging
+import re
 import socket
 import ssl
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import timedelta
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
 import grpc
 import pytest
-from cryptography.hazmat.primitives.serialization import BestAvailableEncryption, Encoding, PrivateFormat
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec, ed448, ed25519, rsa
+from cryptography.hazmat.primitives.serialization import (
+    BestAvailableEncryption,
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+)
+from cryptography.x509.oid import NameOID
 from support.certificates import DAY, Pair, authority, options_of, signed
 
 from mapless import Client, ConnectOptions
@@ -296,6 +307,52 @@ class TestFilesAtTheStart:
         signed(AUTHORITY, "x", begins * DAY, ends * DAY).write(files.certificate, files.key)
         with pytest.raises(SecurityError, match=what):
             Tls(files)
+
+    @pytest.mark.parametrize("which", ["certificate", "key", "client_ca"])
+    @pytest.mark.parametrize("mark", [codecs.BOM_UTF8, codecs.BOM_UTF16_LE], ids=["UTF-8", "UTF-16"])
+    def test_a_byte_order_mark_does_no_harm(self, mutual: TlsFiles, which: str, mark: bytes) -> None:
+        path: Path = getattr(mutual, which)
+        pem = path.read_bytes() + (AUTHORITY.certificate_pem if which == "certificate" else b"")
+        is_utf_16 = mark == codecs.BOM_UTF16_LE
+        path.write_bytes(mark + (pem.decode().encode("utf-16-le") if is_utf_16 else pem.replace(b"\n", b"\r\n")))
+        with serving(mutual) as server:
+            assert server.who_am_i(server.options(signed(AUTHORITY, "robot-7"))) == "robot-7"
+
+    def test_marks_of_a_clients_files_do_no_harm(self, mutual: TlsFiles) -> None:
+        marked = signed(AUTHORITY, "robot-7")
+        files = {"root_certificates": AUTHORITY.certificate_pem, "client_certificate": marked.certificate_pem}
+        files["client_key"] = marked.key_pem
+        with serving(mutual) as server:
+            given: dict[str, Any] = {name: codecs.BOM_UTF8 + pem for name, pem in files.items()}
+            assert server.who_am_i(ConnectOptions(tls=True, **given)) == "robot-7"
+
+    @pytest.mark.parametrize(
+        ("key", "kind"),
+        [
+            (ed25519.Ed25519PrivateKey.generate(), "Ed25519"),
+            (ed448.Ed448PrivateKey.generate(), "Ed448"),
+            (ec.generate_private_key(ec.SECP521R1()), "the curve secp521r1"),
+            (ec.generate_private_key(ec.SECP256K1()), "the curve secp256k1"),
+            (ec.generate_private_key(ec.SECP384R1()), ""),
+            (rsa.generate_private_key(65537, 2048), ""),
+        ],
+        ids=["Ed25519", "Ed448", "P-521", "secp256k1", "P-384", "RSA"],
+    )
+    def test_a_key_that_no_client_accepts_is_refused(self, files: TlsFiles, key: Any, kind: str) -> None:
+        name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "localhost")])
+        now = datetime.now(timezone.utc)
+        made = x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number(), now - DAY, now + DAY)
+        made = made.add_extension(x509.SubjectAlternativeName([x509.DNSName("localhost")]), critical=False)
+        own = made.sign(key, None if kind.startswith("Ed") else hashes.SHA256())
+        files.certificate.write_bytes(own.public_bytes(Encoding.PEM))
+        files.key.write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+        if kind:
+            with pytest.raises(SecurityError, match=re.escape(f"do not accept ({kind}); make a key")):
+                Tls(files)
+            return
+        with serving(files) as server:
+            options = ConnectOptions(tls=True, root_certificates=files.certificate.read_bytes())
+            assert server.who_am_i(options) == ""
 
 
 class TestCommand:

@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
@@ -96,6 +97,24 @@ class TestClients:
                 wait_until(lambda: scraped(server.metrics_address).handled["CANCELLED"] == 1)
                 assert scraped(server.metrics_address).terminated["cancelled"] == 1
             assert is_served(client, "s")
+
+    @pytest.mark.nightly("pings")
+    @pytest.mark.parametrize("has_call", [True, False])
+    def test_pings_every_ten_seconds_end_nothing(self, server: RunningServer, client: Client, has_call: bool) -> None:
+        """The least that gRPC's clients allow; with a call that is quiet, or without any."""
+        with raw_http2.connect(server.address) as pinging:
+            watch = raw_http2.call(1, "/grpc.health.v1.Health/Watch", b"") if has_call else b""
+            pinging.sendall(raw_http2.hello() + watch)
+            for _ in range(5):
+                time.sleep(9.9)
+                pinging.sendall(raw_http2.ping())
+            pinging.settimeout(1.0)
+            received = b""
+            with suppress(TimeoutError):
+                while part := pinging.recv(65536):
+                    received += part
+        assert b"too_many_pings" not in received
+        assert received.count(raw_http2.ping(is_answer=True)) == 5
 
     def test_a_caller_that_never_reads_delays_no_other(self, server: RunningServer, client: Client, scene: str) -> None:
         camera = Camera(800, 600, 700.0, 700.0, 399.5, 299.5)

@@ -6,7 +6,8 @@ import struct
 from collections.abc import Mapping
 
 PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
-_DATA, _HEADERS, _SETTINGS = 0x0, 0x1, 0x4
+_DATA, _HEADERS, _SETTINGS, _PING = 0x0, 0x1, 0x4, 0x6
+_ACK = 0x1
 _END_STREAM, _END_HEADERS = 0x1, 0x4
 _INITIAL_WINDOW_SIZE = 0x4
 
@@ -14,6 +15,11 @@ _INITIAL_WINDOW_SIZE = 0x4
 def hello(window_bytes: int = 65_535) -> bytes:
     """What a client says first; the server may send so much of each answer."""
     return PREFACE + _frame(_SETTINGS, 0, 0, struct.pack(">HI", _INITIAL_WINDOW_SIZE, window_bytes))
+
+
+def ping(is_answer: bool = False) -> bytes:
+    """A ping, or the answer to it."""
+    return _frame(_PING, _ACK if is_answer else 0, 0, b"mapless!")
 
 
 def call(stream: int, method: str, message: bytes) -> bytes:
