@@ -215,6 +215,9 @@ def test_versions_and_extras_are_the_projects() -> None:
     assert [value for name, _, value in arguments if name == "VERSION"] == [PROJECT["version"]]
     for extras in [value for name, _, value in arguments if name == "EXTRAS"]:
         assert set(extras.split(",")) <= set(PROJECT["optional-dependencies"])
+    for stage in ("build-cpu", "build-cuda"):  # what the documentation recommends runs in both
+        (extras,) = [value for name, _, value in arguments_of(stage) if name == "EXTRAS"]
+        assert "networks" in extras.split(",")
     (torch,) = re.findall(r"^TORCH_VERSION := (.*)", (ROOT / "Makefile").read_text(), re.MULTILINE)
     assert [value for name, _, value in arguments if name == "TORCH"] == [f"torch=={torch}"] * len(TARGETS)
 

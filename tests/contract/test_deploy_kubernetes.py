@@ -17,6 +17,7 @@ import pytest
 import yaml  # type: ignore[import-untyped]
 from support.manifests import OLDEST, Json, built, check_confined, check_valid, needs_kubectl
 
+from mapless_server.method.choices import AUTO, BEST_VARIANTS
 from mapless_server.networks.weights.catalogue import CATALOGUE
 from mapless_server.security import assess_binding
 from mapless_server.serve.run import CLOSING_LIMIT_S, NOTIFY_S
@@ -241,7 +242,7 @@ def test_what_is_mounted_exists(folder: str) -> None:
 
 @needs_kubectl
 def test_images_are_those_that_the_dockerfile_makes() -> None:
-    for folder, target in zip(BUILDS, ("cpu", "cpu", "cpu", "cuda", "cuda"), strict=True):
+    for folder, target in zip(BUILDS, ("cpu", "cpu", "cpu", "cuda", "cpu"), strict=True):
         for pod in pods(built(KUBERNETES / folder)):
             assert [container["image"] for container in pod["spec"]["containers"]] == [f"mapless:{VERSION}-{target}"]
 
@@ -254,6 +255,22 @@ def test_the_job_fetches_weights_of_permissive_licences() -> None:
     catalogue = {weights.name: weights for weights in CATALOGUE}
     assert names
     assert not any(catalogue[name].licence.restriction for name in names)
+
+
+@needs_kubectl
+@pytest.mark.parametrize("folder", SERVERS[1:])
+def test_weights_of_all_that_auto_uses_are_mounted(folder: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a CPU: EdgePoint2 first, then ALIKED with LightGlue; on a GPU the latter."""
+    (job,) = read(KUBERNETES / "weights" / "job.yaml")
+    (fetching,) = job["spec"]["template"]["spec"]["containers"]
+    assert {BEST_VARIANTS["edgepoint2"], "aliked", "aliked-lightglue"} <= set(fetching["args"])
+    pod, container = server(built(KUBERNETES / folder))
+    assert settings_of(container, monkeypatch).features == AUTO
+    (mount,) = [it for it in container["volumeMounts"] if it["mountPath"] == "/weights"]
+    (volume,) = [it for it in pod["spec"]["volumes"] if it["name"] == mount["name"]]
+    (claim,) = of_kind(built(KUBERNETES / "weights"), "PersistentVolumeClaim")
+    assert mount["readOnly"] is volume["persistentVolumeClaim"]["readOnly"] is True
+    assert volume["persistentVolumeClaim"]["claimName"] == claim["metadata"]["name"]
 
 
 # Several servers, and scaling
