@@ -16,7 +16,7 @@ PROTO_VENV  := $(VENV)/proto-tools
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help setup lock test nightly weights lint format proto released demo bench bench-turns bench-gpu load load-ray fuzz \
-    docs clean
+    sbom release-images release-image reference docs clean
 
 help:  ## List the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -107,6 +107,24 @@ load-ray: setup  ## Measure replicas on Ray Serve, on this machine: half an hour
 $(VENV)/.docs: $(VENV)/.installed
 	$(INSTALL) $(LOCKED) --editable '.[docs]'
 	touch $@
+
+# What an image holds, for `make sbom`; it is installed as the image's packages are.
+EXTRAS ?= server,otel,postgres,networks
+sbom: setup  ## Write what an image contains as CycloneDX, build/mapless-VERSION.cdx.json; EXTRAS=... for another image
+	$(INSTALL) $(LOCKED) --editable '.[release]'
+	$(BIN)/uv venv --quiet --clear build/image
+	$(INSTALL) --python build/image/bin/python $(LOCKED) $(TORCH)
+	$(INSTALL) --python build/image/bin/python $(LOCKED) '.[$(EXTRAS)]'
+	$(BIN)/python .ci/sbom.py $$($(BIN)/python -c "import importlib.metadata as it; print(it.version('mapless'))") build/image
+
+release-images:  ## At a release: pin the images that are deployed by digest; REGISTRY=host IMAGES="mapless:... python:..." for some
+	$(PYTHON) .ci/images.py pin '$(REGISTRY)' $(IMAGES)
+
+release-image:  ## At a release: build an image, if the version is a release's and the base is pinned; TARGET=cpu TAG=mapless:...
+	$(PYTHON) .ci/images.py build '$(or $(TARGET),cpu)' '$(TAG)'
+
+reference: setup  ## Write the parts of docs/reference that come from the code
+	$(BIN)/python docs/reference.py
 
 docs: $(VENV)/.docs  ## Build the documentation as a site in build/docs; a broken link is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

@@ -1,21 +1,16 @@
-"""mkdocs hooks: fill in what the pages take from the code, and bring in the pages that live beside what they describe.
+"""mkdocs hooks: bring in the pages that live beside what they describe, and make links those of the site.
 
-A page says `<!-- generated: NAME -->` where the text of `reference.GENERATORS[NAME]` belongs. Links are written as they
-work in the repository; here those that leave `docs/` lead to the page that shows the file, or become plain text.
+Links are written as they work in the repository; here those that leave `docs/` lead to the page that shows the file, or
+become plain text.
 """
 
 import os
 import posixpath
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parent))
-
 from mkdocs.structure.files import File, Files
-
-import reference
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -23,6 +18,7 @@ OUTSIDE = {
     "BENCHMARKS.md": "benchmarks/index.md",
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
+    "SECURITY.md": "security-reports.md",
     "client/cpp/README.md": "guides/cpp.md",
     "client/unity/README.md": "guides/unity.md",
     "deploy/envoy/README.md": "operation/envoy.md",
@@ -32,7 +28,6 @@ OUTSIDE = {
 }
 """Pages of the site that lie outside docs/, by their path in the repository."""
 
-_MARKER = re.compile(r"^<!-- generated: (\S+) -->$", re.MULTILINE)
 _LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)#\s]+)(#[^)\s]*)?\)")
 _FENCED = re.compile(r"(^[ ]*```.*?^[ ]*```$)", re.MULTILINE | re.DOTALL)
 
@@ -45,9 +40,8 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Fills in the generated parts and makes links those of the site."""
-    filled = _MARKER.sub(lambda found: reference.GENERATORS[found[1]](), markdown)
-    return relinked(filled, page.file.src_uri)
+    """Makes links those of the site."""
+    return relinked(markdown, page.file.src_uri)
 
 
 def relinked(markdown: str, page: str) -> str:

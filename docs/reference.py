@@ -1,7 +1,7 @@
 """The parts of the reference that come from the code: settings, errors, metrics, commands and the interface.
 
-Each generator returns Markdown, which `hooks.py` puts where a page asks for it. `python docs/reference.py NAME` prints
-one of them.
+Each generator returns Markdown. A page has it between `<!-- generated: NAME -->` and `<!-- end -->`; `make reference`
+writes it there again, and a test compares.
 """
 
 import ast
@@ -260,5 +260,22 @@ GENERATORS: dict[str, Callable[[], str]] = {
     "reference-service": partial(interface, "reference_service"),
 }
 
+_GENERATED = re.compile(r"^(<!-- generated: (\S+) -->\n).*?^(<!-- end -->)$", re.MULTILINE | re.DOTALL)
+
+
+def current(page: str) -> str:
+    """A page's text with its generated parts made again."""
+    return _GENERATED.sub(lambda found: f"{found[1]}\n{GENERATORS[found[2]]()}\n\n{found[3]}", page)
+
+
+def main() -> None:
+    """Writes the generated parts of all pages again."""
+    for path in sorted((ROOT / "docs").rglob("*.md")):
+        text = path.read_text(encoding="utf-8")
+        if (again := current(text)) != text:
+            path.write_text(again, encoding="utf-8")
+            print(path.relative_to(ROOT))
+
+
 if __name__ == "__main__":
-    print(GENERATORS[sys.argv[1]]())
+    main()

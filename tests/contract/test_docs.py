@@ -14,7 +14,7 @@ import pytest
 import typer.main
 from prometheus_client import generate_latest
 from support.bags import compressed, info
-from support.documents import PAGES, ROOT, anchors, blocks, commands, prose, shell
+from support.documents import PAGES, ROOT, anchors, blocks, commands, prose, shell, written
 from support.images import encode, textured
 from support.servers import pose, serving
 from test_imports import LADDER
@@ -41,7 +41,7 @@ from mapless_tools.cli.app import app
 SERVER, CLIENT = Path(errors.__file__).parent, Path(client_errors.__file__).parent
 DOCS, DEPLOY = ROOT / "docs", ROOT / "deploy"
 PAST = ("CHANGELOG.md", "history.md", "city.md")
-CURRENT = "\n".join(page.read_text() for page in PAGES if page.name not in PAST)
+CURRENT = "\n".join(written(page) for page in PAGES if page.name not in PAST)
 
 
 def page_id(page: Path) -> str:
@@ -197,7 +197,7 @@ def test_the_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 
 def rows(page: Path, heading: str) -> list[list[str]]:
     """What stands in backticks in the first two columns of the table with this first heading."""
-    (table,) = re.findall(rf"^\| {heading} \|.*\n\|.*\n((?:\|.*\n)+)", page.read_text(), re.MULTILINE)
+    (table,) = re.findall(rf"^\| {heading} \|.*\n\|.*\n((?:\|.*\n)+)", written(page), re.MULTILINE)
     return [re.findall(r"`([\w*/]+)`", "|".join(row.split("|")[1:3])) for row in table.splitlines()]
 
 

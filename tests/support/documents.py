@@ -16,6 +16,11 @@ PAGES = (
 _FENCE = re.compile(r"^( *)```(\w*)[^\n]*\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
 
 
+def written(page: Path) -> str:
+    """A page's text without the parts that are generated from the code."""
+    return re.sub(r"^<!-- generated: .*?^<!-- end -->$", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+
+
 def blocks(page: Path, language: str) -> list[str]:
     """The fenced blocks of a page in one language."""
     return [
