@@ -16,6 +16,7 @@ import grpc
 import pytest
 from support import gpp
 from support.asgi import requested
+from support.clients import failing, status
 from support.commands import run as run_command
 from support.gateway_app import (
     DATUM,
@@ -318,3 +319,20 @@ def test_grpc_web_costs_at_most_3_ms_over_grpc(server: RunningServer) -> None:
         connection.close()
     least_ms = {name: 1000 * min(them) for name, them in times_s.items()}
     assert least_ms["gRPC-Web"] - least_ms["gRPC"] < 3, least_ms
+
+
+@pytest.mark.parametrize(
+    ("method", "error", "attempts", "ends"),
+    [
+        ("LocalizationService/Localize", status("UNAVAILABLE"), 2, b"grpc-status: 0"),
+        ("ReferenceService/ListScenes", status("CANCELLED"), 2, b"grpc-status: 0"),
+        ("ReferenceService/CreateScene", status("UNAVAILABLE"), 1, b"grpc-status: 14"),  # it may have been created
+        ("LocalizationService/Localize", status("RESOURCE_EXHAUSTED", 0.1), 1, b"grpc-status: 8"),  # its caller waits
+    ],
+)
+async def test_a_call_is_repeated_whose_server_was_lost(method: str, error: Any, attempts: int, ends: bytes) -> None:
+    with failing([error]) as (address, server):
+        async with gateway_of(address) as gateway:
+            answer = await gateway.web(b"", f"/mapless.v1.{method}")
+    assert len(server.tries) == attempts
+    assert ends in answer.body
