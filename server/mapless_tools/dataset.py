@@ -1,6 +1,7 @@
 """Photographs of one place with known poses, whatever the layout on the disk; `ingest.formats` reads them."""
 
 import json
+import os
 import re
 from collections.abc import Callable, Container, Iterator, Mapping
 from contextlib import contextmanager
@@ -18,6 +19,7 @@ from mapless.text_files import read_text
 
 MAX_NAME_LENGTH = 128
 SPLITS = ("", "train", "test")
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".webp")
 _MAX_QUOTED = 1000
 """Characters that messages quote of a file's content, which may be anything and of any length."""
 Parsed = TypeVar("Parsed")
@@ -122,19 +124,42 @@ def legal_id(stem: str, taken: Container[str]) -> str:
 def image_file(folder: Path, image: str) -> Path:
     """The file of an image that a layout names; ValueError if there is none, or the path leads out of the folder.
 
-    Paths written on Windows are read, too (see `with_slashes`).
+    Paths written on Windows are read, too (see `with_slashes`), absolute ones that lead into the folder, those without
+    an ending, and those whose ending has other cases than the file's (.JPG).
     """
-    image = with_slashes(folder, image)
-    if PurePosixPath(image).is_absolute() or ".." in PurePosixPath(image).parts:
-        raise ValueError(f"image: {image!r} leads out of {folder}")
+    image = _within(folder, with_slashes(folder, image))
     file = folder / image
     try:
         found = file.is_file()
     except OSError as error:  # a name that no file can have
         raise ValueError(f"image: {image[:100]!r}: {error.strerror}") from error
-    if not found:
-        raise ValueError(f"image: there is no file {file}")
-    return file
+    if found:
+        return file
+    for other in _other_endings(image):
+        if os.path.isfile(folder / other):
+            return folder / other
+    raise ValueError(f"image: there is no file {file}")
+
+
+def _within(folder: Path, image: str) -> str:
+    """A path from the folder; ValueError if it leads out of it."""
+    path = PurePosixPath(image)
+    for root in (folder, folder.absolute(), folder.resolve()) if path.is_absolute() else ():
+        if path.is_relative_to(root):
+            path = path.relative_to(root)
+            break
+    if path.is_absolute() or ".." in path.parts:
+        raise ValueError(f"image: {image!r} leads out of {folder}")
+    return str(path)
+
+
+def _other_endings(image: str) -> Iterator[str]:
+    """Paths of an image with its own ending in other cases, or, without one, with each that images have."""
+    stem, ending = os.path.splitext(image)
+    is_known = ending.lower() in IMAGE_ENDINGS
+    for known in (ending,) if is_known else IMAGE_ENDINGS:
+        for written in (known.lower(), known.upper(), f".{known[1:].capitalize()}"):
+            yield (stem if is_known else image) + written
 
 
 @contextmanager

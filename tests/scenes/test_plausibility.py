@@ -55,7 +55,6 @@ def test_photographs_of_one_place_are_no_contradiction() -> None:
     """A burst is the first thing that many a scene gets."""
     burst = at(np.zeros((4, 3)) + np.arange(4)[:, None] * 1e-3)
     assert contradictions([], SceneAttributes(), burst) == contradictions(burst, SceneAttributes()) == []
-    assert contradictions(at(np.zeros((5, 3))), SceneAttributes())
 
 
 def at(positions: Array) -> list[RigidTransform]:
@@ -129,10 +128,29 @@ def test_coordinates_of_a_map_projection_are_far_from_a_datum() -> None:
 
 @pytest.mark.parametrize(("factor", "expected"), [(1.0, ""), (1e4, "millimetres?"), (1e-4, "kilometres")])
 def test_impossible_units_are_named_unless_the_unit_is_arbitrary(factor: float, expected: str) -> None:
-    poses = at(factor * np.random.default_rng(1).uniform(-5, 5, (20, 3)))
+    poses = moved(cameras(360), factor)
     found = contradictions(poses, SceneAttributes())
     assert (expected in found[0]) if expected else (found == [])
     assert contradictions(poses, SceneAttributes(arbitrary_unit=True)) == []
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 1e-6, 0.001, 0.005])
+def test_a_robot_that_stands_still_is_not_asked_for_its_unit(noise_m: float) -> None:
+    generator = np.random.default_rng(2)
+    standing = [
+        RigidTransform(rotation_from_vector(generator.normal(0, 0.002, 3)), position)
+        for position in [3.0, 2.0, 1.0] + generator.normal(0, noise_m, (30, 3))
+    ]
+    assert contradictions(standing, SceneAttributes()) == []
+    assert contradictions(cameras(360), SceneAttributes(), standing) == []
+    assert contradictions(standing, SceneAttributes(), cameras(360)) == []
+
+
+def test_a_straight_drive_in_kilometres_is_named() -> None:
+    along = np.linspace(0, 0.015, 30)[:, None] * [1.0, 0, 0]
+    generator = np.random.default_rng(2)
+    poses = at(along + generator.normal(0, 2e-5, along.shape))
+    assert "kilometres" in contradictions(poses, SceneAttributes())[0]
 
 
 def test_latitudes_and_longitudes_are_named() -> None:

@@ -13,6 +13,7 @@ from support.layouts import CAMERA, Truth, assert_reads, reasons, truth, write_i
 from mapless import read_cameras
 from mapless.geometry import Camera, RigidTransform
 from mapless.lenses import Fisheye, RadialTangential
+from mapless_tools.dataset import image_file
 from mapless_tools.ingest import FORMATS
 from mapless_tools.ingest.formats import read_dataset, recognize
 from mapless_tools.ingest.formats.cameras import read_folder
@@ -60,7 +61,7 @@ def test_cameras_json_keeps_what_is_usable_and_names_the_rest(tmp_path: Path) ->
     content["frames"] += [
         dict(good),
         dict(good, image="../images/0.png"),
-        dict(good, image=str(tmp_path / "images" / "0.png")),
+        dict(good, image=str(tmp_path / "images" / "0.png")),  # leads into the folder
         dict(good, image="images/none.png"),
         dict(content["frames"][1], image="images/4.png", world_from_camera=left_handed),
         dict(good, image="images/5.png", width=0),
@@ -74,7 +75,17 @@ def test_cameras_json_keeps_what_is_usable_and_names_the_rest(tmp_path: Path) ->
     dataset = read_dataset(tmp_path)
     assert len(dataset.frames) == 4
     why = list(reasons(dataset).values())
-    expected = ["named twice", "leads out", "leads out", "no file", "reflection", "width", "split", "lens", "name too"]
+    expected = [
+        "named twice",
+        "leads out",
+        "named twice",
+        "no file",
+        "reflection",
+        "width",
+        "split",
+        "lens",
+        "name too",
+    ]
     assert len(why) == len(expected)
     for reason, part in zip(why, expected, strict=True):
         assert part in reason
@@ -222,4 +233,37 @@ def test_names_are_legal_and_unique(tmp_path: Path) -> None:
         (tmp_path / image).parent.mkdir(exist_ok=True)
         (tmp_path / image).write_bytes(b"not opened")
     frames = read_folder(write(tmp_path, *(entry(image=image) for image in images))).frames
-    assert [frame.name for frame in frames] == ["a", "a_2", "a_3", "frame-000001.color", "_a_b___"]
+    assert [frame.name for frame in frames] == ["images_a", "left_a", "right_a", "frame-000001.color", "_a_b___"]
+
+
+@pytest.mark.parametrize("named", ["a.jpg", "a", "{root}/images/a.jpg", "{root}/images/a", "a.JPG"])
+@pytest.mark.parametrize("there", ["a.JPG", "a.jpg", "a.Jpg"])
+def test_an_image_is_found_by_other_cases_and_absolute_paths(tmp_path: Path, named: str, there: str) -> None:
+    write_image(tmp_path / "images" / "x.jpg")
+    (tmp_path / "images" / "x.jpg").rename(tmp_path / "images" / there)
+    found = image_file(tmp_path / "images", named.format(root=tmp_path))
+    assert found == tmp_path / "images" / there
+
+
+@pytest.mark.parametrize("ending", [".jpeg", ".JPEG", ".png", ".PNG", ".webp", ".WEBP"])
+def test_a_path_without_an_ending_finds_every_ending(tmp_path: Path, ending: str) -> None:
+    (tmp_path / f"a.1{ending}").write_bytes(b"it")
+    assert image_file(tmp_path, "a.1").name == f"a.1{ending}"
+
+
+@pytest.mark.parametrize("named", ["/etc/passwd", "../a.jpg", "images/../../a.jpg", "{root}/../a.jpg"])
+def test_a_path_out_of_the_folder_is_refused(tmp_path: Path, named: str) -> None:
+    with pytest.raises(ValueError, match="leads out of"):
+        image_file(tmp_path, named.format(root=tmp_path))
+
+
+def test_files_of_one_name_have_the_ids_of_their_folders(tmp_path: Path) -> None:
+    names = ["images/cam1/1.png", "images/cam0/1.png", "images/cam0/2.png"]
+    for name in names:
+        write_image(tmp_path / name)
+    write(tmp_path, *(entry(image=name) for name in names))
+    assert [frame.name for frame in read_folder(tmp_path).frames] == ["cam1_1", "cam0_1", "2"]
+    write(tmp_path, *(entry(image=name) for name in (names[1], names[0])))
+    assert [frame.name for frame in read_folder(tmp_path).frames] == ["cam0_1", "cam1_1"]
+    write(tmp_path, *(entry(image=name) for name in names[1:]))
+    assert [frame.name for frame in read_folder(tmp_path).frames] == ["1", "2"]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapless.geodesy import geodetic_from_world
-from mapless.geometry import Array, RigidTransform
+from mapless.geometry import Array, RigidTransform, rotation_angle_deg
 from mapless_server.store import SceneAttributes
 
 MIN_CAMERAS = 3
@@ -51,6 +51,10 @@ MIN_HEIGHT_M, MAX_HEIGHT_M = -500.0, 10_000.0
 DEGREES_SPREAD, DEGREES_SHARE, DEGREES_RATIO = 0.05, 0.01, 100.0
 """Latitudes and longitudes of a scene differ by 5 km at most, and by a hundredth of their own value; heights, in
 metres, differ by a hundred times as much."""
+
+STANDING_DEG, STANDING_ELONGATION = 3.0, 10.0
+"""Largest angle between the poses of a camera that stands still, a few times the noise of trackers; and the largest
+ratio of the two widest spreads of its positions: along a way it is larger."""
 
 MIN_COMPARED, UNIT_RATIO = 5, 300.0
 """References whose spread says something, and the ratio of two spreads that indicates another unit: 1000 where both are
@@ -92,7 +96,7 @@ def contradictions(
         return []
     found = [_down(together, attributes), _origin(together, attributes)]
     if not attributes.arbitrary_unit:
-        found.append(_unit(np.array([pose.translation for pose in together])))
+        found.append(_unit(together))
     if poses and added and not any(found):
         found = [_down(added, attributes), _origin(added, attributes), another_unit(poses, added)]
     return [text for text in found if text]
@@ -103,7 +107,7 @@ def another_unit(stored: Sequence[RigidTransform], added: Sequence[RigidTransfor
     if min(len(stored), len(added)) < MIN_COMPARED:
         return ""
     radii = [radius_m(np.array([pose.translation for pose in poses])) for poses in (stored, added)]
-    if not (min(radii) > 0 and max(radii) / min(radii) >= UNIT_RATIO):
+    if not (min(radii) > 0 and max(radii) / min(radii) >= UNIT_RATIO) or stands(stored) or stands(added):
         return ""
     return (
         f"these references are {radii[1]:.3g} m from their median position, in the median, those of the scene "
@@ -163,9 +167,24 @@ def _origin(poses: Sequence[RigidTransform], attributes: SceneAttributes) -> str
     return ""
 
 
-def _unit(positions: Array) -> str:
+def stands(poses: Sequence[RigidTransform]) -> bool:
+    """Whether a camera stands still: it neither turns nor moves along a line, and its positions are noise.
+
+    Positions of a moving one are as close in kilometres, but along a way, or with directions that change.
+    """
+    positions = np.array([pose.translation for pose in poses])
+    if radius_m(positions) >= MIN_RADIUS_M:
+        return False
+    if any(rotation_angle_deg(poses[0].rotation.T @ pose.rotation) > STANDING_DEG for pose in poses):
+        return False
+    spreads = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
+    return bool(spreads[0] <= STANDING_ELONGATION * spreads[1])
+
+
+def _unit(poses: Sequence[RigidTransform]) -> str:
     """The contradiction of positions that nobody can have visited if they are in metres."""
-    if len(positions) < 2:
+    positions = np.array([pose.translation for pose in poses])
+    if len(positions) < 2 or stands(poses):
         return ""
     text = _degrees(positions)
     if text:

@@ -24,6 +24,7 @@ from .collecting import Collector, ReadOptions, from_corner, from_opengl, natura
 
 _POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 _IMAGE_ENDS = (".jpg", ".jpeg", ".png")
+_CASES = tuple(written for end in _IMAGE_ENDS for written in (end, end.upper()))
 _SCANNER_FRAME = re.compile(r"frame_\d+")
 
 
@@ -83,7 +84,7 @@ def _scanner_images(path: Path) -> Any:
     return (
         file
         for file in path.glob("frame_*.json")
-        if _SCANNER_FRAME.fullmatch(file.stem) and any(file.with_suffix(end).is_file() for end in _IMAGE_ENDS)
+        if _SCANNER_FRAME.fullmatch(file.stem) and any(file.with_suffix(end).is_file() for end in _CASES)
     )
 
 

@@ -8,13 +8,17 @@ is arbitrary), ``source``, ``ground_truth``, ``datum`` (where the world is on th
 ``latitude_deg``, ``longitude_deg``, ``height_m``, perhaps ``enu_from_world`` with ``x y z w``) and ``down_in_world``.
 """
 
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from itertools import takewhile
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from mapless.cameras import FOLDER_FILE, camera_of_frame
 from mapless.geometry import RigidTransform
-from mapless_tools.dataset import Dataset, finite_numbers, named, printable, read_json, read_place
+from mapless_tools.dataset import Dataset, finite_numbers, image_file, named, printable, read_json, read_place
 
 from .collecting import Collector, ReadOptions
 
@@ -34,14 +38,36 @@ def read(path: Path, options: ReadOptions) -> Dataset:
     if not isinstance(metric, bool):
         raise ValueError(f"{file}: metric must be true or false")
     collector = Collector(path)
+    names = _names(path, content["frames"])
     for index, entry in enumerate(content["frames"]):
         image = entry.get("image", "?") if isinstance(entry, dict) else "?"
         with collector.attempt(f"{FOLDER_FILE}: frames[{index}] ({image})"):
-            add_frame(collector, entry)
+            add_frame(collector, entry, names)
     texts = {it: printable(str(content[it])) for it in ("source", "ground_truth") if isinstance(content.get(it), str)}
     dataset = collector.dataset(path.resolve().name, "cameras", metric=metric, **texts)
     datum, down_in_world = read_place(file, content)
     return replace(dataset, datum=datum, down_in_world=down_in_world)
+
+
+def _names(folder: Path, entries: Sequence[Any]) -> dict[Path, str]:
+    """Names of the frames by their files: those of the files, with the folders in which files of one name differ.
+
+    `images/cam0/1.jpg` and `images/cam1/1.jpg` are `cam0_1` and `cam1_1`, in whatever order they are listed.
+    """
+    files = set()
+    for entry in entries:
+        with suppress(ValueError, TypeError, KeyError):  # what is wrong with it is said where it is added
+            files.add(image_file(folder, entry["image"]))
+    of_stem: dict[str, list[Path]] = {}
+    for file in files:
+        of_stem.setdefault(file.stem, []).append(file)
+    names = {}
+    for stem, same in of_stem.items():
+        parents = [file.relative_to(folder).parent.parts for file in same]
+        shared = sum(1 for _ in takewhile(lambda level: len(set(level)) == 1, zip(*parents, strict=False)))
+        for file, parts in zip(same, parents, strict=True):
+            names[file] = "_".join([*parts[shared:], stem]) if len(same) > 1 else stem
+    return names
 
 
 def read_folder(path: Path) -> Dataset:
@@ -52,8 +78,8 @@ def read_folder(path: Path) -> Dataset:
     return dataset
 
 
-def add_frame(collector: Collector, entry: Any) -> None:
-    """Adds an entry of `frames`; ValueError names the wrong field."""
+def add_frame(collector: Collector, entry: Any, names: Mapping[Path, str] = MappingProxyType({})) -> None:
+    """Adds an entry of `frames`, named by its file, or as the file itself; ValueError names the wrong field."""
     if not isinstance(entry, dict):
         raise ValueError("must be an object")
     image = entry.get("image")
@@ -66,4 +92,5 @@ def add_frame(collector: Collector, entry: Any) -> None:
     camera = camera_of_frame(entry)
     if not (camera.focal_x_px > 0 and camera.focal_y_px > 0):
         raise ValueError(f"K: focal lengths must be above 0, are {camera.focal_x_px:g} and {camera.focal_y_px:g}")
-    collector.add(image, camera, pose, entry.get("split", ""), collector.image(image).stem)
+    file = collector.image(image)
+    collector.add(image, camera, pose, entry.get("split", ""), names.get(file, file.stem))

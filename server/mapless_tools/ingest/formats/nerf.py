@@ -9,12 +9,10 @@ Pixels: nerfstudio shoots the ray of pixel (0, 0) through (0.5, 0.5), so princip
 """
 
 import math
-import os
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from mapless.cameras import with_slashes
 from mapless.geometry import Camera, RigidTransform, nearest_rotation
 from mapless.lenses import Distortion, Fisheye, RadialTangential
 from mapless_tools.dataset import Dataset, finite_numbers, named, read_json
@@ -23,7 +21,6 @@ from .collecting import Collector, ReadOptions, from_corner, from_opengl, natura
 
 FILE_NAME = "transforms.json"
 SPLIT_FILES = {"transforms_train.json": "train", "transforms_val.json": "test", "transforms_test.json": "test"}
-_ENDINGS = ("", ".png", ".jpg", ".jpeg", ".webp")
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
 
 
@@ -69,12 +66,7 @@ def _image(collector: Collector, frame: Mapping[str, Any]) -> str:
     path = frame.get("file_path")
     if not isinstance(path, str) or not path:
         raise ValueError("file_path must be a path")
-    folder, path = collector.folder, str(PurePosixPath(path))
-    named = (with_slashes(folder, path + ending) for ending in _ENDINGS)
-    # Not Path.is_file, which raises where a name is longer than any file's.
-    found = next((name for name in named if os.path.isfile(folder / name)), path)
-    collector.image(found)
-    return found
+    return collector.image(str(PurePosixPath(path))).relative_to(collector.folder).as_posix()
 
 
 def _world_from_camera(frame: Mapping[str, Any], scale: float, world_from_original: RigidTransform) -> RigidTransform:
