@@ -155,7 +155,7 @@ class TestOrder:
         first, second = toy.admit(client="long"), toy.admit(client="long too")
         toy.admit(client="short", stage="describe")
         batches = [toy.take("host"), toy.take("host")]
-        assert {batch.jobs[0].flow.client for batch in batches} == {"short", "long"}
+        assert {batch.jobs[0].flow.caller for batch in batches} == {"short", "long"}
         toy.finish(next(it for it in batches if it.stage.name == "describe"), Done(None))
         assert toy.scheduler.take("host", toy.now_s) is None
         toy.now_s = 10.0  # none has come for as long as it takes

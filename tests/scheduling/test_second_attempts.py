@@ -98,7 +98,7 @@ def test_a_greedy_caller_takes_no_others_turn(is_crowded: bool, own_jobs: int, d
     Not where others have no room, too.
     """
     toy = Toy()
-    toy.learn("coarse", "more", 0.5)
+    toy.learn("coarse", "more", 0.8)
     job, *_ = [toy.admit(stage="refine", client="mine", deadline_s=200.0) for _ in range(own_jobs)]
     batch = toy.take("host")
     toy.fill()

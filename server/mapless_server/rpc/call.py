@@ -21,8 +21,9 @@ class Call:
     """A call, for its servicer; times are by `time.monotonic`.
 
     The request id identifies it in the log; it is the caller's own if that is well-formed. The message may arrive later
-    than the headers, at `arrived_s`. `client` distinguishes callers: the id that the caller gives, else the address of
-    its connection. `notes` are fields of its line in the log, `stages` those of the queue that its jobs have passed.
+    than the headers, at `arrived_s`. `client` distinguishes the clients of a token: the id that the client gives, else
+    the address of its connection. `notes` are fields of its line in the log, `stages` those of the queue that its jobs
+    have passed.
     """
 
     request_id: str
@@ -36,7 +37,17 @@ class Call:
     @property
     def caller(self) -> Caller:
         """The caller in the engine's form."""
-        return Caller(Flow(self.principal.tenant, self.client), self.deadline_s)
+        return Caller(self.flow, self.deadline_s)
+
+    @property
+    def flow(self) -> Flow:
+        """The owner of the call's jobs.
+
+        A client that its token or certificate names is one caller, however many names it gives itself; others are what
+        they call themselves.
+        """
+        it = self.principal
+        return Flow(it.tenant, it.name, self.client) if it.name else Flow(it.tenant, self.client)
 
     @property
     def trailers(self) -> tuple[tuple[str, str], ...]:

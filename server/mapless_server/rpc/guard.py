@@ -128,8 +128,8 @@ class CallGuard:
             call = self._begun(context, method in ENDLESS_METHODS)
             with self._recorded(method, call, context) as result:
                 try:
-                    principal = self._principal(method, context)
-                    self._check_admission(method, Flow(principal.tenant, call.client))
+                    call = replace(call, principal=self._principal(method, context))
+                    self._check_admission(method, call.flow)
                     response = await reply(handler, method, call, context)
                     context.set_trailing_metadata(call.trailers)
                     result.code = "OK"

@@ -5,7 +5,7 @@ The predicted cost of a job is booked while it is admitted (`Ledger`). A job is 
 """
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from .jobs import Flow, Job, Refusal, Refused
@@ -17,11 +17,11 @@ class WorkQueueOptions:
 
     Attributes:
         max_queued_s: largest predicted computing time of the admitted jobs, seconds per thread of a lane, besides a
-            caller's only job (see `Admission.check_queue`). The result of a job admitted beyond it would be late, and a
-            longer queue has no higher throughput.
+            caller's only job and its equal part (see `Admission.check_queue`). The result of a job admitted beyond it
+            would be late, and a longer queue has no higher throughput.
         max_bytes: largest memory of admitted jobs, and of calls that consist of several jobs, together.
-        quantum_s: computing time credited to a caller in each round of the fair queue; about what one job of a stage
-            takes.
+        quantum_s: a step that is predicted to take longer is a long one, of which one thread is kept free; about what
+            one job of a stage takes.
         stall_limit_s: a batch without any progress (its end, or a job's `check`) for longer is considered hung: its
             thread is lost, and the queue ends.
         heartbeat_s: interval of supervision.
@@ -39,8 +39,14 @@ class WorkQueueOptions:
                 raise ValueError(f"WorkQueueOptions.{name} must be above 0, is {value}")
 
 
-FLOW_SHARE = 0.75
-"""That one caller may use of what other callers leave of either bound, so that there is always room for the next."""
+CLIENT_SHARE = 0.75
+"""That one client may book of what its caller's other clients leave of the caller's part of the computing time, so that
+there is room for the next."""
+EQUAL_SHARE = 0.75
+"""Of an equal part of it, which a caller may book whatever the others hold, and a client of its caller's part: who was
+first with long jobs must not keep the others out while these are computed."""
+MEMORY_SHARE = CLIENT_SHARE**0.5
+"""That one caller may hold of the memory that others leave, and a client of its caller's part."""
 TIME_MARGIN = 1.2
 """A job is admitted if at least so many times its predicted time remains until its deadline. Predictions are averages,
 and a result that comes too late is wasted for everyone."""
@@ -50,7 +56,7 @@ long ones would be admitted on an idle server only, and then leave no room for o
 
 
 class Ledger:
-    """Predicted computing time, by lane, and memory of the admitted jobs: in total and per caller.
+    """Predicted computing time, by lane, and memory of the admitted jobs: in total, per caller and per client.
 
     Attributes:
         jobs: jobs that are admitted and have not ended.
@@ -59,21 +65,21 @@ class Ledger:
     def __init__(self) -> None:
         self.jobs: set[Job] = set()
         self._aside: set[Job] = set()
-        self._flows: dict[Flow, _Holdings] = {}
+        self._clients: dict[Flow, _Holdings] = {}
+        self._callers: dict[tuple[str, str], _Holdings] = {}
         self._all = _Holdings()
 
     def open(self, job: Job, cost_s: Counter[str]) -> None:
         """Books an admitted job."""
         self.jobs.add(job)
-        of_flow = self._flows.setdefault(job.flow, _Holdings())
-        for holdings in (of_flow, self._all):
+        for holdings in self._holding(job.flow):
             holdings.jobs += 1
             holdings.size_bytes += job.size_bytes
         self.rebook(job, cost_s)
 
     def rebook(self, job: Job, cost_s: Counter[str]) -> None:
         """Replaces the computing time predicted for a job, by lane."""
-        for holdings in (self._flows[job.flow], self._all):
+        for holdings in self._holding(job.flow):
             for lane, seconds in job.booked_s.items():  # Counter's methods take ten times as long
                 holdings.booked_s[lane] -= seconds
             for lane, seconds in cost_s.items():
@@ -84,13 +90,13 @@ class Ledger:
         """Counts a job for nothing but its memory, because it waits until a thread is idle otherwise."""
         self.rebook(job, Counter())
         self._aside.add(job)
-        for holdings in (self._flows[job.flow], self._all):
+        for holdings in self._holding(job.flow):
             holdings.aside += 1
 
     def resume(self, job: Job, cost_s: Counter[str]) -> None:
         """Undoes `set_aside`, with the computing time that is now predicted."""
         self._aside.remove(job)
-        for holdings in (self._flows[job.flow], self._all):
+        for holdings in self._holding(job.flow):
             holdings.aside -= 1
         self.rebook(job, cost_s)
 
@@ -100,7 +106,7 @@ class Ledger:
             self.resume(job, Counter())
         self.rebook(job, Counter())
         self.jobs.remove(job)
-        for holdings in (self._flows[job.flow], self._all):
+        for holdings in self._holding(job.flow):
             holdings.jobs -= 1
             holdings.size_bytes -= job.size_bytes
             if not holdings.jobs:
@@ -109,48 +115,90 @@ class Ledger:
 
     def hold(self, flow: Flow, size_bytes: int) -> None:
         """Books memory that a call of several jobs needs besides these jobs."""
-        for holdings in (self._flows.setdefault(flow, _Holdings()), self._all):
+        for holdings in self._holding(flow):
             holdings.size_bytes += size_bytes
 
     def release(self, flow: Flow, size_bytes: int) -> None:
         """Undoes `hold`."""
-        for holdings in (self._flows[flow], self._all):
+        for holdings in self._holding(flow):
             holdings.size_bytes -= size_bytes
         self._forget_if_empty(flow)
 
     def size_bytes(self, flow: Flow | None = None) -> int:
-        """Memory held by one caller, or by all."""
+        """Memory held by one client, or by all."""
         return self._of(flow).size_bytes
 
+    def size_bytes_of_caller(self, flow: Flow) -> int:
+        """Memory held by a client's caller."""
+        return self._callers.get(flow.group, _NOTHING).size_bytes
+
     def job_count(self, flow: Flow | None = None) -> int:
-        """Number of jobs of one caller, or of all, without those that are set aside."""
-        holdings = self._of(flow)
-        return holdings.jobs - holdings.aside
+        """Number of jobs of one client, or of all, without those that are set aside."""
+        return self._of(flow).in_order
+
+    def job_count_of_caller(self, flow: Flow) -> int:
+        """Number of jobs of a client's caller, without those that are set aside."""
+        return self._callers.get(flow.group, _NOTHING).in_order
 
     def booked_s(self, lane: str, flow: Flow | None = None) -> float:
-        """Computing time predicted for the jobs of one caller, or of all."""
+        """Computing time predicted for the jobs of one client, or of all."""
         return self._of(flow).booked_s[lane]
 
-    def ahead_s(self, flow: Flow, lane: str, own_s: float) -> float:
-        """Computing time until a new job of cost `own_s` is done, if all callers get equal shares.
+    def booked_s_of_caller(self, lane: str, flow: Flow) -> float:
+        """Computing time predicted for the jobs of a client's caller."""
+        return self._callers.get(flow.group, _NOTHING).booked_s[lane]
 
-        The caller's other jobs come first, and other callers get as much computing time as this one.
+    def ahead_s(self, flow: Flow, lane: str, own_s: float) -> float:
+        """Computing time until a new job of cost `own_s` is done, without its own, in the order of the fair queue.
+
+        The client's other jobs come first. Its caller's other clients get as much computing time as the client, the
+        tenant's other callers as much as its caller, and other tenants as much as the tenant.
         """
         until_done_s = self.booked_s(lane, flow) + own_s
         return until_done_s - own_s + self.of_others_s(flow, lane, until_done_s)
 
     def of_others_s(self, flow: Flow, lane: str, share_s: float) -> float:
-        """Computing time predicted for the jobs of all callers but one, of each at most `share_s`."""
-        of_others = (it.booked_s[lane] for other, it in self._flows.items() if other != flow)
-        return sum(min(other_s, share_s) for other_s in of_others)
+        """Computing time of other clients, callers and tenants until a client has had `share_s`."""
+        clients, callers, tenants = self._of_rivals_s(flow, lane)
+        total_s = share_s
+        for rivals in (clients, callers, tenants):
+            total_s += sum(min(it, total_s) for it in rivals)
+        return total_s - share_s
+
+    def _of_rivals_s(self, flow: Flow, lane: str) -> tuple[Iterable[float], Iterable[float], Iterable[float]]:
+        """Computing time booked for each other client of the caller, caller of the tenant, and tenant."""
+        clients = [
+            it.booked_s[lane] for other, it in self._clients.items() if other.group == flow.group and other != flow
+        ]
+        callers, tenants = list[float](), Counter[str]()
+        for group, it in self._callers.items():
+            if group[0] != flow.tenant:
+                tenants[group[0]] += it.booked_s[lane]  # type: ignore[assignment]  # not int
+            elif group != flow.group:
+                callers.append(it.booked_s[lane])
+        return clients, callers, tenants.values()
+
+    def caller_count(self, flow: Flow) -> int:
+        """Number of callers that have jobs, with that of this client, whether or not it has any."""
+        return len(self._callers) + (flow.group not in self._callers)
+
+    def client_count(self, flow: Flow) -> int:
+        """Number of this client's caller's clients that have jobs, with this client, whether or not it has any."""
+        return 1 + sum(other.group == flow.group and other != flow for other in self._clients)
 
     def _of(self, flow: Flow | None) -> "_Holdings":
-        return self._all if flow is None else self._flows.get(flow, _NOTHING)
+        return self._all if flow is None else self._clients.get(flow, _NOTHING)
+
+    def _holding(self, flow: Flow) -> tuple["_Holdings", "_Holdings", "_Holdings"]:
+        """What the client, its caller and all hold, to be changed."""
+        of_client = self._clients.setdefault(flow, _Holdings())
+        return of_client, self._callers.setdefault(flow.group, _Holdings()), self._all
 
     def _forget_if_empty(self, flow: Flow) -> None:
-        held = self._flows[flow]
-        if not (held.jobs or held.size_bytes):
-            del self._flows[flow]
+        if self._clients[flow].is_empty:
+            del self._clients[flow]
+        if self._callers[flow.group].is_empty:
+            del self._callers[flow.group]
 
 
 class _Holdings:
@@ -159,6 +207,15 @@ class _Holdings:
         self.aside = 0
         self.size_bytes = 0
         self.booked_s: Counter[str] = Counter()
+
+    @property
+    def in_order(self) -> int:
+        """Number of jobs without those that are set aside."""
+        return self.jobs - self.aside
+
+    @property
+    def is_empty(self) -> bool:
+        return not (self.jobs or self.size_bytes)
 
 
 _NOTHING = _Holdings()
@@ -204,10 +261,11 @@ class Admission:
             raise Refused(Refusal.DEADLINE_INFEASIBLE, message, retry_s)
 
     def check_queue(self, flow: Flow, cost_s: Counter[str]) -> None:
-        """Raises Refused if no job of this cost can be admitted for a caller, whatever its deadline and size.
+        """Raises Refused if no job of this cost can be admitted for a client, whatever its deadline and size.
 
-        An idle server admits any cost: the prediction may be wrong, and only computing corrects it. A caller without
-        jobs is also admitted if its job would be done soon although all others got as much of the server as it does.
+        An idle server admits any cost: the prediction may be wrong, and only computing corrects it. A client without
+        jobs is also admitted if its job would be done soon although the caller's other clients got as much of the
+        caller's part as it does, or, if the caller has no other jobs, although all other callers did of the server.
         """
         if self._is_closed:
             raise Refused(Refusal.DRAINING, "the server is stopping", UNKNOWN_RETRY_S)
@@ -218,20 +276,21 @@ class Admission:
         is_first = not own_jobs
         for lane, own_s in (self.bookable(cost_s) if is_first else cost_s).items():
             excess_s = self._excess_s(flow, lane, own_s)
-            if is_first:
-                excess_s = min(excess_s, ledger.ahead_s(flow, lane, own_s) + own_s - self._bound_s(lane))
             if excess_s > 0:
                 message = f"as much is admitted already as can be computed soon; this caller's jobs in it: {own_jobs}"
                 raise Refused(Refusal.QUEUE_FULL, message, max(MIN_RETRY_S, excess_s / self._threads[lane]))
 
     def check_memory(self, flow: Flow, size_bytes: int) -> None:
-        """Raises Refused if a caller cannot have this much more memory; a single caller may have all of it."""
+        """Raises Refused if a client cannot have this much more memory; a single one may have all of it."""
         self._check_size(size_bytes)
-        all_bytes, held_bytes = self._ledger.size_bytes(), self._ledger.size_bytes(flow)
-        is_first = not (all_bytes or self._ledger.jobs)
+        ledger = self._ledger
+        is_first = not (ledger.size_bytes() or ledger.jobs)
         if not size_bytes or is_first:
             return
-        if held_bytes + size_bytes > self._share(self._options.max_bytes, all_bytes, held_bytes):
+        by_caller = ledger.size_bytes_of_caller(flow)
+        of_caller = MEMORY_SHARE * (self._options.max_bytes - (ledger.size_bytes() - by_caller))
+        of_client = MEMORY_SHARE * (of_caller - (by_caller - ledger.size_bytes(flow)))
+        if by_caller + size_bytes > of_caller or ledger.size_bytes(flow) + size_bytes > of_client:
             raise Refused(Refusal.TOO_MUCH_MEMORY, "the calls in progress hold too much memory", UNKNOWN_RETRY_S)
 
     def _check_size(self, size_bytes: int) -> None:
@@ -250,7 +309,7 @@ class Admission:
         return all(it <= 0 or self._excess_s(job.flow, lane, it) <= 0 for lane, it in added_s.items())
 
     def has_turn(self, job: Job, cost_s: Counter[str]) -> bool:
-        """Whether an admitted job, its caller's only one, may continue although its caller's share is too small for it.
+        """Whether an admitted job, its client's only one, may continue although the share is too small for it.
 
         It may if it would be done soon although all others got as much of the server, as a first job is admitted.
         """
@@ -264,13 +323,25 @@ class Admission:
         return Counter({lane: min(own_s, MAX_BOOKED_SHARE * self._bound_s(lane)) for lane, own_s in cost_s.items()})
 
     def _excess_s(self, flow: Flow, lane: str, added_s: float) -> float:
-        """Computing time by which a caller would exceed its bound with this much more."""
-        held_s = self._ledger.booked_s(lane, flow)
-        return held_s + added_s - self._share(self._bound_s(lane), self._ledger.booked_s(lane), held_s)
+        """Computing time by which a client or its caller would exceed its part with this much more."""
+        ledger, bound_s = self._ledger, self._bound_s(lane)
+        by_all_s, by_caller_s = ledger.booked_s(lane), ledger.booked_s_of_caller(lane, flow)
+        by_client_s = ledger.booked_s(lane, flow)
+        of_caller_s = self._part_s(bound_s, by_all_s, by_caller_s, ledger.caller_count(flow))
+        of_client_s = self._part_s(of_caller_s, by_caller_s, by_client_s, ledger.client_count(flow))
+        caller_excess_s = by_caller_s + added_s - of_caller_s
+        client_excess_s = by_client_s + added_s - CLIENT_SHARE * of_client_s
+        if ledger.job_count(flow):
+            return max(caller_excess_s, client_excess_s)
+        first_excess_s = ledger.of_others_s(flow, lane, added_s) + added_s - bound_s
+        if ledger.job_count_of_caller(flow):
+            return max(caller_excess_s, min(client_excess_s, first_excess_s))
+        return min(max(caller_excess_s, client_excess_s), first_excess_s)
 
     def _bound_s(self, lane: str) -> float:
         return self._options.max_queued_s * self._threads[lane]
 
-    def _share(self, bound: float, held: float, held_by_flow: float) -> float:
-        """The part of a bound that one caller may have, given what it and all callers have."""
-        return FLOW_SHARE * (bound - (held - held_by_flow))
+    @staticmethod
+    def _part_s(bound_s: float, held_s: float, held_by_it_s: float, count: int) -> float:
+        """The part of a bound that one of `count` may have: what the others leave, and at least an equal part."""
+        return max(bound_s - (held_s - held_by_it_s), EQUAL_SHARE * bound_s / count)

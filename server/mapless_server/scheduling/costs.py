@@ -1,9 +1,9 @@
 """Predicted computing times: of a job in a stage, from earlier ones of its kind, and in all the stages that follow."""
 
-import math
 from collections import Counter, OrderedDict, deque
 from collections.abc import Mapping
 from statistics import median_low
+from typing import NamedTuple
 
 from .jobs import Flow, Job, Stage, Step
 
@@ -15,6 +15,8 @@ MEMORY = 10
 """About so many of the last jobs of a kind count."""
 MAX_OF_CALLERS = 4000
 """Predictions for single callers that are kept, about six of each."""
+MAX_OF_CLIENTS = 100
+"""A caller's clients of which predictions are kept, so that one caller does not displace those of others."""
 FORGOTTEN_S = 30.0
 """What a caller's jobs cost longer ago does not count: as long as it is refused, nothing corrects its prediction."""
 
@@ -22,13 +24,13 @@ FORGOTTEN_S = 30.0
 class CostModel:
     """Predicts the computing time of a job in a stage from earlier ones of its kind.
 
-    Photographs of a caller resemble one another, and those of another caller may take fifty times as long: so its own
-    jobs count, as an average with more weight for recent ones, which begins with what is typical. That is the median of
-    all callers' last jobs.
+    Photographs of a client resemble one another, and those of another may take fifty times as long: so its own jobs
+    count, as an average with more weight for recent ones, which begins with what is typical. That is the average of its
+    caller's jobs; of a new caller, the median of all callers' last jobs.
     """
 
     def __init__(self) -> None:
-        self._of_callers: OrderedDict[tuple[str, str, Flow], tuple[int, float, float]] = OrderedDict()
+        self._of_callers: OrderedDict[tuple[str, str, tuple[str, str]], _OfCaller] = OrderedDict()
         self._of_all: dict[tuple[str, str], deque[float]] = {}
 
     def forget(self) -> None:
@@ -42,9 +44,9 @@ class CostModel:
         Unless it `is_certain` that the job reaches the stage, jobs that did not count as well, with nothing.
         """
         stage += "" if is_certain else _EXPECTED
-        _, mean_s, seen_s = self._of_callers.get((stage, kind, flow), (0, 0.0, -math.inf))
-        if now_s - seen_s <= FORGOTTEN_S:
-            return mean_s
+        of_caller = self._of_callers.get((stage, kind, flow.group))
+        if of_caller is not None and (recent_s := of_caller.recent_s(flow, now_s)) is not None:
+            return recent_s
         known = self._of_all.get((stage, kind)) or self._of_all.get((stage, ""))
         return median_low(known) if known else FIRST_GUESS_S
 
@@ -55,16 +57,54 @@ class CostModel:
         self._observe(stage + _EXPECTED, kind, flow, seconds or 0.0, now_s)
 
     def _observe(self, stage: str, kind: str, flow: Flow, seconds: float, now_s: float) -> None:
-        count, mean_s, seen_s = self._of_callers.pop((stage, kind, flow), (0, 0.0, -math.inf))
-        if now_s - seen_s > FORGOTTEN_S:
-            known = self._of_all.get((stage, kind))
-            count, mean_s = (1, median_low(known)) if known else (0, 0.0)
-        count = min(count + 1, MEMORY)
-        self._of_callers[stage, kind, flow] = (count, mean_s + (seconds - mean_s) / count, now_s)
+        of_caller = self._of_callers.pop((stage, kind, flow.group), None) or _OfCaller()
+        known = self._of_all.get((stage, kind))
+        of_caller.observe(flow, seconds, now_s, median_low(known) if known else None)
+        self._of_callers[stage, kind, flow.group] = of_caller
         if len(self._of_callers) > MAX_OF_CALLERS:
             self._of_callers.popitem(last=False)
         for key in (kind, ""):
             self._of_all.setdefault((stage, key), deque(maxlen=MEMORY)).append(seconds)
+
+
+class _Mean(NamedTuple):
+    """An average with more weight for recent values."""
+
+    count: int
+    mean_s: float
+    seen_s: float
+
+    def with_value(self, seconds: float, now_s: float) -> "_Mean":
+        count = min(self.count + 1, MEMORY)
+        return _Mean(count, self.mean_s + (seconds - self.mean_s) / count, now_s)
+
+
+class _OfCaller:
+    """What the jobs of a caller's clients took in a stage, those of each and of all together."""
+
+    def __init__(self) -> None:
+        self._all: _Mean | None = None
+        self._of_clients: OrderedDict[str, _Mean] = OrderedDict()
+
+    def recent_s(self, flow: Flow, now_s: float) -> float | None:
+        """The average of the client, else that of the caller; None if both are too old."""
+        for it in (self._of_clients.get(flow.client), self._all):
+            if it is not None and now_s - it.seen_s <= FORGOTTEN_S:
+                return it.mean_s
+        return None
+
+    def observe(self, flow: Flow, seconds: float, now_s: float, typical_s: float | None) -> None:
+        """Counts a job; `typical_s` is what others took, if any have been observed."""
+        begin = _Mean(0, 0.0, now_s) if typical_s is None else _Mean(1, typical_s, now_s)
+        if self._all is not None and now_s - self._all.seen_s <= FORGOTTEN_S:
+            begin = self._all
+        of_client = self._of_clients.pop(flow.client, None)
+        if of_client is None or now_s - of_client.seen_s > FORGOTTEN_S:
+            of_client = begin._replace(count=min(begin.count, 1))
+        self._of_clients[flow.client] = of_client.with_value(seconds, now_s)
+        if len(self._of_clients) > MAX_OF_CLIENTS:
+            self._of_clients.popitem(last=False)
+        self._all = begin.with_value(seconds, now_s)
 
 
 class StageCosts:

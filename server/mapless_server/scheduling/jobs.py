@@ -10,10 +10,23 @@ from typing import Any, NamedTuple, Protocol
 
 
 class Flow(NamedTuple):
-    """The owner of a job: tenants get equal shares, and so do the clients of a tenant."""
+    """The owner of a job: tenants get equal shares, so do the callers of a tenant, and the clients of a caller.
+
+    Attributes:
+        tenant: empty for the server's own jobs.
+        caller: who cannot be more than one: the name of a token or certificate. Where there is neither, what the client
+            calls itself, or its address.
+        client: what a client calls itself among those of a token or certificate, or its address.
+    """
 
     tenant: str
-    client: str
+    caller: str
+    client: str = ""
+
+    @property
+    def group(self) -> tuple[str, str]:
+        """The tenant and the caller, without the client."""
+        return self[:2]
 
 
 class Refusal(str, Enum):
@@ -285,7 +298,7 @@ class Lane:
         passed_over: batches since the first stage that has waiting jobs was served.
         busy_s: sum of the threads' computing times so far.
         long: numbers of the batches that are computed of which a step is predicted to take more than a quantum.
-        arrivals: of the last jobs that have come to wait: caller, predicted time with later stages, time of arrival.
+        arrivals: of the last jobs that have come to wait: owner, predicted time with later stages, time of arrival.
     """
 
     threads: int
@@ -309,7 +322,7 @@ class Lane:
         They are if one of another caller has come within as long a time.
         """
         return any(
-            _MUCH_SHORTER * its_s <= seconds and now_s - came_s <= seconds and other != flow
+            _MUCH_SHORTER * its_s <= seconds and now_s - came_s <= seconds and other.group != flow.group
             for other, its_s, came_s in self.arrivals
         )
 

@@ -73,9 +73,9 @@ class Scheduler:
         self._quota = quota
         self._stages = {stage.name: stage for stage in stages}
         self._stage_costs = StageCosts(self.costs, self._stages)
-        self._queues: dict[str, FairQueue[Job]] = {stage.name: FairQueue(options.quantum_s) for stage in stages}
+        self._queues: dict[str, FairQueue[Job]] = {stage.name: FairQueue() for stage in stages}
         # Steps of admitted jobs that need more room than there is: computed by threads that are idle otherwise.
-        self._spare: dict[str, FairQueue[Job]] = {stage.name: FairQueue(options.quantum_s) for stage in stages}
+        self._spare: dict[str, FairQueue[Job]] = {stage.name: FairQueue() for stage in stages}
         # When a job was last refused because of those admitted, and when one of a caller that has not most of these.
         self._refused_s = self._crowded_s = -math.inf
         self._running: Counter[str] = Counter()
@@ -86,7 +86,7 @@ class Scheduler:
             self._lanes[name] = Lane(count, own, queues, spare, count)
         self._limits: dict[tuple[str, str], BatchLimit] = {}
         self._declined: Counter[tuple[str, str]] = Counter()
-        self._first_steps: OrderedDict[tuple[Flow, str], Step] = OrderedDict()
+        self._first_steps: OrderedDict[tuple[tuple[str, str], str], Step] = OrderedDict()
         self._ledger = Ledger()
         self._admission = Admission(options, lanes, self._ledger)
         self._timers = Timers()
@@ -149,7 +149,7 @@ class Scheduler:
 
         That is a job as the caller's last one with this stage as its first, or with this step if there was none.
         """
-        step = self._first_steps.get((flow, step.stage), step)
+        step = self._first_steps.get((flow.group, step.stage), step)
         with self._refusals_reported(flow, now_s):
             self._admission.check_queue(flow, self._stage_costs.of(step, flow, now_s))
 
@@ -293,13 +293,15 @@ class Scheduler:
 
     def _has_most(self, flow: Flow) -> bool:
         """Whether a caller's admitted jobs take longer than those of all others together."""
-        return any(2 * self._ledger.booked_s(lane, flow) > self._ledger.booked_s(lane) for lane in self._lanes)
+        ledger = self._ledger
+        return any(2 * ledger.booked_s_of_caller(lane, flow) > ledger.booked_s(lane) for lane in self._lanes)
 
     def _remember(self, flow: Flow, step: Step) -> None:
         """Keeps the first step of a caller's last job, without its payload, for `check_room`."""
-        if (known := self._first_steps.get((flow, step.stage))) is None or known.kind != step.kind:
-            self._first_steps[flow, step.stage] = replace(step, payload=None)
-        self._first_steps.move_to_end((flow, step.stage))
+        key = flow.group, step.stage
+        if (known := self._first_steps.get(key)) is None or known.kind != step.kind:
+            self._first_steps[key] = replace(step, payload=None)
+        self._first_steps.move_to_end(key)
         if len(self._first_steps) > MAX_OF_CALLERS:
             self._first_steps.popitem(last=False)
 

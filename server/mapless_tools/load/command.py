@@ -74,6 +74,24 @@ def soak_command(
     _finish(_soak(data, quick, output, clients=clients, seed=seed, **given))
 
 
+@load_app.command("neighbours")
+def neighbours_command(
+    data: Data = None,
+    elsewhere: Annotated[
+        Path | None, typer.Option(help="Folder as for --data of another place, which the neighbour asks about.")
+    ] = None,
+    quick: Quick = False,
+    deadline_s: Deadline = 30.0,
+    step_s: Annotated[float, typer.Option(help="Seconds alone, and seconds beside the neighbour.")] = 60.0,
+    clients: Clients = 4,
+    seed: Seed = 0,
+    output: Output = OUTPUT,
+) -> None:
+    """A fleet under its token, alone and beside another token whose calls are endless and each of a new client."""
+    given = {"deadline_s": deadline_s, "step_s": step_s, "clients": clients, "seed": seed}
+    _finish(_neighbours(data, elsewhere, quick, output, **given))
+
+
 @load_app.command("all")
 def all_command(data: Data = None, minutes: Minutes = 10.0, quick: Quick = False, output: Output = OUTPUT) -> None:
     """All three, one after the other."""
@@ -133,6 +151,25 @@ def _soak(data: Path | None, quick: bool, output: Path, **given: Any) -> list[Ch
     lines, checks = [*step_lines([*result.before, result.soak]), *soak_lines(result)], soak_checks(result)
     figure = draw_soak(result.states, result.slopes)
     _report_drawn(result.scene, lines, checks, soak_json(result), figure, output / "soak.svg", log)
+    return checks
+
+
+def _neighbours(data: Path | None, elsewhere: Path | None, quick: bool, output: Path, **given: Any) -> list[Check]:
+    from mapless_tools.demo import place_of
+    from mapless_tools.usage import usage_errors
+
+    from .neighbours import NeighbourOptions, measure_neighbours, neighbour_checks
+    from .report import report_part, step_lines
+
+    brief = {"ramp_s": 3.0, "step_s": 6.0, "settle_s": 1.0} if quick else {}
+    with _measuring() as progress:
+        with usage_errors():
+            options, place = NeighbourOptions(**(given | brief)), place_of(data)
+            other = None if elsewhere is None else place_of(elsewhere)
+        log = _new_log(output, "neighbours")
+        result = measure_neighbours(place, other, options, progress, log)
+    lines, checks = [f"{place.title}:", "", *step_lines(result.all_steps)], neighbour_checks(result)
+    report_part(output / OUTPUT_FILE, "neighbours", lines, checks, result, log)
     return checks
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mapless import Client, wire
+from mapless import Client, ConnectOptions, wire
 from mapless.geometry import Camera
 from mapless.names import reference_name, scene_name
 from mapless.v1 import localization_service_pb2 as pb
@@ -92,17 +92,22 @@ class LoadedServer:
 
 @contextmanager
 def server_with_scene(
-    place: Place, progress: Progress, environment: Mapping[str, str] | None = None, log: Path | None = None
+    place: Place,
+    progress: Progress,
+    environment: Mapping[str, str] | None = None,
+    log: Path | None = None,
+    connect: ConnectOptions = CONNECT,
 ) -> Iterator[LoadedServer]:
     """Starts a server, stores the references of a place, and has it answer every query once.
 
     It uses the settings of the environment, to which `environment` is added. Its log is appended to the file `log`.
+    References are stored with the token of `connect`.
     """
     port = free_port()
     with tempfile.TemporaryDirectory(prefix="mapless-load-") as data_dir:
         flags = {"--metrics-port": str(port), "--metrics-host": "127.0.0.1"}
         with child_server(Path(data_dir), flags, environment, log) as server:
-            with Client(server.address, CONNECT) as client:
+            with Client(server.address, connect) as client:
                 progress("storing references", 0, len(place.references))
                 store_references(client, place.references)
                 progress("first answers", 0, len(place.queries))

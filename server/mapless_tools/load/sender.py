@@ -21,6 +21,7 @@ REFUSED_PAUSE_S = 0.1
 """Before a refused caller in a closed loop calls again, where the server does not say when."""
 ReadAnswer = Callable[[bytes], str]
 """The outcome of an answer, in a few words."""
+Metadata = tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,9 +35,17 @@ class Target:
 
 @asynccontextmanager
 async def connected(
-    address: str, method: str, clients: int, deadline_s: float, read_answer: ReadAnswer
+    address: str,
+    method: str,
+    clients: int,
+    deadline_s: float,
+    read_answer: ReadAnswer,
+    metadata: Callable[[], Metadata] = tuple,
 ) -> AsyncIterator[Target]:
-    """Connects several clients to a method, "/package.Service/Method", until the end of the block."""
+    """Connects several clients to a method, "/package.Service/Method", until the end of the block.
+
+    `metadata` makes the metadata of each call.
+    """
     options = [
         # Channels to one address share a connection otherwise, and the server would see one client.
         ("grpc.use_local_subchannel_pool", 1),
@@ -49,10 +58,14 @@ async def connected(
     try:
         for channel in channels:
             await asyncio.wait_for(channel.channel_ready(), 30)
-        yield Target([channel.unary_unary(method) for channel in channels], deadline_s, read_answer)
+        yield Target([_with_metadata(it.unary_unary(method), metadata) for it in channels], deadline_s, read_answer)
     finally:
         for channel in channels:
             await channel.close()
+
+
+def _with_metadata(method: Any, metadata: Callable[[], Metadata]) -> Callable[..., Any]:
+    return lambda request, timeout: method(request, timeout=timeout, metadata=metadata())
 
 
 async def send_open_loop(target: Target, plan: Sequence[PlannedCall], start_s: float | None = None) -> list[CallRecord]:

@@ -1,0 +1,181 @@
+"""A fleet beside a caller that asks without end under a token of its own, as a new client with each call.
+
+The fleet's calls, their times and their photographs are the same alone and beside the neighbour.
+"""
+
+import asyncio
+import tempfile
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from mapless_server.method.options import check_bounds
+from mapless_server.security import create_token
+from mapless_server.settings import PREFIX
+from mapless_tools.child import CONNECT
+from mapless_tools.demo import Photograph, Place
+from mapless_tools.progress import Progress
+
+from .calls import CallRecord, Fate, account_of
+from .driving import METHOD, LoadedServer, find_saturation, open_step, photo_request, read_answer, server_with_scene
+from .report import Check
+from .sender import Metadata, connected, send_closed_loop
+from .step import Step
+
+MAX_P50_OVER_ALONE = 1.5
+MIN_SHARE_OF_ANSWERS = 0.9
+_WARM_UP_S = 3.0
+"""The neighbour calls before the fleet does, so that its calls have filled the queue."""
+
+
+@dataclass(frozen=True)
+class NeighbourOptions:
+    """Options of the measurement.
+
+    Attributes:
+        clients: number of the fleet's robots, each with its own connection and id.
+        callers: calls of the neighbour side by side, each followed by the next.
+        share: the fleet's load, as a share of the largest rate of its answers.
+        deadline_s: deadline of every call.
+        ramp_s: time with each number of concurrent calls, by which that rate is found.
+        step_s: time alone, and time beside the neighbour.
+        settle_s: beginning of each that its rates leave out.
+    """
+
+    clients: int = 4
+    callers: int = 8
+    share: float = 0.4
+    deadline_s: float = 30.0
+    ramp_s: float = 10.0
+    step_s: float = 60.0
+    settle_s: float = 5.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "clients callers", at_least=1)
+        check_bounds(self, "share deadline_s ramp_s", above=0)
+        check_bounds(self, "settle_s", at_least=0, below=self.step_s)
+
+
+@dataclass(frozen=True, eq=False)
+class NeighbourResult:
+    """The fleet's steps: concurrent calls, then its load alone and beside the neighbour, whose outcomes are counted."""
+
+    options: NeighbourOptions
+    ramp: Sequence[Step]
+    saturation_per_s: float
+    alone: Step
+    beside: Step
+    neighbour_outcomes: dict[str, int]
+
+    @property
+    def all_steps(self) -> list[Step]:
+        """All steps in order."""
+        return [*self.ramp, self.alone, self.beside]
+
+
+def measure_neighbours(
+    place: Place, elsewhere: Place | None, options: NeighbourOptions, progress: Progress, log: Path | None = None
+) -> NeighbourResult:
+    """Starts a server with three tokens, and measures; the neighbour's photographs are of another place, or of none."""
+    with tempfile.TemporaryDirectory(prefix="mapless-tokens-") as folder:
+        file = Path(folder) / "tokens"
+        surveyor, fleet, neighbour = (
+            create_token(file, name, "default", role, None)
+            for name, role in (("surveyor", "write"), ("fleet", "localize"), ("neighbour", "localize"))
+        )
+        environment = {f"{PREFIX}TOKENS_FILE": str(file)}
+        with server_with_scene(place, progress, environment, log, replace(CONNECT, token=surveyor)) as server:
+            foreign = [
+                photo_request(it.data, it.camera, ()) for it in (elsewhere.queries if elsewhere else _of_nothing(place))
+            ]
+            return asyncio.run(_measure(server, (fleet, neighbour), foreign, options, progress))
+
+
+def neighbour_checks(result: NeighbourResult) -> list[Check]:
+    """The bars."""
+    alone, beside = result.alone.account, result.beside.account
+    alone_ms, beside_ms = alone.answers.p50_ms, beside.answers.p50_ms
+    figure, bar = "the fleet's p50 beside the neighbour", f"at most {MAX_P50_OVER_ALONE:g} times that alone"
+    p50 = Check(figure, "-", bar, None)
+    if alone_ms is not None and beside_ms is not None:
+        ratio = beside_ms / alone_ms
+        value = f"{beside_ms:.0f} ms, {ratio:.2f} times {alone_ms:.0f} ms"
+        p50 = Check(figure, value, bar, ratio <= MAX_P50_OVER_ALONE)
+    share = beside.count(Fate.ANSWERED) / max(1, alone.count(Fate.ANSWERED))
+    return [
+        p50,
+        Check(
+            "the fleet's answers beside the neighbour",
+            f"{beside.count(Fate.ANSWERED)}, {100 * share:.0f} % of {alone.count(Fate.ANSWERED)}",
+            f"at least {100 * MIN_SHARE_OF_ANSWERS:.0f} % of those alone",
+            share >= MIN_SHARE_OF_ANSWERS,
+        ),
+    ]
+
+
+async def _measure(
+    server: LoadedServer,
+    tokens: tuple[str, str],
+    foreign: Sequence[bytes],
+    options: NeighbourOptions,
+    progress: Progress,
+) -> NeighbourResult:
+    (fleet, neighbour), numbers, robots = tokens, count(), count()
+
+    def of_fleet() -> Metadata:
+        return ("authorization", f"Bearer {fleet}"), ("x-client-id", f"robot-{next(robots) % options.clients}")
+
+    def of_neighbour() -> Metadata:
+        return ("authorization", f"Bearer {neighbour}"), ("x-client-id", f"id-{next(numbers)}")
+
+    asked = server.address, METHOD
+    async with (
+        connected(*asked, options.clients, options.deadline_s, read_answer, of_fleet) as target,
+        connected(*asked, options.callers, options.deadline_s, read_answer, of_neighbour) as other,
+    ):
+        ramp, saturation_per_s = await find_saturation(server, target, options.ramp_s, progress)
+        records: list[CallRecord] = []
+
+        @asynccontextmanager
+        async def calling() -> AsyncIterator[None]:
+            seconds = options.step_s + _WARM_UP_S
+            task = asyncio.create_task(send_closed_loop(other, foreign, options.callers, seconds))
+            await asyncio.sleep(_WARM_UP_S)
+            yield
+            records.extend(await task)
+
+        rate_per_s = options.share * saturation_per_s
+        progress("alone", 0, 1)
+        alone = await open_step(
+            "alone", server, target, rate_per_s, options.step_s, settle_s=options.settle_s, seed=options.seed
+        )
+        progress("beside the neighbour", 0, 1)
+        beside = await open_step(
+            "beside the neighbour",
+            server,
+            target,
+            rate_per_s,
+            options.step_s,
+            settle_s=options.settle_s,
+            seed=options.seed,
+            beside=calling,
+        )
+    outcomes = dict(account_of(records, options.step_s + _WARM_UP_S).outcomes)
+    return NeighbourResult(options, ramp, saturation_per_s, alone, beside, outcomes)
+
+
+def _of_nothing(place: Place) -> list[Photograph]:
+    """Photographs of noise, by the size and camera of a place's first query: features everywhere, no match."""
+    query, random = place.queries[0], np.random.default_rng(0)
+    camera, made = query.camera, []
+    for _ in range(4):
+        coarse = random.integers(0, 256, (camera.height_px // 8, camera.width_px // 8, 3)).astype(np.uint8)
+        noise = cv2.resize(coarse, (camera.width_px, camera.height_px), interpolation=cv2.INTER_CUBIC)
+        made.append(replace(query, data=bytes(cv2.imencode(".jpg", noise)[1])))
+    return made
