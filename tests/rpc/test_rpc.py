@@ -30,7 +30,7 @@ from mapless.wire import FieldError
 from mapless_server.errors import NotFound, Overloaded, PermissionDenied, Unauthenticated
 from mapless_server.rpc import Call
 from mapless_server.rpc.guard import ANSWER_MARGIN_SHARE
-from mapless_server.scheduling import StageRecord
+from mapless_server.scheduling import Flow, StageRecord
 from mapless_server.security import Principal, Role
 
 
@@ -186,6 +186,7 @@ async def test_the_caller_is_authenticated_before_its_message(
     (call,) = seen
     assert call.principal == Principal("acme", Role.LOCALIZE, "robot-7")
     assert call.client == "headset-3"
+    assert call.flow == Flow("acme", "robot-7", "headset-3")
     assert {method for method, _ in asked} == {METHOD}
     unknown, _, known = lines_of(caplog)
     assert "tenant" not in unknown
@@ -233,6 +234,7 @@ async def test_every_caller_is_admitted_by_default_by_address(counted: Counted, 
     (call,) = seen
     assert call.principal == Principal()
     assert re.fullmatch(r"ipv4:127\.0\.0\.1:\d+", call.client)
+    assert call.flow == Flow("default", call.client)
     assert len(call.request_id) == 32
 
 

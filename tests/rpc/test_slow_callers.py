@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Any, cast
 
 import grpc
@@ -29,8 +30,8 @@ from support.waiting import until
 from mapless.errors import from_rpc_error
 from mapless_server.errors import Overloaded, RequestError, Unauthenticated, Unavailable
 from mapless_server.rpc import receiving, sending
-from mapless_server.rpc.receiving import OpenMethods, Receiver
-from mapless_server.rpc.sending import Unread
+from mapless_server.rpc.receiving import OpenMethods, Places, Receiver
+from mapless_server.rpc.sending import Pace, Unread
 from mapless_server.scheduling import Flow
 from mapless_server.security import Principal
 
@@ -54,9 +55,9 @@ def test_unread_answers_of_a_tenant_are_limited_but_for_small_ones(monkeypatch: 
     monkeypatch.setattr(sending, "SMALL_ANSWER_BYTES", 100)
     unread = Unread()
 
-    def answer(size_bytes: int, tenant: str = "ours") -> Answered:
+    def answer(size_bytes: int, tenant: str = "ours", caller: str = "") -> Answered:
         call = Answered()
-        unread.add(tenant, size_bytes, cast(Any, call))
+        unread.add(tenant, caller, size_bytes, cast(Any, call))
         return call
 
     first = answer(1500)
@@ -73,6 +74,47 @@ def test_unread_answers_of_a_tenant_are_limited_but_for_small_ones(monkeypatch: 
     for it in (small, large):
         it.is_read()
     assert answer(1500)
+
+
+def test_a_token_that_reads_nothing_leaves_room_to_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sending, "UNREAD_BYTES", 1000)
+    monkeypatch.setattr(sending, "SMALL_ANSWER_BYTES", 10)
+    unread = Unread()
+
+    def answers(caller: str) -> int:
+        for count in range(100):
+            try:
+                unread.add("ours", caller, 50, cast(Any, Answered()))
+            except Overloaded:
+                return count
+        return 100
+
+    assert [answers("deaf"), answers("robot"), answers("third")] == [15, 3, 1]
+
+
+async def test_refusals_of_one_token_do_not_delay_those_of_another() -> None:
+    pace, begin_s = Pace(), time.monotonic()
+    flood = [asyncio.ensure_future(pace.turn(begin_s + 30, ("t", "flood"))) for _ in range(400)]
+    await asyncio.sleep(0)
+    asked_s = time.monotonic()
+    await pace.turn(begin_s + 30, ("t", "robot"))
+    assert time.monotonic() - asked_s < 0.5
+    assert not all(it.done() for it in flood)
+    await asyncio.gather(*flood)
+
+
+async def test_a_token_takes_at_most_its_part_of_the_calls() -> None:
+    places = Places()
+    with ExitStack() as stack:
+        for _ in range(receiving.MAX_CALLS_OF_CALLER):
+            stack.enter_context(places.taken(("t", "many")))
+        with pytest.raises(Overloaded) as refused, places.taken(("t", "many")):
+            pass
+        assert refused.value.reason == "TOO_MANY_CALLS"
+        with places.taken(("t", "robot")), places.taken(("u", "many")):
+            pass
+    with places.taken(("t", "many")):
+        pass
 
 
 class TestCallsWithHeadersOnly:

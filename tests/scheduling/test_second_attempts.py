@@ -52,7 +52,7 @@ def test_a_step_beyond_the_bounds_takes_no_room() -> None:
 def test_what_waits_for_an_idle_thread_is_no_job_of_its_caller() -> None:
     """Whose next job is admitted like a first one, which needs no more than its turn among the others' jobs."""
     toy = Toy()
-    job = again(toy, "slow", 5)
+    job = again(toy, "slow", 4)
     toy.admit(client="other 0")
     mine = toy.admit(client="mine")
     assert "this caller's jobs in it: 1" in str(toy.refusal(client="mine"))
@@ -98,7 +98,7 @@ def test_a_greedy_caller_takes_no_others_turn(is_crowded: bool, own_jobs: int, d
     Not where others have no room, too.
     """
     toy = Toy()
-    toy.learn("coarse", "more", 0.8)
+    toy.learn("coarse", "more", 0.9)
     job, *_ = [toy.admit(stage="refine", client="mine", deadline_s=200.0) for _ in range(own_jobs)]
     batch = toy.take("host")
     toy.fill()

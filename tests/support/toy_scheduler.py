@@ -51,11 +51,11 @@ class PlantedQuota:
         self.charged: list[float] = []
         self.settled: list[tuple[float, float]] = []
 
-    def charge(self, tenant: str, cost_s: float, now_s: float) -> float:
+    def charge(self, tenant: str, caller: str, cost_s: float, now_s: float) -> float:
         self.charged.append(cost_s)
         return 0.0 if len(self.charged) <= self.admitted else 7.0
 
-    def settle(self, tenant: str, predicted_s: float, actual_s: float, now_s: float) -> None:
+    def settle(self, tenant: str, caller: str, predicted_s: float, actual_s: float, now_s: float) -> None:
         self.settled.append((predicted_s, actual_s))
 
 

@@ -27,7 +27,7 @@ from mapless_server.scheduling import Flow
 from mapless_server.security import ENDLESS_METHODS, OPEN_METHODS, Principal
 
 from .call import Call
-from .receiving import Context, OpenMethods, Receiver, quiet_ended_calls
+from .receiving import Context, OpenMethods, Places, Receiver, quiet_ended_calls
 from .sending import ENDLESS_SEND_LIMIT_S, PACED_CODES, REQUEST_ID_KEY, SEND_LIMIT_S, Pace, Sender, Unread
 
 if TYPE_CHECKING:
@@ -113,6 +113,7 @@ class CallGuard:
         self._receiver = Receiver()
         self._sender = Sender()
         self._unread = Unread()
+        self._places = Places()
         self._pace = Pace()
         self._open = OpenMethods(self._receiver)
         quiet_ended_calls()
@@ -130,7 +131,8 @@ class CallGuard:
                 try:
                     call = replace(call, principal=self._principal(method, context))
                     self._check_admission(method, call.flow)
-                    response = await reply(handler, method, call, context)
+                    with self._places.taken(call.principal.holder):
+                        response = await reply(handler, method, call, context)
                     context.set_trailing_metadata(call.trailers)
                     result.code = "OK"
                     return response
@@ -139,7 +141,7 @@ class CallGuard:
                     call.note(reason=error.reason, error=str(error))
                     if error.code in PACED_CODES:
                         error.__traceback__ = error.__context__ = None  # they hold the message
-                        await self._pace.turn(call.deadline_s)
+                        await self._pace.turn(call.deadline_s, call.principal.holder)
                     await self._sender.error(context, call.request_id, error, streams)
                     raise  # not reached: sending it raises
                 except asyncio.CancelledError:
@@ -221,7 +223,7 @@ class CallGuard:
         except FieldError as error:
             raise InvalidArgument(str(error), field=error.field) from None
         data = bytes(handler.response_serializer(response))
-        self._unread.add(call.principal.tenant, len(data), context)
+        self._unread.add(*call.principal.holder, len(data), context)
         call.note(bytes_out=len(data))
         return data
 

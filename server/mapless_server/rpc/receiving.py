@@ -7,7 +7,9 @@ methods are served as if their callers sent streams, of which the first message 
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import grpc
@@ -62,6 +64,35 @@ class Receiver:
     def _forget(self, reading: asyncio.Future[Any]) -> None:
         self._reading.discard(reading)
         retrieve(reading)
+
+
+MAX_CALLS_OF_CALLER = 512
+"""Calls of one token or certificate at a time, a quarter of those of all: calls of which only the headers have come
+need no room in the queue, and would otherwise leave no place for others."""
+
+
+class Places:
+    """Limits the calls in progress of each token or certificate; runs on the event loop."""
+
+    def __init__(self) -> None:
+        self._taken: Counter[tuple[str, str]] = Counter()
+
+    @contextmanager
+    def taken(self, holder: tuple[str, str]) -> Iterator[None]:
+        """Takes a place for a call of a tenant's caller; Overloaded if it has too many. Without a name none counts."""
+        if self._taken[holder] >= MAX_CALLS_OF_CALLER and holder[1]:
+            raise Overloaded(
+                f"{MAX_CALLS_OF_CALLER} calls of this caller are in progress",
+                reason="TOO_MANY_CALLS",
+                retry_after_s=1.0,
+            )
+        self._taken[holder] += 1
+        try:
+            yield
+        finally:
+            self._taken[holder] -= 1
+            if not self._taken[holder]:
+                del self._taken[holder]
 
 
 class OpenMethods:

@@ -104,6 +104,8 @@ class Sender:
 UNREAD_BYTES = 256 * 2**20
 """Answers that a tenant's callers have not read yet; grpc keeps them in memory as long as the connection lasts, though
 their handlers have ended. As many as sixteen of the largest photographs."""
+UNREAD_SHARE = 0.75
+"""Of that, what one token may have of what the tenant's others leave."""
 SMALL_ANSWER_BYTES = 256 * 1024
 """Such an answer is sent all the same: callers that read nothing must not keep others from being localized."""
 
@@ -112,20 +114,27 @@ class Unread:
     """Limits the answers in memory that callers are slow to read; runs on the event loop."""
 
     def __init__(self) -> None:
-        self._bytes: Counter[str] = Counter()
+        self._of_tenants: Counter[str] = Counter()
+        self._of_callers: Counter[tuple[str, str]] = Counter()
 
-    def add(self, tenant: str, size_bytes: int, context: Context) -> None:
-        """Counts an answer until it is sent; Overloaded for a large one beside too many of the tenant."""
-        unread_bytes = self._bytes[tenant]
-        if size_bytes > SMALL_ANSWER_BYTES and unread_bytes and unread_bytes + size_bytes > UNREAD_BYTES:
+    def add(self, tenant: str, caller: str, size_bytes: int, context: Context) -> None:
+        """Counts an answer until it is sent; Overloaded for a large one beside too many of the tenant or caller.
+
+        A caller without a token or certificate has no name, and shares what the tenant may have with the others.
+        """
+        unread_bytes, by_caller = self._of_tenants[tenant], self._of_callers[tenant, caller]
+        share = UNREAD_SHARE if caller else 1.0
+        most_bytes = share * (UNREAD_BYTES - (unread_bytes - by_caller))
+        if size_bytes > SMALL_ANSWER_BYTES and unread_bytes and by_caller + size_bytes > most_bytes:
             message = f"answers of {unread_bytes // 2**20} MiB wait to be read by their callers"
             raise Overloaded(message, reason="UNREAD_ANSWERS", retry_after_s=1.0)
-        self._bytes[tenant] += size_bytes
+        self._of_tenants[tenant] += size_bytes
+        self._of_callers[tenant, caller] += size_bytes
 
         def sent(_: object) -> None:
-            self._bytes[tenant] -= size_bytes
-            if not self._bytes[tenant]:
-                del self._bytes[tenant]
+            self._of_tenants[tenant] -= size_bytes
+            self._of_callers[tenant, caller] -= size_bytes
+            self._of_tenants, self._of_callers = +self._of_tenants, +self._of_callers
 
         context.add_done_callback(sent)
 
@@ -162,8 +171,8 @@ PACED_CODES = frozenset({"RESOURCE_EXHAUSTED", "UNAUTHENTICATED", "PERMISSION_DE
 """Of what a caller may repeat as fast as it is answered. UNAVAILABLE is not among them, which sends it elsewhere."""
 
 PER_S = 50
-"""Refusals a second, of all callers, that are not delayed: 2 % of a core. A server of twenty answers a second refuses
-fewer at three times what it can do."""
+"""Refusals a second, of all callers together, that are not delayed: 2 % of a core. A server of twenty answers a second
+refuses fewer at three times what it can do."""
 
 BURST = 50
 """So many are not delayed although they come at once."""
@@ -176,17 +185,24 @@ MOST_DELAYED = 256
 
 
 class Pace:
-    """Gives refusals their turns; runs on the event loop."""
+    """Gives refusals their turns, and callers that are refused equal parts of them; runs on the event loop."""
 
     def __init__(self) -> None:
-        self._free_s = 0.0
+        self._free_s: dict[tuple[str, str], float] = {}
         self._delayed = 0
 
-    async def turn(self, deadline_s: float) -> None:
-        """Returns when the next refusal may be sent, before the call's deadline, by `time.monotonic`."""
+    async def turn(self, deadline_s: float, caller: tuple[str, str] = ("", "")) -> None:
+        """Returns when the next refusal of a caller may be sent, before the call's deadline, by `time.monotonic`.
+
+        The caller is the tenant and the name of its token or certificate; all that have none are one.
+        """
         now_s = time.monotonic()
-        self._free_s = min(max(self._free_s, now_s - BURST / PER_S) + 1 / PER_S, now_s + LONGEST_S)
-        wait_s = min(self._free_s, deadline_s) - now_s
+        begin_s = now_s - BURST / PER_S
+        self._free_s = {other: free_s for other, free_s in self._free_s.items() if free_s > begin_s}
+        earliest_s = self._free_s.pop(caller, begin_s)
+        interval_s = (len(self._free_s) + 1) / PER_S
+        free_s = self._free_s[caller] = min(earliest_s + interval_s, now_s + LONGEST_S)
+        wait_s = min(free_s, deadline_s) - now_s
         if wait_s > 0 and self._delayed < MOST_DELAYED:
             self._delayed += 1
             try:

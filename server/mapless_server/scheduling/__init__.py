@@ -9,8 +9,9 @@ admission   A job is admitted if its predicted computing time and its memory fit
             its deadline (`admission`); otherwise it is refused at once. Predictions (`costs`) are averages of the
             caller's earlier jobs of the same kind, or else typical of all callers'.
 lane        A group of threads, such as "host" or "device". Each stage is computed by one lane.
-fairness    Of the jobs that wait for a stage, the next one is chosen by deficit round robin over tenants and their
-            clients (`fair_queue`). While short jobs keep coming, long steps leave one thread of a lane to them.
+fairness    Of the jobs that wait for a stage (`fair_queue`), the next one is of those who have been given the least
+            computing time: first among tenants, then among the tenant's callers, then among the caller's clients
+            (`shares`). While short jobs keep coming, long steps leave one thread of a lane to them.
 batch       Waiting jobs of the same stage and bucket are computed together, up to the stage's `max_batch`.
 deadline    A job ends at its deadline wherever it is, and with its fallback, if it has one, shortly before. The thread
             that computes it notices at its next `Job.check`.

@@ -5,10 +5,11 @@ The predicted cost of a job is booked while it is admitted (`Ledger`). A job is 
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from .jobs import Flow, Job, Refusal, Refused
+from .shares import Shares
 
 
 @dataclass(frozen=True)
@@ -16,8 +17,8 @@ class WorkQueueOptions:
     """Bounds of admission, order of computing, and supervision of the threads.
 
     Attributes:
-        max_queued_s: largest predicted computing time of the admitted jobs, seconds per thread of a lane, besides a
-            caller's only job and its equal part (see `Admission.check_queue`). The result of a job admitted beyond it
+        max_queued_s: largest predicted computing time of the admitted jobs, seconds per thread of a lane, of a
+            caller and of those who come first (see `Admission.check_queue`). The result of a job admitted beyond it
             would be late, and a longer queue has no higher throughput.
         max_bytes: largest memory of admitted jobs, and of calls that consist of several jobs, together.
         quantum_s: a step that is predicted to take longer is a long one, of which one thread is kept free; about what
@@ -40,11 +41,7 @@ class WorkQueueOptions:
 
 
 CLIENT_SHARE = 0.75
-"""That one client may book of what its caller's other clients leave of the caller's part of the computing time, so that
-there is room for the next."""
-EQUAL_SHARE = 0.75
-"""Of an equal part of it, which a caller may book whatever the others hold, and a client of its caller's part: who was
-first with long jobs must not keep the others out while these are computed."""
+"""That one client may book of what its caller may book beside its other clients, so that there is room for the next."""
 MEMORY_SHARE = CLIENT_SHARE**0.5
 """That one caller may hold of the memory that others leave, and a client of its caller's part."""
 TIME_MARGIN = 1.2
@@ -62,7 +59,9 @@ class Ledger:
         jobs: jobs that are admitted and have not ended.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, shares: Shares) -> None:
+        """Counts those who have jobs in the shares, too."""
+        self._shares = shares
         self.jobs: set[Job] = set()
         self._aside: set[Job] = set()
         self._clients: dict[Flow, _Holdings] = {}
@@ -72,6 +71,7 @@ class Ledger:
     def open(self, job: Job, cost_s: Counter[str]) -> None:
         """Books an admitted job."""
         self.jobs.add(job)
+        self._shares.enter(job.flow)
         for holdings in self._holding(job.flow):
             holdings.jobs += 1
             holdings.size_bytes += job.size_bytes
@@ -106,6 +106,7 @@ class Ledger:
             self.resume(job, Counter())
         self.rebook(job, Counter())
         self.jobs.remove(job)
+        self._shares.leave(job.flow)
         for holdings in self._holding(job.flow):
             holdings.jobs -= 1
             holdings.size_bytes -= job.size_bytes
@@ -149,42 +150,41 @@ class Ledger:
         return self._callers.get(flow.group, _NOTHING).booked_s[lane]
 
     def ahead_s(self, flow: Flow, lane: str, own_s: float) -> float:
-        """Computing time until a new job of cost `own_s` is done, without its own, in the order of the fair queue.
+        """Computing time until a new job of cost `own_s` is done, without its own, in the order of `Shares`.
 
-        The client's other jobs come first. Its caller's other clients get as much computing time as the client, the
-        tenant's other callers as much as its caller, and other tenants as much as the tenant.
+        The client's other jobs come first, and of its caller's other clients, the tenant's other callers, and other
+        tenants what brings them to as much as it has been given then.
         """
         until_done_s = self.booked_s(lane, flow) + own_s
         return until_done_s - own_s + self.of_others_s(flow, lane, until_done_s)
 
     def of_others_s(self, flow: Flow, lane: str, share_s: float) -> float:
-        """Computing time of other clients, callers and tenants until a client has had `share_s`."""
-        clients, callers, tenants = self._of_rivals_s(flow, lane)
-        total_s = share_s
-        for rivals in (clients, callers, tenants):
-            total_s += sum(min(it, total_s) for it in rivals)
-        return total_s - share_s
+        """Computing time of other clients, callers and tenants until a client has been given `share_s` more."""
+        of_clients_s = self.of_clients_s(flow, lane, share_s)
+        return of_clients_s + self.of_callers_s(flow, lane, share_s + of_clients_s)
 
-    def _of_rivals_s(self, flow: Flow, lane: str) -> tuple[Iterable[float], Iterable[float], Iterable[float]]:
-        """Computing time booked for each other client of the caller, caller of the tenant, and tenant."""
-        clients = [
-            it.booked_s[lane] for other, it in self._clients.items() if other.group == flow.group and other != flow
-        ]
-        callers, tenants = list[float](), Counter[str]()
+    def of_clients_s(self, flow: Flow, lane: str, share_s: float) -> float:
+        """Computing time of the caller's other clients until this one has been given `share_s` more."""
+        return sum(
+            min(it.booked_s[lane], max(0.0, share_s - self._shares.lead_s(other, flow)))
+            for other, it in self._clients.items()
+            if other.group == flow.group and other != flow
+        )
+
+    def of_callers_s(self, flow: Flow, lane: str, share_s: float) -> float:
+        """Computing time of other callers and tenants until a client's caller has been given `share_s` more."""
+        others_s, of_tenants_s, of_tenant = 0.0, Counter[str](), dict[str, Flow]()
         for group, it in self._callers.items():
-            if group[0] != flow.tenant:
-                tenants[group[0]] += it.booked_s[lane]  # type: ignore[assignment]  # not int
+            other = Flow(*group)
+            if other.tenant != flow.tenant:
+                of_tenants_s[other.tenant] += it.booked_s[lane]
+                of_tenant[other.tenant] = other
             elif group != flow.group:
-                callers.append(it.booked_s[lane])
-        return clients, callers, tenants.values()
-
-    def caller_count(self, flow: Flow) -> int:
-        """Number of callers that have jobs, with that of this client, whether or not it has any."""
-        return len(self._callers) + (flow.group not in self._callers)
-
-    def client_count(self, flow: Flow) -> int:
-        """Number of this client's caller's clients that have jobs, with this client, whether or not it has any."""
-        return 1 + sum(other.group == flow.group and other != flow for other in self._clients)
+                others_s += min(it.booked_s[lane], max(0.0, share_s - self._shares.lead_s(other, flow)))
+        total_s = share_s + others_s
+        for tenant, other in of_tenant.items():
+            others_s += min(of_tenants_s[tenant], max(0.0, total_s - self._shares.lead_s(other, flow)))
+        return others_s
 
     def _of(self, flow: Flow | None) -> "_Holdings":
         return self._all if flow is None else self._clients.get(flow, _NOTHING)
@@ -263,9 +263,7 @@ class Admission:
     def check_queue(self, flow: Flow, cost_s: Counter[str]) -> None:
         """Raises Refused if no job of this cost can be admitted for a client, whatever its deadline and size.
 
-        An idle server admits any cost: the prediction may be wrong, and only computing corrects it. A client without
-        jobs is also admitted if its job would be done soon although the caller's other clients got as much of the
-        caller's part as it does, or, if the caller has no other jobs, although all other callers did of the server.
+        An idle server admits any cost: the prediction may be wrong, and only computing corrects it.
         """
         if self._is_closed:
             raise Refused(Refusal.DRAINING, "the server is stopping", UNKNOWN_RETRY_S)
@@ -323,25 +321,18 @@ class Admission:
         return Counter({lane: min(own_s, MAX_BOOKED_SHARE * self._bound_s(lane)) for lane, own_s in cost_s.items()})
 
     def _excess_s(self, flow: Flow, lane: str, added_s: float) -> float:
-        """Computing time by which a client or its caller would exceed its part with this much more."""
-        ledger, bound_s = self._ledger, self._bound_s(lane)
-        by_all_s, by_caller_s = ledger.booked_s(lane), ledger.booked_s_of_caller(lane, flow)
-        by_client_s = ledger.booked_s(lane, flow)
-        of_caller_s = self._part_s(bound_s, by_all_s, by_caller_s, ledger.caller_count(flow))
-        of_client_s = self._part_s(of_caller_s, by_caller_s, by_client_s, ledger.client_count(flow))
-        caller_excess_s = by_caller_s + added_s - of_caller_s
-        client_excess_s = by_client_s + added_s - CLIENT_SHARE * of_client_s
-        if ledger.job_count(flow):
-            return max(caller_excess_s, client_excess_s)
-        first_excess_s = ledger.of_others_s(flow, lane, added_s) + added_s - bound_s
-        if ledger.job_count_of_caller(flow):
-            return max(caller_excess_s, min(client_excess_s, first_excess_s))
-        return min(max(caller_excess_s, client_excess_s), first_excess_s)
+        """Computing time by which a client or its caller would exceed its part of the bound with this much more.
+
+        The caller's part is what those leave who come first: who has been given less than others may book all of it,
+        also while their long jobs fill the queue. The first job of a client may use all that the caller's others leave.
+        """
+        ledger = self._ledger
+        of_caller_s = ledger.booked_s_of_caller(lane, flow) + added_s
+        part_s = self._bound_s(lane) - ledger.of_callers_s(flow, lane, of_caller_s)
+        of_client_s = ledger.booked_s(lane, flow) + added_s
+        left_s = part_s - ledger.of_clients_s(flow, lane, of_client_s)
+        share = CLIENT_SHARE if ledger.job_count(flow) else 1.0
+        return max(of_caller_s - part_s, of_client_s - share * left_s)
 
     def _bound_s(self, lane: str) -> float:
         return self._options.max_queued_s * self._threads[lane]
-
-    @staticmethod
-    def _part_s(bound_s: float, held_s: float, held_by_it_s: float, count: int) -> float:
-        """The part of a bound that one of `count` may have: what the others leave, and at least an equal part."""
-        return max(bound_s - (held_s - held_by_it_s), EQUAL_SHARE * bound_s / count)

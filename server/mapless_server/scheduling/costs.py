@@ -68,15 +68,15 @@ class CostModel:
 
 
 class _Mean(NamedTuple):
-    """An average with more weight for recent values."""
+    """An average of the last jobs, about as many as `weight`, with more weight for recent ones."""
 
-    count: int
+    weight: int
     mean_s: float
     seen_s: float
 
     def with_value(self, seconds: float, now_s: float) -> "_Mean":
-        count = min(self.count + 1, MEMORY)
-        return _Mean(count, self.mean_s + (seconds - self.mean_s) / count, now_s)
+        weight = min(self.weight + 1, MEMORY)
+        return _Mean(weight, self.mean_s + (seconds - self.mean_s) / weight, now_s)
 
 
 class _OfCaller:
@@ -100,7 +100,7 @@ class _OfCaller:
             begin = self._all
         of_client = self._of_clients.pop(flow.client, None)
         if of_client is None or now_s - of_client.seen_s > FORGOTTEN_S:
-            of_client = begin._replace(count=min(begin.count, 1))
+            of_client = begin._replace(weight=min(begin.weight, 1))
         self._of_clients[flow.client] = of_client.with_value(seconds, now_s)
         if len(self._of_clients) > MAX_OF_CLIENTS:
             self._of_clients.popitem(last=False)

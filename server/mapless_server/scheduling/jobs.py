@@ -28,6 +28,11 @@ class Flow(NamedTuple):
         """The tenant and the caller, without the client."""
         return self[:2]
 
+    @property
+    def named_caller(self) -> str:
+        """The token's or certificate's name; empty if the caller has neither."""
+        return self.caller if self.client else ""
+
 
 class Refusal(str, Enum):
     """Reasons why a job is not admitted."""
@@ -216,6 +221,7 @@ class Job:
         begins_until_s: until when it waits for a thread that is idle otherwise; None if it does not wait so.
         booked_s: computing time still predicted for it, by lane.
         charged_s: computing time charged to its tenant at admission.
+        charged_step_s: computing time charged to its owner for the current step, as predicted.
         unusual_s: part of the current batch's computing time that is not used for predictions; set by its stage.
         is_computed: whether it is in a batch now.
         timer_s: the `due_s` of the timer that the scheduler has set.
@@ -234,6 +240,7 @@ class Job:
     begins_until_s: float | None = None
     booked_s: Counter[str] = field(default_factory=Counter)
     charged_s: float = 0.0
+    charged_step_s: float = 0.0
     unusual_s: float = 0.0
     is_computed: bool = False
     timer_s: float = -math.inf
@@ -385,12 +392,12 @@ class Observer:
 
 
 class Quota(Protocol):
-    """Limits the computing rate of tenants."""
+    """Limits the computing rate of tenants, and divides it among their tokens; without one, the caller is empty."""
 
-    def charge(self, tenant: str, cost_s: float, now_s: float) -> float:
+    def charge(self, tenant: str, caller: str, cost_s: float, now_s: float) -> float:
         """Books predicted computing time and returns 0; if the limit is reached, returns the seconds to wait."""
         ...
 
-    def settle(self, tenant: str, predicted_s: float, actual_s: float, now_s: float) -> None:
+    def settle(self, tenant: str, caller: str, predicted_s: float, actual_s: float, now_s: float) -> None:
         """Replaces booked computing time by the time used."""
         ...

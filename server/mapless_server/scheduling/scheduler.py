@@ -7,7 +7,7 @@ import itertools
 import math
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 
@@ -36,6 +36,7 @@ from .jobs import (
     StageResult,
     Step,
 )
+from .shares import Shares
 from .timers import Timers
 
 FIRST_STAGE_INTERVAL = 4
@@ -73,9 +74,10 @@ class Scheduler:
         self._quota = quota
         self._stages = {stage.name: stage for stage in stages}
         self._stage_costs = StageCosts(self.costs, self._stages)
-        self._queues: dict[str, FairQueue[Job]] = {stage.name: FairQueue() for stage in stages}
+        self._shares = Shares()
+        self._queues: dict[str, FairQueue[Job]] = {stage.name: FairQueue(self._shares) for stage in stages}
         # Steps of admitted jobs that need more room than there is: computed by threads that are idle otherwise.
-        self._spare: dict[str, FairQueue[Job]] = {stage.name: FairQueue() for stage in stages}
+        self._spare: dict[str, FairQueue[Job]] = {stage.name: FairQueue(self._shares) for stage in stages}
         # When a job was last refused because of those admitted, and when one of a caller that has not most of these.
         self._refused_s = self._crowded_s = -math.inf
         self._running: Counter[str] = Counter()
@@ -87,7 +89,7 @@ class Scheduler:
         self._limits: dict[tuple[str, str], BatchLimit] = {}
         self._declined: Counter[tuple[str, str]] = Counter()
         self._first_steps: OrderedDict[tuple[tuple[str, str], str], Step] = OrderedDict()
-        self._ledger = Ledger()
+        self._ledger = Ledger(self._shares)
         self._admission = Admission(options, lanes, self._ledger)
         self._timers = Timers()
         self._batch_number = itertools.count(1)
@@ -127,7 +129,7 @@ class Scheduler:
             # The server's own jobs have no tenant and are free; a job that continues others is charged when it ends.
             if self._quota is not None and job.flow.tenant and not job.continues:
                 job.charged_s = cost_s.total()
-                wait_s = self._quota.charge(job.flow.tenant, job.charged_s, now_s)
+                wait_s = self._quota.charge(job.flow.tenant, job.flow.named_caller, job.charged_s, now_s)
                 if wait_s > 0:
                     raise Refused(Refusal.TENANT_QUOTA, "the tenant's computing time is used up", wait_s)
         self._observer.admitted(cost_s.total())
@@ -178,7 +180,7 @@ class Scheduler:
         is_first_due = lane.passed_over >= FIRST_STAGE_INTERVAL - 1
         stage = waiting[0] if is_first_due else waiting[-1]
         lane.passed_over = 0 if stage is waiting[0] else lane.passed_over + 1
-        jobs = self._pop_batch(self._queues[stage.name], stage, is_allowed)
+        jobs = self._pop_batch(self._queues[stage.name], stage, is_allowed, now_s)
         for job in jobs:
             self._observer.waited(stage.name, now_s - job.waits_since_s)
         return self._begin(lane, stage, jobs, now_s)
@@ -188,7 +190,7 @@ class Scheduler:
         stages = [it for it, queue in zip(lane.stages, lane.spare, strict=True) if any(map(is_allowed, queue))]
         if not stages:
             return None
-        jobs = self._pop_batch(self._spare[stages[-1].name], stages[-1], is_allowed)
+        jobs = self._pop_batch(self._spare[stages[-1].name], stages[-1], is_allowed, now_s)
         for job in jobs:
             job.begins_until_s = None
             self._timers.set(job)
@@ -228,6 +230,7 @@ class Scheduler:
             is_slow = isinstance(result, Abandoned) and usual_s > self._stage_costs.of_step(job, now_s)
             if is_slow or not isinstance(result, Exception):
                 self._stage_costs.learn(job, usual_s, isinstance(result, Done), now_s)
+            self._shares.charge(job.flow, share_s - job.charged_step_s)
             job.used_s += share_s
             job.unusual_s = 0.0
             job.is_computed = False
@@ -369,10 +372,7 @@ class Scheduler:
         return self._declined[step.stage, step.kind] % _TRY_ONE_IN == 0
 
     def _enqueue(self, job: Job, cost_s: float, now_s: float) -> None:
-        """Lets a job wait for its step.
-
-        The cost includes later stages: with a cheap first stage the order would otherwise be first in, first out.
-        """
+        """Lets a job wait for its step; the cost includes later stages."""
         stage = self._stages[job.step.stage]
         job.waits_since_s = now_s
         self._queue_of(job).push(job, job.flow, cost_s)
@@ -383,12 +383,23 @@ class Scheduler:
         """The queue in which a job waits for its step."""
         return (self._queues if job.begins_until_s is None else self._spare)[job.step.stage]
 
-    def _pop_batch(self, queue: FairQueue[Job], stage: Stage, is_allowed: Callable[[Job], bool]) -> tuple[Job, ...]:
-        first = queue.pop(is_allowed)
-        bucket = first.step.bucket
+    def _pop_batch(
+        self, queue: FairQueue[Job], stage: Stage, is_allowed: Callable[[Job], bool], now_s: float
+    ) -> tuple[Job, ...]:
+        """Removes the next job and others to be computed with it, and charges for them what is predicted."""
+
+        def charge_s(job: Job) -> float:
+            job.charged_step_s = self._stage_costs.of_step(job, now_s)
+            return job.charged_step_s
+
+        jobs = [queue.pop(charge_s, is_allowed)]
+        bucket = jobs[0].step.bucket
         limit = self._limits.get((stage.name, bucket))
         at_most = stage.max_batch if limit is None else min(stage.max_batch, limit.size)
-        return (first, *queue.pop_alike(lambda job: job.step.bucket == bucket, at_most - 1))
+        with suppress(IndexError):
+            while len(jobs) < at_most:
+                jobs.append(queue.pop(charge_s, lambda job: job.step.bucket == bucket))
+        return tuple(jobs)
 
     def _end(self, job: Job, ending: Ending, value: Any, now_s: float) -> None:
         stage, queue = self._stages[job.step.stage], self._queue_of(job)
@@ -400,7 +411,7 @@ class Scheduler:
         if self._quota is not None and job.flow.tenant:
             # The batch that it is in has not been added to `used_s` yet.
             used_s = max(job.used_s, job.charged_s) if job.is_computed else job.used_s
-            self._quota.settle(job.flow.tenant, job.charged_s, used_s, now_s)
+            self._quota.settle(job.flow.tenant, job.flow.named_caller, job.charged_s, used_s, now_s)
         self._observer.ended(stage.name, ending)
 
     def _give_fallback(self, job: Job, fallback: Fallback, now_s: float) -> None:

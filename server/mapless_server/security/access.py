@@ -41,6 +41,11 @@ class Principal:
     role: Role = Role.WRITE
     name: str = ""
 
+    @property
+    def holder(self) -> tuple[str, str]:
+        """The tenant and the name, which together are unique."""
+        return self.tenant, self.name
+
 
 SceneKey = NewType("SceneKey", str)
 """The id of a scene of the default tenant, as in stores without tenants; "tenant/scene" for all others.
