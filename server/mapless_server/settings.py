@@ -143,7 +143,7 @@ class Settings(BaseModel):
     tokens_file: Path | None = None
     """Hashes of the bearer tokens that callers must have; see mapless-server token."""
     insecure: bool = False
-    """Whether to listen beyond this machine with neither TLS nor tokens."""
+    """Whether to listen beyond this machine with neither tokens nor clients' certificates."""
     metrics: bool = True
     """Whether to serve metrics to Prometheus."""
     metrics_host: str = Field(default="127.0.0.1", min_length=1)
@@ -271,8 +271,22 @@ class LoadedSettings:
     def __str__(self) -> str:
         """A line for each setting; secrets show as asterisks, also the password of a URL in any other setting."""
         width = max(map(len, self.origins))
-        shown = {name: _PASSWORD.sub(r"\1**********", str(getattr(self.settings, name))) for name in self.origins}
+        shown = self._shown
         return "\n".join(f"  {name:<{width}}  {shown[name]}  ({origin})" for name, origin in self.origins.items())
+
+    @property
+    def fields(self) -> dict[str, dict[str, object]]:
+        """The same for programs: `settings`, by name, and `origins` of those that are not defaults."""
+        given = {name: origin for name, origin in self.origins.items() if origin != "default"}
+        return {"settings": self._shown, "origins": {**given}}
+
+    @property
+    def _shown(self) -> dict[str, object]:
+        values = {name: getattr(self.settings, name) for name in self.origins}
+        return {
+            name: it if it is None or isinstance(it, int | float) else _PASSWORD.sub(r"\1**********", str(it))
+            for name, it in values.items()
+        }
 
 
 def load_settings(flags: Mapping[str, Any], config: Path | None = None) -> LoadedSettings:

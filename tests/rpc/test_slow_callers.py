@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -81,13 +82,15 @@ def test_a_token_that_reads_nothing_leaves_room_to_others(monkeypatch: pytest.Mo
     monkeypatch.setattr(sending, "SMALL_ANSWER_BYTES", 10)
     unread = Unread()
 
+    def fits(caller: str) -> bool:
+        try:
+            unread.add("ours", caller, 50, cast(Any, Answered()))
+        except Overloaded:
+            return False
+        return True
+
     def answers(caller: str) -> int:
-        for count in range(100):
-            try:
-                unread.add("ours", caller, 50, cast(Any, Answered()))
-            except Overloaded:
-                return count
-        return 100
+        return len(list(itertools.takewhile(fits, itertools.repeat(caller))))
 
     assert [answers("deaf"), answers("robot"), answers("third")] == [15, 3, 1]
 

@@ -46,7 +46,8 @@ def test_names_that_do_not_resolve_have_no_address(name: str) -> None:
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
 def test_no_protection_beyond_loopback_is_rejected(host: str, tls: str, tokens: str, insecure: str) -> None:
     level, _ = assess(host, f"{tls} {tokens} {insecure}")
-    assert (level == logging.CRITICAL) == (host == "0.0.0.0" and not (tls or tokens or insecure))
+    protected = tokens or "client_certificates" in tls or insecure
+    assert (level == logging.CRITICAL) == (host == "0.0.0.0" and not protected)
 
 
 @pytest.mark.parametrize(
@@ -55,10 +56,11 @@ def test_no_protection_beyond_loopback_is_rejected(host: str, tls: str, tokens: 
         ("127.0.0.1", "", logging.INFO, "every user of this machine"),
         ("127.0.0.1", "tokens", logging.INFO, "^$"),
         ("127.0.0.1", "tls", logging.INFO, "^$"),
-        ("0.0.0.0", "", logging.CRITICAL, "tls_certificate and tls_key or tokens_file.*127.0.0.1.*insecure"),
+        ("0.0.0.0", "", logging.CRITICAL, "tokens_file, with tls_certificate.*tls_client_ca.*127.0.0.1.*insecure"),
+        ("0.0.0.0", "tls", logging.CRITICAL, "TLS alone keeps nobody out.*tokens_file .mapless-server token.*insecure"),
         ("0.0.0.0", "insecure", logging.WARNING, "everybody who can reach"),
         ("0.0.0.0", "tokens", logging.WARNING, "in clear, unless a proxy"),
-        ("0.0.0.0", "tls", logging.WARNING, "neither tokens nor clients' certificates"),
+        ("0.0.0.0", "tls insecure", logging.WARNING, "TLS alone keeps nobody out"),
         ("0.0.0.0", "tls tokens", logging.INFO, "^$"),
         ("0.0.0.0", "tls client_certificates", logging.INFO, "^$"),
     ],

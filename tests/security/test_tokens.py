@@ -35,8 +35,11 @@ from mapless_server.security import (
     read_tokens,
     revoke_token,
     sha256_of,
+    written_secret,
 )
+from mapless_server.security.protection import Protection
 from mapless_server.security.reloading import Reloading
+from mapless_server.settings import Settings
 from mapless_tools.cli import tokens as command
 
 NOW = datetime(2030, 1, 1, tzinfo=timezone.utc)
@@ -404,3 +407,47 @@ class TestCommand:
         monkeypatch.setenv("MAPLESS_TOKENS_FILE", str(path))
         result = CliRunner().invoke(command.token_app, ["list", "--text"])
         assert result.stdout == "a  read      tenant t  never expires\n"
+
+
+def test_a_secret_is_written_for_its_owner_alone(tmp_path: Path) -> None:
+    """Whatever the umask; no file is replaced, and a failed command leaves none."""
+    mask = os.umask(0)
+    try:
+        with written_secret(tmp_path / "new") as file:
+            file.write("secret")
+    finally:
+        os.umask(mask)
+    assert (tmp_path / "new").stat().st_mode & 0o777 == 0o600
+    with pytest.raises(SecurityError, match="exists already"), written_secret(tmp_path / "new") as file:
+        file.write("other")
+    assert (tmp_path / "new").read_text() == "secret"
+    with pytest.raises(SecurityError, match="No such file"), written_secret(tmp_path / "no" / "folder"):
+        pass
+    with pytest.raises(ValueError, match="cannot"), written_secret(tmp_path / "failed"):
+        raise ValueError("cannot")
+    assert not (tmp_path / "failed").exists()
+
+
+def test_files_that_everybody_reads_are_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    file = tmp_path / "tokens"
+    create_token(file, "robot", "default", "read", None)
+    for mode, is_warned in ((0o600, False), (0o440, False), (0o644, True), (0o602, True)):
+        caplog.clear()
+        file.chmod(mode)
+        Protection.of(Settings(tokens_file=file))
+        assert ("every user of this machine" in caplog.text) == is_warned
+
+
+def test_a_new_token_is_in_the_named_file_alone(tmp_path: Path) -> None:
+    """And not in that of hashes, if both are the same."""
+    tokens, other = tmp_path / "tokens", tmp_path / "robot.token"
+    asked = ["create", "robot", "--role", "localize", "--tokens-file", str(tokens), "--output"]
+    assert CliRunner().invoke(command.token_app, [*asked, str(tokens)]).exit_code == 1
+    assert not tokens.exists()
+    result = CliRunner().invoke(command.token_app, [*asked, str(other)])
+    token = other.read_text().strip()
+    assert result.exit_code == 0
+    assert token not in result.output
+    assert read_tokens(tokens).find(token) is not None
+    assert CliRunner().invoke(command.token_app, [*asked, str(other)]).exit_code == 1
+    assert other.read_text().strip() == token

@@ -150,3 +150,14 @@ def test_secrets_are_hidden_when_settings_are_shown() -> None:
     assert "database_url" in shown
     assert "hunter2" not in shown
     assert re.search(r"^  port +50051  \(default\)$", shown, re.MULTILINE)
+
+
+def test_the_settings_are_fields_of_the_log_without_secrets() -> None:
+    loaded = load_settings({"port": 7, "otlp_endpoint": "http://user:hunter2@collector:4317"})
+    assert loaded.fields["settings"]["port"] == 7
+    assert loaded.fields["settings"]["insecure"] is False
+    assert loaded.fields["origins"] == {"port": "flag", "otlp_endpoint": "flag"}
+    assert set(loaded.fields["settings"]) == set(Settings.model_fields)
+    assert "hunter2" not in f"{loaded.fields}"
+    with_url = LoadedSettings(Settings(database_url="postgresql://me:hunter2@host/db"), loaded.origins)  # type: ignore[arg-type]
+    assert "hunter2" not in f"{with_url.fields}"

@@ -27,7 +27,7 @@ from .access import (
 from .binding import assess_binding, is_loopback
 from .rate import RateLimiter
 from .reloading import SecurityError
-from .tokens import create_token, read_tokens, revoke_token
+from .tokens import create_token, read_tokens, revoke_token, written_secret
 
 __all__ = [
     "DEFAULT_TENANT",
@@ -54,4 +54,5 @@ __all__ = [
     "scene_id_of",
     "sha256_of",
     "tenant_of",
+    "written_secret",
 ]

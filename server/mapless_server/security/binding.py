@@ -32,33 +32,27 @@ def assess_binding(settings: Settings, resolve: Resolve = resolve_host) -> tuple
     operator, which may be empty.
     """
     host, tls, tokens = settings.host, settings.tls_certificate is not None, settings.tokens_file is not None
-    loopback = is_loopback(host, resolve)
-    if not tls and not tokens:
-        if loopback:
-            return logging.INFO, (
-                "neither TLS nor tokens are set: every user of this machine has all rights, and no other machine can "
-                "connect"
-            )
-        problem = (
-            f"neither TLS nor tokens are set, and on {host} everybody who can reach this machine could read and delete "
-            "all scenes"
-        )
-        if settings.insecure:
-            return logging.WARNING, problem
-        return logging.CRITICAL, (
-            f"{problem}: set tls_certificate and tls_key or tokens_file, or listen on 127.0.0.1, or set insecure if "
-            "another program restricts access"
-        )
-    if loopback:
-        return logging.INFO, ""
-    if not tls:
+    if tokens:
+        if tls or is_loopback(host, resolve):
+            return logging.INFO, ""
         return logging.WARNING, "tokens are set without TLS: they are sent in clear, unless a proxy terminates TLS"
-    if not tokens and settings.tls_client_ca is None:
-        return logging.WARNING, (
-            "connections are encrypted, but neither tokens nor clients' certificates are required: on "
-            f"{host} everybody who can reach this machine has all rights"
+    if settings.tls_client_ca is not None:
+        return logging.INFO, ""
+    if is_loopback(host, resolve):
+        return logging.INFO, "" if tls else (
+            "neither TLS nor tokens are set: every user of this machine has all rights, and no other machine can "
+            "connect"
         )
-    return logging.INFO, ""
+    problem = (
+        f"{'TLS alone keeps nobody out' if tls else 'neither TLS nor tokens are set'}, and on {host} everybody who can "
+        "reach this machine could read and delete all scenes"
+    )
+    if settings.insecure:
+        return logging.WARNING, problem
+    return logging.CRITICAL, (
+        f"{problem}: set tokens_file{'' if tls else ', with tls_certificate and tls_key'} (mapless-server token "
+        "create), or tls_client_ca, or listen on 127.0.0.1, or set insecure if another program restricts access"
+    )
 
 
 def _is_loopback(text: str) -> bool:

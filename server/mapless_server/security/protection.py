@@ -11,7 +11,7 @@ from .access import Authenticator, Tokens
 from .binding import assess_binding
 from .rate import RateLimiter
 from .reloading import Reloading, SecurityError
-from .tokens import read_tokens
+from .tokens import read_tokens, warn_of_readers
 
 if TYPE_CHECKING:
     from .tls import Tls
@@ -35,6 +35,8 @@ class Protection:
             raise SecurityError(sentence)
         if sentence:
             log.log(level, "%s", sentence)
+        for secret in filter(None, (settings.tokens_file, settings.tls_key)):
+            warn_of_readers(secret)
         tls = tokens = None
         if settings.tls_certificate is not None and settings.tls_key is not None:
             from .tls import Tls, TlsFiles  # cryptography's X.509, a twentieth of what a server imports

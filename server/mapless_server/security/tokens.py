@@ -9,12 +9,14 @@ is JSON, which programs can read and write:
 """
 
 import fcntl
+import logging
 import os
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
+from typing import TextIO
 
 from pydantic import ValidationError
 
@@ -28,6 +30,9 @@ PREFIX = "mapless_"
 
 _TOKEN_BYTES = 32
 _FILE_MODE = 0o600
+_OF_OTHERS = 0o006
+
+log = logging.getLogger(__name__)
 
 
 def read_tokens(path: Path) -> Tokens:
@@ -57,6 +62,40 @@ def create_token(path: Path, name: str, tenant: str, role: str, expires: datetim
             raise SecurityError(f"a token of the name {name!r} exists already; revoke it first, or use another name")
         _write(file, Tokens(tokens=(*old.tokens, new), tenants=old.tenants))
     return token
+
+
+@contextmanager
+def written_secret(path: Path) -> Iterator[TextIO]:
+    """Opens a new file that its owner alone can read; it is removed again if the block raises.
+
+    SecurityError if there is a file of this name, or it cannot be written.
+    """
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, _FILE_MODE)
+    except FileExistsError:
+        raise SecurityError(f"{path} exists already, and is not overwritten") from None
+    except OSError as error:
+        raise SecurityError(f"{path}: {error.strerror}") from error
+    try:
+        with open(descriptor, "w") as file:
+            yield file
+            file.flush()
+            os.fsync(descriptor)
+    except BaseException as error:
+        os.unlink(path)
+        if isinstance(error, OSError):
+            raise SecurityError(f"{path}: {error.strerror}") from error
+        raise
+
+
+def warn_of_readers(path: Path) -> None:
+    """Logs a warning if others than its owner and group can read a file of secrets, or others can write it."""
+    try:
+        mode = path.stat().st_mode
+    except OSError:
+        return  # whoever reads it says so
+    if mode & _OF_OTHERS:
+        log.warning("%s can be read or changed by every user of this machine (mode %o): chmod 600", path, mode & 0o777)
 
 
 def revoke_token(path: Path, name: str) -> None:

@@ -16,7 +16,7 @@ import typer
 from pydantic import SecretStr
 
 from mapless_server import __version__
-from mapless_server.settings import ConfigError, Settings, bounds_text, default_text, load_settings
+from mapless_server.settings import ConfigError, LoadedSettings, Settings, bounds_text, default_text, load_settings
 
 from .libraries import configure_libraries
 
@@ -60,7 +60,7 @@ def serve_command(config: Config = None, **flags: Any) -> None:
     except ConfigError as error:
         fail(str(error))
     configure_logging(loaded.settings)
-    logging.getLogger(__name__).info("mapless-server %s\n%s", __version__, loaded)
+    _log_start(loaded)
     configure_libraries(loaded.settings)
 
     gc.disable()  # a fifth of the time of the imports, also of torch's; `serve` enables it when it is ready
@@ -71,6 +71,15 @@ def serve_command(config: Config = None, **flags: Any) -> None:
         asyncio.run(serve(loaded.settings))
     except StartupError as error:
         fail(str(error))
+
+
+def _log_start(loaded: LoadedSettings) -> None:
+    """Logs version and settings: a line for each for people, fields for programs."""
+    log = logging.getLogger(__name__)
+    if loaded.settings.log_format == "text":
+        log.info("mapless-server %s\n%s", __version__, loaded)
+    else:
+        log.info("mapless-server %s", __version__, extra={"fields": loaded.fields})
 
 
 def fail(message: str, code: int = 2) -> NoReturn:

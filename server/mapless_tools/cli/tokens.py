@@ -1,4 +1,4 @@
-"""`mapless-server token`: create, list, revoke. Standard output has the token alone, for programs."""
+"""`mapless-server token`: create, list, revoke. A new token is printed alone, for programs, or written to a file."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -31,13 +31,22 @@ def create_command(
     tenant: Annotated[str, typer.Option(help="Tenant whose scenes the holder can access.")] = DEFAULT_TENANT,
     expires: Annotated[str | None, typer.Option(help="When it ends, 2027-01-01T00:00:00Z; default: never.")] = None,
     tokens_file: TokensFile = None,
+    output: Annotated[
+        Path | None, typer.Option(help="New file for the token, which its owner alone can read; default: print it.")
+    ] = None,
 ) -> None:
-    """Create a token and print it, once: the file has only its hash."""
-    from mapless_server.security import create_token
+    """Create a token and write or print it, once: the file of tokens has only its hash."""
+    from mapless_server.security import create_token, written_secret
 
     name = _one_name(name, name_flag)
     with _tokens_file(tokens_file) as path:
-        token = create_token(path, name, tenant, role, _read_time(expires) if expires else None)
+        ends = _read_time(expires) if expires else None
+        if output is not None:
+            with written_secret(output) as file:
+                file.write(create_token(path, name, tenant, role, ends) + "\n")
+            typer.echo(f"the token {name!r} of tenant {tenant!r} is in {output}", err=True)
+            return
+        token = create_token(path, name, tenant, role, ends)
     typer.echo(f"the token {name!r} of tenant {tenant!r}; it is not shown again:", err=True)
     print(token)
 

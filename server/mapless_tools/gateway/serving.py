@@ -60,6 +60,12 @@ def run(server: str, connect: ConnectOptions, options: GatewayOptions, binding: 
     """
     if not (binding.is_loopback or binding.insecure):
         _check_tokens(server, replace(connect, token=None))
+    if connect.token is not None and not binding.is_loopback:
+        print(
+            "note: everybody who can reach this gateway localizes with the rights of the token that it was given; "
+            "give it one of the role localize",
+            file=sys.stderr,
+        )
     # Its callers have the limit of time; the server may start after it.
     connect = replace(connect, connect_timeout_s=math.inf)
     rpc = None
