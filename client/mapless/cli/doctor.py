@@ -32,7 +32,8 @@ _MAX_OFFSET_S = 5.0
 """Of two clocks. Certificates and tokens expire, and times of captures are compared, by minutes at the least."""
 _MAX_ERROR = 0.05
 """Of a reference's photograph, which is matched with itself, from its stored pose; metres or units."""
-_TIME_KEY, _VERSION_KEY = "x-mapless-time", "x-mapless-version"
+_TIME_KEY, _VERSION_KEY, _CONNECTIONS_KEY = "x-mapless-time", "x-mapless-version", "x-mapless-connections"
+_FEW_CONNECTIONS = 4096
 
 
 @dataclass(frozen=True)
@@ -223,6 +224,17 @@ def _check_version(session: _Session) -> _Result:
     return NOTE, f"client {client}, server {server} ({libraries})", advice
 
 
+def _check_limits(session: _Session) -> _Result:
+    """Reads how many connections the server accepts at a time."""
+    text = session.trailers.get(_CONNECTIONS_KEY, "")
+    if not text.isdecimal():
+        return NOTE, "the server does not say how many connections it accepts", ""
+    if int(text) >= _FEW_CONNECTIONS:
+        return OK, f"the server accepts {text} connections at a time", ""
+    advice = "raise the hard limit of its file descriptors (LimitNOFILE, --ulimit nofile)"
+    return NOTE, f"the server accepts {text} connections at a time: as many idle ones keep others out", advice
+
+
 def _check_query(session: _Session) -> _Result:
     """Localizes a reference's photograph in its own scene."""
     client = session.client
@@ -255,6 +267,7 @@ _CHECKS: dict[str, tuple[Callable[[_Session], _Result], bool]] = {
     "token": (_check_token, True),
     "clock": (_check_clock, False),
     "version": (_check_version, False),
+    "limits": (_check_limits, False),
     "query": (_check_query, False),
 }
 """The checks in their order, and whether those after it need it."""

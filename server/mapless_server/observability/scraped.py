@@ -26,6 +26,8 @@ class Scraped(Collector):
         token_cache: returns the counters of the cache of references' tokens.
         gpu_memory: returns bytes by kind: allocated, reserved, peak.
         certificate_expiry: returns when the certificate expires, Unix seconds.
+        connections: returns the number of open connections.
+        most_connections: returns how many there may be.
     """
 
     def __init__(self) -> None:
@@ -34,6 +36,8 @@ class Scraped(Collector):
         self.token_cache: Callable[[], TokenCacheCounters] | None = None
         self.gpu_memory: Callable[[], Mapping[str, float]] | None = None
         self.certificate_expiry: Callable[[], float] | None = None
+        self.connections: Callable[[], int] | None = None
+        self.most_connections: Callable[[], int] | None = None
 
     def describe(self) -> Iterable[Metric]:
         """Implements Collector: only the names, when it is registered."""
@@ -41,8 +45,8 @@ class Scraped(Collector):
 
     def collect(self) -> Iterable[Metric]:
         """Implements Collector."""
-        parts = self._reference_cache, self._retrieval_index, self._token_cache, self._gpu_memory, self._certificate
-        for add_to in parts:
+        of_caches = self._reference_cache, self._retrieval_index, self._token_cache
+        for add_to in (*of_caches, self._gpu_memory, self._certificate, self._connections):
             metrics: dict[str, Metric] = {}
             try:
                 add_to(metrics)
@@ -91,6 +95,15 @@ class Scraped(Collector):
         expiry = _gauge(metrics, name, "When the server's certificate expires.")
         if self.certificate_expiry is not None:
             expiry.add_metric([], self.certificate_expiry())
+
+    def _connections(self, metrics: dict[str, Metric]) -> None:
+        text = "Open connections to the port of calls, also those without a token."
+        count = _gauge(metrics, "mapless_open_connections", text)
+        most = _gauge(metrics, "mapless_max_connections", "How many there may be; further ones are refused.")
+        if self.connections is not None:
+            count.add_metric([], self.connections())
+        if self.most_connections is not None:
+            most.add_metric([], self.most_connections())
 
 
 def _counter(metrics: dict[str, Metric], name: str, text: str, labels: Iterable[str] = ()) -> CounterMetricFamily:

@@ -11,9 +11,10 @@ from mapless_server.engine.query import Caller
 from mapless_server.scheduling import Flow, StageRecord
 from mapless_server.security import Principal
 
+from .descriptors import most_connections
 from .sending import REQUEST_ID_KEY
 
-TIME_KEY, VERSION_KEY = "x-mapless-time", "x-mapless-version"
+TIME_KEY, VERSION_KEY, CONNECTIONS_KEY = "x-mapless-time", "x-mapless-version", "x-mapless-connections"
 
 
 @dataclass(frozen=True)
@@ -51,8 +52,13 @@ class Call:
 
     @property
     def trailers(self) -> tuple[tuple[str, str], ...]:
-        """Trailers of a successful answer: its caller is authenticated, and may know the version."""
-        return (REQUEST_ID_KEY, self.request_id), (TIME_KEY, f"{time.time():.3f}"), (VERSION_KEY, __version__)
+        """Trailers of a successful answer: its caller is authenticated, and may know version and limit."""
+        return (
+            (REQUEST_ID_KEY, self.request_id),
+            (TIME_KEY, f"{time.time():.3f}"),
+            (VERSION_KEY, __version__),
+            (CONNECTIONS_KEY, str(most_connections())),
+        )
 
     def note(self, **fields: object) -> None:
         """Adds fields to the call's line in the log and to its trace; they cannot replace the standard fields."""

@@ -21,6 +21,13 @@ from mapless_server.observability.exporter import MetricsServer
 from mapless_server.observability.metrics import Metrics
 from mapless_server.observability.scraped import gpu_memory
 from mapless_server.observability.store_probe import StoreProbe
+from mapless_server.rpc.descriptors import (
+    handshake_s,
+    most_connections,
+    open_connections,
+    raise_limit,
+    watch_connections,
+)
 from mapless_server.scheduling import Fatal
 from mapless_server.security import SecurityError
 from mapless_server.security.protection import Protection
@@ -42,6 +49,8 @@ MAX_CONCURRENT_RPCS = 2048
 the headers have come, whose time `rpc.receiving` limits."""
 MAX_CALLS_PER_CONNECTION = 128
 """Far below that, so that one connection cannot take all; a client sends further calls as earlier ones end."""
+
+_MOST_OF_GRPC = 2**31 - 1
 
 _LAST_BYTES_S = 0.5
 """Time for answers in transit when the last call has ended."""
@@ -113,6 +122,9 @@ def _options(settings: Settings) -> list[tuple[str, int]]:
     return [
         ("grpc.max_receive_message_length", max_message_bytes),
         ("grpc.max_send_message_length", max_message_bytes),
+        # Without them a connection that never becomes ready for calls would last for two minutes.
+        ("grpc.server_handshake_timeout_ms", round(1000 * handshake_s())),
+        ("grpc.max_allowed_incoming_connections", min(most_connections(), _MOST_OF_GRPC)),
         # With reuseport, the default, a second server shares the port silently and gets half of the calls.
         ("grpc.so_reuseport", 0),
         ("grpc.max_concurrent_streams", MAX_CALLS_PER_CONNECTION),
@@ -201,6 +213,7 @@ async def _start(
     stack: AsyncExitStack, settings: Settings, make: MakeEngine, store: Store | None, listen: Listen
 ) -> Running:
     metrics = Metrics()
+    raise_limit()
     protection = Protection.of(settings)  # first, so that a rejected start makes no store
     store = store or open_store(settings)
     store.observer = metrics
@@ -228,6 +241,13 @@ async def _start(
     if protection.refreshes:
         _run_task(stack, keep_fresh(protection.refreshes))
     _run_task(stack, watch_store(store, services.set_changeable))
+    if port := _port_of(listener.address):
+
+        def connections() -> int:
+            return open_connections(port)
+
+        metrics.scraped.connections, metrics.scraped.most_connections = connections, most_connections
+        _run_task(stack, watch_connections(connections))
 
     async def stop_serving() -> None:
         await asyncio.wait({failed})
@@ -244,6 +264,12 @@ async def _start(
     stack.push_async_callback(listener.stop)
     stack.push_async_callback(services.drain, settings.drain_delay_s, settings.drain_grace_s)
     return Running(listener.address, metrics_address, engine, failed)
+
+
+def _port_of(address: str) -> int:
+    """The port of "host:port"; 0 where another program listens."""
+    port = address.rpartition(":")[2]
+    return int(port) if port.isdecimal() else 0
 
 
 def _make_tracer(settings: Settings) -> "OtlpTracer | None":

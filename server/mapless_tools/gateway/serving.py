@@ -1,22 +1,53 @@
 """The gateway's process: from options to a server that listens, and its end."""
 
+import asyncio
 import math
 import socket
 import sys
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import uvicorn
+from uvicorn.protocols.http.auto import AutoHTTPProtocol
 
 from mapless import Client, ConnectOptions, Unauthenticated
 from mapless.pem import without_marks
+from mapless_server.rpc.descriptors import raise_limit
 from mapless_server.security import is_loopback
 
 from .app import GatewayOptions, gateway
 from .client import ServerClient
 
 _GRACE_S = 10
+_REQUEST_LIMIT_S = 15.0
+"""For the head of a request; the guard limits the time of its body."""
+
+
+class _EndingIdle(AutoHTTPProtocol):  # type: ignore[misc,valid-type]
+    """Ends a connection whose next request does not arrive: uvicorn would wait for its first for ever."""
+
+    _ends: asyncio.TimerHandle | None = None
+    _last: Any = None
+
+    def connection_made(self, transport: Any) -> None:
+        """Extends the library's."""
+        super().connection_made(transport)
+        self._ends = self.loop.call_later(_REQUEST_LIMIT_S, self._end_unless_busy)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Extends the library's."""
+        if self._ends is not None:
+            self._ends.cancel()
+        super().connection_lost(exc)
+
+    def _end_unless_busy(self) -> None:
+        is_new, self._last = self.cycle is not self._last, self.cycle
+        if self.cycle is None or (self.cycle.response_complete and not is_new):
+            self.transport.close()
+        else:
+            self._ends = self.loop.call_later(_REQUEST_LIMIT_S, self._end_unless_busy)
 
 
 @dataclass(frozen=True)
@@ -66,6 +97,7 @@ def run(server: str, connect: ConnectOptions, options: GatewayOptions, binding: 
             "give it one of the role localize",
             file=sys.stderr,
         )
+    raise_limit()
     # Its callers have the limit of time; the server may start after it.
     connect = replace(connect, connect_timeout_s=math.inf)
     rpc = None
@@ -78,6 +110,7 @@ def run(server: str, connect: ConnectOptions, options: GatewayOptions, binding: 
     application = gateway(lambda: ServerClient(server, connect), options, rpc)
     config = uvicorn.Config(
         application,
+        http=_EndingIdle,
         log_level="warning",
         server_header=False,
         timeout_graceful_shutdown=_GRACE_S,
