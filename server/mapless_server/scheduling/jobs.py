@@ -287,7 +287,7 @@ class Batch:
     number: int
 
 
-_ARRIVALS = 16
+_ARRIVALS = 64
 _MUCH_SHORTER = 4
 """A job that takes so many times less than the steps of others does not wait for them, if a lane has two threads."""
 
