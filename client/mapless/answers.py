@@ -106,6 +106,7 @@ class Diagnostics:
             photograph was tracked.
         captured: whether the server keeps the call for a time, including the photograph.
         processor_s: processor time of the server's own threads for this photograph, seconds.
+        stationary_keypoint_count: keypoints that were left out because they are fixed to the camera, such as a bonnet.
     """
 
     request_id: str
@@ -125,6 +126,7 @@ class Diagnostics:
     retrieval: str = ""
     captured: bool = False
     processor_s: float = 0.0
+    stationary_keypoint_count: int = 0
 
     @property
     def is_tracked(self) -> bool:

@@ -9,8 +9,7 @@ import pytest
 
 from mapless_tools.dataset import Dataset
 from mapless_tools.ingest.formats.cameras import read_folder
-
-from .places import Place, read_place
+from research.evidence.places import Place, read_place
 
 DATA = Path(os.environ.get("TEST_DATA") or Path(__file__).parents[3] / "shared" / "data")
 

@@ -18,9 +18,9 @@ from mapless_server.scenes.audit.coverage import check_coverage
 from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.audit.resection import with_focal
 from mapless_tools.dataset import Dataset
+from research.evidence.places import Place, read_place
 
 from .conftest import DATA, read_place_once
-from .places import Place, read_place
 
 pytestmark = [pytest.mark.realdata, pytest.mark.timeout(300)]
 

@@ -16,9 +16,9 @@ from mapless_server.method.priors.known import NO_PRIORS, GravityPrior, Priors
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
 from mapless_server.method.uncertainty.radii import accuracy_from_covariance
 from mapless_tools.dataset import Dataset
+from research.evidence.places import METRIC, OTHERS, Measured, Pair, Place, answered, cross_pairs, right_pairs
 
 from .conftest import read_place_once
-from .places import METRIC, OTHERS, Measured, Pair, Place, answered, cross_pairs, right_pairs
 
 pytestmark = pytest.mark.realdata
 

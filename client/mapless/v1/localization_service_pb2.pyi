@@ -471,7 +471,7 @@ class Hypothesis(_message.Message):
     def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., inlier_count: _Optional[int] = ..., references: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class Diagnostics(_message.Message):
-    __slots__ = ("request_id", "backend", "weights_sha256", "features", "variant", "store_generation", "references", "scale", "stages", "queue_duration", "total_duration", "processed_width_px", "processed_height_px", "server_version", "retrieval", "captured", "processor_duration")
+    __slots__ = ("request_id", "backend", "weights_sha256", "features", "variant", "store_generation", "references", "scale", "stages", "queue_duration", "total_duration", "processed_width_px", "processed_height_px", "server_version", "retrieval", "captured", "processor_duration", "stationary_keypoint_count")
     REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
     BACKEND_FIELD_NUMBER: _ClassVar[int]
     WEIGHTS_SHA256_FIELD_NUMBER: _ClassVar[int]
@@ -489,6 +489,7 @@ class Diagnostics(_message.Message):
     RETRIEVAL_FIELD_NUMBER: _ClassVar[int]
     CAPTURED_FIELD_NUMBER: _ClassVar[int]
     PROCESSOR_DURATION_FIELD_NUMBER: _ClassVar[int]
+    STATIONARY_KEYPOINT_COUNT_FIELD_NUMBER: _ClassVar[int]
     request_id: str
     backend: str
     weights_sha256: str
@@ -506,7 +507,8 @@ class Diagnostics(_message.Message):
     retrieval: str
     captured: bool
     processor_duration: _duration_pb2.Duration
-    def __init__(self, request_id: _Optional[str] = ..., backend: _Optional[str] = ..., weights_sha256: _Optional[str] = ..., features: _Optional[str] = ..., variant: _Optional[_Union[Variant, str]] = ..., store_generation: _Optional[int] = ..., references: _Optional[_Iterable[_Union[ReferenceUse, _Mapping]]] = ..., scale: _Optional[_Union[ScaleEstimate, _Mapping]] = ..., stages: _Optional[_Iterable[_Union[StageTiming, _Mapping]]] = ..., queue_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., total_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., processed_width_px: _Optional[int] = ..., processed_height_px: _Optional[int] = ..., server_version: _Optional[str] = ..., retrieval: _Optional[str] = ..., captured: bool = ..., processor_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ...) -> None: ...
+    stationary_keypoint_count: int
+    def __init__(self, request_id: _Optional[str] = ..., backend: _Optional[str] = ..., weights_sha256: _Optional[str] = ..., features: _Optional[str] = ..., variant: _Optional[_Union[Variant, str]] = ..., store_generation: _Optional[int] = ..., references: _Optional[_Iterable[_Union[ReferenceUse, _Mapping]]] = ..., scale: _Optional[_Union[ScaleEstimate, _Mapping]] = ..., stages: _Optional[_Iterable[_Union[StageTiming, _Mapping]]] = ..., queue_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., total_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., processed_width_px: _Optional[int] = ..., processed_height_px: _Optional[int] = ..., server_version: _Optional[str] = ..., retrieval: _Optional[str] = ..., captured: bool = ..., processor_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., stationary_keypoint_count: _Optional[int] = ...) -> None: ...
 
 class ReferenceUse(_message.Message):
     __slots__ = ("name", "match_count", "inlier_count", "similarity")

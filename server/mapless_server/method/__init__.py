@@ -13,6 +13,8 @@ cache                        results that are kept within a bound, here and by t
 observations                 observations of the same point; metric points
 nearest                      nearest neighbours of two photographs' descriptors, and their epipolar lines
 matching, lightglue          how two photographs are matched: nearest neighbours, or a network
+stationary                   (ours) what is fixed to the camera, such as a bonnet, and no place
+pairs                        pairs of references: their order, their matches as they are cached
 correspond                   matches among references, and of the query with them
 priors/                      what is known of the query's pose beforehand
 intrinsics                   errors of the query's intrinsics, and the evidence of them

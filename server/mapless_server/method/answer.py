@@ -81,6 +81,7 @@ class Answer:
         reference_match_counts: per reference, feature matches with the query.
         reference_inlier_counts: per reference, inliers on points that it observes.
         support: structure, matches and estimate; None if those stages were not reached.
+        stationary_count: keypoints of the query whose matches were left out, because they are fixed to the camera.
     """
 
     outcome: Localization | Rejection
@@ -89,6 +90,7 @@ class Answer:
     reference_match_counts: tuple[int, ...] = ()
     reference_inlier_counts: tuple[int, ...] = ()
     support: Support | None = None
+    stationary_count: int = 0
 
     @property
     def is_finite(self) -> bool:

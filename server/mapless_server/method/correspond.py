@@ -18,7 +18,7 @@ from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -34,12 +34,14 @@ from .matching import (
 )
 from .nearest import best_of_both, epipolar_distance_px, epipolar_distances_px, mutual_matches
 from .observations import Tracks, build_tracks
+from .pairs import PairKey, PairMatches, in_order, is_one_photograph
+from .stationary import IgnoredKeypoints, StationaryOptions, stationary_matches, without_ignored
 from .views import Matches, PosedView, View
 
 _PAIRS_THAT_COUNT = 10
 """For `Matcher.pair_s`, about."""
 
-PAIR_RULE = 2
+PAIR_RULE = 3
 """Version of how two references are matched; to be raised by every change that can change a match."""
 
 
@@ -70,11 +72,13 @@ class Correspondences:
         reference_pairs: for each i < j, matches between references i and j.
         query_matches: for each reference, matches (query keypoint, reference keypoint).
         source: the references as they were matched, and where results from these alone are cached; None caches none.
+        stationary_count: number of keypoints of the query whose matches were left out, see `stationary`.
     """
 
     reference_pairs: Mapping[tuple[int, int], Matches]
     query_matches: tuple[Matches, ...]
     source: MatchedReferences | None = None
+    stationary_count: int = 0
     _tracks: dict[int | None, Tracks] = field(default_factory=dict, init=False, repr=False)
 
     def tracks(self, references: Sequence[PosedView], anchor: int | None = None) -> Tracks:
@@ -110,10 +114,11 @@ class Matcher:
         self.options = options or CorrespondOptions()
         self.pair_matching = pair_matching
         self.pair_s: float | None = None
+        self.stationary = StationaryOptions()
         self.stored: StoredPairs | None = None
         self._threads = SharedThreads(threads)
         self._query_matching = query_matching or NearestNeighbours(self.options.query_ratio, self._threads)
-        self._remembered: LruCache[Matches] = LruCache(self.options.remembered_pairs)
+        self._remembered: LruCache[PairMatches] = LruCache(self.options.remembered_pairs)
         self._structures: LruCache[Any] = LruCache(self.options.structure_bytes)
 
     def correspond(
@@ -130,19 +135,20 @@ class Matcher:
         `match_query` or another call with the same references, are used as they are.
         """
 
-        def of_pair(pair: tuple[int, int]) -> Matches:
+        def of_pair(pair: tuple[int, int]) -> PairMatches:
             check()
-            return self.match_references(references[pair[0]], references[pair[1]], wide)
+            return self._pair(references[pair[0]], references[pair[1]], wide)
 
         pairs = list(combinations(range(len(references)), 2))
         self._look_up([in_order(references[i], references[j]) for i, j in pairs], wide)
-        pair_matches = self._threads.map(of_pair, pairs)
+        found = dict(zip(pairs, self._threads.map(of_pair, pairs), strict=True))
         if query_matches is None:
             query_matches = self.match_query(query, references, check)
+        kept = _without_stationary(query, references, found, query_matches, self.stationary)
         # Strong matches of a pair may be stored at any time, so that its matches are not determined.
         source = MatchedReferences(tuple(references), self.matching(wide), self._structures)
         known = source if self.pair_matching is None else None
-        return Correspondences(dict(zip(pairs, pair_matches, strict=True)), tuple(query_matches), known)
+        return replace(kept, source=known)
 
     def match_query(
         self, query: View, references: Sequence[PosedView], check: Callable[[], None] = lambda: None
@@ -239,14 +245,18 @@ class Matcher:
 
         They are strong ones if the strict matches have been looked up as such; otherwise from nearest neighbours.
         """
+        return self._pair(first, second, wide).agreeing
+
+    def _pair(self, first: PosedView, second: PosedView, wide: bool) -> PairMatches:
         pair = in_order(first, second)
-        strong = self._remembered.get(_Key.of(pair, False, True)) is not None
-        key = _Key.of(pair, wide, strong)
+        strong = self._remembered.get(PairKey.of(pair, False, True)) is not None
+        key = PairKey.of(pair, wide, strong)
         matches = self._remembered.get(key)
         if matches is None:
-            matches = self._widened(*pair, self.match_references(*pair)) if wide else self._match_strictly(*pair)
+            made = self._widened(*pair, self._pair(*pair, False).all) if wide else self._match_strictly(*pair)
+            matches = PairMatches.of(*pair, made, self.stationary)
             self._remembered.put(key, matches)
-        return matches if pair[0] is first else np.ascontiguousarray(matches[:, ::-1])
+        return matches if pair[0] is first else matches.swapped()
 
     def match_pair(
         self,
@@ -258,6 +268,8 @@ class Matcher:
         pause: Callable[[], None] = lambda: None,
     ) -> Matches:
         """Computes the matches of two references, given `in_order`, anew and without caching them.
+
+        Stationary ones come last: what is fixed to a camera is found by them (see `stationary`).
 
         Args:
             first: a reference.
@@ -287,14 +299,14 @@ class Matcher:
 
     def _found(self, pairs: Sequence[tuple[PosedView, PosedView]], wide: bool, strong: bool) -> list[bool]:
         """Caches these pairs' stored matches; returns which of the pairs are cached then."""
-        keys = [_Key.of(pair, wide, strong) for pair in pairs]
+        keys = [PairKey.of(pair, wide, strong) for pair in pairs]
         found = [self._remembered.get(key) is not None for key in keys]
         missing = [i for i, is_cached in enumerate(found) if not is_cached]
         if missing and self.stored is not None:
             stored = self.stored.find(self.matching(wide, strong), [pairs[i] for i in missing])
             for i, matches in zip(missing, stored, strict=True):
                 if matches is not None:
-                    self._remembered.put(keys[i], matches)
+                    self._remembered.put(keys[i], PairMatches.of(*pairs[i], matches, self.stationary))
                     found[i] = True
         return found
 
@@ -314,13 +326,15 @@ class Matcher:
         return self._filtered(first, second, self.pair_matching.match_one(first.view, second.view, pause))
 
     def _filtered(self, first: PosedView, second: PosedView, matches: Matches) -> Matches:
-        if _is_one_photograph(first, second):
+        if is_one_photograph(first, second):
             return matches[:0]
-        return matches[epipolar_distance_px(first, second, matches) < self.options.epipolar_px]
+        stationary = stationary_matches(first, second, matches, self.stationary)
+        agreeing = epipolar_distance_px(first, second, matches) < self.options.epipolar_px
+        return PairMatches(matches[agreeing & ~stationary], matches[stationary]).all
 
     def _widened(self, first: PosedView, second: PosedView, strict: Matches) -> Matches:
         """Returns the strict matches, and matches along the epipolar lines of the other keypoints."""
-        if _is_one_photograph(first, second):
+        if is_one_photograph(first, second):
             return strict
         similarity = first.view.features.unit_descriptors() @ second.view.features.unit_descriptors().T
         similarity[epipolar_distances_px(first, second) >= self.options.epipolar_px] = -1.0
@@ -329,35 +343,23 @@ class Matcher:
         return np.concatenate([strict, added[~taken]])
 
 
-class _Key(NamedTuple):
-    """The key of a pair of references in the cache."""
-
-    first: str
-    second: str
-    wide: bool
-    strong: bool
-
-    @classmethod
-    def of(cls, pair: tuple[PosedView, PosedView], wide: bool, strong: bool) -> "_Key":
-        return cls(pair[0].key, pair[1].key, wide, strong)
-
-
-def _is_one_photograph(first: PosedView, second: PosedView) -> bool:
-    """Whether two references are one photograph at two poses, of two places that are copies of each other.
-
-    Its matches with itself say nothing of the place, but satisfy the epipolar constraint of poses that are only shifted
-    against each other: points at infinity, with which any position agrees.
-    """
-    return np.array_equal(first.view.features.keypoints, second.view.features.keypoints)
-
-
-def in_order(first: PosedView, second: PosedView) -> tuple[PosedView, PosedView]:
-    """Returns two references in the order in which they are always matched, whichever comes first in a query.
-
-    The ratio test of wide matches is not symmetric, and the order decides how sums are rounded. Names, unlike keys, are
-    the same wherever the scene is stored.
-    """
-    return (first, second) if (first.name, first.key) <= (second.name, second.key) else (second, first)
+def _without_stationary(
+    query: View,
+    references: Sequence[PosedView],
+    pairs: Mapping[tuple[int, int], PairMatches],
+    query_matches: Sequence[Matches],
+    options: StationaryOptions,
+) -> Correspondences:
+    """The correspondences without those of keypoints that are fixed to the camera."""
+    of_pairs = {pair: it.agreeing for pair, it in pairs.items()}
+    ignored = IgnoredKeypoints(references, {pair: it.stationary for pair, it in pairs.items()}, options)
+    if not ignored:
+        return Correspondences(of_pairs, tuple(query_matches))
+    of_query, of_reference = ignored.of(query), [ignored.of(reference.view) for reference in references]
+    of_pairs = {(i, j): without_ignored(it, of_reference[i], of_reference[j]) for (i, j), it in of_pairs.items()}
+    kept = tuple(without_ignored(it, of_query, theirs) for it, theirs in zip(query_matches, of_reference, strict=True))
+    before, after = (np.unique(np.concatenate([it[:, 0] for it in some])) for some in (query_matches, kept))
+    return Correspondences(of_pairs, kept, stationary_count=len(before) - len(after))
 
 
 def make_matcher(features: str, threads: int = 1, weights: Path | None = None, device: str = "cpu") -> Matcher:

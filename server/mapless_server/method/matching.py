@@ -17,6 +17,7 @@ from .options import check_bounds
 from .views import Matches, PosedView, View
 
 ItemT = TypeVar("ItemT")
+ResultT = TypeVar("ResultT")
 
 
 @dataclass(frozen=True)
@@ -142,9 +143,9 @@ class SharedThreads:
         self.threads = threads
         self._pool = ThreadPoolExecutor(max(1, threads - 1), "match")
 
-    def map(self, compute: Callable[[ItemT], Matches], items: Sequence[ItemT]) -> list[Matches]:
+    def map(self, compute: Callable[[ItemT], ResultT], items: Sequence[ItemT]) -> list[ResultT]:
         """The results for all items, in order; raises what a computation raises, when no other one is running."""
-        results: dict[int, Matches] = {}
+        results: dict[int, ResultT] = {}
         rest = iter(list(enumerate(items)))  # the next item is taken under the interpreter's lock
 
         def work() -> None:

@@ -201,7 +201,9 @@ class Coarse:
         matches = tuple(len(m) for m in prepared.correspondences.query_matches)
         inliers = support.inliers_by_reference() if support else (0,) * len(prepared.references)
         seconds = dict(prepared.context.stage_seconds)
-        return shifted(Answer(outcome, scale, seconds, matches, inliers, support), prepared.origin)
+        stationary_count = prepared.correspondences.stationary_count
+        made = Answer(outcome, scale, seconds, matches, inliers, support, stationary_count)
+        return shifted(made, prepared.origin)
 
 
 def reconstruct(batch: Sequence[Prepared]) -> list[Coarse | Answer | Exception]:
@@ -243,6 +245,8 @@ def with_wide_correspondences(coarse: Coarse) -> Coarse:
         known = prepared.correspondences.query_matches
         in_world = prepared.references_in_world
         correspondences = pipeline.matcher.correspond(query, in_world, True, context.check, known)
+        # What was left out is not among the known matches any more.
+        correspondences = replace(correspondences, stationary_count=prepared.correspondences.stationary_count)
     with context.stage("coarse"):
         if pipeline.reconstructor.uses_correspondences:
             reconstruction = reconstruct_one(

@@ -36,10 +36,14 @@ MIN_MATCHES = 24
 """Fewer inliers are no evidence: any eight matches satisfy some fundamental matrix."""
 
 
+def distinct_matches(first: View, second: View) -> Matches:
+    """Matches of descriptors that nothing else in the other view resembles."""
+    return mutual_matches(first.features, second.features, RATIO)
+
+
 def consistent_matches(first: View, second: View) -> Matches:
     """Inlier matches of one fundamental matrix, without use of poses; none if there are too few."""
-    matches = mutual_matches(first.features, second.features, RATIO)
-    return consistent(first, second, matches)
+    return consistent(first, second, distinct_matches(first, second))
 
 
 def consistent(first: View, second: View, matches: Matches) -> Matches:

@@ -22,6 +22,7 @@ from mapless_server.method.match import vote
 from mapless_server.method.nearest import epipolar_distance_px, mutual_matches
 from mapless_server.method.observations import Tracks, build_tracks, triangulate
 from mapless_server.method.results import PointMatches, Structure
+from mapless_server.method.stationary import IgnoredKeypoints, fixed_in, without_ignored
 from mapless_server.method.structure import StructureOptions, observe, refine_points
 from mapless_server.method.views import Matches, PosedView
 from mapless_server.store import LruCache
@@ -56,12 +57,14 @@ class PairMatches:
 class Neighbourhood:
     """Metric points that neighbours triangulate, and their tracks over the neighbours.
 
-    The covariances of the points (P, 3, 3) are in square metres, world axes.
+    The covariances of the points (P, 3, 3) are in square metres, world axes. `fixed` is what is fixed to the
+    neighbours' cameras, such as a bonnet, and no part of the points.
     """
 
     references: tuple[PosedView, ...]
     structure: Structure
     point_covariance: Array
+    fixed: IgnoredKeypoints
 
 
 _EPIPOLAR_PX = 2.0
@@ -74,19 +77,21 @@ def build_neighbourhood(references: Sequence[PosedView], pairs: PairMatches) -> 
     if len(references) < 2:
         nothing = np.empty(0, np.intp)
         structure = Structure(np.empty((0, 3)), Tracks(nothing, nothing, nothing), options.first_noise)
-        return Neighbourhood(tuple(references), structure, np.empty((0, 3, 3)))
+        return Neighbourhood(tuple(references), structure, np.empty((0, 3, 3)), fixed_in(references, {}))
+    every = {(i, j): pairs.match(references[i], references[j]) for i, j in combinations(range(len(references)), 2)}
+    fixed = fixed_in(references, every)
+    ignored = [fixed.of(reference.view) for reference in references]
     matches = {}
-    for i, j in combinations(range(len(references)), 2):
-        first, second = references[i], references[j]
-        found = pairs.match(first, second)
-        matches[i, j] = found[epipolar_distance_px(first, second, found) < _EPIPOLAR_PX]
+    for (i, j), found in every.items():
+        kept = without_ignored(found, ignored[i], ignored[j])
+        matches[i, j] = kept[epipolar_distance_px(references[i], references[j], kept) < _EPIPOLAR_PX]
     tracks = build_tracks(matches, [len(r.view.features) for r in references])
     observations = observe(tracks, references, options.first_noise)
     refined = refine_points(observations, triangulate(observations), options)
     covariance = refined.observations.point_covariances(refined.x_in_world)
     trusted = refined.trusted & np.isfinite(covariance).all(axis=(1, 2))
     structure = Structure(refined.x_in_world[trusted], refined.observations.tracks.select(trusted), refined.noise)
-    return Neighbourhood(tuple(references), structure, covariance[trusted])
+    return Neighbourhood(tuple(references), structure, covariance[trusted], fixed)
 
 
 def match_points(
@@ -96,7 +101,12 @@ def match_points(
 
     The second result has the matches with each reference.
     """
-    found = tuple(pairs.match(subject, reference) for reference in neighbourhood.references)
+    fixed = neighbourhood.fixed
+    own = fixed.of(subject.view)
+    found = tuple(
+        without_ignored(pairs.match(subject, reference), own, fixed.of(reference.view))
+        for reference in neighbourhood.references
+    )
     if not len(neighbourhood.structure.x_in_world):
         nothing = np.empty(0, np.intp)
         return PointMatches(nothing, nothing, np.empty(0, bool), 0.0), found

@@ -301,6 +301,7 @@ def diagnostics_to_message(result: Result, options: LocalizeOptions) -> pb.Diagn
         processed_height_px=result.processed.height_px,
         server_version=__version__,
         retrieval=result.choice.descriptor if result.choice else "",
+        stationary_keypoint_count=answer.stationary_count,
     )
     message.references.extend(_reference_uses(result))
     for stage, seconds in result.stage_seconds.items():

@@ -1,4 +1,4 @@
-"""Pairs of photographs that are described and matched, each once."""
+"""Pairs of photographs that are described and matched, each once, without what is fixed to their cameras."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.readings import MatchedPair, Pair, Verdict, consistent_matches, judge
-from mapless_server.method.views import PosedView
+from mapless_server.method.readings import MatchedPair, Pair, Verdict, consistent, distinct_matches, judge
+from mapless_server.method.stationary import fixed_in, without_ignored
+from mapless_server.method.views import Matches, PosedView
 from mapless_server.settings import available_cores
 from mapless_tools.dataset import Frame
 from mapless_tools.progress import Progress
@@ -25,6 +26,7 @@ class Comparison:
     extractor: FeatureExtractor
     progress: Progress
     views: dict[int, PosedView | None] = field(default_factory=dict)
+    distinct: dict[Pair, Matches] = field(default_factory=dict)
     matched: list[MatchedPair] = field(default_factory=list)
     pairs: list[Pair] = field(default_factory=list)
 
@@ -36,9 +38,11 @@ class Comparison:
             for done, (i, view) in enumerate(zip(missing, threads.map(self._view, missing), strict=True), 1):
                 self.views[i] = view
                 self.progress("checking poses", done, len(missing))
-            found = list(threads.map(self._match, new))
-        self.pairs += new
-        self.matched += [item for item in found if item is not None and len(item.matches)]
+            usable = [pair for pair in new if self.readable().keys() >= set(pair)]
+            self.distinct |= dict(zip(usable, threads.map(self._match, usable), strict=True))
+            self.pairs += new
+            found = threads.map(self._consistent, *self._without_fixed())
+            self.matched = [item for item in found if len(item.matches)]
 
     def verdict(self) -> Verdict:
         """The verdict on all pairs so far."""
@@ -62,8 +66,23 @@ class Comparison:
         view = self.extractor.extract(image, frame.camera)
         return PosedView(str(index), frame.name, view, frame.world_from_camera)
 
-    def _match(self, pair: Pair) -> MatchedPair | None:
-        first, second = (self.views[i] for i in pair)
-        if first is None or second is None:
-            return None
-        return MatchedPair(pair, consistent_matches(first.view, second.view))
+    def _posed(self, index: int) -> PosedView:
+        view = self.views[index]
+        assert view is not None
+        return view
+
+    def _match(self, pair: Pair) -> Matches:
+        return distinct_matches(*(self._posed(i).view for i in pair))
+
+    def _without_fixed(self) -> tuple[Sequence[Pair], Sequence[Matches]]:
+        """The pairs and their matches, without those of what is fixed to a camera, such as a badge or a bonnet."""
+        compared = sorted({i for pair in self.distinct for i in pair})
+        index, views = {i: k for k, i in enumerate(compared)}, [self._posed(i) for i in compared]
+        fixed = fixed_in(views, {(index[a], index[b]): it for (a, b), it in self.distinct.items()})
+        ignored = {i: fixed.of(self._posed(i).view) for i in compared}
+        kept = [without_ignored(it, ignored[a], ignored[b]) for (a, b), it in self.distinct.items()]
+        return list(self.distinct), kept
+
+    def _consistent(self, pair: Pair, matches: Matches) -> MatchedPair:
+        first, second = (self._posed(i).view for i in pair)
+        return MatchedPair(pair, consistent(first, second, matches))

@@ -1,0 +1,216 @@
+"""Keypoints that are fixed to the camera: a bonnet, a gripper, a badge, a time stamp, a watermark.
+
+They match at the same pixels wherever the camera is. Between two references whose poses say that what is seen there
+must have moved, such matches are found; where several pairs show them, all keypoints around are ignored in the
+references of that camera, and in a photograph of it. Matches of a photograph with them would say "the pose of the
+reference", whatever else it shows.
+
+At the same pixels, poses predict far points, and those near the point that a camera moves towards. So it is asked
+whether a point at any depth in front of both cameras, up to infinity, can be seen there: with x a pixel of the first
+camera, its point at depth z is seen in the second one at
+
+    K2 (R K1^-1 x + t / z),   0 < 1 / z < infinity,
+
+a part of the epipolar line, from the pixel of infinite depth to the epipole. A reference at the same pose, or one that
+looks along its own motion, so proves nothing, and neither does a pair of photographs that show the same from the same
+place though their poses differ: there the poses are wrong.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, Camera
+
+from .options import check_bounds
+from .views import Matches, PosedView, View
+
+
+@dataclass(frozen=True)
+class StationaryOptions:
+    """Options of finding what is fixed to the camera; pixels are those of an image of 1024 columns.
+
+    Attributes:
+        same_px: largest distance between the pixels of a match that are the same.
+        contradicted_px: smallest distance of a pixel from all those that the poses can explain; greater than what poses
+            and intrinsics of references are off.
+        same_view_share: of a photograph's keypoints, if so many match another's at the same pixels, both show the same
+            from the same place.
+        support: number of matches, of different pairs or at different pixels, that show that a part of the image is
+            fixed.
+        cells: number of columns of the grid on which they are counted.
+        reach: cells to each side that are counted together, and ignored around a cell that is fixed; digits that change
+            are beside others that do not.
+    """
+
+    same_px: float = 1.0
+    contradicted_px: float = 4.0
+    same_view_share: float = 0.35
+    support: int = 3
+    cells: int = 160
+    reach: int = 2
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "same_px contradicted_px", above=0)
+        check_bounds(self, "same_view_share", above=0, at_most=1)
+        check_bounds(self, "support cells", at_least=1)
+        check_bounds(self, "reach", at_least=0)
+
+
+_COLUMNS = 1024.0
+
+
+def stationary_matches(
+    first: PosedView, second: PosedView, matches: Matches, options: StationaryOptions
+) -> NDArray[np.bool_]:
+    """Which matches (M,) of two references are at the same pixels, where their poses allow no point at any depth."""
+    none = np.zeros(len(matches), bool)
+    if not _have_same_size(first.view.camera, second.view.camera) or not len(matches):
+        return none
+    scale = first.view.camera.width_px / _COLUMNS
+    pixels, others = (it.view.features.keypoints[matches[:, side]] for side, it in enumerate((first, second)))
+    same = np.flatnonzero(np.abs(pixels - others).max(axis=1) <= options.same_px * scale)
+    fewer = min(len(first.view.features), len(second.view.features))
+    if not len(same) or len(same) > options.same_view_share * fewer:
+        return none
+    off_px = distance_from_explained_px(first, second, *(it[same].astype(np.float64) for it in (pixels, others)))
+    none[same[off_px > options.contradicted_px * scale]] = True
+    return none
+
+
+def distance_from_explained_px(first: PosedView, second: PosedView, pixels: Array, others: Array) -> Array:
+    """Distances (N,) of pixels of the second view (N, 2) from where it sees the points at these of the first (N, 2).
+
+    The distance is that from the nearest pixel of a point at any depth in front of both cameras; infinite if there is
+    no such point.
+    """
+    second_from_first = second.world_from_camera.rotation.T @ first.world_from_camera.rotation
+    # The difference first: world coordinates may be millions of metres.
+    apart = first.world_from_camera.translation - second.world_from_camera.translation
+    length = float(np.linalg.norm(apart))
+    towards = second.world_from_camera.rotation.T @ (apart / length if length > 1e-9 else 0 * apart)
+    matrix = second.view.camera.matrix()
+    infinite = first.view.camera.rays(pixels) @ (matrix @ second_from_first).T
+    epipole = np.broadcast_to(matrix @ towards, infinite.shape)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        line = np.cross(infinite, epipole)
+        line = line / np.linalg.norm(line[:, :2], axis=1, keepdims=True)
+        signed = (line[:, :2] * others).sum(axis=1) + line[:, 2]
+        foot = others - signed[:, None] * line[:, :2]
+        # The inverse depth at which the line's nearest point is seen.
+        from_infinite, from_epipole = (it[:, :2] - foot * it[:, 2:] for it in (infinite, epipole))
+        inverse_depth = -(from_infinite * from_epipole).sum(axis=1) / (from_epipole**2).sum(axis=1)
+        is_seen = (inverse_depth >= 0) & (infinite[:, 2] + inverse_depth * epipole[:, 2] > 0)
+        ends = [
+            np.where(it[:, 2] > 0, np.linalg.norm(it[:, :2] / it[:, 2:] - others, axis=1), np.inf)
+            for it in (infinite, epipole)
+        ]
+    return np.asarray(np.where(is_seen, np.abs(signed), np.fmin(*ends)))
+
+
+class IgnoredKeypoints:
+    """Parts of images that are fixed to their cameras, as some references show."""
+
+    def __init__(
+        self,
+        references: Sequence[PosedView],
+        stationary: Mapping[tuple[int, int], Matches],
+        options: StationaryOptions,
+    ) -> None:
+        """Counts the stationary matches of pairs of references, by the references' indices."""
+        self._options = options
+        self._fixed: list[tuple[View, NDArray[np.bool_]]] = []
+        found = {pair: matches for pair, matches in stationary.items() if len(matches)}
+        if not found:
+            return
+        for members in _by_camera(references):
+            fixed = _fixed_cells(references, members, found, options)
+            if fixed.any():
+                self._fixed.append((references[members[0]].view, fixed))
+
+    def __bool__(self) -> bool:
+        return bool(self._fixed)
+
+    def of(self, view: View) -> NDArray[np.bool_]:
+        """Which keypoints (N,) of a reference or of a photograph are ignored; none of another camera."""
+        for example, fixed in self._fixed:
+            if view.has_camera_of(example):
+                return np.asarray(fixed.ravel()[_cells(view.features.keypoints, view.camera, self._options)])
+        return np.zeros(len(view.features), bool)
+
+
+def _fixed_cells(
+    references: Sequence[PosedView],
+    members: Sequence[int],
+    stationary: Mapping[tuple[int, int], Matches],
+    options: StationaryOptions,
+) -> NDArray[np.bool_]:
+    """The cells of one camera's images that are fixed to it."""
+    camera = references[members[0]].view.camera
+    shape = _grid_shape(camera, options)
+    pixels, pairs = [np.empty((0, 2), np.float32)], [0]
+    for (i, j), matches in stationary.items():
+        one, side = (i, 0) if i in members else (j, 1)
+        if one in members:
+            pixels.append(references[one].view.features.keypoints[matches[:, side]])
+            pairs.append(len(matches))
+    # Of each pair a cell counts once, however many keypoints are at one place.
+    cells, size = _cells(np.concatenate(pixels), camera, options), shape[0] * shape[1]
+    once = np.unique(np.repeat(np.arange(len(pairs)), pairs) * size + cells) % size
+    count = np.bincount(once, minlength=size).reshape(shape).astype(np.float32)
+    side = 2 * options.reach + 1
+    around = cv2.boxFilter(count, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    fixed = ((count > 0) & (np.rint(around) >= options.support)).astype(np.uint8)
+    return np.asarray(cv2.dilate(fixed, np.ones((side, side), np.uint8)) > 0)
+
+
+def without_ignored(matches: Matches, first: NDArray[np.bool_], second: NDArray[np.bool_]) -> Matches:
+    """Matches of keypoints that are not ignored, of either view (N,), (M,)."""
+    return matches[~(first[matches[:, 0]] | second[matches[:, 1]])]
+
+
+def fixed_in(
+    references: Sequence[PosedView],
+    pairs: Mapping[tuple[int, int], Matches],
+    options: StationaryOptions | None = None,
+) -> IgnoredKeypoints:
+    """Finds what is fixed to the cameras of references by the matches of their pairs, which no poses have filtered."""
+    options = options or StationaryOptions()
+    found = {
+        (i, j): matches[stationary_matches(references[i], references[j], matches, options)]
+        for (i, j), matches in pairs.items()
+    }
+    return IgnoredKeypoints(references, found, options)
+
+
+def _by_camera(references: Sequence[PosedView]) -> list[list[int]]:
+    """Indices of the references of each camera."""
+    groups: list[list[int]] = []
+    for i, reference in enumerate(references):
+        for group in groups:
+            if reference.view.has_camera_of(references[group[0]].view):
+                group.append(i)
+                break
+        else:
+            groups.append([i])
+    return groups
+
+
+def _have_same_size(first: Camera, second: Camera) -> bool:
+    return (first.width_px, first.height_px) == (second.width_px, second.height_px)
+
+
+def _grid_shape(camera: Camera, options: StationaryOptions) -> tuple[int, int]:
+    return max(1, round(options.cells * camera.height_px / camera.width_px)), options.cells
+
+
+def _cells(pixels: NDArray[np.float32], camera: Camera, options: StationaryOptions) -> NDArray[np.intp]:
+    """Indices (N,) of the cells of pixels (N, 2), row by row; the nearest of pixels outside, which lenses have."""
+    rows, columns = _grid_shape(camera, options)
+    x, y = pixels.T
+    column = np.clip((x + 0.5) * (columns / camera.width_px), 0, columns - 1).astype(np.intp)
+    row = np.clip((y + 0.5) * (rows / camera.height_px), 0, rows - 1).astype(np.intp)
+    return np.asarray(row * columns + column)

@@ -1,0 +1,29 @@
+"""Measures a constant again and writes its page: `PYTHONPATH=client:server python -m research.evidence KEY [SCENES]`.
+
+SCENES is the folder of the scenes' folders, by default ../shared/data. Without a KEY it lists them.
+"""
+
+import importlib
+import sys
+from pathlib import Path
+
+from .page import PAGES, page
+
+MODULES = {"stationary": ("stationary-overlays", "stationary-contradicted-px", "stationary-support")}
+"""The keys that each module measures, by `measure(key, scenes)`, which returns the question and the table's rows."""
+
+
+def main(arguments: list[str]) -> None:
+    """Writes the page of the key in the arguments, or prints the keys."""
+    module_of = {key: module for module, keys in MODULES.items() for key in keys}
+    if not arguments or arguments[0] not in module_of:
+        print("\n".join(module_of))
+        sys.exit(0 if not arguments else 2)
+    key, scenes = arguments[0], Path(arguments[1] if len(arguments) > 1 else "../shared/data")
+    measured = importlib.import_module(f".{module_of[key]}", __package__)
+    PAGES.mkdir(exist_ok=True)
+    (PAGES / f"{key}.md").write_text(page(*measured.measure(key, scenes)))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

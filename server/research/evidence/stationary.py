@@ -1,0 +1,327 @@
+"""What is fixed to the camera: photographs of other places with the same overlay, and those of the place itself."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Camera, RigidTransform
+from mapless_server.images import ImageLimits, decode_image
+from mapless_server.method.answer import Localization
+from mapless_server.method.coarse.make import make_reconstructor
+from mapless_server.method.correspond import make_matcher
+from mapless_server.method.features import FeatureExtractor, make_extractor
+from mapless_server.method.localize import localize
+from mapless_server.method.nearest import mutual_matches
+from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.pipeline import Pipeline
+from mapless_server.method.stationary import IgnoredKeypoints, StationaryOptions, stationary_matches
+from mapless_server.method.views import Features, PosedView, View
+from mapless_tools.dataset import Dataset
+from mapless_tools.evaluate.metrics import pose_error
+from mapless_tools.evaluate.plan import evenly_spread
+from mapless_tools.evaluate.references import choose_references
+from mapless_tools.ingest.formats.cameras import read_folder
+
+from .overlays import OVERLAYS, Image, Mask, Overlay, black
+from .page import Question, Row
+
+ROOM = Path(__file__).parents[2] / "mapless_tools" / "demo" / "room"
+KITCHEN, DRIVE = "7scenes-redkitchen-seq01-first600", "kitti-drive-a"
+CLEAN = (DRIVE, KITCHEN, "fountain-P11", "tum-fr3-office", "euroc-v101-drone", "office-lockers")
+REFERENCES = 10
+"""References of a query."""
+QUERIES = 11
+"""Of other places, for each scene and overlay: 198 in all. Of the place itself at most 6."""
+RIGHT_M = 0.25
+OFF = StationaryOptions(support=1_000_000)
+
+
+@dataclass(frozen=True)
+class Posed:
+    """A photograph in the size that is measured, with its camera and pose."""
+
+    name: str
+    image: Image
+    camera: Camera
+    world_from_camera: RigidTransform
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A place that is asked: its references, photographs of it, and photographs of other places in its size."""
+
+    name: str
+    references: Sequence[Posed]
+    queries: Sequence[Posed]
+    others: Sequence[Image]
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A scene whose photographs carry an overlay, with their features; and with the same pixels black and masked."""
+
+    references: Sequence[PosedView]
+    others: Sequence[View]
+    queries: Sequence[PosedView]
+    black_references: Sequence[PosedView]
+    black_queries: Sequence[PosedView]
+
+
+def scenes_in(folder: Path, count: int = QUERIES) -> list[Scene]:
+    """The demo's room, the kitchen and the drive, each with photographs of other places."""
+    room, kitchen, drive = (read_folder(it) for it in (ROOM, folder / KITCHEN, folder / DRIVE))
+    elsewhere = [read_folder(folder / name) for name in ("tum-fr3-office", "meeting-room", "fountain-P11")]
+    names = [frame.name for frame in room.frames]
+    stations, asked = ([i for i, name in enumerate(names) if kind in name] for kind in ("reference", "query"))
+    every = evenly_spread(list(range(len(kitchen.frames))), 20)
+    between = evenly_spread([i for i in range(1, len(kitchen.frames) - 1) if i not in every], 6)
+    numbers = list(range(len(drive.frames)))
+    return [
+        _scene("room", room, 0.5, (stations, asked[:6]), [*elsewhere, kitchen], count),
+        _scene("kitchen", kitchen, 1.0, (every, between), [*elsewhere, room], count),
+        _scene("drive", drive, 0.8, (numbers[::2], evenly_spread(numbers[1:-1:2], 6)), [drive, elsewhere[2]], count),
+    ]
+
+
+def _scene(
+    name: str,
+    dataset: Dataset,
+    scale: float,
+    chosen: tuple[Sequence[int], Sequence[int]],
+    places: Sequence[Dataset],
+    count: int,
+) -> Scene:
+    references, queries = ([_posed(dataset, i, scale) for i in indices] for indices in chosen)
+    camera = references[0].camera
+    return Scene(name, references, queries, [_other(places, dataset, camera, i) for i in range(count)])
+
+
+def _posed(dataset: Dataset, index: int, scale: float) -> Posed:
+    frame = dataset.frames[index]
+    camera = frame.camera.resized(round(scale * frame.camera.width_px), round(scale * frame.camera.height_px))
+    image = cv2.resize(_read(dataset, index), (camera.width_px, camera.height_px), interpolation=cv2.INTER_AREA)
+    return Posed(f"{frame.name}-{index}", np.asarray(image, np.uint8), camera, frame.world_from_camera)
+
+
+def _other(places: Sequence[Dataset], scene: Dataset, camera: Camera, number: int) -> Image:
+    """A photograph of another place, cut to the size of a camera; mirrored if it is of the same one."""
+    place = places[number % len(places)]
+    image = _read(place, number * 7919 % len(place.frames))
+    if place is scene:
+        image = np.ascontiguousarray(image[:, ::-1])
+    scale = max(camera.width_px / image.shape[1], camera.height_px / image.shape[0]) + 1e-3
+    image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+    return np.ascontiguousarray(image[-camera.height_px :, : camera.width_px])
+
+
+def _read(dataset: Dataset, index: int) -> Image:
+    return decode_image(dataset.frames[index].image_path.read_bytes(), ImageLimits())
+
+
+def draw(scene: Scene, overlay: Overlay, extractor: FeatureExtractor) -> Drawn:
+    """Draws an overlay on all photographs of a scene and of other places, and finds their features."""
+    camera, dark = scene.references[0].camera, black(overlay)
+    return Drawn(
+        [_view(it, overlay, i, extractor, False) for i, it in enumerate(scene.references)],
+        [with_overlay(it, camera, overlay, 500 + 31 * i, extractor, False) for i, it in enumerate(scene.others)],
+        [_view(it, overlay, 300 + 7 * i, extractor, False) for i, it in enumerate(scene.queries)],
+        [_view(it, dark, i, extractor, True) for i, it in enumerate(scene.references)],
+        [_view(it, dark, 300 + 7 * i, extractor, True) for i, it in enumerate(scene.queries)],
+    )
+
+
+def _view(posed: Posed, overlay: Overlay, number: int, extractor: FeatureExtractor, masked: bool) -> PosedView:
+    view = with_overlay(posed.image, posed.camera, overlay, number, extractor, masked)
+    return PosedView(f"{posed.name}-{masked}", posed.name, view, posed.world_from_camera)
+
+
+def with_overlay(
+    image: Image, camera: Camera, overlay: Overlay, number: int, extractor: FeatureExtractor, masked: bool
+) -> View:
+    """The view of a photograph with an overlay; without the keypoints on it if `masked`."""
+    drawn, mask = overlay(image, number)
+    encoded = cv2.imencode(".jpg", drawn[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])[1]
+    decoded = cv2.imdecode(encoded, cv2.IMREAD_COLOR_RGB)
+    assert decoded is not None
+    view = extractor.extract(np.asarray(decoded, np.uint8), camera)
+    if not masked:
+        return view
+    kept, features = ~on_mask(view, mask), view.features
+    return replace(
+        view, features=Features(features.keypoints[kept], features.descriptors[kept], features.sizes_px[kept])
+    )
+
+
+def on_mask(view: View, mask: Mask) -> NDArray[np.bool_]:
+    """Which keypoints (N,) lie on the covered pixels or within 1 % of the width of them."""
+    camera, (h, w) = view.camera, mask.shape
+    side = 2 * round(0.01 * w) + 1
+    wide = cv2.dilate(mask.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
+    at = np.clip((view.features.keypoints + 0.5) * (w / camera.width_px, h / camera.height_px), 0, (w - 1, h - 1))
+    column, row = at.astype(int).T
+    return np.asarray(wide[row, column] > 0)
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """Which photographs of other places were localized, and which of the place itself rightly."""
+
+    others: Sequence[bool]
+    right: Sequence[bool]
+
+
+def ask(drawn: Drawn, features: str, options: StationaryOptions) -> Outcomes:
+    """Asks a scene whose photographs carry an overlay."""
+    pipeline = Pipeline(make_reconstructor("geometric", Path()), make_matcher(features, 1))
+    pipeline.matcher.stationary = options
+    others = [localized(view, drawn.references, pipeline) is not None for view in drawn.others]
+    right = [_is_right(it, drawn.references, pipeline) for it in drawn.queries]
+    pipeline.matcher.close()
+    return Outcomes(others, right)
+
+
+def ask_black(drawn: Drawn, features: str) -> Sequence[bool]:
+    """Which photographs of the place are localized rightly with the overlay's pixels black and masked."""
+    pipeline = Pipeline(make_reconstructor("geometric", Path()), make_matcher(features, 1))
+    right = [_is_right(it, drawn.black_references, pipeline) for it in drawn.black_queries]
+    pipeline.matcher.close()
+    return right
+
+
+def _is_right(query: PosedView, references: Sequence[PosedView], pipeline: Pipeline) -> bool:
+    pose = localized(query.view, references, pipeline)
+    return pose is not None and pose_error(query.world_from_camera, pose)[0] < RIGHT_M
+
+
+def localized(query: View, references: Sequence[PosedView], pipeline: Pipeline) -> RigidTransform | None:
+    """The pose of a photograph from the references that it matches most; None if it is rejected."""
+    chosen = choose_references(query, references, REFERENCES, ratio=pipeline.matcher.options.query_ratio)
+    outcome = localize(query, [references[i] for i in chosen], pipeline, LocalizeOptions()).outcome
+    return outcome.world_from_camera if isinstance(outcome, Localization) else None
+
+
+def ignored_share(references: Sequence[PosedView], options: StationaryOptions, ratio: float = 0.9) -> float:
+    """Share of all keypoints that are ignored in sets of ten references that follow one another."""
+    ignored = count = 0
+    for begin in range(0, max(1, len(references) - REFERENCES + 1), REFERENCES // 2):
+        some = references[begin : begin + REFERENCES]
+        found = {}
+        for i, j in combinations(range(len(some)), 2):
+            matches = mutual_matches(some[i].view.features, some[j].view.features, ratio, True)
+            found[i, j] = matches[stationary_matches(some[i], some[j], matches, options)]
+        fixed = IgnoredKeypoints(some, found, options)
+        ignored += sum(int(fixed.of(it.view).sum()) for it in some)
+        count += sum(len(it.view.features) for it in some)
+    return ignored / max(count, 1)
+
+
+def clean(folder: Path, name: str, extractor: FeatureExtractor) -> list[PosedView]:
+    """At most 30 photographs of a scene, as they are."""
+    dataset = read_folder(folder / name)
+    found = []
+    for i in evenly_spread(list(range(len(dataset.frames))), min(30, len(dataset.frames))):
+        frame = dataset.frames[i]
+        view = extractor.extract(_read(dataset, i), frame.camera)
+        found.append(PosedView(f"{name}-{i}", frame.name, view, frame.world_from_camera))
+    return found
+
+
+DATA = (
+    "The demo's room (480x360, 16 references), the kitchen of 7-Scenes (20 references) and the drive of KITTI (13), "
+    "SIFT, with the overlays of `research.evidence.overlays` on every photograph (badge, bonnet, gripper, time stamp "
+    "whose digits change, display, half-transparent watermark); asked with photographs of other places (office, "
+    "meeting room, fountain, kitchen, room; the drive also with its own mirrored ones) that carry the same overlay, "
+    "and with 6 of the place itself. A right one is within 0.25 m."
+)
+_CODE = "mapless_server.method.stationary:StationaryOptions"
+QUESTIONS = {
+    it.key: it
+    for it in (
+        Question(
+            "stationary-overlays",
+            f"{_CODE}.reach",
+            "How many photographs of other places are localized because they carry the same picture as the references, "
+            "and how many of the place itself are lost by ignoring it?",
+            DATA + " Beside it the same with the pixels of the overlay black, and their keypoints removed.",
+            "Two cells to each side, 2.5 of 160 columns: digits that change are as far from those that do not.",
+        ),
+        Question(
+            "stationary-contradicted-px",
+            f"{_CODE}.contradicted_px",
+            "How far must the pixels of a match be from all that the poses explain, so that it is of no place?",
+            DATA
+            + " Here the badge and the time stamp, and 4 photographs of other places each; and the share of keypoints "
+            "that are ignored in photographs without overlays, ten references at a time.",
+            "Four pixels: errors of poses and intrinsics are under two, and greater bounds leave more of an overlay "
+            "that the poses of a straight drive explain nearly.",
+        ),
+        Question(
+            "stationary-support",
+            f"{_CODE}.support",
+            "How many matches at the same pixels show that a part of the image is fixed to the camera?",
+            DATA
+            + " Here the badge and the time stamp, and 4 photographs of other places each; and the share of keypoints "
+            "that are ignored in photographs without overlays, ten references at a time.",
+            "Three: single wrong matches, at the same pixels by chance, are no evidence, and small texts still are.",
+        ),
+    )
+}
+_ALTERNATIVES = {
+    "stationary-contradicted-px": [
+        replace(StationaryOptions(), contradicted_px=value) for value in (2.0, 4.0, 8.0, 16.0)
+    ],
+    "stationary-support": [replace(StationaryOptions(), support=value) for value in (1, 2, 3, 5, 10)],
+}
+
+
+def measure(key: str, folder: Path) -> tuple[Question, Sequence[Row]]:
+    """Measures one of `QUESTIONS` with the scenes of a folder."""
+    if key == "stationary-overlays":
+        return QUESTIONS[key], list(_overlays(folder))
+    return QUESTIONS[key], list(_alternatives(folder, key))
+
+
+def _overlays(folder: Path, features: str = "sift", weights: Path | None = None) -> Iterator[Row]:
+    extractor = make_extractor(features, weights)
+    for scene in scenes_in(folder):
+        for name, overlay in OVERLAYS.items():
+            drawn = draw(scene, overlay, extractor)
+            without, with_it = ask(drawn, features, OFF), ask(drawn, features, StationaryOptions())
+            dark = ask_black(drawn, features)
+            row = {
+                "scene": scene.name,
+                "overlay": name,
+                "other places localized, nothing ignored": _of(without.others),
+                "other places localized": _of(with_it.others),
+                "right, black and masked": _of(dark),
+                "right": _of(with_it.right),
+            }
+            print(row, flush=True)
+            yield row
+
+
+def _alternatives(folder: Path, key: str) -> Iterator[Row]:
+    extractor, field = make_extractor("sift"), QUESTIONS[key].constant.split(".")[-1]
+    drawn = [
+        draw(scene, OVERLAYS[name], extractor) for scene in scenes_in(folder, 4) for name in ("badge", "time stamp")
+    ]
+    places = {name: clean(folder, name, extractor) for name in CLEAN}
+    for options in _ALTERNATIVES[key]:
+        asked = [ask(it, "sift", options) for it in drawn]
+        row: dict[str, object] = {
+            field: getattr(options, field),
+            "other places localized": _of([it for one in asked for it in one.others]),
+            "right": _of([it for one in asked for it in one.right]),
+        }
+        row |= {f"ignored in {name}, %": f"{100 * ignored_share(it, options):.2f}" for name, it in places.items()}
+        print(row, flush=True)
+        yield row
+
+
+def _of(found: Sequence[bool]) -> str:
+    return f"{sum(found)} of {len(found)}"
