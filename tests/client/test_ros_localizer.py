@@ -1,7 +1,7 @@
 """A robot's localizer without ROS and without a server: answers and odometry are planted."""
 
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -101,6 +101,18 @@ def test_without_odometry_tf_gets_the_body(client: PlantedClient) -> None:
     late = make(client).localize(shot(11.0), RosCamera(CAMERA))
     assert (late.level, late.tf_edge) == ("OK", None)
     assert "tf does not know odom > base_link" in late.message
+
+
+def test_null_odometry_is_as_odometry_that_is_unknown(client: PlantedClient) -> None:
+    def lost(target: str, source: str, stamp_ns: int) -> RigidTransform:
+        if target == "odom":
+            raise ValueError("quaternion must have norm 1, has 0")
+        return lookup(target, source, stamp_ns)
+
+    localizer = Localizer(cast(Any, client), LocalizerOptions("hall"), lost)
+    outcome = localizer.localize(shot(1.0), RosCamera(CAMERA))
+    assert (outcome.level, outcome.tf_edge) == ("OK", None)
+    assert "tf does not know odom > base_link" in outcome.message
 
 
 def test_failures_are_outcomes(client: PlantedClient) -> None:

@@ -9,7 +9,8 @@ from support.images import encode, textured
 from mapless.deep_pixels import eight_bits
 from mapless_server.images import ImageLimits, decode_image
 
-GREY = np.asarray(cv2.normalize(textured(200, 150)[..., 0], None, 0, 255, cv2.NORM_MINMAX), np.uint8)  # type: ignore[call-overload]
+_SHOWN = textured(200, 150)[..., 0].astype(float)
+GREY = np.asarray((_SHOWN - _SHOWN.min()) * 255 / np.ptp(_SHOWN), np.uint8)
 LIMITS = ImageLimits()
 
 

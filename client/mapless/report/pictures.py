@@ -9,6 +9,9 @@ import io
 import re
 from dataclasses import dataclass
 
+import numpy as np
+
+from ..deep_pixels import eight_bits
 from ..pixels import format_of_image
 
 REDUCED_SIDE_PX = 1600
@@ -122,7 +125,8 @@ def _reduced(image: bytes) -> bytes | None:
     try:
         with Image.open(io.BytesIO(image)) as opened:
             opened.draft("RGB", (REDUCED_SIDE_PX, REDUCED_SIDE_PX))
-            small = opened.convert("RGB")
+            is_deep = opened.mode.startswith("I")  # pillow would cut 16 bits off at 255
+            small = (Image.fromarray(eight_bits(np.asarray(opened))) if is_deep else opened).convert("RGB")
             small.thumbnail((REDUCED_SIDE_PX, REDUCED_SIDE_PX))
             small.save(out, "JPEG", quality=85)
     except (OSError, ValueError, Image.DecompressionBombError):
