@@ -199,11 +199,13 @@ def test_added_references_that_contradict_their_scene_are_said(client: Client, s
     for stored in client.add_references("added", added):
         assert "degrees off the down of 3 reference cameras" in stored.warnings[0]
     request = create_request("scenes/added", NewReference("c", PHOTO, CAMERA, pose(3.0)))
-    (text,) = stubs.references.CreateReference(request, timeout=20).warnings
+    text, _ = stubs.references.CreateReference(request, timeout=20).warnings
     assert "degrees off the down of 4 reference cameras" in text
     assert client.get_scene("added").reference_count == 4
     client.update_scene("added", down_in_world=None)
-    assert client.add_reference("added", NewReference("d", PHOTO, CAMERA, pose(4.0))).warnings == ()
+    (text,) = client.add_reference("added", NewReference("d", PHOTO, CAMERA, pose(4.0))).warnings
+    assert text.startswith("d is the same photograph as a, but its pose is 4 m and 22.9 degrees away")
+    assert client.get_scene("added").reference_count == 5
     client.delete_scene("added")
 
 

@@ -307,11 +307,27 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
             )
             for (reference_id, photo, world_from_camera), found in zip(drafts, described, strict=True)
         ]
+        warnings += await self._stored(self._repeats, scene_key, drafts, call)
         records = await self._stored(self._store.add_references, scene_key, references)
         if blank := [record.reference_id for record in records if not record.feature_count]:
             call.note(references_without_features=blank[:MAX_NOTED])
         shares = {it.reference_id: found.ignored_share for it, found in zip(records, described, strict=True)}
         return records, warnings + nearly_ignored(shares)
+
+    def _repeats(self, scene_key: SceneKey, drafts: Sequence[Draft], call: Call) -> list[str]:
+        """Returns and logs which poses or photographs the references to be added repeat."""
+        from mapless_server.scenes.repeats import PosedImage, repeats  # services do not load what computes
+
+        added = [PosedImage.of(reference_id, photo.image, pose) for reference_id, photo, pose in drafts]
+        posed = [(photo.camera, pose) for _, photo, pose in drafts]
+        try:
+            stored = self._store.list_alike(scene_key, {it.image_sha256 for it in added}, posed)
+        except DataLoss as error:
+            return [f"the references were not compared with the scene's: {error}"]
+        found = repeats(added, stored)
+        if found:
+            call.note(repeats=found)
+        return found
 
     async def _stored(self, operation: Callable[..., T], *arguments: object) -> T:
         """Runs an operation of the store in a thread; raises Unavailable while the server starts."""

@@ -1,19 +1,20 @@
 """The reading half of the store, and what it caches."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial, wraps
 from typing import Any, Concatenate, NamedTuple, NoReturn, ParamSpec, Protocol, TypeVar
 
-from sqlalchemy import Connection, Row, Select, select
+from sqlalchemy import Connection, Row, Select, or_, select
 
+from mapless.geometry import Camera, RigidTransform
 from mapless_server.errors import AlreadyExists, NotFound, RequestError
 from mapless_server.method.cache import LruCache
 from mapless_server.security import SceneKey
 
-from . import queries, rows, tables
+from . import codec, queries, rows, tables
 from .database import DamagedPages, Database, unavailable, unless_damaged
 from .queries import read_changes
 from .records import DescribedReference, ReferenceRecord, SceneAttributes, SceneChanges, SceneRecord, SceneSnapshot
@@ -28,6 +29,9 @@ RECORD_BYTES = 700
 """About the size of a ReferenceRecord in memory, arrays and strings included."""
 ATTRIBUTES_BYTES = 2000
 """About the size of SceneAttributes in memory."""
+
+ALIKE_WITHIN = 10_000
+"""Newest references of a scene among which equal ones are searched: milliseconds."""
 
 UNWRITABLE = frozenset({"STORE_READ_ONLY", "STORE_FULL", "STORE_UNAVAILABLE"})
 """Reasons of faults after which the next change would most likely fail, too."""
@@ -208,6 +212,28 @@ class StoreReader:
         NotFound if there is no such scene; DataLoss if camera and pose of one of them are damaged.
         """
         found = self._read_page(select(tables.reference), scene_key, limit, after)
+        return [rows.reference_record(row) for row in found]
+
+    @observed
+    def list_alike(
+        self, scene_key: SceneKey, images_sha256: Collection[str], posed: Sequence[tuple[Camera, RigidTransform]]
+    ) -> list[ReferenceRecord]:
+        """References with one of these images, or one of these cameras and poses, among the `ALIKE_WITHIN` newest.
+
+        Ordered by id. DataLoss if camera and pose of one of them are damaged.
+        """
+        column = tables.reference.c
+        newest = (
+            select(tables.reference)
+            .where(column.scene_id == scene_key)
+            .order_by(column.generation.desc())
+            .limit(ALIKE_WITHIN)
+            .subquery()
+        )
+        geometries = {codec.encode_geometry(*it) for it in posed}
+        is_alike = or_(newest.c.image_sha256.in_(images_sha256), newest.c.geometry.in_(geometries))
+        with self.database.read() as connection:
+            found = connection.execute(select(newest).where(is_alike).order_by(newest.c.reference_id)).all()
         return [rows.reference_record(row) for row in found]
 
     @observed
