@@ -178,9 +178,15 @@ def _without_covariance(message: Any) -> dict[str, Any]:
     return {} if message.HasField("covariance") else {"covariance": np.full((6, 6), np.nan)}
 
 
-def scene_from_message(message: reference_pb.Scene, warnings: Iterable[str] = ()) -> Scene:
-    """A scene, and what the call found about it."""
-    return read(Scene, message, scene_id=names.parse_scene_name(message.name), warnings=tuple(warnings))
+def scene_from_message(message: reference_pb.Scene, response: Any = None) -> Scene:
+    """A scene, and what the response of the call says about it beside."""
+    found = {name: getattr(response, name) for name in _SAID_OF_SCENES if hasattr(response, name)}
+    if "warnings" in found:
+        found["warnings"] = tuple(found["warnings"])
+    return read(Scene, message, scene_id=names.parse_scene_name(message.name), **found)
+
+
+_SAID_OF_SCENES = "warnings", "contradiction", "compared_pair_count", "agreeing_pair_count"
 
 
 def reference_from_message(message: reference_pb.Reference, warnings: Iterable[str] = ()) -> Reference:

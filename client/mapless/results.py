@@ -19,7 +19,11 @@ class Scene:
         calibration: measured factors of radii; None if never measured.
         arbitrary_unit: whether lengths are in an arbitrary unit, as of a COLMAP model, instead of metres.
         warnings: contradictions of these properties and the references' poses, which `update_scene` found, or of the
-            references' intrinsics, of which `get_scene` knows; else empty.
+            references' intrinsics or poses with one another, of which `get_scene` knows; else empty.
+        contradiction: the sentence of the warnings that says that the scene contradicts itself, because its references
+            do not agree with their poses; empty if it does not, or is not known to. Of `get_scene` alone.
+        compared_pair_count: pairs of references that show enough in common to be compared with their poses.
+        agreeing_pair_count: how many of these agree with them.
     """
 
     scene_id: str
@@ -31,6 +35,9 @@ class Scene:
     calibration: Calibration | None = None
     arbitrary_unit: bool = False
     warnings: tuple[str, ...] = ()
+    contradiction: str = ""
+    compared_pair_count: int = 0
+    agreeing_pair_count: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +52,8 @@ class Reference:
         create_time: when it was stored, by the server's clock.
         image: the file's bytes, if requested.
         warnings: contradictions of the scene's datum, direction of gravity and unit and the poses stored in the same
-            message, which `add_reference` and `add_references` found; else empty.
+            message, which `add_reference` and `add_references` found, and that the scene contradicts itself, as far as
+            that was known; else empty.
     """
 
     scene_id: str

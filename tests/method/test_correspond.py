@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import combinations, product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method import correspond, matching, nearest
 from mapless_server.method.correspond import Matcher, make_matcher
 from mapless_server.method.features import FEATURES
-from mapless_server.method.matching import OPTIONS, CorrespondOptions, SharedThreads
+from mapless_server.method.matching import OPTIONS, CorrespondOptions, SharedThreads, StoredPair
 from mapless_server.method.nearest import best_of_both, epipolar_distance_px, epipolar_distances_px, mutual_matches
 from mapless_server.method.views import Features, Matches, PosedView, View
 
@@ -222,12 +223,15 @@ def matched_pairs(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Features, Featu
     """Every pair whose descriptors have been compared."""
     calls: list[tuple[Features, Features]] = []
 
-    def spy(first: Features, second: Features, ratio: float, either: bool = False) -> Matches:
-        calls.append((first, second))
-        return mutual_matches(first, second, ratio, either)
+    def spy(usual: Callable[..., Any]) -> Callable[..., Any]:
+        def compare(first: Features, second: Features, *options: Any) -> Any:
+            calls.append((first, second))
+            return usual(first, second, *options)
 
-    for module in (correspond, matching):
-        monkeypatch.setattr(module, "mutual_matches", spy)
+        return compare
+
+    for module, name in (correspond, "mutual_matches_of_ratios"), (matching, "mutual_matches"):
+        monkeypatch.setattr(module, name, spy(getattr(nearest, name)))
     return calls
 
 
@@ -262,10 +266,10 @@ class Shelf:
         self.matches = matches
         self.asked: list[tuple[str, list[tuple[str, str]]]] = []
 
-    def find(self, matching: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> list[Matches | None]:
+    def find(self, matching: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> list[StoredPair | None]:
         keys = [(first.key, second.key) for first, second in pairs]
         self.asked.append((matching, keys))
-        return [self.matches.get(key) for key in keys]
+        return [StoredPair(self.matches[key]) if key in self.matches else None for key in keys]
 
 
 @pytest.mark.parametrize("wide", [False, True])
@@ -297,8 +301,9 @@ class FullShelf(Shelf):
             for kind in kinds
         }
 
-    def find(self, matching: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> list[Matches | None]:
-        return [self.of.get(matching, {}).get((first.key, second.key)) for first, second in pairs]
+    def find(self, matching: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> list[StoredPair | None]:
+        found = [self.of.get(matching, {}).get((first.key, second.key)) for first, second in pairs]
+        return [None if it is None else StoredPair(it) for it in found]
 
 
 class TestPairMatching:

@@ -22,7 +22,7 @@ from support.waiting import wait_until
 from mapless_server.errors import Unavailable
 from mapless_server.method import correspond, matching, nearest
 from mapless_server.method.correspond import Matcher, in_order
-from mapless_server.method.matching import CorrespondOptions, PairMatching
+from mapless_server.method.matching import CorrespondOptions, PairMatching, StoredPair
 from mapless_server.method.options import StageContext
 from mapless_server.method.views import Features, Matches, PosedView, View
 from mapless_server.scenes import background
@@ -107,7 +107,7 @@ class Server:
         """By the references' names, of all pairs that are stored."""
         name_of = {it.key: it.name.rpartition("/")[2] for it in self.references()}
         found = self.pairs.load(self.name(wide), [(a, b) for a in name_of for b in name_of])
-        return {(name_of[a], name_of[b]): matches for (a, b), matches in found.items()}
+        return {(name_of[a], name_of[b]): it and it.matches for (a, b), it in found.items()}
 
 
 @pytest.fixture
@@ -128,14 +128,16 @@ def store(place: Folder) -> Iterator[Store]:
 def compared(monkeypatch: pytest.MonkeyPatch) -> Counter[int]:
     """How often two sets of features were compared, by the sum of their first coordinates."""
     counts: Counter[int] = Counter()
-    usual = nearest.mutual_matches
 
-    def counting(first: Features, second: Features, ratio: float, either: bool = False) -> Matches:
-        counts[round(1e3 * float(first.keypoints[0, 0] + second.keypoints[0, 0]))] += 1
-        return usual(first, second, ratio, either)
+    def counting(usual: Callable[..., Any]) -> Callable[..., Any]:
+        def compare(first: Features, second: Features, *options: Any) -> Any:
+            counts[round(1e3 * float(first.keypoints[0, 0] + second.keypoints[0, 0]))] += 1
+            return usual(first, second, *options)
 
-    for module in (correspond, matching):
-        monkeypatch.setattr(module, "mutual_matches", counting)
+        return compare
+
+    for module, name in (correspond, "mutual_matches_of_ratios"), (matching, "mutual_matches"):
+        monkeypatch.setattr(module, name, counting(getattr(nearest, name)))
     return counts
 
 
@@ -244,7 +246,9 @@ class TestDamage:
         claim = server.pairs.claim(server.name(), pairs.Progress())
         assert claim is not None
         for wrong in ([len(first.view.features), 0], [0, len(second.view.features)], [-1, 0]):
-            server.pairs.add(server.name(), claim, {(first.key, second.key): np.array([wrong], np.int32)}, False)
+            server.pairs.add(
+                server.name(), claim, {(first.key, second.key): StoredPair(np.array([wrong], np.int32))}, False
+            )
             assert server.finder.find(server.matcher.matching(), [(first, second)]) == [None]
             server.pairs.discard(server.name(), server.finder.take_damaged(server.name()))
         assert server.counts.found == {"damaged": 3, "stored": 0, "absent": 0}

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.stores import Place, assert_same_bits, faults_of, let_pass, make_reference
 
+from mapless_server.method.matching import StoredPair
 from mapless_server.security import SceneKey
 from mapless_server.store import Store, pairs
 from mapless_server.store.backup import back_up, restore
@@ -31,6 +32,10 @@ def matches(count: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 2048, (count, 2), np.int32)
 
 
+def pair_of(count: int) -> StoredPair:
+    return StoredPair(matches(count))
+
+
 def key_of(store: Store, name: str) -> str:
     return store.find_keys(SCENE, [name])[name]
 
@@ -48,7 +53,7 @@ def complete(store: Store, stored: PairStore) -> dict[tuple[str, str], np.ndarra
     for claim in claim_all(stored):
         others = stored.list_missing(MATCHING, claim, [key_of(store, name) for name in "abc"], 20)
         made = {(other, claim.key): matches(5, seed) for seed, other in enumerate(others)}
-        stored.add(MATCHING, claim, made, is_complete=True)
+        stored.add(MATCHING, claim, {pair: StoredPair(it, 1.5) for pair, it in made.items()}, is_complete=True)
         everything |= made
     return everything
 
@@ -59,10 +64,13 @@ class TestMatches:
         store, stored = two
         claim = claim_all(stored)[0]
         pair = key_of(store, "b"), key_of(store, "a")
-        stored.add(MATCHING, claim, {pair: matches(count)}, is_complete=True)
+        stored.add(MATCHING, claim, {pair: StoredPair(matches(count), 0.1)}, is_complete=True)
         found = stored.load(MATCHING, [pair, pair[::-1], (key_of(store, "c"), key_of(store, "a"))])
         assert list(found) == [pair]
-        assert_same_bits(np.asarray(found[pair]), matches(count))
+        it = found[pair]
+        assert it is not None
+        assert it.error_px == 0.1
+        assert_same_bits(it.matches, matches(count))
 
     @pytest.mark.parametrize("which", ["first_key", "second_key"])
     def test_are_deleted_with_either_reference(self, two: tuple[Store, PairStore], place: Place, which: str) -> None:
@@ -88,7 +96,14 @@ class TestMatches:
 
     @pytest.mark.parametrize(
         "damage",
-        ["data = ?", "sha256 = 'no'", "first_key = second_key, second_key = first_key", "matching = 'sift/wide'"],
+        [
+            "data = ?",
+            "sha256 = 'no'",
+            "error_px = 9",
+            "error_px = NULL",
+            "first_key = second_key, second_key = first_key",
+            "matching = 'sift/wide'",
+        ],
     )
     def test_damaged_ones_are_found_out_and_claimed_again(
         self, two: tuple[Store, PairStore], place: Place, damage: str
@@ -110,10 +125,10 @@ class TestMatches:
         claim = next(it for it in claim_all(stored) if it.reference_id == "c")
         gone, left = key_of(store, "a"), key_of(store, "b")
         store.delete_reference(SCENE, "a")
-        stored.add(MATCHING, claim, {(gone, claim.key): matches(3), (left, claim.key): matches(4)}, is_complete=True)
+        stored.add(MATCHING, claim, {(gone, claim.key): pair_of(3), (left, claim.key): pair_of(4)}, is_complete=True)
         assert place.fetch("SELECT first_key FROM reference_pair") == [(left,)]
         store.delete_reference(SCENE, "c")
-        stored.add(MATCHING, claim, {(left, claim.key): matches(4)}, is_complete=True)
+        stored.add(MATCHING, claim, {(left, claim.key): pair_of(4)}, is_complete=True)
         stored.postpone(MATCHING, claim)
         assert place.fetch("SELECT count(*) FROM reference_pair") == [(0,)]
 
@@ -125,7 +140,8 @@ class TestMatches:
             restore(tmp_path / "backup", other.database)
             found = PairStore(other.database)
             for pair, loaded in found.load(MATCHING, made).items():
-                assert_same_bits(np.asarray(loaded), made[pair])
+                assert loaded is not None
+                assert_same_bits(loaded.matches, made[pair])
             assert found.count_waiting(MATCHING) == 0
 
 
@@ -154,7 +170,7 @@ class TestClaims:
         store, stored = two
         claim = next(it for it in claim_all(stored) if it.reference_id == "c")
         keys = [key_of(store, name) for name in "ab"]
-        stored.add(MATCHING, claim, {(keys[0], claim.key): matches(2)}, is_complete=False)
+        stored.add(MATCHING, claim, {(keys[0], claim.key): pair_of(2)}, is_complete=False)
         assert claim_all(stored) == [claim]
         assert stored.list_missing(MATCHING, claim, keys, 20) == [keys[1]]
         assert stored.list_missing(MATCHING, claim, keys, 1) == []
@@ -214,7 +230,7 @@ def match_all(store: Store, name: str) -> int:
     pairs, progress, count = PairStore(store.database), Progress(), 0
     keys = list(store.find_keys(SCENE, ["a", "b", "c"]).values())
     while claim := pairs.claim(name, progress):
-        made = {(other, claim.key): np.zeros((1, 2), np.int32) for other in pairs.list_missing(name, claim, keys, 9)}
+        made = {(other, claim.key): pair_of(1) for other in pairs.list_missing(name, claim, keys, 9)}
         pairs.add(name, claim, made, is_complete=True)
         count += len(made)
     return count

@@ -60,7 +60,7 @@ async def create_scene(
 
 
 def _scene(response: Any) -> Scene:
-    return scene_from_message(response.scene, getattr(response, "warnings", ()))
+    return scene_from_message(response.scene, response)
 
 
 async def get_scene(connection: Connection, scene: str, *, timeout_s: float | None = None) -> Scene:

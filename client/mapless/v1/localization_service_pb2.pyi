@@ -80,6 +80,7 @@ class Advice(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     ADVICE_CHECK_CALIBRATION: _ClassVar[Advice]
     ADVICE_TELL_PLACES_APART: _ClassVar[Advice]
     ADVICE_CHECK_PRIOR: _ClassVar[Advice]
+    ADVICE_CHECK_REFERENCE_POSES: _ClassVar[Advice]
 
 class RejectionReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -146,6 +147,7 @@ ADVICE_CHOOSE_OTHER_REFERENCES: Advice
 ADVICE_CHECK_CALIBRATION: Advice
 ADVICE_TELL_PLACES_APART: Advice
 ADVICE_CHECK_PRIOR: Advice
+ADVICE_CHECK_REFERENCE_POSES: Advice
 REJECTION_REASON_UNSPECIFIED: RejectionReason
 REJECTION_REASON_NO_USABLE_REFERENCES: RejectionReason
 REJECTION_REASON_DEGENERATE_REFERENCES: RejectionReason

@@ -145,12 +145,18 @@ class GetSceneRequest(_message.Message):
     def __init__(self, name: _Optional[str] = ...) -> None: ...
 
 class GetSceneResponse(_message.Message):
-    __slots__ = ("scene", "warnings")
+    __slots__ = ("scene", "warnings", "contradiction", "compared_pair_count", "agreeing_pair_count")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     WARNINGS_FIELD_NUMBER: _ClassVar[int]
+    CONTRADICTION_FIELD_NUMBER: _ClassVar[int]
+    COMPARED_PAIR_COUNT_FIELD_NUMBER: _ClassVar[int]
+    AGREEING_PAIR_COUNT_FIELD_NUMBER: _ClassVar[int]
     scene: Scene
     warnings: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, scene: _Optional[_Union[Scene, _Mapping]] = ..., warnings: _Optional[_Iterable[str]] = ...) -> None: ...
+    contradiction: str
+    compared_pair_count: int
+    agreeing_pair_count: int
+    def __init__(self, scene: _Optional[_Union[Scene, _Mapping]] = ..., warnings: _Optional[_Iterable[str]] = ..., contradiction: _Optional[str] = ..., compared_pair_count: _Optional[int] = ..., agreeing_pair_count: _Optional[int] = ...) -> None: ...
 
 class UpdateSceneRequest(_message.Message):
     __slots__ = ("scene", "update_mask")

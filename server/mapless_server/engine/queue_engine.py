@@ -239,6 +239,7 @@ class QueueEngine:
         """Frees the memory of deleted references."""
         for tier in self.tiers:
             tier.pipeline.matcher.forget(keys)
+        self.references.agreements.forget_references(keys)
 
     def forget_scene(self, scene_key: SceneKey) -> None:
         """Frees the memory of a deleted scene."""

@@ -9,9 +9,11 @@ from mapless_server.images import ImageLimits
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import StageContext
 from mapless_server.scenes import Choice, Selection, rank_references
+from mapless_server.scenes.agreement import SceneAgreements
 from mapless_server.scenes.audit.scene_auditor import SceneAuditor, SceneTools
 from mapless_server.scenes.retrieval.ranking import nearest_references
 from mapless_server.security import SceneKey, scene_id_of
+from mapless_server.store import SceneAttributes
 
 from .photos import Description, Photo, QueryViews
 from .query import POSE_PRIOR
@@ -20,18 +22,34 @@ from .query import POSE_PRIOR
 class References:
     """The references of all scenes: loaded, chosen, described, audited. Safe to use from several threads."""
 
-    def __init__(self, tools: SceneTools, extractors: Sequence[FeatureExtractor], limits: ImageLimits) -> None:
-        """Raises ValueError unless the descriptor is computed from the first extractor's features."""
+    def __init__(
+        self,
+        tools: SceneTools,
+        extractors: Sequence[FeatureExtractor],
+        limits: ImageLimits,
+        agreements: SceneAgreements,
+    ) -> None:
+        """The agreements say which scenes contradict themselves.
+
+        Raises ValueError unless the descriptor is computed from the first extractor's features.
+        """
         descriptor = tools.descriptor
         if descriptor.extractor not in (None, extractors[0].name):
             raise ValueError(f"{descriptor.name} is made of {descriptor.extractor}, not of {extractors[0].name}")
-        self.load, self.attributes = tools.library.load, tools.library.attributes
+        self.load = tools.library.load
         self.report_damaged = tools.indexes.report_damaged
+        self.agreements = agreements
         self._tools = tools
         self._indexes = tools.indexes
         self._descriptor = descriptor
         self._extractors = extractors
         self._limits = limits
+
+    def attributes(self, scene_key: SceneKey) -> SceneAttributes:
+        """Returns the attributes of a scene, with its contradiction as far as it is known; errors as in `Store`."""
+        attributes = self._tools.library.attributes(scene_key)
+        contradiction = self.agreements.known(scene_key).contradiction
+        return replace(attributes, contradiction=contradiction) if contradiction else attributes
 
     def choose(self, scene_key: SceneKey, views: QueryViews, selection: Selection, context: StageContext) -> Choice:
         """Chooses references for a photograph by its global descriptor, or near a pose prior without reading it.
@@ -84,6 +102,7 @@ class References:
     def forget_scene(self, scene_key: SceneKey) -> None:
         """Frees the memory of a deleted scene."""
         self._indexes.forget(scene_key)
+        self.agreements.forget_scene(scene_key)
 
     @property
     def index_bytes(self) -> int:
@@ -91,5 +110,6 @@ class References:
         return self._indexes.size_bytes
 
     def close(self) -> None:
-        """Ends the background work of the library."""
+        """Ends the background work of the library and of the agreements."""
+        self.agreements.close()
         self._tools.library.close()

@@ -21,6 +21,7 @@ from mapless_server.method.pipeline import Coarse, Pipeline, Prepared
 from mapless_server.method.rejection import Hint, Hypothesis, Rejection, RejectionReason
 from mapless_server.method.results import Support
 from mapless_server.method.trust.judge import trust_in_scene
+from mapless_server.method.trust.references import supporters_of, with_contradiction, without_agreement
 from mapless_server.scenes import ANYWHERE, Selection
 from mapless_server.scenes.library import FeaturesMissing
 from mapless_server.scheduling import Abandoned, Done, Ending, Failure, Fallback, Job, Next, StageResult, Step
@@ -140,6 +141,8 @@ class QueryStages:
             attributes = run.source.attributes(query.scene_key)
             if query.is_generic:
                 attributes = replace(attributes, calibration=None, self_calibrations=())
+            if attributes.contradiction:  # radii and trust measured by its references say nothing
+                attributes = replace(attributes, self_calibrations=())
             run = run.but(attributes=attributes)
             if run.tries_turns and not run.views.quarter_turns:
                 assert run.best is not None
@@ -378,8 +381,13 @@ class QueryStages:
             beyond = narrowing.contradiction(outcome.world_from_camera, run.attributes.unit)
             if beyond:
                 answer = replace(answer, outcome=Rejection(RejectionReason.PRIOR_CONFLICT, beyond))
+        if run.attributes.contradiction and isinstance(answer.outcome, Localization) and answer.support is not None:
+            answer = replace(answer, outcome=without_agreement(supporters_of(answer.support)) or answer.outcome)
         if isinstance(answer.outcome, Rejection):
             answer = hinted(answer, run.view, run.references, is_searched(run) and not narrowing.is_empty)
+            if run.attributes.contradiction:
+                rejection = with_contradiction(answer.outcome, run.attributes.contradiction)
+                answer = replace(answer, outcome=rejection)
         seconds = run.context.stage_seconds | answer.stage_seconds
         if run.best is not None:
             seconds = run.best.seconds_with({f"{tier.features}/{name}": it for name, it in seconds.items()})

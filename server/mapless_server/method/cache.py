@@ -40,6 +40,13 @@ class LruCache(Generic[Value]):
             self._entries.move_to_end(key)
             return entry[0]
 
+    def pop(self, key: Hashable) -> Value | None:
+        """Removes and returns a value, or None; not counted as an eviction."""
+        with self._lock:
+            value, size = self._entries.pop(key, (None, 0))
+            self.used -= size
+            return value
+
     def forget(self, is_gone: Callable[[Any, Value], bool]) -> list[Any]:
         """Drops the entries for which `is_gone(key, value)` is true; returns their keys.
 

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from .agreement import ReferenceErrors, pair_error_px, thinned
 from .cache import LruCache
 from .matching import (
     OPTIONS,
@@ -32,7 +33,7 @@ from .matching import (
     SharedThreads,
     StoredPairs,
 )
-from .nearest import best_of_both, epipolar_distance_px, epipolar_distances_px, mutual_matches
+from .nearest import best_of_both, epipolar_distance_px, epipolar_distances_px, mutual_matches_of_ratios
 from .observations import Tracks, build_tracks
 from .pairs import PairKey, PairMatches, in_order, is_one_photograph
 from .stationary import IgnoredKeypoints, StationaryOptions, stationary_matches, without_ignored
@@ -71,6 +72,8 @@ class Correspondences:
     Attributes:
         reference_pairs: for each i < j, matches between references i and j.
         query_matches: for each reference, matches (query keypoint, reference keypoint).
+        reference_error_px: returns the error of a pair of references, by their indices, see `agreement`; None where
+            the references were not matched by a `Matcher`.
         source: the references as they were matched, and where results from these alone are cached; None caches none.
         stationary_count: number of keypoints of the query whose matches were left out, see `stationary`.
     """
@@ -79,6 +82,7 @@ class Correspondences:
     query_matches: tuple[Matches, ...]
     source: MatchedReferences | None = None
     stationary_count: int = 0
+    reference_error_px: ReferenceErrors | None = None
     _tracks: dict[int | None, Tracks] = field(default_factory=dict, init=False, repr=False)
 
     def tracks(self, references: Sequence[PosedView], anchor: int | None = None) -> Tracks:
@@ -119,6 +123,8 @@ class Matcher:
         self._threads = SharedThreads(threads)
         self._query_matching = query_matching or NearestNeighbours(self.options.query_ratio, self._threads)
         self._remembered: LruCache[PairMatches] = LruCache(self.options.remembered_pairs)
+        self._errors: LruCache[float] = LruCache(self.options.remembered_pairs)
+        self._distinct: LruCache[Matches] = LruCache(self.options.remembered_pairs)
         self._structures: LruCache[Any] = LruCache(self.options.structure_bytes)
 
     def correspond(
@@ -148,7 +154,11 @@ class Matcher:
         # Strong matches of a pair may be stored at any time, so that its matches are not determined.
         source = MatchedReferences(tuple(references), self.matching(wide), self._structures)
         known = source if self.pair_matching is None else None
-        return replace(kept, source=known)
+
+        def error_px(i: int, j: int) -> float | None:
+            return self.error_px(references[i], references[j])
+
+        return replace(kept, source=known, reference_error_px=error_px)
 
     def match_query(
         self, query: View, references: Sequence[PosedView], check: Callable[[], None] = lambda: None
@@ -283,6 +293,20 @@ class Matcher:
             strict = self._match_strongly(first, second, pause) if strong else self._match_strictly(first, second)
         return self._widened(first, second, strict) if wide else strict
 
+    def error_px(self, first: PosedView, second: PosedView) -> float | None:
+        """The error of a pair by `pair_error_px`; None if it has too few matches, or was neither matched nor stored.
+
+        It is computed when it is first asked for, in a millisecond or two.
+        """
+        pair = in_order(first, second)
+        key = pair[0].key, pair[1].key
+        error_px = self._errors.get(key)
+        if error_px is None and (distinct := self._distinct.get(key)) is not None:
+            error_px = pair_error_px(*pair, distinct)
+            self._note_error(*pair, error_px)
+            self._distinct.pop(key)
+        return error_px
+
     def has_enough(self, nearest: Matches) -> bool:
         """Whether nearest neighbours find so many matches of a pair that `pair_matching` is not used for it."""
         return len(nearest) >= self.options.enough_matches
@@ -304,9 +328,10 @@ class Matcher:
         missing = [i for i, is_cached in enumerate(found) if not is_cached]
         if missing and self.stored is not None:
             stored = self.stored.find(self.matching(wide, strong), [pairs[i] for i in missing])
-            for i, matches in zip(missing, stored, strict=True):
-                if matches is not None:
-                    self._remembered.put(keys[i], PairMatches.of(*pairs[i], matches, self.stationary))
+            for i, it in zip(missing, stored, strict=True):
+                if it is not None:
+                    self._remembered.put(keys[i], PairMatches.of(*pairs[i], it.matches, self.stationary))
+                    self._note_error(*pairs[i], it.error_px)
                     found[i] = True
         return found
 
@@ -314,20 +339,30 @@ class Matcher:
         """Removes what was computed from deleted references from the caches, in time linear in their size."""
         gone = frozenset(keys)
         self._remembered.forget(lambda pair, _: pair.first in gone or pair.second in gone)
+        for of_pairs in (self._errors, self._distinct):
+            of_pairs.forget(lambda pair, _: not gone.isdisjoint(pair))
         self._structures.forget(lambda key, _: not gone.isdisjoint(key[0]))
 
     def _match_strictly(self, first: PosedView, second: PosedView) -> Matches:
+        ratios = self.options.reference_ratio, self.options.distinct_ratio
         return self._filtered(
-            first, second, mutual_matches(first.view.features, second.view.features, self.options.reference_ratio, True)
+            first, second, *mutual_matches_of_ratios(first.view.features, second.view.features, ratios)
         )
 
     def _match_strongly(self, first: PosedView, second: PosedView, pause: Callable[[], None]) -> Matches:
         assert self.pair_matching is not None
-        return self._filtered(first, second, self.pair_matching.match_one(first.view, second.view, pause))
+        matches = self.pair_matching.match_one(first.view, second.view, pause)
+        return self._filtered(first, second, matches, matches)
 
-    def _filtered(self, first: PosedView, second: PosedView, matches: Matches) -> Matches:
+    def _note_error(self, first: PosedView, second: PosedView, error_px: float | None) -> None:
+        if error_px is not None:
+            self._errors.put((first.key, second.key), error_px)
+
+    def _filtered(self, first: PosedView, second: PosedView, matches: Matches, distinct: Matches) -> Matches:
         if is_one_photograph(first, second):
             return matches[:0]
+        moving = distinct[~stationary_matches(first, second, distinct, self.stationary)]
+        self._distinct.put((first.key, second.key), thinned(moving))
         stationary = stationary_matches(first, second, matches, self.stationary)
         agreeing = epipolar_distance_px(first, second, matches) < self.options.epipolar_px
         return PairMatches(matches[agreeing & ~stationary], matches[stationary]).all

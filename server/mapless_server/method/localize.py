@@ -122,6 +122,7 @@ def solve(coarse: Coarse, counts_agreement: bool = False) -> Answer:
     query_matches = tuple(prepared.correspondences.query_matches)
     sigma = prepared.options.intrinsics
     support = Support(query, references, structure, matches, None, prepared.origin, None, query_matches, sigma)
+    support = replace(support, reference_error_px=prepared.correspondences.reference_error_px)
     with stage("pnp"):
         estimate = solve_pose(query, structure, matches, scale.world_from_query, options.pnp, priors)
     if isinstance(estimate, Rejection):

@@ -29,6 +29,7 @@ class CorrespondOptions:
             between references, from either of them; loose, because the epipolar constraint filters too.
         query_ratio: the same ratio for matches with the query, which have no other filter.
         epipolar_px: largest distance from the epipolar line, in both images; keypoints are accurate to about a pixel.
+        distinct_ratio: the ratio of matches between references that show, without the poses, whether these agree.
         wide_ratio: the ratio among the keypoints along the line; stricter, because they are few.
         wide_similarity: smallest cosine of descriptors of a match along the line, for the same reason.
         guided_similarity: smallest cosine of descriptors of a match that is searched near a point's projection.
@@ -48,6 +49,7 @@ class CorrespondOptions:
 
     reference_ratio: float = 0.9
     query_ratio: float = 0.85
+    distinct_ratio: float = 0.8
     epipolar_px: float = 2.0
     wide_ratio: float = 0.8
     wide_similarity: float = 0.85
@@ -60,7 +62,7 @@ class CorrespondOptions:
     structure_bytes: int = 32 * 2**20
 
     def __post_init__(self) -> None:
-        check_bounds(self, "reference_ratio query_ratio wide_ratio", above=0, at_most=1)
+        check_bounds(self, "reference_ratio query_ratio distinct_ratio wide_ratio", above=0, at_most=1)
         check_bounds(self, "wide_similarity guided_similarity", at_least=-1)
         check_bounds(self, "epipolar_px", above=0)
         check_bounds(self, "sampled_share", at_least=1)
@@ -69,7 +71,12 @@ class CorrespondOptions:
 
 
 _ALIKED = CorrespondOptions(
-    reference_ratio=1.0, query_ratio=0.95, wide_ratio=0.9, wide_similarity=0.6, guided_similarity=0.65
+    reference_ratio=1.0,
+    query_ratio=0.95,
+    distinct_ratio=0.9,
+    wide_ratio=0.9,
+    wide_similarity=0.6,
+    guided_similarity=0.65,
 )
 
 _EDGEPOINT2 = replace(_ALIKED, wide_similarity=0.84, guided_similarity=0.86)
@@ -121,11 +128,24 @@ class PairMatching(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class StoredPair:
+    """What is stored of a pair of references.
+
+    Attributes:
+        matches: (M, 2), within the distance from the epipolar lines that the matching allows.
+        error_px: see `agreement.pair_error_px`; None if it is not known.
+    """
+
+    matches: Matches
+    error_px: float | None = None
+
+
 class StoredPairs(Protocol):
     """Matches of pairs of references that were made before."""
 
-    def find(self, matching: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> Sequence[Matches | None]:
-        """Returns the stored matches of each pair, given `in_order`; None for a pair that is not stored.
+    def find(self, matching: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> Sequence[StoredPair | None]:
+        """Returns what is stored of each pair, given `in_order`; None for a pair that is not stored.
 
         `matching` is what `Matcher.matching` returns. Does not raise.
         """

@@ -2,7 +2,7 @@
 
 import sys
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import Any
 
@@ -23,12 +23,10 @@ def mutual_matches(first: Features, second: Features, ratio: float, either: bool
 
     Descriptors have unit length, so with cosine s the distance is sqrt(2 - 2 s).
     """
+    if either:
+        return mutual_matches_of_ratios(first, second, (ratio,))[0]
     if len(first) < 2 or len(second) < 2:
         return np.empty((0, 2), np.int32)
-    if either:
-        similarity = np.empty((len(first), len(second)), np.float32)
-        deque(cosine_blocks(first, second, similarity), 0)
-        return best_of_both(similarity, ratio, either=True)
     nearest, best, second_best = np.empty(len(first), np.intp), *np.empty((2, len(first)), np.float32)
     best_of_column, begin = np.full(len(second), -np.inf, np.float32), 0
     for cosines in cosine_blocks(first, second):
@@ -42,6 +40,15 @@ def mutual_matches(first: Features, second: Features, ratio: float, either: bool
     mutual = best >= best_of_column[nearest]
     keep = np.flatnonzero(mutual & (best > -1.0) & (1 - best < ratio**2 * (1 - second_best)))
     return np.stack([keep, nearest[keep]], axis=1).astype(np.int32)
+
+
+def mutual_matches_of_ratios(first: Features, second: Features, ratios: Sequence[float]) -> list[Matches]:
+    """For each ratio, the mutual nearest neighbours that pass the test from either side, of one comparison."""
+    if len(first) < 2 or len(second) < 2:
+        return [np.empty((0, 2), np.int32) for _ in ratios]
+    similarity = np.empty((len(first), len(second)), np.float32)
+    deque(cosine_blocks(first, second, similarity), 0)
+    return _best_of_both(similarity, ratios, either=True)
 
 
 def cosine_blocks(
@@ -91,8 +98,14 @@ def best_of_both(
 
     If `either`, it suffices to pass the ratio test by column. Overwrites the matrix.
     """
+    return _best_of_both(similarity, (ratio,), smallest, either)[0]
+
+
+def _best_of_both(
+    similarity: NDArray[np.float32], ratios: Sequence[float], smallest: float = -1.0, either: bool = False
+) -> list[Matches]:
     if not similarity.size:
-        return np.empty((0, 2), np.int32)
+        return [np.empty((0, 2), np.int32) for _ in ratios]
     rows = np.arange(len(similarity))
     nearest = similarity.argmax(axis=1)
     best = similarity[rows, nearest]
@@ -103,8 +116,9 @@ def best_of_both(
     if either:
         mutual &= np.bincount(nearest[mutual], minlength=similarity.shape[1])[nearest] == 1  # ties are not matched
         second_best = np.minimum(second_best, similarity.max(axis=0)[nearest])
-    keep = mutual & (best > smallest) & (1 - best < ratio**2 * (1 - second_best))
-    return np.stack([rows[keep], nearest[keep]], axis=1).astype(np.int32)
+    mutual &= best > smallest
+    kept = [mutual & (1 - best < ratio**2 * (1 - second_best)) for ratio in ratios]
+    return [np.stack([rows[keep], nearest[keep]], axis=1).astype(np.int32) for keep in kept]
 
 
 def epipolar_distance_px(first: PosedView, second: PosedView, matches: Matches) -> Array:
@@ -142,6 +156,18 @@ def fundamental_matrix(first: PosedView, second: PosedView) -> Array:
     essential = cross_matrix(baseline) @ first_from_world @ second.world_from_camera.rotation
     k_first_inv, k_second_inv = (np.linalg.inv(v.view.camera.matrix()) for v in (first, second))
     return np.asarray(k_first_inv.T @ essential @ k_second_inv)
+
+
+def sampson_px(fundamental: Array, x_first: Array, x_second: Array) -> Array:
+    """Sampson distances (M,) of matched pixels (M, 2) from x_first^T F x_second = 0, pixels; NaN if F is zero.
+
+    To first order, how far both keypoints together must be moved to satisfy it.
+    """
+    one, other = (np.column_stack([pixels, np.ones(len(pixels))]) for pixels in (x_first, x_second))
+    lines_first, lines_second = other @ fundamental.T, one @ fundamental
+    slope = np.sqrt((lines_first[:, :2] ** 2).sum(axis=1) + (lines_second[:, :2] ** 2).sum(axis=1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.abs((one * lines_first).sum(axis=1)) / slope)
 
 
 def _lines(lines: Array) -> Array:

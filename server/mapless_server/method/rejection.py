@@ -43,6 +43,8 @@ class Advice(str, Enum):
     """Use a prior, or a photograph that shows what distinguishes the places."""
     CHECK_PRIOR = "check_prior"
     """The prior contradicts the photograph, or leaves no reference."""
+    CHECK_REFERENCE_POSES = "check_reference_poses"
+    """What the references show in common does not agree with their poses."""
 
 
 class IntrinsicsParameter(str, Enum):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,9 @@ from .observations import KeypointNoise, Tracks
 from .options import IntrinsicsSigma
 from .priors.known import PriorCheck
 from .views import Matches, PosedView, View
+
+if TYPE_CHECKING:  # services do not load what computes
+    from .agreement import ReferenceErrors
 
 
 class ScaleStage(str, Enum):
@@ -263,6 +267,7 @@ class Support:
         two_view: matches with single references, where the pose rests on them too.
         query_matches: matches of the query with each reference.
         intrinsics_sigma: the caller's standard deviations of the query's intrinsics; None for the usual ones.
+        reference_error_px: returns the error of a pair of references, see `agreement`; None if it is not known.
     """
 
     query: View
@@ -274,6 +279,7 @@ class Support:
     two_view: TwoViewSupport | None = None
     query_matches: tuple[Matches, ...] = ()
     intrinsics_sigma: IntrinsicsSigma | None = None
+    reference_error_px: ReferenceErrors | None = None
 
     def inlier_count(self) -> int:
         """Number of inliers of the estimate, two-view inliers included."""

@@ -59,6 +59,7 @@ COUNTED: Mapping[str, tuple[str, str, tuple[str, ...]]] = {
 WAITING = {
     "background_waiting": "References that wait to be matched in the background, as last counted.",
     "depth_waiting": "References that wait for a network to predict their depth, as last counted.",
+    "contradicting_scenes": "Scenes in use whose references do not agree with their poses.",
     "calibration_waiting": "Scenes that changed since they were calibrated, as last counted.",
 }
 """What they set by name."""

@@ -17,12 +17,14 @@ from functools import partial
 
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.method.correspond import in_order
+from mapless_server.method.matching import StoredPair
 from mapless_server.method.options import StageContext, check_bounds
-from mapless_server.method.views import Matches, PosedView
+from mapless_server.method.views import PosedView
 from mapless_server.store import Store
 from mapless_server.store.compaction import compact_features
 from mapless_server.store.pairs import CLAIM_S, Claim, Pair, PairStore, Progress, delete_unused, record_use
 
+from .agreement import SceneAgreements
 from .calibration.calibrator import SceneCalibrations
 from .depth.scene_depths import SceneDepths
 from .indexes import SceneIndexes
@@ -87,12 +89,14 @@ class BackgroundMatching:
         options: BackgroundOptions | None = None,
         calibrations: SceneCalibrations | None = None,
         depths: SceneDepths | None = None,
+        agreements: SceneAgreements | None = None,
     ) -> None:
         """Makes the object; nothing is matched before `start` or `match_waiting`.
 
         The matchings are ordered, the most important first, each with the finder that queries use for it. `is_idle` is
         whether the server computes nothing for a caller. Depths of references are made before scenes are calibrated,
-        which uses them and happens when all references are matched; None makes none.
+        which uses them and happens when all references are matched; None makes none. The agreements of scenes are
+        brought up to date after their references are matched.
         """
         self._store = store
         self._pairs = PairStore(store.database)
@@ -102,6 +106,7 @@ class BackgroundMatching:
         self._observer = observer
         self._calibrations = calibrations
         self._depths = depths
+        self._agreements = agreements
         self.options = options or BackgroundOptions()
         self._progress = {matching.name: Progress() for matching in matchings}
         self._closing = threading.Event()
@@ -185,6 +190,8 @@ class BackgroundMatching:
             used.append(self._calibrations.kind)
         if self._depths is not None:
             used += self._depths.kinds
+        if self._agreements is not None:
+            self._agreements.derive_all()
         record_use(self._store.database, used)
         delete_unused(self._store.database, self._pause)
         rewritten = set(compact_features(self._store.database, self._pause))
@@ -239,14 +246,16 @@ class BackgroundMatching:
             )
             return
         self._pairs.add(matching.name, claim, made, is_complete)
+        if self._agreements is not None and any(it.error_px is not None for it in made.values()):
+            self._agreements.touch(claim.scene_key)
         self._observer.count("background_pairs", len(made))
         self._observer.count("background_cpu_seconds", time.thread_time() - begin_s)
 
     def _match(
         self, library: ReferenceLibrary, matching: Matching, claim: Claim, until_s: float
-    ) -> tuple[dict[Pair, Matches], bool]:
+    ) -> tuple[dict[Pair, StoredPair], bool]:
         """Matches a reference's pairs until a time or until closed; returns the pairs, and whether these are all."""
-        made: dict[Pair, Matches] = {}
+        made: dict[Pair, StoredPair] = {}
         self._let_callers_first()
         self._check()
         wanted = self._nearest(matching, claim)
@@ -272,12 +281,15 @@ class BackgroundMatching:
                 return made, False
         return made, True
 
-    def _match_pair(self, matching: Matching, first: PosedView, second: PosedView) -> dict[Pair, Matches]:
+    def _match_pair(self, matching: Matching, first: PosedView, second: PosedView) -> dict[Pair, StoredPair]:
         """Matches a pair, unless it needs no matches of this kind."""
         base = matching.base
         begun = None if base is None else self._matchings[matching].find_one(base.name, first, second)
         matches = matching.match_pair(first, second, begun, self._pause)
-        return {} if matches is None else {(first.key, second.key): matches}
+        if matches is None:
+            return {}
+        error_px = None if matching.wide else matching.matcher.error_px(first, second)
+        return {(first.key, second.key): StoredPair(matches, error_px)}
 
     def _nearest(self, matching: Matching, claim: Claim) -> list[str]:
         """Ids of the references that a query from the claimed one's place would choose first, without stored pairs.

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from mapless_server.method.cache import LruCache
 from mapless_server.method.correspond import Matcher
 from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.matching import StoredPair
 from mapless_server.method.views import KeypointDepths, Matches, PosedView
 from mapless_server.store.database import Database
 from mapless_server.store.depths import load_depths
@@ -78,7 +79,7 @@ class PairFinder:
         self._damaged: dict[str, set[Pair]] = {}
         self._guard = threading.Lock()
 
-    def find(self, matching: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> list[Matches | None]:
+    def find(self, matching: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> list[StoredPair | None]:
         """See `StoredPairs.find`."""
         try:
             found, damaged_count = self._read(matching_name(self._extractor, matching), pairs)
@@ -86,23 +87,24 @@ class PairFinder:
             log.warning("stored matches cannot be read, and are made by the query: %s", error)
             self._observer.count("stored_pairs_failures")
             return [None] * len(pairs)
-        stored_count = sum(matches is not None for matches in found)
+        stored_count = sum(it is not None for it in found)
         absent_count = len(pairs) - stored_count - damaged_count
         self._observer.looked_up("stored_pairs", stored_count, absent_count, damaged_count)
         return found
 
     def find_one(self, name: str, first: PosedView, second: PosedView) -> Matches | None:
         """The matches of a pair, given `in_order`, for the background; None if not stored. Errors as in PairStore."""
-        return self._read(name, [(first, second)])[0][0]
+        stored = self._read(name, [(first, second)])[0][0]
+        return None if stored is None else stored.matches
 
-    def _read(self, name: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> tuple[list[Matches | None], int]:
-        """Reads the stored, undamaged matches of each pair; also returns the number of damaged ones."""
+    def _read(self, name: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> tuple[list[StoredPair | None], int]:
+        """Reads what is stored, undamaged, of each pair; also returns the number of damaged ones."""
         keys = [(first.key, second.key) for first, second in pairs]
         stored = self._pairs.load(name, keys)
         found = {
-            key: matches
+            key: it
             for key, pair in zip(keys, pairs, strict=True)
-            if (matches := stored.get(key)) is not None and _is_within(matches, *pair)
+            if (it := stored.get(key)) is not None and _is_within(it.matches, *pair)
         }
         damaged = stored.keys() - found.keys()
         if damaged:

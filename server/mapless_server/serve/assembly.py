@@ -24,6 +24,7 @@ from mapless_server.networks.weights import CATALOGUE, WeightsError, WeightsMiss
 from mapless_server.networks.weights.folder import Status, look_up
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scenes import GlobalDescriptor
+from mapless_server.scenes.agreement import SceneAgreements
 from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.audit.scene_auditor import SceneTools
 from mapless_server.scenes.background import BackgroundMatching
@@ -150,14 +151,15 @@ def engine_over(
     library = ReferenceLibrary(store, depths if any(tier.uses_depths for tier in tiers) else None)
     indexes = SceneIndexes(store, library, descriptor, first, options.index_cache_bytes)
     pairs = PairMatches(tiers[0].pipeline.matcher.options.reference_ratio, CACHED_AUDIT_PAIRS)
+    agreements = SceneAgreements(store, indexes, library, first, tiers[0].pipeline.matcher, observed)
     tools = SceneTools(library, indexes, descriptor, first, pairs)
-    references = References(tools, extractors, options.image_limits)
+    references = References(tools, extractors, options.image_limits, agreements)
     engine = QueueEngine(tiers, references, options, observer, quota, method)
     maker = None
     if depth_network is not None:
         maker = DepthMaker(indexes, first, tiers[0].pipeline.matcher, depth_network)
     made = None if depths is None else SceneDepths(store, depths, maker, observed)
-    engine.background = _background_matching(store, indexes, engine, observed, made, depths)
+    engine.background = _background_matching(store, indexes, engine, observed, made, depths, agreements)
     return engine
 
 
@@ -168,6 +170,7 @@ def _background_matching(
     observer: BackgroundObserver,
     made: SceneDepths | None,
     depths: DepthFinder | None,
+    agreements: SceneAgreements,
 ) -> BackgroundMatching:
     """Makes the matching for the queries of each tier, in order; queries look for its results from then on."""
     pairs, matchings, strong = PairStore(store.database), dict[Matching, PairFinder](), dict[Matching, PairFinder]()
@@ -186,8 +189,9 @@ def _background_matching(
         matchings | strong,
         lambda: engine.queue.job_count == 0,
         observer,
-        calibrations=SceneCalibrations(store, calibrator, observer, depths if first.uses_depths else None),
+        calibrations=SceneCalibrations(store, calibrator, observer, depths if first.uses_depths else None, agreements),
         depths=made,
+        agreements=agreements,
     )
 
 

@@ -91,11 +91,24 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         """Implements ReferenceService.GetScene."""
         key = scene_key_from_name(request.name, "name", call.principal.tenant)
         scene = await self._stored(self._store.get_scene, key)
-        known = await self._stored(self._store.get_attributes, key)
+        agreement = await self._stored(self._engine().references.agreements.current, key)
+        if agreement.contradicts_itself:  # what its references say of lenses is of no use then
+            warnings = {agreement.contradiction: None}
+        else:
+            warnings = await self._stored(self._lens_warnings, key)
+        return pb.GetSceneResponse(
+            scene=scene_to_message(scene),
+            warnings=warnings,
+            contradiction=agreement.contradiction,
+            compared_pair_count=agreement.pair_count,
+            agreeing_pair_count=agreement.agreeing_count,
+        )
+
+    def _lens_warnings(self, key: SceneKey) -> dict[str, None]:
+        known = self._store.get_attributes(key)
         # Older ones may be of a server that is gone, and of references that have been replaced.
         newest = max((it.generation for it in known.self_calibrations), default=0)
-        warnings = dict.fromkeys(it.lens for it in known.self_calibrations if it.lens and it.generation == newest)
-        return pb.GetSceneResponse(scene=scene_to_message(scene), warnings=warnings)
+        return dict.fromkeys(it.lens for it in known.self_calibrations if it.lens and it.generation == newest)
 
     async def UpdateScene(self, request: pb.UpdateSceneRequest, call: Call) -> pb.UpdateSceneResponse:
         """Implements ReferenceService.UpdateScene."""
@@ -311,8 +324,11 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         records = await self._stored(self._store.add_references, scene_key, references)
         if blank := [record.reference_id for record in records if not record.feature_count]:
             call.note(references_without_features=blank[:MAX_NOTED])
+        agreements = self._engine().references.agreements
+        agreements.changed(scene_key)
+        contradiction = agreements.known(scene_key).contradiction
         shares = {it.reference_id: found.ignored_share for it, found in zip(records, described, strict=True)}
-        return records, warnings + nearly_ignored(shares)
+        return records, [*warnings, *([contradiction] if contradiction else []), *nearly_ignored(shares)]
 
     def _repeats(self, scene_key: SceneKey, drafts: Sequence[Draft], call: Call) -> list[str]:
         """Returns and logs which poses or photographs the references to be added repeat."""

@@ -98,6 +98,8 @@ def encode_attributes(attributes: SceneAttributes) -> bytes | None:
     content = asdict(attributes)
     if not attributes.self_calibrations:  # which are stored apart from these, and captured together
         del content["self_calibrations"]
+    if not attributes.contradiction:  # likewise
+        del content["contradiction"]
     if attributes.calibration is not None and attributes.calibration.create_time is not None:
         content["calibration"]["create_time"] = attributes.calibration.create_time.isoformat()
     return _to_json(content)
@@ -119,6 +121,7 @@ def decode_attributes(owner: str, data: bytes | None, sha256: str | None) -> Sce
             Calibration(**calibration) if calibration else None,
             content.get("arbitrary_unit", False),  # which 0.2.0 did not write
             tuple(_calibration_from_dict(it) for it in content.get("self_calibrations", ())),
+            content.get("contradiction", ""),
         )
 
 

@@ -17,7 +17,7 @@ from typing import Any
 from sqlalchemy import Connection, Row, Select, delete, func, literal, or_, select, update
 
 from mapless_server.errors import NotFound
-from mapless_server.method.views import Matches
+from mapless_server.method.matching import StoredPair
 from mapless_server.security import SceneKey
 
 from . import codec, queries, rows
@@ -77,16 +77,44 @@ class PairStore:
         self._database = database
         self._claim_s = claim_s
 
-    def load(self, matching: str, pairs: Collection[Pair]) -> dict[Pair, Matches | None]:
-        """Loads the stored matches of these pairs; None for damaged ones."""
+    def load(self, matching: str, pairs: Collection[Pair]) -> dict[Pair, StoredPair | None]:
+        """Loads what is stored of these pairs; None for damaged ones."""
         column = reference_pair.c
         first, second = ({pair[side] for pair in pairs} for side in (0, 1))
-        stored: Select[Any] = select(column.first_key, column.second_key, column.data, column.sha256)
+        stored: Select[Any] = select(column.first_key, column.second_key, column.data, column.sha256, column.error_px)
         stored = stored.where(column.matching == matching, column.first_key.in_(first), column.second_key.in_(second))
         with self._database.read() as connection:
             found: Sequence[Row[Any]] = unless_damaged(connection, lambda: connection.execute(stored).all(), list)
         wanted = set(pairs)
         return {_pair(row): _decoded(matching, row) for row in found if _pair(row) in wanted}
+
+    def list_errors(self, matching: str, scene_key: SceneKey, at_most: int) -> dict[Pair, float]:
+        """The known errors of a scene's pairs, see `method.agreement`, pixels; of a large scene some of its pairs."""
+        column = reference_pair.c
+        known: Select[Any] = (
+            select(column.first_key, column.second_key, column.error_px)
+            .join(reference, reference.c.key == column.first_key)
+            .where(reference.c.scene_id == scene_key, column.matching == matching, column.error_px.is_not(None))
+        )
+        with self._database.read() as connection:
+            return {_pair(row): row.error_px for row in connection.execute(known.limit(at_most))}
+
+    def list_scenes_with_errors(self, matching: str, above_px: float, at_most: int) -> list[SceneKey]:
+        """Scenes with a pair whose error is larger."""
+        column = reference_pair.c
+        found: Select[Any] = (
+            select(reference.c.scene_id)
+            .join(reference_pair, reference.c.key == column.first_key)
+            .where(column.matching == matching, column.error_px > above_px)
+            .distinct()
+        )
+        with self._database.read() as connection:
+            return [SceneKey(it) for it in connection.scalars(found.limit(at_most))]
+
+    def list_existing(self, keys: Collection[str]) -> set[str]:
+        """Those of these references' keys that exist."""
+        with self._database.read() as connection:
+            return set(connection.scalars(select(reference.c.key).where(reference.c.key.in_(keys))))
 
     def claim(self, matching: str, progress: Progress) -> Claim | None:
         """Claims a reference whose pairs are not matched; None if none may be claimed now.
@@ -136,17 +164,18 @@ class PairStore:
             found = {key for pair in connection.execute(stored) for key in pair}
         return [key for key in [key for key in others if key in preceding][:at_most] if key not in found]
 
-    def add(self, matching: str, claim: Claim, matches: Mapping[Pair, Matches], is_complete: bool) -> None:
+    def add(self, matching: str, claim: Claim, made: Mapping[Pair, StoredPair], is_complete: bool) -> None:
         """Stores pairs of a claimed reference and ends the claim; if not complete, others may claim it at once.
 
         Pairs of references that were deleted meanwhile, and pairs that are stored already, are ignored.
         """
-        data = {pair: codec.encode_matches(it) for pair, it in matches.items()}
+        data = {pair: codec.encode_matches(it.matches) for pair, it in made.items()}
         with self._database.write() as connection:
-            present = _locked(connection, {claim.key, *(key for pair in matches for key in pair)})
+            present = _locked(connection, {claim.key, *(key for pair in made for key in pair)})
             for pair in sorted(pair for pair in data if present.issuperset(pair)):
                 row = {"first_key": pair[0], "second_key": pair[1], "matching": matching, "data": data[pair]}
-                row["sha256"] = codec.sha256_for(_owner(matching, pair), data[pair])
+                row["error_px"] = made[pair].error_px
+                row["sha256"] = codec.sha256_for(_owner(matching, pair, made[pair].error_px), data[pair])
                 queries.insert_new(connection, reference_pair, row)
             due_us = None if is_complete else rows.now_us()
             connection.execute(_of_claim(matching, claim).values(due_time_us=due_us, failure_count=0))
@@ -252,16 +281,17 @@ def _pair(row: Row[Any]) -> Pair:
     return row.first_key, row.second_key
 
 
-def _decoded(matching: str, row: Row[Any]) -> Matches | None:
+def _decoded(matching: str, row: Row[Any]) -> StoredPair | None:
+    owner = _owner(matching, _pair(row), row.error_px)
     try:
-        return codec.decode_matches(_owner(matching, _pair(row)), row.data, row.sha256)
+        return StoredPair(codec.decode_matches(owner, row.data, row.sha256), row.error_px)
     except codec.Damaged:
         return None
 
 
-def _owner(matching: str, pair: Pair) -> str:
-    """Owner of a pair's matches, for `codec.sha256_for`."""
-    return f"{pair[0]}+{pair[1]} {matching}"
+def _owner(matching: str, pair: Pair, error_px: float | None) -> str:
+    """Owner of a pair's matches, for `codec.sha256_for`; with the pair's error, if it is known."""
+    return f"{pair[0]}+{pair[1]} {matching}" + ("" if error_px is None else f" {error_px!r}")
 
 
 log = logging.getLogger(__name__)

@@ -77,9 +77,9 @@ class SceneAttributes:
 
     The datum is the position of its world on the Earth; `down_in_world` the unit vector in the direction of gravity,
     None for that of the datum, if there is one. The calibration has measured factors of the radii of answers; the
-    self-calibrations, one for each kind of answers, are only filled for answers. ContradictingDown if datum and
-    down_in_world do not belong to the same world; DatumWithoutMetres if there is a datum, but the unit of length is
-    arbitrary instead of the metre.
+    self-calibrations, one for each kind of answers, and the contradiction, a sentence if the scene contradicts itself,
+    are only filled for answers. ContradictingDown if datum and down_in_world do not belong to the same world;
+    DatumWithoutMetres if there is a datum, but the unit of length is arbitrary instead of the metre.
     """
 
     datum: Datum | None = None
@@ -87,6 +87,7 @@ class SceneAttributes:
     calibration: Calibration | None = None
     arbitrary_unit: bool = False
     self_calibrations: tuple[SelfCalibration, ...] = ()
+    contradiction: str = ""
 
     @property
     def unit(self) -> str:

@@ -3,6 +3,7 @@
 from sqlalchemy import (
     BigInteger,
     Column,
+    Double,
     ForeignKey,
     Index,
     Integer,
@@ -15,7 +16,7 @@ from sqlalchemy import (
     text,
 )
 
-SCHEMA_VERSION = 8
+SCHEMA_VERSION = 9
 
 metadata = MetaData()
 
@@ -131,6 +132,7 @@ reference_pair = Table(
     Column("matching", _Matching, primary_key=True),
     Column("data", LargeBinary, nullable=False),  # see codec.py
     Column("sha256", _Sha256, nullable=False),
+    Column("error_px", Double),  # see method/agreement.py; null if it is not known
     Index("reference_pair_by_second", "second_key"),
 )
 

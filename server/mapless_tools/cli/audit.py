@@ -46,7 +46,7 @@ def audit_command(
     *,
     connection: Connection,
 ) -> None:
-    """Examine the references of a scene against their neighbours; exit code 1 when any of them is wrong.
+    """Examine the references of a scene against their neighbours; exit code 1 when any of them is wrong, or all.
 
     Findings are also reported if it ends early: exit code 1 after an error, 130 after Ctrl-C.
     """
@@ -66,11 +66,13 @@ def audit_command(
         with terminable(), connected(connection, settings) as client, progress_bars() as progress:
             known = client.get_scene(scene)
             examined.total = known.reference_count
-            examined.warnings = [*warnings_of(client, known), *known.warnings]
+            examined.of_poses = warnings_of(client, known)
+            examined.see(known)
             progress("audit", 0, examined.total)
             for found in client.audit_scene(scene, page_size=page_size, timeout_s=timeout_s(page_size)):
                 examined.audits.append(found)
                 progress("audit", len(examined.audits), examined.total)
+            examined.see(client.get_scene(scene))  # again: meanwhile more of its pairs have been compared
     except (ValueError, ConfigError) as error:
         fail(str(error), code=2)
     except (MaplessError, ServerFailed) as error:
@@ -86,19 +88,39 @@ def audit_command(
     finally:
         if examined.total is not None:
             _report(examined, everything, report, html, as_json)
-    if any(a.verdict in ALARMS for a in examined.audits):
+    if examined.contradiction or any(a.verdict in ALARMS for a in examined.audits):
         raise typer.Exit(1)
 
 
 @dataclass
 class Examined:
-    """The findings of an audit, why it ended early, and warnings of what contradicts the references' poses."""
+    """The findings of an audit, and why it ended early.
+
+    `of_poses` are warnings of what contradicts the references' poses alone, `of_scene` those of the server;
+    `contradiction` is the one that says that the scene contradicts itself, and empty if none does. Of `compared_pairs`
+    pairs of references, `agreeing_pairs` agree with their poses.
+    """
 
     scene: str
     audits: list[ReferenceAudit] = field(default_factory=list)
     total: int | None = None
     stopped: str = ""
-    warnings: list[str] = field(default_factory=list)
+    of_poses: list[str] = field(default_factory=list)
+    of_scene: tuple[str, ...] = ()
+    contradiction: str = ""
+    compared_pairs: int = 0
+    agreeing_pairs: int = 0
+
+    @property
+    def warnings(self) -> list[str]:
+        """All warnings; that the scene contradicts itself comes first."""
+        others = [*self.of_poses, *(it for it in self.of_scene if it != self.contradiction)]
+        return [self.contradiction, *others] if self.contradiction else others
+
+    def see(self, known: KnownScene) -> None:
+        """Takes over what the server says of the scene now."""
+        self.of_scene, self.contradiction = known.warnings, known.contradiction
+        self.compared_pairs, self.agreeing_pairs = known.compared_pair_count, known.agreeing_pair_count
 
 
 def warnings_of(client: Client, known: KnownScene) -> list[str]:
@@ -130,12 +152,14 @@ def _report(examined: Examined, everything: bool, report: Path | None, html: Pat
     console = Console(soft_wrap=True)
     if not printed_as_json(as_json, to_json(examined)):
         for warning in examined.warnings:
-            console.print(f"warning: {warning}", markup=False, highlight=False)
+            kind = "wrong" if warning == examined.contradiction else "warning"
+            console.print(f"{kind}: {warning}", markup=False, highlight=False)
         if shown:
             Console().print(table_of(shown))
             for audit in shown:
                 console.print(f"{reference_id_of(audit)}: {audit.message}", markup=False, highlight=False)
         console.print(summary_of(examined), markup=False)
+        console.print(pairs_of(examined), markup=False)
     if report is not None:
         write_json(report, to_json(examined))
     if html is not None:
@@ -159,6 +183,14 @@ def summary_of(examined: Examined) -> str:
     if not examined.stopped:
         return found
     return f"stopped after {len(examined.audits)} of {examined.total} references ({examined.stopped}); {found}"
+
+
+def pairs_of(examined: Examined) -> str:
+    """How the pairs of a scene's references agree with their poses, in one line."""
+    if not examined.compared_pairs:
+        return "too little overlap: no two references show enough in common to compare their poses"
+    counts = f"{examined.agreeing_pairs} of {examined.compared_pairs} pairs of references agree with their poses"
+    return f"{counts}: the scene contradicts itself" if examined.contradiction else counts
 
 
 def reference_id_of(audit: ReferenceAudit) -> str:
@@ -203,6 +235,9 @@ def to_json(examined: Examined) -> dict[str, Any]:
         "scene": examined.scene,
         "summary": summary_of(examined),
         "stopped": examined.stopped,
+        "contradiction": examined.contradiction,
+        "compared_pairs": examined.compared_pairs,
+        "agreeing_pairs": examined.agreeing_pairs,
         "warnings": examined.warnings,
         "reference_count": examined.total,
         "references": [asdict(a) for a in examined.audits],

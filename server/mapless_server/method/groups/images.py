@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
+from ..agreement import ReferenceErrors
 from ..answer import Answer, Localization
 from ..match import MatchOptions, search, vote
 from ..pipeline import Prepared
@@ -68,6 +69,7 @@ class MatchedImage:
         own_covariance: (6, 6) covariance of `own_pose`, order x y z rx ry rz, fixed world axes, metres and radians.
         match: see GroupImage.
         query_matches: matches of the photograph with each reference.
+        reference_error_px: returns the error of a pair of references, see `agreement`; None if it is not known.
     """
 
     image: int
@@ -79,6 +81,7 @@ class MatchedImage:
     own_covariance: Array | None
     match: MatchOptions
     query_matches: tuple[Matches, ...] = ()
+    reference_error_px: ReferenceErrors | None = None
 
     def camera_matches(self, rig_from_camera: RigidTransform) -> CameraMatches:
         """Returns the tracked matches as pixels and points of a camera with this pose in the rig."""
@@ -234,6 +237,7 @@ def tracked_support(prepared: Prepared) -> Support | None:
     query_matches = tuple(correspondences.query_matches)
     sigma = prepared.options.intrinsics
     support = Support(query, references, structure, matches, None, prepared.origin, None, query_matches, sigma)
+    support = replace(support, reference_error_px=correspondences.reference_error_px)
     return support if len(matches) else None
 
 

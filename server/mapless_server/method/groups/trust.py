@@ -29,12 +29,13 @@ from ..trust.evidence import (
     votes_on,
 )
 from ..trust.judge import JudgeOptions, low_trust, trust_of
+from ..trust.references import Supporters, disagreeing_references
 from .generalized import CameraMatches, rig_ransac
 from .images import PosedImage
 
 
 def trust_of_group(matched: Sequence[PosedImage], coverage: float) -> tuple[float, Rejection | None]:
-    """Computes the trust, 0 to 1, and a rejection GATE if it is less than 1 - coverage.
+    """Computes the trust, 0 to 1, and a rejection GATE if it is less than 1 - coverage or the references do not agree.
 
     The photographs have joint poses, and together at least four inliers. The coverage is the share of right answers to
     accept, above 0 and at most 1.
@@ -60,7 +61,15 @@ def trust_of_group(matched: Sequence[PosedImage], coverage: float) -> tuple[floa
         _references_apart(matched, distance_m),
     )
     trust = trust_of(evidence, JudgeOptions())
-    return trust, low_trust(evidence, trust, coverage)
+    supporters = [
+        Supporters(
+            [reference.name for reference in it.source.references],
+            it.inliers_by_reference(),
+            it.source.reference_error_px,
+        )
+        for it in matched
+    ]
+    return trust, disagreeing_references(supporters) or low_trust(evidence, trust, coverage)
 
 
 def _distance_m(matched: Sequence[PosedImage]) -> float:

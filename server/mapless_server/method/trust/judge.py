@@ -49,6 +49,7 @@ from ..views import Matches
 from .cameras import wrong_camera
 from .evidence import Evidence, Votes, evidence_of, votes_of
 from .intrinsics import wrong_intrinsics
+from .references import disagreeing_references, supporters_of
 
 RIVAL_MIN_SHARE, RIVAL_MIN_KEYPOINTS = 0.5, 10
 """Least number of keypoints of a rival, as a share of those of the first pose, and in all. A place with less than half
@@ -166,11 +167,13 @@ def contradiction(
     is_doubted: bool = False,
     unit: str = "m",
 ) -> Rejection | None:
-    """Rejects a pose whose matches contradict the intrinsics or support a second pose, or whose radius is too large.
+    """Rejects a pose whose references, intrinsics or other matches contradict it, or whose radius is too large.
 
     For one that is doubted for lack of evidence see `wrong_camera`.
     """
     assert support.estimate is not None
+    if disagreeing := disagreeing_references([supporters_of(support)]):
+        return disagreeing
     evidence = support.estimate.intrinsics
     best = support.references[int(np.argmax(support.inliers_by_reference()))].name
     wrong = wrong_intrinsics(evidence, best, options.intrinsics) if evidence else None

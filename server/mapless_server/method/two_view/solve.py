@@ -74,7 +74,7 @@ def solve_two_view(
         best = adjusted
     if best.estimate is None or best.inlier_count < MIN_INLIERS:
         return None
-    matched = best.support, tuple(correspondences.query_matches), intrinsics
+    matched = best.support, tuple(correspondences.query_matches), intrinsics, correspondences.reference_error_px
     return Support(query, tuple(references), structure, searched, best.estimate, origin, *matched)
 
 

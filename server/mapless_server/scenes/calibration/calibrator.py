@@ -35,6 +35,7 @@ from mapless_server.store.calibrations import (
     renew,
 )
 
+from ..agreement import SceneAgreements
 from ..indexes import SceneIndexes
 from ..library import Closed, ReferenceLibrary
 from ..observer import BackgroundObserver
@@ -76,16 +77,22 @@ class Calibrator:
         self._max_cpu_s = max_cpu_s
 
     def calibrate(
-        self, scene_key: SceneKey, library: ReferenceLibrary, newest: Sequence[str], pause: Callable[[], None]
+        self,
+        scene_key: SceneKey,
+        library: ReferenceLibrary,
+        newest: Sequence[str],
+        pause: Callable[[], None],
+        contradicts_itself: bool = False,
     ) -> SelfCalibration:
         """Localizes references of a scene, and fits the model to the results.
 
         `newest` are ids of its latest references, the latest first; `pause` is called between the stages of each, and
-        may raise, which ends it. NotFound if there is no such scene (field "scene").
+        may raise, which ends it. In a scene that `contradicts_itself` none are localized: its poses measure nothing.
+        NotFound if there is no such scene (field "scene").
         """
         context = StageContext(pause)
         entries = self._indexes.entries(scene_key, context)
-        sample = self._sample(entries, newest)
+        sample = [] if contradicts_itself else self._sample(entries, newest)
         shared: list[SharedErrors] = []
         results = self._localize(scene_key, entries, library, sample, context, shared)
         found, lens = fit(results, self.kind, entries.generation), lens_contradiction(shared)
@@ -208,9 +215,18 @@ class SceneCalibrations:
     """Calibrates the scenes of a store; for use by one thread."""
 
     def __init__(
-        self, store: Store, calibrator: Calibrator, observer: BackgroundObserver, depths: DepthFinder | None = None
+        self,
+        store: Store,
+        calibrator: Calibrator,
+        observer: BackgroundObserver,
+        depths: DepthFinder | None = None,
+        agreements: SceneAgreements | None = None,
     ) -> None:
-        """The `observer` receives the events; `depths` are those that queries use."""
+        """The `observer` receives the events; `depths` are those that queries use.
+
+        The agreements say which scenes contradict themselves; None knows none.
+        """
+        self._agreements = agreements
         self._depths = depths
         self._store = store
         self._calibrator = calibrator
@@ -274,7 +290,8 @@ class SceneCalibrations:
         newest = list_newest(self._store.database, claim.scene_key, SAMPLE)
         # Of its own, so that references that queries use stay in memory.
         with closing(ReferenceLibrary(self._store.uncached(_CACHE_BYTES), self._depths)) as library:
-            return self._calibrator.calibrate(claim.scene_key, library, newest, pause)
+            is_wrong = self._agreements is not None and self._agreements.known(claim.scene_key).contradicts_itself
+            return self._calibrator.calibrate(claim.scene_key, library, newest, pause, is_wrong)
 
     def _report_failure(self, claim: CalibrationClaim, error: Exception) -> None:
         wait_s = postpone(self._store.database, claim)
