@@ -129,6 +129,26 @@ def read_cameras(file: str | Path) -> dict[Path, Camera]:
     return dict(_photograph(path, index, frame) for index, frame in enumerate(frames))
 
 
+def read_masks(file: str | Path) -> dict[Path, Path]:
+    """The masks of a cameras.json, the field `mask` of frames that have one, by the photograph's path.
+
+    Paths are relative to the file. Errors as of `read_cameras`.
+    """
+    read_cameras(file)
+    path = Path(file)
+    found: dict[Path, Path] = {}
+    content: Any = read_json(read_text(path))
+    for index, frame in enumerate(content["frames"]):
+        mask = frame.get("mask")
+        if mask is None:
+            continue
+        if not isinstance(mask, str) or not mask:
+            raise ValueError(f"{path}: frames[{index}]: mask must be a path, is {shown(mask)}")
+        image = path.parent / with_slashes(path.parent, frame["image"])
+        found[image] = path.parent / with_slashes(path.parent, mask)
+    return found
+
+
 def with_slashes(folder: Path, path: str) -> str:
     """A path from a folder, as a file in it names it: written on Windows, with slashes in place of backslashes.
 

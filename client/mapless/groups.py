@@ -21,6 +21,7 @@ class RigImage:
         rig_from_camera: pose of the camera in the rig, metres, OpenCV's axes; the rig's frame is arbitrary.
         references: the references to use, at most 64; empty: the server chooses.
         priors: priors on this camera's pose; soft ones are terms of the joint estimate.
+        mask: a PNG of the photograph's size, 0 at the pixels to ignore; None: all are used.
     """
 
     image: ImageSource
@@ -28,6 +29,7 @@ class RigImage:
     rig_from_camera: RigidTransform
     references: tuple[str, ...] = ()
     priors: Priors = field(default_factory=Priors)
+    mask: ImageSource | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,7 @@ class SequenceFrame:
         capture_time: time of the photograph, with time zone.
         references: the references to use, at most 64; empty: the server chooses.
         priors: priors on this camera's pose; soft ones are terms of the joint estimate.
+        mask: a PNG of the photograph's size, 0 at the pixels to ignore; None: all are used.
     """
 
     image: ImageSource
@@ -49,6 +52,7 @@ class SequenceFrame:
     capture_time: datetime | None = None
     references: tuple[str, ...] = ()
     priors: Priors = field(default_factory=Priors)
+    mask: ImageSource | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,12 +15,16 @@ ImageSource = bytes | str | os.PathLike[str]
 
 @dataclass(frozen=True, eq=False)
 class NewReference:
-    """A reference to be stored: id within the scene, photograph, its camera and its pose (metric)."""
+    """A reference to be stored: id within the scene, photograph, its camera and its pose (metric).
+
+    The mask, a PNG of the photograph's size or its path, is 0 at the pixels to ignore; None: all are used.
+    """
 
     reference_id: str
     image: ImageSource
     camera: Camera
     world_from_camera: RigidTransform
+    mask: ImageSource | None = None
 
 
 @dataclass(frozen=True)
@@ -62,8 +66,14 @@ def create_request(
             image=read_image(reference.image, f"{field}.image"),
             intrinsics=wire.camera_to_message(reference.camera, f"{field}.camera"),
             world_from_camera=world_from_camera,
+            mask=read_mask(reference.mask, f"{field}.mask"),
         ),
     )
+
+
+def read_mask(mask: ImageSource | None, field: str = "mask") -> bytes | None:
+    """Reads a mask's bytes, None for none; TypeError as `read_image`."""
+    return None if mask is None else read_image(mask, field)
 
 
 def read_image(image: ImageSource, field: str = "image") -> bytes:

@@ -51,6 +51,8 @@ class Reference:
         feature_count: local features found in it; with none it is blank, and nothing can be matched with it.
         create_time: when it was stored, by the server's clock.
         image: the file's bytes, if requested.
+        mask: the bytes of its mask's file, if requested and there is one.
+        mask_sha256: hash of that file, hexadecimal; empty without a mask.
         warnings: contradictions of the scene's datum, direction of gravity and unit and the poses stored in the same
             message, which `add_reference` and `add_references` found, and that the scene contradicts itself, as far as
             that was known; else empty.
@@ -65,6 +67,8 @@ class Reference:
     create_time: datetime
     image: bytes | None = field(default=None, repr=False)
     warnings: tuple[str, ...] = ()
+    mask: bytes | None = field(default=None, repr=False)
+    mask_sha256: str = ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,6 +31,7 @@ def localize(
     options: ConnectOptions | None = None,
     priors: Priors | None = None,
     axes: Axes | str = "",
+    mask: ImageSource | None = None,
     timeout_s: float | None = None,
 ) -> LocalizationResult | Rejected:
     """Localizes a photograph, in one line; `Client.localize` has more options.
@@ -45,6 +46,7 @@ def localize(
         options: options of the connection; None for no encryption, with the token of MAPLESS_TOKEN if it is set.
         priors: knowledge of the pose before the photograph is used, for example its position.
         axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: of `LocalizationResult.in_axes`.
+        mask: a PNG of the photograph's size that is 0 at the pixels to ignore; None: all are used.
         timeout_s: deadline of the call.
 
     Raises:
@@ -52,7 +54,7 @@ def localize(
     """
     client = _client(address or default_address(), options or ConnectOptions(token=os.environ.get(TOKEN_VARIABLE)))
     scene = scene or os.environ.get(SCENE_VARIABLE) or _only_scene(client, timeout_s)
-    return client.localize(image, camera, scene, priors=priors, axes=axes, timeout_s=timeout_s)
+    return client.localize(image, camera, scene, priors=priors, axes=axes, mask=mask, timeout_s=timeout_s)
 
 
 def default_address() -> str:

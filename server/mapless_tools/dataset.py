@@ -10,12 +10,14 @@ from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapless.cameras import with_slashes
 from mapless.geodesy import Datum
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless.scenes import Vector, unit_vector
 from mapless.text_files import read_text
+from mapless_server.images import ImageLimits, decode_mask
 
 MAX_NAME_LENGTH = 128
 SPLITS = ("", "train", "test")
@@ -30,7 +32,8 @@ class Frame:
     """A photograph whose pose is known, in metres, or in the dataset's unit if it is not metric.
 
     Its name is a legal reference id; the EXIF orientation of its file is not to be applied. The split is "train" for
-    frames that a benchmark builds its references from, "test" for its queries, empty if unknown.
+    frames that a benchmark builds its references from, "test" for its queries, empty if unknown. The mask, a PNG of the
+    photograph's size, is 0 at the pixels to ignore; None without one.
     """
 
     name: str
@@ -38,10 +41,18 @@ class Frame:
     camera: Camera
     world_from_camera: RigidTransform
     split: str = ""
+    mask_path: Path | None = None
 
     def __post_init__(self) -> None:
         if self.split not in SPLITS:
             raise ValueError(f"split must be one of {', '.join(map(repr, SPLITS))}, not {self.split!r}")
+
+    def read_ignored(self) -> NDArray[np.bool_] | None:
+        """The ignored pixels, (H, W); None if all are used. InvalidArgument or OSError if the mask is bad."""
+        if self.mask_path is None:
+            return None
+        size = self.camera.width_px, self.camera.height_px
+        return decode_mask(self.mask_path.read_bytes(), size, ImageLimits())
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support.commands import run
 from support.images import encode, textured
@@ -23,6 +24,7 @@ from mapless_tools.ingest.formats import read_dataset
 from mapless_tools.ingest.formats.writing import LAYOUTS, PosedImage, cameras_files
 
 LENSES = (None, RadialTangential(0.1, -0.2, 0.01, 0.02, 0.3), Fisheye(0.1, 0.2, 0.3, 0.4))
+MASK = encode(".png", np.where(textured() > 90, 255, 0).astype(np.uint8))
 ENDINGS = (".png", ".jpg", ".webp")
 
 
@@ -31,7 +33,13 @@ def filled(client: Client) -> Iterator[tuple[str, list[NewReference]]]:
     """A scene of three references: each another lens, another kind of file, ids with what ids may have."""
     scene = f"export-{time.monotonic_ns()}"
     references = [
-        NewReference(f"r.{i}-_A", encode(ending, textured(seed=i)), replace(CAMERA, distortion=lens), truth().poses[i])
+        NewReference(
+            f"r.{i}-_A",
+            encode(ending, textured(seed=i)),
+            replace(CAMERA, distortion=lens),
+            truth().poses[i],
+            MASK if i == 1 else None,
+        )
         for i, (lens, ending) in enumerate(zip(LENSES, ENDINGS, strict=True))
     ]
     client.create_scene(scene)
@@ -52,6 +60,7 @@ def test_an_export_imports_as_the_same_scene(
         frame = frames[reference.reference_id]
         assert frame.image_path.name == reference.reference_id + ending
         assert frame.image_path.read_bytes() == reference.image
+        assert (frame.mask_path and frame.mask_path.read_bytes()) == reference.mask
         assert_same_camera(frame.camera, reference.camera, px=1e-12)
         assert_same_pose(frame.world_from_camera, reference.world_from_camera, 1e-12)
     # Its own importer agrees: there is nothing to add to the scene that it came from.

@@ -22,7 +22,7 @@ from ..groups import (
 from ..messages import answer_from_message, rig_from_message, sequence_from_message
 from ..names import reference_names, scene_name
 from ..priors import Priors, set_priors
-from ..requests import ImageSource, IntrinsicsUncertainty, read_image
+from ..requests import ImageSource, IntrinsicsUncertainty, read_image, read_mask
 from ..v1 import localization_service_pb2 as pb
 
 P = ParamSpec("P")
@@ -51,6 +51,7 @@ async def _localize_request(
     include_debug: bool = False,
     capture_time: datetime | None = None,
     session_from_camera: RigidTransform | None = None,
+    mask: ImageSource | None = None,
     timeout_s: float | None = None,
 ) -> pb.LocalizeRequest:
     """Localizes a photograph: estimates the pose of its camera.
@@ -81,6 +82,8 @@ async def _localize_request(
         capture_time: time of the photograph, with time zone; returned with the answer.
         session_from_camera: the device's own pose at that time; returned with the answer, and used for
             `LocalizationResult.world_from_session`.
+        mask: a PNG of the photograph's size, or its path, that is 0 at the pixels to ignore, which show nothing of the
+            place: the camera's own vehicle, gripper or badge, or people; None: all are used.
         timeout_s: deadline of the call.
     """
     scene = scene_name(scene)
@@ -88,6 +91,7 @@ async def _localize_request(
         scene=scene,
         references=reference_names(scene, references),
         image=await connection.unblocked(read_image, image),
+        mask=await connection.unblocked(read_mask, mask),
         intrinsics=wire.camera_to_message(camera),
         options=_options_to_message(
             variant=wire.enum_value(pb.Variant, variant),
@@ -269,6 +273,9 @@ def _options_to_message(**values: Any) -> pb.LocalizeOptions:
 def _photograph_to_message(message: M, given: RigImage | SequenceFrame, scene: str, field: str) -> M:
     """Sets what the photographs of rigs and of sequences have in common; reads the file. Errors name the field."""
     message.image = read_image(given.image, f"{field}.image")
+    mask = read_mask(given.mask, f"{field}.mask")
+    if mask is not None:
+        message.mask = mask
     message.intrinsics.CopyFrom(wire.camera_to_message(given.camera, f"{field}.camera"))
     message.references.extend(reference_names(scene, given.references))
     set_priors(message, given.priors, f"{field}.priors")

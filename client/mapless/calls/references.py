@@ -16,7 +16,7 @@ from ..messages import read, reference_from_message, scene_from_message
 from ..names import reference_name, reference_names, scene_name, shown
 from ..options import ConnectOptions
 from ..priors import Priors, set_priors
-from ..requests import ImageSource, NewReference, create_request, read_image
+from ..requests import ImageSource, NewReference, create_request, read_image, read_mask
 from ..results import (
     Coverage,
     Reference,
@@ -274,6 +274,7 @@ async def retrieve_references(
     count: int = 0,
     *,
     priors: Priors | None = None,
+    mask: ImageSource | None = None,
     timeout_s: float | None = None,
 ) -> list[RetrievedReference]:
     """Finds the references most similar to a photograph; `localize` chooses among twice as many by feature matches.
@@ -284,11 +285,13 @@ async def retrieve_references(
         scene: the scene to search.
         count: number of references, at most 1000; 0 for the server's default.
         priors: only references near the camera's prior position and heading are considered.
+        mask: a PNG of the photograph's size, 0 at the pixels to ignore; None: all are used.
         timeout_s: deadline of the call.
     """
     request = pb.RetrieveReferencesRequest(
         scene=scene_name(scene),
         image=await connection.unblocked(read_image, image),
+        mask=await connection.unblocked(read_mask, mask),
         intrinsics=wire.camera_to_message(camera),
     )
     wire.set_numbers(request, {"count": count})

@@ -57,9 +57,11 @@ async def stored_reference(wanted: pb.CreateReferenceRequest, connection: Connec
 
 
 def difference(wanted: pb.Reference, stored: Reference) -> str:
-    """What distinguishes two references of one name: "photograph", "intrinsics", "pose"; empty if they are equal."""
+    """What distinguishes references of one name: "photograph", "mask", "intrinsics", "pose"; empty if none does."""
     if stored.image_sha256 != hashlib.sha256(wanted.image).hexdigest():
         return "photograph"
+    if stored.mask_sha256 != (hashlib.sha256(wanted.mask).hexdigest() if wanted.HasField("mask") else ""):
+        return "mask"
     if wire.camera_to_message(stored.camera) != wanted.intrinsics:
         return "intrinsics"
     ours = wire.transform_from_message(wanted.world_from_camera, "").matrix()

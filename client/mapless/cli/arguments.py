@@ -45,6 +45,8 @@ or the JSON of an answer that has a pose.
 
 _COUNT_DEFAULT = "(default: the server's)"
 
+_MASK = "PNG of the photograph's size, 0 where it shows nothing of the place"
+
 _COMMON_DEFAULTS: dict[str, Any] = {
     "json": None,
     "timeout": 30.0,
@@ -276,6 +278,7 @@ def _add_reference(reference: argparse.ArgumentParser) -> None:
     add.add_argument("--id", help="of the reference (default: the file's name without its ending)")
     add.add_argument("--camera", required=True, help="its camera, see `mapless --help`")
     add.add_argument("--pose", required=True, help="its world_from_camera, likewise")
+    add.add_argument("--mask", type=Path, metavar="FILE", help=f"{_MASK}")
     add.set_defaults(run=commands.add_reference)
     listing = actions.add_parser("list", help="all references of a scene")
     listing.add_argument("scene")
@@ -305,6 +308,12 @@ def _add_localize(command: argparse.ArgumentParser) -> None:
     command.add_argument("photo", type=Path, help="or a folder of photographs")
     command.add_argument(
         "--camera", help="the camera of the photographs, see `mapless --help`; not needed with a cameras.json"
+    )
+    command.add_argument(
+        "--mask",
+        type=Path,
+        metavar="FILE",
+        help=f"{_MASK}; or a folder of masks, PHOTO.jpg.png (default: those that the folder's cameras.json names)",
     )
     command.add_argument("--reference", action="append", default=[], help="use this reference; may be repeated")
     command.add_argument(
@@ -353,6 +362,7 @@ def _add_questions(groups: argparse._SubParsersAction[_Command]) -> None:
     retrieve.add_argument("photo", type=Path)
     retrieve.add_argument("--camera", required=True, help="its camera, see `mapless --help`")
     retrieve.add_argument("--count", type=_count, default=0, help=f"how many {_COUNT_DEFAULT}")
+    retrieve.add_argument("--mask", type=Path, metavar="FILE", help=_MASK)
     _add_limits(retrieve)
     retrieve.set_defaults(run=commands.retrieve)
 

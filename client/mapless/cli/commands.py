@@ -125,6 +125,7 @@ def add_reference(client: Client, arguments: argparse.Namespace) -> int:
         image=arguments.photo,
         camera=read_camera(arguments.camera, arguments.photo),
         world_from_camera=read_pose(arguments.pose),
+        mask=arguments.mask,
     )
     stored = client.add_reference(arguments.scene, reference)
     if not stored.feature_count:
@@ -214,7 +215,8 @@ def retrieve(client: Client, arguments: argparse.Namespace) -> int:
     """Finds the references most similar to a photograph."""
     camera = read_camera(arguments.camera, arguments.photo)
     given = limits(arguments)
-    found = client.retrieve_references(arguments.photo, camera, arguments.scene, arguments.count, priors=given)
+    asked = arguments.photo, camera, arguments.scene, arguments.count
+    found = client.retrieve_references(*asked, priors=given, mask=arguments.mask)
     rows = [(it.name.rpartition("/")[2], f"{it.similarity:.3f}", *_position(it.world_from_camera)) for it in found]
     return show(arguments, found, table(("REFERENCE", "SIMILARITY", "X", "Y", "Z"), rows))
 

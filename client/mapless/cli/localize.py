@@ -14,10 +14,11 @@ from typing import Any, TextIO
 import numpy as np
 
 from ..answers import LocalizationResult, Rejected
-from ..cameras import FOLDER_FILE, read_camera, read_cameras, read_pose
+from ..cameras import FOLDER_FILE, read_camera, read_cameras, read_masks, read_pose
 from ..client import Client
 from ..errors import InvalidArgument, MaplessError, NotFound
 from ..geometry import Camera
+from ..masks import find_mask, mask_name
 from ..priors import GeoPositionPrior, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
 from ..report import write_report
 from ..requests import ImageSource, IntrinsicsUncertainty
@@ -26,17 +27,18 @@ from . import output
 from .folder import EXIT_REJECTED, Concurrency, LimitedClient, Outcome, Tally
 
 ENDINGS = frozenset({".jpg", ".jpeg", ".png", ".webp"})
-_FIELDS_OF_PHOTOS = ("image", "intrinsics")
+_FIELDS_OF_PHOTOS = ("image", "intrinsics", "mask")
 _DRAWN_REFERENCES, _SHOWN_REFERENCES = 16, 4
 
 
 @dataclass(frozen=True)
 class Photo:
-    """A photograph to localize, its name in the output, and its camera."""
+    """A photograph to localize, its name in the output, its camera, and its mask, if it has one."""
 
     path: Path
     name: str
     camera: Camera
+    mask: Path | None = None
 
 
 def run(client: Client, arguments: argparse.Namespace) -> int:
@@ -58,8 +60,10 @@ def run(client: Client, arguments: argparse.Namespace) -> int:
 
 def _one(client: Client, arguments: argparse.Namespace) -> int:
     path, given = arguments.photo, arguments.camera
-    photo = Photo(path, path.name, _camera_beside(path) if given is None else read_camera(given, path))
-    answers = _answers(client, photo, photo.path, arguments)
+    camera = _camera_beside(path) if given is None else read_camera(given, path)
+    mask = _listed_mask(path, given) if arguments.mask is None else _found_mask(arguments.mask, path)
+    photo = Photo(path, path.name, camera, mask)
+    answers = _answers(client, photo, photo.path, photo.mask, arguments)
     first = next(answers)  # before the output file is created, which an error would leave empty
     indent = None if arguments.progressive else 2  # of several answers each is a line
     with _opened(arguments.output) as file:
@@ -74,7 +78,12 @@ def _one(client: Client, arguments: argparse.Namespace) -> int:
 
 def _folder(client: Client, arguments: argparse.Namespace) -> int:
     """Localizes a folder: prints a line per photograph, in order; an error of one does not end the others."""
-    photos = photos_of(arguments.photo, arguments.camera)
+    photos = [
+        replace(it, mask=it.mask if arguments.mask is None else find_mask(arguments.mask, _names(it)))
+        for it in photos_of(arguments.photo, arguments.camera)
+    ]
+    if arguments.mask is not None and not any(it.mask for it in photos):
+        raise ValueError(f"{arguments.mask} has a mask of none of the photographs: {mask_name(photos[0].name)} or so")
     names = [photo.name for photo in photos]
     width = max(map(len, names))
     as_json = bool(arguments.output) or output.is_json(arguments)
@@ -114,7 +123,8 @@ def photos_of(folder: Path, camera: str | None) -> list[Photo]:
         cameras = read_cameras(folder / FOLDER_FILE)
         if not cameras:
             raise ValueError(f"{folder / FOLDER_FILE} lists no photographs")
-        return [Photo(path, path.relative_to(folder).as_posix(), its) for path, its in cameras.items()]
+        masks = read_masks(folder / FOLDER_FILE)
+        return [Photo(path, path.relative_to(folder).as_posix(), its, masks.get(path)) for path, its in cameras.items()]
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDINGS)
     if not paths:
         raise ValueError(f"{folder} holds no photographs ({', '.join(sorted(ENDINGS))})")
@@ -127,6 +137,27 @@ def _camera_beside(path: Path) -> Camera:
         if (folder / FOLDER_FILE).is_file():
             return read_camera(folder / FOLDER_FILE, path)
     raise ValueError(f"give --camera, the camera of the photograph: there is no {FOLDER_FILE} beside it")
+
+
+def _listed_mask(path: Path, camera: str | None) -> Path | None:
+    """The mask that a cameras.json names, if the photograph's camera is from one: the one given, or one beside it."""
+    files = [folder / FOLDER_FILE for folder in path.resolve().parents[:2]] if camera is None else [Path(camera)]
+    file = next((it for it in files if it.name == FOLDER_FILE and it.is_file()), None)
+    if file is None:
+        return None
+    return {image.resolve(): mask for image, mask in read_masks(file).items()}.get(path.resolve())
+
+
+def _found_mask(masks: Path, photo: Path) -> Path:
+    found = find_mask(masks, [photo.name])
+    if found is None:
+        raise ValueError(f"{masks} has no mask of {photo.name}: {mask_name(photo.name)}")
+    return found
+
+
+def _names(photo: Photo) -> list[str]:
+    """Paths that a photograph may have in a folder of images: with a cameras.json beside images/, without that."""
+    return list(dict.fromkeys([photo.name, photo.name.removeprefix("images/"), photo.path.name]))
 
 
 def _all(client: Client, photos: list[Photo], arguments: argparse.Namespace) -> Generator[Outcome, None, None]:
@@ -163,21 +194,27 @@ def _concerns_all(error: MaplessError) -> bool:
 
 def _localize(client: Client, photo: Photo, arguments: argparse.Namespace) -> LocalizationResult | Rejected:
     """Returns the final answer; a file that cannot be read is an error of this photograph alone."""
-    try:
-        image = photo.path.read_bytes()
-    except OSError as error:
-        message = f"{photo.path} cannot be read: {error.strerror}"
-        raise InvalidArgument("INVALID_ARGUMENT", message, reason="UNREADABLE_FILE", field="image") from error
-    (answer,) = _answers(client, photo, image, arguments)
+    image = _read(photo.path, "image")
+    mask = None if photo.mask is None else _read(photo.mask, "mask")
+    (answer,) = _answers(client, photo, image, mask, arguments)
     return answer
 
 
+def _read(path: Path, field: str) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        message = f"{path} cannot be read: {error.strerror}"
+        raise InvalidArgument("INVALID_ARGUMENT", message, reason="UNREADABLE_FILE", field=field) from error
+
+
 def _answers(
-    client: Client, photo: Photo, image: ImageSource, arguments: argparse.Namespace
+    client: Client, photo: Photo, image: ImageSource, mask: ImageSource | None, arguments: argparse.Namespace
 ) -> Iterator[LocalizationResult | Rejected]:
     """Yields the answer; with --progressive, a coarse pose may come first."""
     options: dict[str, Any] = {
         "priors": priors(arguments),
+        "mask": mask,
         "intrinsics_uncertainty": intrinsics_uncertainty(arguments),
         "variant": arguments.variant,
         "allow_coarse": arguments.allow_coarse,

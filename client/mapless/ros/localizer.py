@@ -15,6 +15,7 @@ from mapless.errors import MaplessError
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
 from mapless.groups import SequenceFrame, SequenceLocalization
 from mapless.priors import PosePrior, Priors
+from mapless.requests import ImageSource, read_mask
 
 from .cameras import RosCamera
 from .poses import pose_of_body, stamp_ns_of, time_of, transform_from_pose
@@ -56,6 +57,7 @@ class LocalizerOptions:
         timeout_s: deadline of a call.
         sequence_length: largest number of images, 2 to 16, with which an image that is rejected alone is localized
             together, by the odometry between them; 0 for never. This takes as long as localizing all of them.
+        mask: a PNG of the camera's size that is 0 where the camera sees the robot itself, or its path; None for none.
     """
 
     scene: str
@@ -67,6 +69,7 @@ class LocalizerOptions:
     coverage: float = 0.0
     timeout_s: float = 5.0
     sequence_length: int = 0
+    mask: ImageSource | None = None
 
     def __post_init__(self) -> None:
         if not self.scene:
@@ -125,6 +128,7 @@ class Localizer:
     def __init__(self, client: Client, options: LocalizerOptions, lookup: Lookup) -> None:
         self._client = client
         self._options = options
+        self._mask = read_mask(options.mask)
         self._lookup = lookup
         self._lock = threading.Lock()
         self._guess: _Guess | None = None
@@ -183,13 +187,15 @@ class Localizer:
                 priors=priors,
                 coverage=coverage,
                 capture_time=time_of(stamp_ns),
+                mask=self._mask,
                 timeout_s=timeout_s,
             )
             if self._options.sequence_length and odom_from_body is not None:
                 tracked = odom_from_body.compose(extrinsics)
                 # The last answer as a prior of several would be counted several times.
                 own = Priors() if self._options.use_last_pose else priors
-                self._recent.append(SequenceFrame(photo, camera.camera, tracked, time_of(stamp_ns), priors=own))
+                frame = SequenceFrame(photo, camera.camera, tracked, time_of(stamp_ns), priors=own, mask=self._mask)
+                self._recent.append(frame)
                 if isinstance(answer, Rejected) and len(self._recent) > 1:
                     together = self._client.localize_sequence(
                         list(self._recent), self._options.scene, coverage=coverage, timeout_s=timeout_s

@@ -124,7 +124,7 @@ def _call(
 ) -> tuple[float, float, Array | None]:
     image = frame.image_path.read_bytes()
     begin_cpu_s, begin_s = _processor_s(server.process_id), time.perf_counter()
-    answer = client.localize(image, frame.camera, SCENE, priors=priors)
+    answer = client.localize(image, frame.camera, SCENE, priors=priors, mask=frame.mask_path)
     wall_s, cpu_s = time.perf_counter() - begin_s, _processor_s(server.process_id) - begin_cpu_s
     position = answer.world_from_camera.translation if isinstance(answer, LocalizationResult) else None
     return cpu_s, wall_s, position

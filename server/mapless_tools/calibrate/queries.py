@@ -100,6 +100,7 @@ def localize(client: Client, scene: str, query: Query, *, count: int, variant: s
             reference_count=count if query.reranked or not query.references else 0,
             rerank_references=query.reranked,
             ignore_calibration=True,
+            mask=frame.mask_path,
             timeout_s=CONNECT.timeout_s,
         )
     except InvalidArgument as error:
@@ -191,7 +192,7 @@ def _without(client: Client, scene: str, frame: Frame, known: Sequence[Reference
     if not others:
         raise UsageError(f"scene {scene} has no reference but {frame.image_path.name} itself")
     if len(others) > MAX_RERANKED:
-        similar = client.retrieve_references(frame.image_path, frame.camera, scene, MAX_RERANKED)
+        similar = client.retrieve_references(frame.image_path, frame.camera, scene, MAX_RERANKED, mask=frame.mask_path)
         names = (it.name.rpartition("/")[2] for it in similar)
         others = [name for name in names if name not in left_out]
     return Query(frame, tuple(others), reranked=True)

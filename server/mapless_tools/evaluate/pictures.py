@@ -131,7 +131,7 @@ class _Shown:
     @staticmethod
     def of(frame: Frame, matcher: Matcher) -> "_Shown":
         image = decode_image(frame.image_path.read_bytes(), matcher.limits)
-        view = matcher.extractor.extract(image, frame.camera)
+        view = matcher.extractor.extract(image, frame.camera, frame.read_ignored())
         scale = HEIGHT_PX / image.shape[0]
         size = (round(image.shape[1] * scale), HEIGHT_PX)
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)

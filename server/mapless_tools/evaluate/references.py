@@ -87,7 +87,8 @@ def rank_by_matches(
 
     def view_of(frame: Frame) -> View:
         try:
-            return matcher.extractor.extract(decode_image(frame.image_path.read_bytes(), matcher.limits), frame.camera)
+            image = decode_image(frame.image_path.read_bytes(), matcher.limits)
+            return matcher.extractor.extract(image, frame.camera, frame.read_ignored())
         except InvalidArgument as error:
             raise UsageError(f"{frame.image_path}: {error}") from error
 

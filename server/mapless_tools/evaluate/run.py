@@ -68,7 +68,7 @@ def plan_for(dataset: Dataset, options: EvaluationOptions, settings: Settings, p
 def store_references(client: Client, scene: str, references: Sequence[Frame], progress: Progress) -> None:
     """Creates a scene with these references."""
     client.create_scene(scene)
-    new = (NewReference(f.name, f.image_path, f.camera, f.world_from_camera) for f in references)
+    new = (NewReference(f.name, f.image_path, f.camera, f.world_from_camera, f.mask_path) for f in references)
     total = len(references)
     progress("storing references", 0, total)
     client.add_references(scene, new, on_progress=lambda done: progress("storing references", done, total))
@@ -89,6 +89,7 @@ def localize_query(
     """Localizes one query; if it has no references, the server chooses k of those of the scene, given by name."""
     frame = query.frame
     image = frame.image_path.read_bytes()
+    mask = None if frame.mask_path is None else frame.mask_path.read_bytes()
     start_s = time.perf_counter()
     answer = client.localize(
         image,
@@ -98,6 +99,7 @@ def localize_query(
         variant=options.variant,
         scale_strategy=options.scale_strategy,
         reference_count=0 if query.references else options.k,
+        mask=mask,
     )
     latency_ms = 1000 * (time.perf_counter() - start_s)
     return _result(frame, answer, query.references, latency_ms, references)

@@ -13,7 +13,7 @@ from mapless.v1 import localization_service_pb2 as pb
 
 from .guard import Failure, checked_json
 
-FIELDS = ("image", "intrinsics", "scene", "request")
+FIELDS = ("image", "intrinsics", "scene", "request", "mask")
 _MAX_PART_BYTES = 2**20
 
 
@@ -31,6 +31,8 @@ async def read_form(headers: Headers, body: AsyncGenerator[bytes, None], default
         if not value:
             raise Failure("is missing or empty", field=field)
     request.image = parts.get("image", request.image)
+    if "mask" in parts:
+        request.mask = parts["mask"]
     scene = parts["scene"].decode(errors="replace") if "scene" in parts else request.scene or default_scene
     if not scene:
         raise Failure("is missing, and the gateway has none of its own", field="scene")

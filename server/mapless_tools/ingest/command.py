@@ -55,6 +55,10 @@ def import_command(
     scene: Scene,
     format: Annotated[str, typer.Option(help=f"Layout of the folder: {FORMAT_NAMES}.")] = "auto",
     images: Annotated[Path | None, typer.Option(help="Folder of a COLMAP model's images.")] = None,
+    masks: Annotated[
+        Path | None,
+        typer.Option(help="Folder of masks, 0 = ignore: a/1.jpg.png for a/1.jpg, as COLMAP has them; or one for all."),
+    ] = None,
     ground_truth: Annotated[
         Path | None, typer.Option(help="SfM pseudo ground truth of 7-Scenes or 12-Scenes, instead of their own poses.")
     ] = None,
@@ -112,6 +116,7 @@ def import_command(
     try:
         read = ReadOptions(
             images=images,
+            masks=masks,
             ground_truth=ground_truth,
             intrinsics=_intrinsics(intrinsics),
             bag=bag,

@@ -25,6 +25,7 @@ class Stored:
     image_sha256: str
     camera: Camera
     world_from_camera: RigidTransform
+    mask_sha256: str = ""
 
 
 class KnownReferences:
@@ -62,13 +63,24 @@ class KnownReferences:
 
 def stored_of(reference: Reference) -> Stored:
     """What identifies a reference of the server."""
-    return Stored(reference.reference_id, reference.image_sha256, reference.camera, reference.world_from_camera)
+    return Stored(
+        reference.reference_id,
+        reference.image_sha256,
+        reference.camera,
+        reference.world_from_camera,
+        reference.mask_sha256,
+    )
+
+
+_MASKED = {False: "it has no mask", True: "it has a mask"}
 
 
 def difference(there: Stored, new: Stored) -> str:
     """Says in what two references differ besides their ids; empty if they are the same."""
     if there.image_sha256 != new.image_sha256:
         return "its image differs"
+    if there.mask_sha256 != new.mask_sha256:
+        return "its mask differs" if there.mask_sha256 and new.mask_sha256 else _MASKED[bool(there.mask_sha256)]
     return _camera_difference(there.camera, new.camera) or _pose_difference(
         there.world_from_camera, new.world_from_camera
     )

@@ -6,6 +6,8 @@ It can also rescue a damaged store: undamaged references are written.
 from pathlib import Path
 
 from mapless import Client, Reference
+from mapless.masks import FOLDER as MASKS
+from mapless.masks import mask_name
 from mapless_tools.output_files import whole_file
 from mapless_tools.progress import Progress
 
@@ -29,7 +31,8 @@ def export_scene(client: Client, scene: str, folder: Path, layout: str, progress
     """Writes a scene's references into a folder, except damaged ones.
 
     ValueError as in `check_target`, or without references. The layouts `cameras` and `kapture` also have the scene's
-    datum, down and unit. A calibration is not exported, since it holds for this server version only; a backup keeps it.
+    datum, down and unit. Masks are written to masks/, under COLMAP's names. A calibration is not
+    exported, since it holds for this server version only; a backup keeps it.
 
     The description is written last, so a folder without it is an interrupted export. If every reference is damaged,
     nothing is left in the folder.
@@ -48,7 +51,12 @@ def export_scene(client: Client, scene: str, folder: Path, layout: str, progress
         place.mkdir(parents=True, exist_ok=True)
         with whole_file(place / name) as file:
             file.write_bytes(image)
-        return PosedImage(name, reference.camera, reference.world_from_camera)
+        if reference.mask is not None:
+            mask = folder / MASKS / mask_name(name)
+            mask.parent.mkdir(parents=True, exist_ok=True)
+            with whole_file(mask) as file:
+                file.write_bytes(reference.mask)
+        return PosedImage(name, reference.camera, reference.world_from_camera, reference.mask is not None)
 
     known = client.get_scene(scene)
     images, damaged = fetch_all(client, scene, take, progress)

@@ -48,6 +48,8 @@ def fetch_all(
             return None, error.message
         if with_image and hashlib.sha256(reference.image or b"").hexdigest() != reference.image_sha256:
             return None, f"reference {reference.reference_id!r}: the image received is not the one that was stored"
+        if with_image and reference.mask_sha256 and not _is_mask_of(reference):
+            return None, f"reference {reference.reference_id!r}: the mask received is not the one that was stored"
         return take(reference), ""
 
     progress("references", 0, len(references))
@@ -64,6 +66,10 @@ def fetch_all(
     finally:
         threads.shutdown(wait=True, cancel_futures=True)
     return taken, damaged
+
+
+def _is_mask_of(reference: Reference) -> bool:
+    return hashlib.sha256(reference.mask or b"").hexdigest() == reference.mask_sha256
 
 
 def _reference_ids(client: Client, scene: str) -> list[str]:

@@ -156,6 +156,11 @@ def refuse_wrong_images(report: ImportReport) -> None:
         if size != (camera.width_px, camera.height_px):
             reason = f"has {size[0]}x{size[1]} pixels, its camera {camera.width_px}x{camera.height_px}"
             report.refused.append(Refusal(frame.name, f"{frame.image_path.name} {reason}"))
+            continue
+        try:
+            frame.read_ignored()
+        except (OSError, InvalidArgument) as error:
+            report.refused.append(Refusal(frame.name, f"{frame.mask_path}: {error}"))
 
 
 def _store(report: ImportReport, options: ImportOptions, settings: Settings, connection: Connection) -> None:

@@ -16,7 +16,7 @@ from typing import NoReturn
 
 from mapless import Client, NewReference, errors
 from mapless_server.errors import InvalidArgument as BadImage
-from mapless_server.images import image_size
+from mapless_server.images import check_mask, image_size
 from mapless_tools.dataset import Frame, Refusal
 from mapless_tools.progress import Progress
 
@@ -176,5 +176,22 @@ def read_item(frame: Frame) -> Item:
         raise ValueError(f"{file}: {error}") from error
     if (width, height) != (camera.width_px, camera.height_px):
         raise ValueError(f"{file} has {width}x{height} pixels, its camera {camera.width_px}x{camera.height_px}")
-    new = NewReference(frame.name, image, camera, frame.world_from_camera)
-    return new, Stored(frame.name, hashlib.sha256(image).hexdigest(), camera, frame.world_from_camera)
+    mask = _read_mask(frame)
+    digests = [hashlib.sha256(it).hexdigest() if it else "" for it in (image, mask)]
+    new = NewReference(frame.name, image, camera, frame.world_from_camera, mask)
+    return new, Stored(frame.name, digests[0], camera, frame.world_from_camera, digests[1])
+
+
+def _read_mask(frame: Frame) -> bytes | None:
+    """Reads a frame's mask; ValueError if it cannot be the mask of its photograph."""
+    file, camera = frame.mask_path, frame.camera
+    if file is None:
+        return None
+    try:
+        mask = file.read_bytes()
+        check_mask(mask, (camera.width_px, camera.height_px), ANY_SIZE)
+    except OSError as error:
+        raise ValueError(f"{file} cannot be read: {error.strerror}") from error
+    except BadImage as error:
+        raise ValueError(f"{file}: {error}") from error
+    return mask

@@ -38,6 +38,7 @@ PARAMETERS: dict[str, Any] = {
     "coverage": 0.0,
     "timeout": 5.0,
     "sequence_length": 0,
+    "mask": "",
     "compressed": False,
     "rectified": False,
     "publish_tf": True,
@@ -69,6 +70,7 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
             coverage=self._given["coverage"],
             timeout_s=self._given["timeout"],
             sequence_length=self._given["sequence_length"],
+            mask=self._given["mask"] or None,
         )
         self._client = mapless.Client(self._given["address"], self._connect_options())
         self._tf = tf2_ros.Buffer()

@@ -16,21 +16,20 @@ MARGIN_PX = 4.0
 """Keypoints are at least so far from an ignored pixel, in the image that features are found in."""
 
 
-def usable_pixels(ignored: Ignored, width_px: int, height_px: int, margin_px: float = MARGIN_PX) -> NDArray[np.bool_]:
-    """Pixels (height, width) of a reduced image that are further than a margin from every ignored pixel.
+def usable_pixels(ignored: Ignored, width_px: int, height_px: int) -> NDArray[np.bool_]:
+    """Pixels (height, width) of a reduced image that are further than MARGIN_PX from every ignored pixel.
 
     Args:
         ignored: (H, W), of the image at any size.
         width_px: of the reduced image.
         height_px: of the reduced image.
-        margin_px: in pixels of the reduced image.
     """
     shares = cv2.resize(ignored.astype(np.float32), (width_px, height_px), interpolation=cv2.INTER_AREA)
     clear = np.asarray(shares <= 0, np.uint8)  # a pixel that is ignored in part is ignored
     if clear.all():
         return np.ones(clear.shape, bool)
     distance_px = cv2.distanceTransform(clear, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.asarray(distance_px > margin_px, bool)
+    return np.asarray(distance_px > MARGIN_PX, bool)
 
 
 def are_usable(usable: NDArray[np.bool_], pixels: Array) -> NDArray[np.bool_]:

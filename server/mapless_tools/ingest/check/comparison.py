@@ -58,12 +58,12 @@ class Comparison:
     def _view(self, index: int) -> PosedView | None:
         frame = self.frames[index]
         try:
-            image = decode_image(frame.image_path.read_bytes(), LIMITS)
+            image, ignored = decode_image(frame.image_path.read_bytes(), LIMITS), frame.read_ignored()
         except (OSError, InvalidArgument):
             return None
         if image.shape[:2] != (frame.camera.height_px, frame.camera.width_px):
             return None
-        view = self.extractor.extract(image, frame.camera)
+        view = self.extractor.extract(image, frame.camera, ignored)
         return PosedView(str(index), frame.name, view, frame.world_from_camera)
 
     def _posed(self, index: int) -> PosedView:

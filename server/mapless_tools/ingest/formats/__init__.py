@@ -14,6 +14,7 @@ from mapless_tools.dataset import Dataset, printable
 
 from .. import FORMATS
 from .collecting import Intrinsics, KeyframeOptions, ReadOptions
+from .masks import with_masks
 
 __all__ = ["Intrinsics", "KeyframeOptions", "ReadOptions", "fits", "read_dataset", "recognize"]
 
@@ -54,7 +55,12 @@ def read_dataset(path: Path, format: str = "auto", options: ReadOptions | None =
         dataset: Dataset = module.read(path, options or ReadOptions())
     except ValueError as error:
         raise ValueError(printable(str(error))) from error
-    return dataset
+    return _with_masks(dataset, path, options or ReadOptions())
+
+
+def _with_masks(dataset: Dataset, path: Path, options: ReadOptions) -> Dataset:
+    root = path if options.images is None else options.images
+    return dataset if options.masks is None else with_masks(dataset, root, options.masks)
 
 
 def _check_there(path: Path) -> None:

@@ -2,10 +2,11 @@
 
 `cameras.json` holds ``frames``, a list of objects with ``image`` (path from the folder), ``width`` and ``height``,
 ``K`` (3x3, pixels, (0, 0) the centre of the top-left one), ``dist`` (OpenCV's k1 k2 p1 p2 [k3], or null) and
-``world_from_camera`` (4x4, camera axes x right, y down, z forward), perhaps also ``split`` ("train" or "test") and
-``lens`` ("fisheye": dist is then OpenCV's fisheye k1 k2 k3 k4); and beside them ``metric`` (false: the unit of length
-is arbitrary), ``source``, ``ground_truth``, ``datum`` (where the world is on the Earth, `mapless.geodesy.Datum`:
-``latitude_deg``, ``longitude_deg``, ``height_m``, perhaps ``enu_from_world`` with ``x y z w``) and ``down_in_world``.
+``world_from_camera`` (4x4, camera axes x right, y down, z forward), perhaps also ``split`` ("train" or "test"),
+``lens`` ("fisheye": dist is then OpenCV's fisheye k1 k2 k3 k4) and ``mask`` (path of a PNG that is 0 at the pixels to
+ignore); and beside them ``metric`` (false: the unit of length is arbitrary), ``source``, ``ground_truth``, ``datum``
+(where the world is on the Earth, `mapless.geodesy.Datum`: ``latitude_deg``, ``longitude_deg``,
+``height_m``, perhaps ``enu_from_world`` with ``x y z w``) and ``down_in_world``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -93,4 +94,4 @@ def add_frame(collector: Collector, entry: Any, names: Mapping[Path, str] = Mapp
     if not (camera.focal_x_px > 0 and camera.focal_y_px > 0):
         raise ValueError(f"K: focal lengths must be above 0, are {camera.focal_x_px:g} and {camera.focal_y_px:g}")
     file = collector.image(image)
-    collector.add(image, camera, pose, entry.get("split", ""), names.get(file, file.stem))
+    collector.add(image, camera, pose, entry.get("split", ""), names.get(file, file.stem), entry.get("mask"))

@@ -64,6 +64,8 @@ class ReadOptions:
 
     Attributes:
         images: folder of the images, if it is not the layout's usual one; only for `colmap`.
+        masks: folder of masks under COLMAP's names, "a/1.jpg.png" of "a/1.jpg", or a mask of all images; None for those
+            that the layout itself names.
         ground_truth: poses that replace the layout's own: a file or folder of SfM pseudo ground truth, for `7scenes`
             and `12scenes`.
         intrinsics: for layouts without them (`7scenes`, `tum`, recordings); None for the layout's usual ones.
@@ -71,6 +73,7 @@ class ReadOptions:
     """
 
     images: Path | None = None
+    masks: Path | None = None
     ground_truth: Path | None = None
     intrinsics: Intrinsics | None = None
     bag: BagOptions = field(default_factory=BagOptions)
@@ -112,11 +115,17 @@ class Collector:
         return file
 
     def add(
-        self, image: str, camera: Camera, world_from_camera: RigidTransform, split: str = "", name: str = ""
+        self,
+        image: str,
+        camera: Camera,
+        world_from_camera: RigidTransform,
+        split: str = "",
+        name: str = "",
+        mask: str | None = None,
     ) -> None:
         """Adds a frame; ValueError names what is wrong.
 
-        The image is a path from the folder. The frame's id is made from `name`, or else from that path
+        Image and mask are paths from the folder. The frame's id is made from `name`, or else from the image's path
         without its ending.
         """
         file = self.image(image)
@@ -126,9 +135,19 @@ class Collector:
         # The folders belong to the id: sequences count their frames from 0, each of them.
         parts = PurePosixPath(name or file.relative_to(self.folder).with_suffix("")).parts
         identifier = legal_id("_".join(parts), self._ids)
-        self.frames.append(Frame(identifier, file, camera, world_from_camera, split))
+        self.frames.append(Frame(identifier, file, camera, world_from_camera, split, self._mask(mask)))
         self._ids.add(identifier)
         self._images.add(file)
+
+    def _mask(self, mask: str | None) -> Path | None:
+        if mask is None:
+            return None
+        if not isinstance(mask, str) or not mask:
+            raise ValueError(f"mask: must be a path, is {mask!r}")
+        try:
+            return image_file(self.folder, mask)
+        except ValueError as error:
+            raise ValueError(f"mask: {str(error).removeprefix('image: ')}") from None
 
     def dataset(self, name: str, layout: str, *, metric: bool, source: str = "", ground_truth: str = "") -> Dataset:
         """Makes the dataset of all added frames; ValueError if there is none."""

@@ -19,10 +19,12 @@ from pathlib import Path
 from typing import Any
 
 from mapless.geometry import RigidTransform
+from mapless.masks import FOLDER as MASKS
 from mapless_tools.dataset import Dataset, finite_numbers, read_place
 
 from .collecting import Collector, ReadOptions, filled_lines, rotation_of, text_lines
 from .colmap.cameras import PARAMETERS, ColmapCamera
+from .masks import with_own_masks
 
 PROPERTIES = "# mapless: "
 """Begins a comment of our own exports in sensors.txt: what kapture has no field for, as JSON."""
@@ -61,6 +63,7 @@ def read(path: Path, options: ReadOptions) -> Dataset:
             collector.add(image, cameras[sensor].camera(), poses.world_from_device(timestamp, sensor))
     is_metric = is_capture or bool(properties.get("metric", False))
     dataset = collector.dataset(path.resolve().name, "kapture", metric=is_metric, source=f"kapture {path.name}")
+    dataset = with_own_masks(dataset, collector.folder, path / MASKS)  # of our own exports
     datum, down = read_place(tables / "sensors.txt", properties)
     return replace(dataset, datum=datum, down_in_world=down)
 

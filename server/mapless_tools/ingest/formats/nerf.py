@@ -3,7 +3,8 @@
 Read are `frames`, each with `file_path` (with or without ending) and `transform_matrix` (world_from_camera with
 OpenGL's camera axes); in a frame or for all, `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`, `camera_angle_x`, `camera_angle_y`,
 `camera_model`, `is_fisheye`, k1 to k4, p1 and p2; and for all `applied_transform` and `applied_scale`, which are
-undone, and `train_filenames`, `val_filenames`, `test_filenames`.
+undone, and `train_filenames`, `val_filenames`, `test_filenames`. A frame's `mask_path` is its mask: black pixels are
+ignored, as in nerfstudio.
 
 Pixels: nerfstudio shoots the ray of pixel (0, 0) through (0.5, 0.5), so principal points count from the corner.
 """
@@ -59,7 +60,10 @@ def _read_file(file: Path, split: str, collector: Collector) -> None:
             image = _image(collector, frame)
             pose = _world_from_camera(frame, scale, transform)
             camera = _camera(collector, image, content | frame)
-            collector.add(image, camera, pose, splits.get(str(frame["file_path"]), split))
+            mask = frame.get("mask_path")
+            if isinstance(mask, str):
+                mask = with_slashes(collector.folder, mask)
+            collector.add(image, camera, pose, splits.get(str(frame["file_path"]), split), mask=mask)
 
 
 def _image(collector: Collector, frame: Mapping[str, Any]) -> str:

@@ -9,6 +9,8 @@ from mapless import Scene
 from mapless.cameras import FOLDER_FILE
 from mapless.geometry import Camera, RigidTransform
 from mapless.lenses import DEFAULT_LENS_MODEL, lens_model_of
+from mapless.masks import FOLDER as MASKS
+from mapless.masks import mask_name
 
 from .colmap.cameras import from_camera
 from .kapture import PROPERTIES
@@ -18,11 +20,15 @@ IMAGES = "images"
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """An image that is stored under `name` in the layout's folder of images, with its camera and pose."""
+    """An image that is stored under `name` in the layout's folder of images, with its camera and pose.
+
+    If it `has_mask`, that is stored in the folder `mapless.masks.FOLDER` under COLMAP's name.
+    """
 
     name: str
     camera: Camera
     world_from_camera: RigidTransform
+    has_mask: bool = False
 
 
 Describe = Callable[..., dict[str, str]]
@@ -122,6 +128,8 @@ def _entry(image: PosedImage) -> dict[str, Any]:
         "dist": None if lens is None else list(vars(lens).values()),
         "world_from_camera": image.world_from_camera.matrix().tolist(),
     }
+    if image.has_mask:
+        entry["mask"] = f"{MASKS}/{mask_name(image.name)}"
     model = DEFAULT_LENS_MODEL if lens is None else lens_model_of(lens)
     return entry if model == DEFAULT_LENS_MODEL else entry | {"lens": model}
 

@@ -14,9 +14,11 @@ import numpy as np
 
 from mapless.cameras import with_slashes
 from mapless.geometry import Array, Camera, Quaternion, RigidTransform
+from mapless.masks import FOLDER as MASKS
 from mapless_tools.dataset import Dataset
 
 from ..collecting import Collector, ReadOptions, natural_order, text_lines
+from ..masks import with_own_masks
 from .cameras import ColmapCamera
 from .files import ImageRecord, announced, read_cameras, read_images
 
@@ -138,9 +140,10 @@ def read(path: Path, options: ReadOptions) -> Dataset:
     for name, reason in model.refused:
         with collector.attempt(name):
             raise ValueError(reason)
-    return collector.dataset(
+    dataset = collector.dataset(
         path.resolve().name, "colmap", metric=False, source=f"COLMAP model {folders[0]}", ground_truth="SfM (COLMAP)"
     )
+    return with_own_masks(dataset, images, images.parent / MASKS)
 
 
 def _images_folder(path: Path, model_folder: Path, model: Model, given: Path | None) -> Path:
