@@ -60,10 +60,8 @@ def _read_file(file: Path, split: str, collector: Collector) -> None:
             image = _image(collector, frame)
             pose = _world_from_camera(frame, scale, transform)
             camera = _camera(collector, image, content | frame)
-            mask = frame.get("mask_path")
-            if isinstance(mask, str):
-                mask = with_slashes(collector.folder, mask)
-            collector.add(image, camera, pose, splits.get(str(frame["file_path"]), split), mask=mask)
+            its_split = splits.get(str(frame["file_path"]), split)
+            collector.add(image, camera, pose, its_split, mask=frame.get("mask_path"))
 
 
 def _image(collector: Collector, frame: Mapping[str, Any]) -> str:
