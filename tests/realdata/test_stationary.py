@@ -1,0 +1,19 @@
+"""What poses predict at the same pixels is kept: on a drive, where nothing is fixed to the camera."""
+
+from collections.abc import Callable
+
+import pytest
+from research.evidence.stationary import DRIVE, clean, ignored_share, windows
+
+from mapless_server.method.features import SiftExtractor
+from mapless_server.method.stationary import StationaryOptions
+from mapless_tools.dataset import Dataset
+
+from .conftest import DATA
+
+pytestmark = [pytest.mark.realdata, pytest.mark.nightly]
+
+
+def test_a_drive_keeps_its_far_points(photographs: Callable[[str], Dataset]) -> None:
+    photographs(DRIVE)
+    assert ignored_share(windows(clean(DATA, DRIVE, SiftExtractor())), StationaryOptions()) <= 0.01
