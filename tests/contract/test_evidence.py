@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
+
 from research.evidence.page import PAGES
 
 STATED = re.compile(r"`([\w.]+):([\w.]+)` = `([^`]+)`")

@@ -3,11 +3,11 @@
 from collections.abc import Callable
 
 import pytest
-from research.evidence.stationary import DRIVE, clean, ignored_share, windows
 
 from mapless_server.method.features import SiftExtractor
 from mapless_server.method.stationary import StationaryOptions
 from mapless_tools.dataset import Dataset
+from research.evidence.stationary import DRIVE, clean, ignored_share, windows
 
 from .conftest import DATA
 
