@@ -9,6 +9,7 @@ import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import cast
 
 import pytest
 import yaml  # type: ignore[import-untyped]
@@ -43,7 +44,8 @@ class Registry(BaseHTTPRequestHandler):
         code = 401 if not is_known else 404 if name == self.absent else 200
         self.send_response(code)
         if code == 401:
-            realm = f"http://127.0.0.1:{self.server.server_address[1]}/token"
+            _, port = cast("tuple[str, int]", self.server.server_address)
+            realm = f"http://127.0.0.1:{port}/token"
             self.send_header(
                 "WWW-Authenticate", f'Bearer realm="{realm}",service="test",scope="repository:{name}:pull"'
             )

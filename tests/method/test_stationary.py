@@ -218,13 +218,15 @@ def image_of(frame: Frame) -> Image:
 
 
 def photographed(image: Image, camera: Camera, carried: Overlay, number: int) -> View:
-    return SiftExtractor().extract(carried(cv2.resize(image, SIZE), number)[0], camera.resized(*SIZE))
+    return SiftExtractor().extract(
+        carried(np.asarray(cv2.resize(image, SIZE), np.uint8), number)[0], camera.resized(*SIZE)
+    )
 
 
 @pytest.mark.parametrize("case", range(2))
 def test_elsewhere_with_the_same_overlay_is_not_localized(room: list[PosedView], carried: Overlay, case: int) -> None:
     shapes = random_for("shapes", case).integers(0, 256, (24, 32, 3)).astype(np.uint8)
-    image = cv2.resize(shapes, SIZE, interpolation=cv2.INTER_NEAREST)
+    image = np.asarray(cv2.resize(shapes, SIZE, interpolation=cv2.INTER_NEAREST), np.uint8)
     query = photographed(image, REFERENCE_CAMERA, carried, 100 + case)
     assert isinstance(ask(query, room, StationaryOptions()), Rejection)
 

@@ -21,9 +21,10 @@ from support.waiting import wait_until
 
 from mapless_server.errors import Unavailable
 from mapless_server.method import correspond, matching, nearest
-from mapless_server.method.correspond import Matcher, in_order
+from mapless_server.method.correspond import Matcher
 from mapless_server.method.matching import CorrespondOptions, PairMatching, StoredPair
 from mapless_server.method.options import StageContext
+from mapless_server.method.pairs import in_order
 from mapless_server.method.views import Features, Matches, PosedView, View
 from mapless_server.scenes import background
 from mapless_server.scenes.background import BackgroundMatching, BackgroundOptions

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from functools import partial
 
 from mapless_server.errors import DataLoss, NotFound
-from mapless_server.method.correspond import in_order
 from mapless_server.method.matching import StoredPair
 from mapless_server.method.options import StageContext, check_bounds
+from mapless_server.method.pairs import in_order
 from mapless_server.method.views import PosedView
 from mapless_server.store import Store
 from mapless_server.store.compaction import compact_features
