@@ -148,8 +148,8 @@ async def main(arguments: argparse.Namespace) -> None:
                     continue
                 found = await examine(engine, store, sample, change, f"scene-{i}")
                 counts = (found.outcomes[it] for it in ("right", "wrong", "advised", "rejected"))
-                cells = sample.name, reading, len(sample.references), found.said_at or "-"
-                cells = *cells, f"{found.agreeing}/{found.pairs}", *counts, f"{found.cpu_s:.1f}"
+                cells: list[object] = [sample.name, reading, len(sample.references), found.said_at or "-"]
+                cells += [f"{found.agreeing}/{found.pairs}", *counts, f"{found.cpu_s:.1f}"]
                 print("| " + " | ".join(map(str, cells)) + " |", flush=True)
                 if arguments.verbose:
                     print(f"<!-- {found.text} -->", flush=True)

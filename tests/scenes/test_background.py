@@ -108,7 +108,7 @@ class Server:
         """By the references' names, of all pairs that are stored."""
         name_of = {it.key: it.name.rpartition("/")[2] for it in self.references()}
         found = self.pairs.load(self.name(wide), [(a, b) for a in name_of for b in name_of])
-        return {(name_of[a], name_of[b]): it and it.matches for (a, b), it in found.items()}
+        return {(name_of[a], name_of[b]): None if it is None else it.matches for (a, b), it in found.items()}
 
 
 @pytest.fixture

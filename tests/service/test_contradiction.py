@@ -1,6 +1,6 @@
 """A scene whose poses are of OpenGL's axes, or inverse, through a server: it is said, and no pose is answered."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ FRAMES = read_folder(Path(mapless_tools.demo.__file__).parent / "room").frames
 REFERENCES = [it for it in FRAMES if "query" not in it.name][:5]
 QUERIES = [it for it in FRAMES if "query" in it.name][:2]
 PATIENT_S = 120.0
-READINGS = {
+READINGS: dict[str, Callable[[RigidTransform], RigidTransform]] = {
     "right": lambda pose: pose,
     "opengl": lambda pose: RigidTransform(pose.rotation @ np.diag([1.0, -1.0, -1.0]), pose.translation),
     "inverse": lambda pose: pose.inverse(),

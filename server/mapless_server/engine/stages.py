@@ -385,9 +385,8 @@ class QueryStages:
             answer = replace(answer, outcome=without_agreement(supporters_of(answer.support)) or answer.outcome)
         if isinstance(answer.outcome, Rejection):
             answer = hinted(answer, run.view, run.references, is_searched(run) and not narrowing.is_empty)
-            if run.attributes.contradiction:
-                rejection = with_contradiction(answer.outcome, run.attributes.contradiction)
-                answer = replace(answer, outcome=rejection)
+        if run.attributes.contradiction and isinstance(answer.outcome, Rejection):
+            answer = replace(answer, outcome=with_contradiction(answer.outcome, run.attributes.contradiction))
         seconds = run.context.stage_seconds | answer.stage_seconds
         if run.best is not None:
             seconds = run.best.seconds_with({f"{tier.features}/{name}": it for name, it in seconds.items()})

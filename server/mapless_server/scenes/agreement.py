@@ -19,9 +19,10 @@ import numpy as np
 
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.method.agreement import MAX_ERROR_PX, consistent_matches
-from mapless_server.method.correspond import Matcher, in_order
+from mapless_server.method.correspond import Matcher
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import StageContext
+from mapless_server.method.pairs import in_order
 from mapless_server.method.readings import MatchedPair, explain
 from mapless_server.method.views import PosedView
 from mapless_server.security import SceneKey

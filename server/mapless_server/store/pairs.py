@@ -173,9 +173,14 @@ class PairStore:
         with self._database.write() as connection:
             present = _locked(connection, {claim.key, *(key for pair in made for key in pair)})
             for pair in sorted(pair for pair in data if present.issuperset(pair)):
-                row = {"first_key": pair[0], "second_key": pair[1], "matching": matching, "data": data[pair]}
-                row["error_px"] = made[pair].error_px
-                row["sha256"] = codec.sha256_for(_owner(matching, pair, made[pair].error_px), data[pair])
+                row = {
+                    "first_key": pair[0],
+                    "second_key": pair[1],
+                    "matching": matching,
+                    "data": data[pair],
+                    "error_px": made[pair].error_px,
+                    "sha256": codec.sha256_for(_owner(matching, pair, made[pair].error_px), data[pair]),
+                }
                 queries.insert_new(connection, reference_pair, row)
             due_us = None if is_complete else rows.now_us()
             connection.execute(_of_claim(matching, claim).values(due_time_us=due_us, failure_count=0))
