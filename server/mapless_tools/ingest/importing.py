@@ -39,6 +39,9 @@ from .report import (
 )
 from .upload import Uploader
 
+MUCH_IGNORED = 0.8
+"""Share of a photograph: a mask that ignores more is most likely inverted."""
+
 
 @dataclass(frozen=True)
 class ImportOptions:
@@ -104,6 +107,7 @@ def run_import(
     with terminable(), _reported(report, report_file):
         if options.check:
             with progress_bars() as progress:
+                _warn(report, [much_ignored(frames)])
                 report.verdict = check_frames(frames, progress)
             for line in verdict_lines(report.verdict, frames):
                 _print(line)
@@ -135,6 +139,21 @@ def read_frames(folder: Path, options: ImportOptions) -> tuple[Dataset, tuple[Fr
         step = len(frames) / options.max_count
         frames = [frames[int(i * step)] for i in range(options.max_count)]
     return dataset, tuple(_prefixed(frame, options.id_prefix) for frame in frames)
+
+
+def much_ignored(frames: Sequence[Frame]) -> str:
+    """A warning if the first mask ignores most of its photograph, as an inverted one does; empty otherwise."""
+    masked = next((frame for frame in frames if frame.mask_path is not None), None)
+    try:
+        ignored = None if masked is None else masked.read_ignored()
+    except (OSError, InvalidArgument):  # refused by name, where it is read
+        return ""
+    if masked is None or ignored is None or ignored.mean() <= MUCH_IGNORED:
+        return ""
+    return (
+        f"the mask {masked.mask_path} ignores {100 * ignored.mean():.0f} % of {masked.name}: 0 means ignore, every "
+        "other value use; is it inverted?"
+    )
 
 
 def leave_same_poses(report: ImportReport, verdict: Verdict) -> None:
