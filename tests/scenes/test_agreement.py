@@ -1,10 +1,18 @@
 """Whether a scene contradicts itself, from the errors of its pairs."""
 
+import threading
+import time
+from collections.abc import Iterator
 from itertools import combinations
+from typing import Any, cast
 
 import pytest
 
-from mapless_server.scenes.agreement import Agreement, agreement_of
+from mapless_server.method.correspond import make_matcher
+from mapless_server.method.features import SiftExtractor
+from mapless_server.scenes.agreement import Agreement, SceneAgreements, agreement_of
+from mapless_server.security import SceneKey
+from mapless_server.store import Store
 
 GOOD, BAD = 0.4, 60.0
 
@@ -51,3 +59,86 @@ def test_two_sessions_with_worlds_of_their_own_are_found() -> None:
     assert agreement_of(worlds | between("a", "b", 3, BAD) | {("a0", "b0"): GOOD}).group_sizes == (9, 7)
     assert agreement_of(worlds | between("a", "b", 3, GOOD)) == Agreement(66, 66, GOOD)
     assert agreement_of(worlds).group_sizes == ()
+
+
+def test_large_scenes_that_disagree_are_grouped_in_linear_time() -> None:
+    pairs = {(f"{i:05}", f"{i + 1:05}"): BAD for i in range(20_000)}
+    begin_s = time.thread_time()
+    assert agreement_of(pairs).contradicts_itself
+    assert time.thread_time() - begin_s < 3.0
+
+
+class Counts(dict[str, int]):
+    """The observer's last figures by name."""
+
+    def waiting(self, what: str, count: int) -> None:
+        self[what] = count
+
+
+class Pairs:
+    """Stored errors of a scene's pairs, which are read when they may be."""
+
+    def __init__(self) -> None:
+        self.errors_px = session("a", 8, BAD)
+        self.may_read = threading.Event()
+        self.may_read.set()
+        self.reads = 0
+
+    def list_errors(self, *_: object) -> dict[tuple[str, str], float]:
+        self.reads += 1
+        assert self.may_read.wait(10)
+        return self.errors_px
+
+
+HALL = SceneKey("hall")
+
+
+class TestScenes:
+    @pytest.fixture
+    def counts(self) -> Counts:
+        return Counts()
+
+    @pytest.fixture
+    def pairs(self) -> Pairs:
+        return Pairs()
+
+    @pytest.fixture
+    def agreements(
+        self, counts: Counts, pairs: Pairs, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+    ) -> Iterator[SceneAgreements]:
+        nothing: Any = None
+        matcher = make_matcher("sift")
+        with Store.open(tmp_path) as store:
+            made = SceneAgreements(store, nothing, nothing, SiftExtractor(), matcher, cast(Any, counts))
+            monkeypatch.setattr(made, "_pairs", pairs)
+            monkeypatch.setattr(made, "_explain", lambda *_: "")
+            yield made
+            made.close()
+        matcher.close()
+
+    def test_contradicting_scenes_are_counted_until_they_are_deleted(
+        self, agreements: SceneAgreements, counts: Counts
+    ) -> None:
+        assert agreements.current(HALL).contradicts_itself
+        assert counts == {"contradicting_scenes": 1}
+        agreements.forget_scene(HALL)
+        assert counts == {"contradicting_scenes": 0}
+
+    def test_a_scene_that_is_deleted_meanwhile_is_not_counted(
+        self, agreements: SceneAgreements, counts: Counts, pairs: Pairs
+    ) -> None:
+        pairs.may_read.clear()
+        update = agreements.touch(HALL)
+        assert update is not None
+        agreements.forget_scene(HALL)
+        pairs.may_read.set()
+        update.result(10)
+        assert counts == {"contradicting_scenes": 0}
+
+    def test_pairs_that_take_long_to_read_are_read_seldom(self, agreements: SceneAgreements, pairs: Pairs) -> None:
+        agreements.current(HALL)
+        agreements.current(HALL)
+        assert pairs.reads == 1
+        agreements.changed(HALL)
+        agreements.current(HALL)
+        assert pairs.reads == 2

@@ -7,9 +7,10 @@ start when it is first asked for.
 """
 
 import logging
+import math
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -49,9 +50,12 @@ GROWTH = 1.5
 
 READ_PAIRS = 20_000
 EXPLAINED_PAIRS = 24
-STALE_S = 2.0
+STALE_S, REST_FACTOR = 2.0, 50.0
+"""What is known of a scene is derived again after so long, and after so many times what reading its pairs took: 20,000
+take a tenth of a second, which queries would have to share."""
+LONGEST_WAIT_S = 3.0
+"""For what must be computed, by who asks for the agreement as it is now."""
 _KNOWN_SCENES = 10_000
-_LONGEST_WAIT_S = 3.0
 
 
 @dataclass(frozen=True)
@@ -145,25 +149,10 @@ def _two_worlds(errors_px: Mapping[Pair, float]) -> tuple[int, ...]:
 def _grouped(links: Mapping[str, Mapping[str, int]]) -> dict[str, int]:
     """Groups of references: each is in the group with which most of its pairs agree, by so many votes more than not."""
     group: dict[str, int] = {}
-    begin = max(links, key=lambda key: (sum(links[key].values()), key))
-    waiting, order = [begin], [begin]
-    seen = {begin}
-    left = sorted(links)
-    while len(order) < len(links):  # along pairs that agree, as far as these lead
-        if not waiting:
-            waiting = [next(key for key in left if key not in seen)]
-            seen.add(waiting[0])
-            order.append(waiting[0])
-            continue
-        key = waiting.pop(0)
-        for other in sorted(links[key]):
-            if links[key][other] > 0 and other not in seen:
-                seen.add(other)
-                order.append(other)
-                waiting.append(other)
+    order = _along_agreeing(links)
     for _ in range(3):
         before = dict(group)
-        for key in order:
+        for number, key in enumerate(order):
             votes: dict[int, int] = {}
             for other, vote in links[key].items():
                 if other in group and other != key:
@@ -172,17 +161,35 @@ def _grouped(links: Mapping[str, Mapping[str, int]]) -> dict[str, int]:
             if best >= 0 and votes[best] > 0:
                 group[key] = best
             elif key not in group:
-                group[key] = len(order) + order.index(key)
+                group[key] = len(order) + number
         if group == before:
             break
     return group
+
+
+def _along_agreeing(links: Mapping[str, Mapping[str, int]]) -> list[str]:
+    """All references, along pairs that agree as far as these lead, from the one with the most of them on."""
+    begin = max(links, key=lambda key: (sum(links[key].values()), key))
+    waiting, order, seen = deque([begin]), [begin], {begin}
+    left = iter(sorted(links))
+    while len(order) < len(links):
+        if waiting:
+            key = waiting.popleft()
+            found = [other for other in sorted(links[key]) if links[key][other] > 0 and other not in seen]
+        else:
+            found = [next(key for key in left if key not in seen)]
+        seen.update(found)
+        order += found
+        waiting += found
+    return order
 
 
 @dataclass(eq=False)
 class _Known:
     """What is known of a scene: errors of sampled pairs, the references that were sampled, and the last result.
 
-    `sampled_size` is the number of its references when they were sampled.
+    `sampled_size` is the number of its references when they were sampled; before `rests_until_s`, by `time.monotonic`,
+    nothing is derived again.
     """
 
     errors_px: dict[Pair, float] = field(default_factory=dict)
@@ -190,7 +197,7 @@ class _Known:
     sampled_size: int = 0
     agreement: Agreement | None = None
     explained_pairs: int = 0
-    read_s: float = float("-inf")
+    rests_until_s: float = -math.inf
     update: "Future[None] | None" = None
 
 
@@ -226,29 +233,29 @@ class SceneAgreements:
     def known(self, scene_key: SceneKey) -> Agreement:
         """The agreement as last computed, without waiting; brings it up to date in the background."""
         self.touch(scene_key)
-        return self._known(scene_key).agreement or Agreement()
+        return self._agreement(scene_key)
 
     def current(self, scene_key: SceneKey) -> Agreement:
         """The agreement as it is now; waits some seconds at most for what must be computed."""
         update = self.touch(scene_key)
         if update is not None:
             with suppress(TimeoutError):
-                update.result(_LONGEST_WAIT_S)
-        return self._known(scene_key).agreement or Agreement()
+                update.result(LONGEST_WAIT_S)
+        return self._agreement(scene_key)
 
     def touch(self, scene_key: SceneKey) -> "Future[None] | None":
         """Brings the agreement of a scene up to date in the background, unless that was done a moment ago."""
         with self._guard:
             known = self._known(scene_key)
             is_running = known.update is not None and not known.update.done()
-            if not is_running and not self._closing.is_set() and time.monotonic() - known.read_s >= STALE_S:
+            if not is_running and not self._closing.is_set() and time.monotonic() >= known.rests_until_s:
                 known.update = self._thread.submit(self._update, scene_key, known)
             return known.update
 
     def changed(self, scene_key: SceneKey) -> None:
         """Brings the agreement up to date in the background, however recent it is: references were added."""
         with self._guard:
-            self._known(scene_key).read_s = float("-inf")
+            self._known(scene_key).rests_until_s = -math.inf
         self.touch(scene_key)
 
     def forget_references(self, keys: Collection[str]) -> None:
@@ -259,7 +266,7 @@ class SceneAgreements:
                 for pair in [it for it in known.errors_px if not gone.isdisjoint(it)]:
                     del known.errors_px[pair]
                 known.sampled -= gone
-                known.read_s = float("-inf")
+                known.rests_until_s = -math.inf
 
     def forget_scene(self, scene_key: SceneKey) -> None:
         """Drops what is known of a deleted scene."""
@@ -274,10 +281,16 @@ class SceneAgreements:
             self.touch(scene_key)
 
     def _known(self, scene_key: SceneKey) -> _Known:
+        """What is known of a scene, for a change; with the guard."""
         return self._scenes.setdefault(scene_key, _Known())
 
+    def _agreement(self, scene_key: SceneKey) -> Agreement:
+        with self._guard:
+            known = self._scenes.get(scene_key)
+        return (known and known.agreement) or Agreement()
+
     def _update(self, scene_key: SceneKey, known: _Known) -> None:
-        known.read_s = time.monotonic()
+        known.rests_until_s = time.monotonic() + STALE_S
         try:
             self._derive(scene_key, known)
         except NotFound:
@@ -288,8 +301,13 @@ class SceneAgreements:
             log.warning("the pairs of scene %s could not be compared with its poses: %s", scene_key, error)
 
     def _derive(self, scene_key: SceneKey, known: _Known) -> None:
+        begin_s = time.monotonic()
         stored = self._pairs.list_errors(self._matching, scene_key, READ_PAIRS)
         found = agreement_of(self._with_kept(known, stored))
+        with self._guard:
+            if known.rests_until_s > begin_s:  # nothing has changed meanwhile
+                took_s = time.monotonic() - begin_s
+                known.rests_until_s = max(known.rests_until_s, begin_s + REST_FACTOR * took_s)
         # Known before it is explained, which takes a second or two.
         self._settle(scene_key, known, found)
         if len(stored) < ENOUGH_PAIRS:
@@ -315,10 +333,12 @@ class SceneAgreements:
         before = known.agreement or Agreement()
         if found.contradicts_itself and not found.explanation:
             found = replace(found, explanation=before.explanation)
-        known.agreement = found
+        with self._guard:
+            known.agreement = found
+            if self._scenes.get(scene_key) is not known:  # deleted meanwhile
+                return
+            (self._contradicting.add if found.contradicts_itself else self._contradicting.discard)(scene_key)
         if found.contradicts_itself != before.contradicts_itself:
-            with self._guard:
-                (self._contradicting.add if found.contradicts_itself else self._contradicting.discard)(scene_key)
             self._count()
             if found.contradicts_itself:
                 log.warning("scene %s: %s", scene_key, found.contradiction)

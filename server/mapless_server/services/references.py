@@ -52,6 +52,7 @@ from .messages.references import (
 
 if TYPE_CHECKING:  # services do not load what computes
     from mapless_server.engine.queue_engine import QueueEngine
+    from mapless_server.scenes.agreement import Agreement
 
 MAX_BATCH = 1000
 MAX_RETRIEVED = 1000
@@ -91,7 +92,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         """Implements ReferenceService.GetScene."""
         key = scene_key_from_name(request.name, "name", call.principal.tenant)
         scene = await self._stored(self._store.get_scene, key)
-        agreement = await self._stored(self._engine().references.agreements.current, key)
+        agreement = await self._agreement(key)
         if agreement.contradicts_itself:  # what its references say of lenses is of no use then
             warnings = {agreement.contradiction: None}
         else:
@@ -103,6 +104,15 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
             compared_pair_count=agreement.pair_count,
             agreeing_pair_count=agreement.agreeing_count,
         )
+
+    async def _agreement(self, key: SceneKey) -> Agreement:
+        """How a scene's references agree now; no thread of the store waits for what must be computed."""
+        from mapless_server.scenes.agreement import LONGEST_WAIT_S  # services do not load what computes
+
+        agreements = self._engine().references.agreements
+        if (update := agreements.touch(key)) is not None:
+            await asyncio.wait([asyncio.wrap_future(update)], timeout=LONGEST_WAIT_S)
+        return agreements.known(key)
 
     def _lens_warnings(self, key: SceneKey) -> dict[str, None]:
         known = self._store.get_attributes(key)
