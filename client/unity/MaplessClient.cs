@@ -597,15 +597,20 @@ namespace Mapless
         {
             Reference stored = await GetReferenceAsync(scene + "/references/" + wanted.ReferenceId, false, left, cancellation)
                 .ConfigureAwait(true);
-            string sha256;
-            using (var hash = System.Security.Cryptography.SHA256.Create())
-            {
-                sha256 = BitConverter.ToString(hash.ComputeHash(wanted.Reference.Image.ToByteArray())).Replace("-", "");
-            }
-            bool isSame = string.Equals(sha256, stored.ImageSha256, StringComparison.OrdinalIgnoreCase)
+            string mask = wanted.Reference.HasMask ? Sha256Of(wanted.Reference.Mask) : "";
+            bool isSame = string.Equals(Sha256Of(wanted.Reference.Image), stored.ImageSha256, StringComparison.OrdinalIgnoreCase)
+                && string.Equals(mask, stored.MaskSha256, StringComparison.OrdinalIgnoreCase)
                 && wanted.Reference.Intrinsics.Equals(stored.Intrinsics)
                 && IsSame(wanted.Reference.WorldFromCamera, stored.WorldFromCamera);
             return isSame ? stored : null;
+        }
+
+        private static string Sha256Of(ByteString bytes)
+        {
+            using (var hash = System.Security.Cryptography.SHA256.Create())
+            {
+                return BitConverter.ToString(hash.ComputeHash(bytes.ToByteArray())).Replace("-", "");
+            }
         }
 
         private static bool IsSame(CreateSceneRequest wanted, Scene stored)

@@ -272,6 +272,7 @@ bool Client::Stored(const std::string& scene, const v1::CreateReferenceRequest& 
   }
   const bool is_same = IsSame(wanted.reference(), stored);
   stored.clear_image();
+  stored.clear_mask();
   return is_same;
 }
 

@@ -48,7 +48,7 @@ bool IsSame(const v1::CreateSceneRequest& wanted, const v1::Scene& stored) {
 
 bool IsSame(const v1::Reference& wanted, const v1::Reference& stored) {
   const auto &a = wanted.world_from_camera(), &b = stored.world_from_camera();
-  return wanted.image() == stored.image() &&
+  return wanted.image() == stored.image() && wanted.has_mask() == stored.has_mask() && wanted.mask() == stored.mask() &&
          google::protobuf::util::MessageDifferencer::Equals(wanted.intrinsics(), stored.intrinsics()) &&
          SameRotation(a.rotation(), b.rotation()) && Near(a.translation_m().x(), b.translation_m().x()) &&
          Near(a.translation_m().y(), b.translation_m().y()) && Near(a.translation_m().z(), b.translation_m().z());
