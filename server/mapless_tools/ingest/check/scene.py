@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from mapless import Client, Reference
+from mapless import Client, DataLoss, InvalidArgument, NotFound, Reference
 from mapless_server.method.features import FeatureExtractor, SiftExtractor
 from mapless_server.method.readings import Alignment, Pair, PairError, align, errors_of
 from mapless_tools.dataset import Frame
@@ -88,16 +88,26 @@ def check_with_scene(
     progress: Progress,
     extractor: FeatureExtractor | None = None,
 ) -> SceneVerdict:
-    """Compares new frames with references of a scene; those that are there already are left out."""
+    """Compares new frames with references of a scene; those that are there already are left out.
+
+    So are photographs that the server cannot read and references that it cannot give: damaged ones, or deleted since.
+    """
     there = {reference.reference_id: reference for reference in existing}
     new = [frame for frame in frames if frame.name not in there]
     new = [new[int(i)] for i in np.linspace(0, len(new) - 1, min(len(new), COMPARED)).round()] if new else []
     wanted = [_partners(client, scene, frame, there, progress, i, len(new)) for i, frame in enumerate(new)]
     used = sorted({name for names in wanted for name in names})
     with TemporaryDirectory(prefix="mapless-") as folder:
-        stored = [_frame(client, scene, there[name], Path(folder) / str(i)) for i, name in enumerate(used)]
-        comparison = Comparison([*stored, *new], extractor or SiftExtractor(), progress)
-        pairs: list[Pair] = [(used.index(name), len(stored) + i) for i, names in enumerate(wanted) for name in names]
+        stored = {
+            name: it
+            for i, name in enumerate(used)
+            if (it := _frame(client, scene, there[name], Path(folder) / str(i))) is not None
+        }
+        position = {name: i for i, name in enumerate(stored)}
+        comparison = Comparison([*stored.values(), *new], extractor or SiftExtractor(), progress)
+        pairs: list[Pair] = [
+            (position[name], len(stored) + i) for i, names in enumerate(wanted) for name in names if name in position
+        ]
         comparison.compare(pairs)
         views, matched = comparison.readable(), comparison.matched
     errors = errors_of(views, matched)
@@ -121,10 +131,10 @@ def _partners(
     progress("comparing with the scene", number + 1, count)
     names: list[str] = []
     try:
-        image = frame.image_path.read_bytes()
-    except OSError:
+        similar = client.retrieve_references(frame.image_path, frame.camera, scene, SIMILAR)
+    except (OSError, InvalidArgument):  # refused where it is stored
         return names
-    for found in client.retrieve_references(image, frame.camera, scene, SIMILAR):
+    for found in similar:
         name = found.name.rpartition("/")[2]
         if name in there:
             names.append(name)
@@ -135,6 +145,9 @@ def _partners(
     return list(dict.fromkeys([*names, *(it.reference_id for it in near[:NEAREST])]))
 
 
-def _frame(client: Client, scene: str, reference: Reference, file: Path) -> Frame:
-    file.write_bytes(client.get_reference(scene, reference.reference_id, include_image=True).image or b"")
+def _frame(client: Client, scene: str, reference: Reference, file: Path) -> Frame | None:
+    try:
+        file.write_bytes(client.get_reference(scene, reference.reference_id, include_image=True).image or b"")
+    except (DataLoss, NotFound):
+        return None
     return Frame(reference.reference_id, file, reference.camera, reference.world_from_camera)
