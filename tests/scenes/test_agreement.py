@@ -10,7 +10,8 @@ import pytest
 
 from mapless_server.method.correspond import make_matcher
 from mapless_server.method.features import SiftExtractor
-from mapless_server.scenes.agreement import Agreement, SceneAgreements, agreement_of
+from mapless_server.scenes.agreement import Agreement, agreement_of
+from mapless_server.scenes.scene_agreements import SceneAgreements
 from mapless_server.security import SceneKey
 from mapless_server.store import Store
 

@@ -9,9 +9,9 @@ from mapless_server.images import ImageLimits
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.options import StageContext
 from mapless_server.scenes import Choice, Selection, rank_references
-from mapless_server.scenes.agreement import SceneAgreements
 from mapless_server.scenes.audit.scene_auditor import SceneAuditor, SceneTools
 from mapless_server.scenes.retrieval.ranking import nearest_references
+from mapless_server.scenes.scene_agreements import SceneAgreements
 from mapless_server.security import SceneKey, scene_id_of
 from mapless_server.store import SceneAttributes
 

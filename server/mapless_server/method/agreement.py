@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array
 
-from .nearest import fundamental_matrix, mutual_matches_of_ratios, sampson_px
-from .views import Matches, PosedView, View
+from .nearest import fundamental_matrix, sampson_px
+from .views import Matches, PosedView
 
 MIN_MATCHES = 24
 """Fewer say nothing: any eight matches satisfy some fundamental matrix."""
@@ -98,18 +98,6 @@ def pair_error_px(first: PosedView, second: PosedView, matches: Matches) -> floa
         if _are_behind(first, second, x_first[in_both], x_second[in_both]):
             return LARGEST_ERROR_PX
     return min(error_px, LARGEST_ERROR_PX)
-
-
-def consistent_matches(first: View, second: View, ratio: float) -> Matches:
-    """Distinct matches (M, 2) by this ratio that one fundamental matrix explains; none if there are too few."""
-    (matches,) = mutual_matches_of_ratios(first.features, second.features, (ratio,))
-    if len(matches) < MIN_MATCHES:
-        return matches[:0]
-    x_first = first.features.keypoints[matches[:, 0]].astype(np.float64)
-    x_second = second.features.keypoints[matches[:, 1]].astype(np.float64)
-    _, info = poselib.estimate_fundamental(x_first, x_second, _RANSAC, {})
-    consistent = matches[np.asarray(info["inliers"], bool)]
-    return consistent if len(consistent) >= MIN_MATCHES else matches[:0]
 
 
 def _rotation_errors_px(first: PosedView, second: PosedView, x_first: Array, x_second: Array) -> Array:

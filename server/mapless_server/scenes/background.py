@@ -24,13 +24,13 @@ from mapless_server.store import Store
 from mapless_server.store.compaction import compact_features
 from mapless_server.store.pairs import CLAIM_S, Claim, Pair, PairStore, Progress, delete_unused, record_use
 
-from .agreement import SceneAgreements
 from .calibration.calibrator import SceneCalibrations
 from .depth.scene_depths import SceneDepths
 from .indexes import SceneIndexes
 from .library import Closed, ReferenceLibrary
 from .observer import BackgroundObserver
 from .retrieval.ranking import rank_beside
+from .scene_agreements import SceneAgreements
 from .stored import Matching, PairFinder
 
 log = logging.getLogger(__name__)

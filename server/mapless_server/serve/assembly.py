@@ -24,7 +24,6 @@ from mapless_server.networks.weights import CATALOGUE, WeightsError, WeightsMiss
 from mapless_server.networks.weights.folder import Status, look_up
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scenes import GlobalDescriptor
-from mapless_server.scenes.agreement import SceneAgreements
 from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.audit.scene_auditor import SceneTools
 from mapless_server.scenes.background import BackgroundMatching
@@ -34,6 +33,7 @@ from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.scenes.retrieval.vlad import VladDescriptor
+from mapless_server.scenes.scene_agreements import SceneAgreements
 from mapless_server.scenes.stored import DepthFinder, Matching, PairFinder
 from mapless_server.scheduling import Observer, Quota, WorkQueueOptions
 from mapless_server.security import RateLimiter

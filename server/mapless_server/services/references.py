@@ -107,7 +107,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
 
     async def _agreement(self, key: SceneKey) -> Agreement:
         """How a scene's references agree now; no thread of the store waits for what must be computed."""
-        from mapless_server.scenes.agreement import LONGEST_WAIT_S  # services do not load what computes
+        from mapless_server.scenes.scene_agreements import LONGEST_WAIT_S  # services do not load what computes
 
         agreements = self._engine().references.agreements
         if (update := agreements.touch(key)) is not None:

@@ -35,12 +35,12 @@ from mapless_server.store.calibrations import (
     renew,
 )
 
-from ..agreement import SceneAgreements
 from ..indexes import SceneIndexes
 from ..library import Closed, ReferenceLibrary
 from ..observer import BackgroundObserver
 from ..retrieval.index import Entries
 from ..retrieval.ranking import rank_beside, spread_choice
+from ..scene_agreements import SceneAgreements
 from ..stored import DepthFinder
 from .fit import LeftOut, fit
 from .lens import LENS_REFERENCES, SharedErrors, lens_contradiction, shared_errors, without_errors

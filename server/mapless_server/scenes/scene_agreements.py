@@ -1,0 +1,284 @@
+"""Whether the scenes of a store contradict themselves: their references compared with their poses, pair by pair.
+
+The errors of pairs (`method.agreement`) are those that matching in the background has stored. Where they are too few,
+because it is off, has not come so far or was done by an earlier version, some pairs of a few references are matched
+here, unless queries have matched them already. What is known of a scene is kept in memory, and derived again after a
+start when it is first asked for.
+"""
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Collection, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from mapless_server.errors import DataLoss, NotFound
+from mapless_server.method.agreement import MAX_ERROR_PX
+from mapless_server.method.correspond import Matcher
+from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.nearest import mutual_matches
+from mapless_server.method.options import StageContext
+from mapless_server.method.pairs import in_order
+from mapless_server.method.readings import MatchedPair, consistent, explain
+from mapless_server.method.views import PosedView
+from mapless_server.security import SceneKey
+from mapless_server.store import Store
+from mapless_server.store.pairs import Pair, PairStore
+
+from .agreement import MIN_GROUP, Agreement, agreement_of
+from .indexes import SceneIndexes
+from .library import Closed, ReferenceLibrary
+from .observer import BackgroundObserver
+from .retrieval.index import Entries
+from .retrieval.ranking import rank_beside
+from .stored import Matching
+
+log = logging.getLogger(__name__)
+
+ENOUGH_PAIRS, SAMPLED_REFERENCES, SAMPLED_NEIGHBOURS = 12, 12, 3
+"""If fewer pairs are stored, so many references are matched with so many others each, those that look most similar."""
+
+GROWTH = 1.5
+"""A scene with so many times the references is sampled again."""
+
+READ_PAIRS = 20_000
+EXPLAINED_PAIRS = 24
+STALE_S, REST_FACTOR = 2.0, 50.0
+"""What is known of a scene is derived again after so long, and after so many times what reading its pairs took: 20,000
+take a tenth of a second, which queries would have to share."""
+LONGEST_WAIT_S = 3.0
+"""For what must be computed, by who asks for the agreement as it is now."""
+_KNOWN_SCENES = 10_000
+
+
+@dataclass(eq=False)
+class _Known:
+    """What is known of a scene: errors of sampled pairs, the references that were sampled, and the last result.
+
+    `sampled_size` is the number of its references when they were sampled; before `rests_until_s`, by `time.monotonic`,
+    nothing is derived again.
+    """
+
+    errors_px: dict[Pair, float] = field(default_factory=dict)
+    sampled: set[str] = field(default_factory=set)
+    sampled_size: int = 0
+    agreement: Agreement | None = None
+    explained_pairs: int = 0
+    rests_until_s: float = -math.inf
+    update: "Future[None] | None" = None
+
+
+class SceneAgreements:
+    """The agreement of the scenes of a store; thread-safe. What takes long is computed in a thread of its own."""
+
+    def __init__(
+        self,
+        store: Store,
+        indexes: SceneIndexes,
+        library: ReferenceLibrary,
+        extractor: FeatureExtractor,
+        matcher: Matcher,
+        observer: BackgroundObserver,
+    ) -> None:
+        """The extractor and the matcher are those of the first tier's queries."""
+        self._pairs = PairStore(store.database)
+        self._indexes, self._library = indexes, library
+        self._extractor, self._matcher = extractor, matcher
+        self._matching = Matching(extractor, matcher).name
+        self._observer = observer
+        self._scenes: dict[SceneKey, _Known] = {}
+        self._guard = threading.Lock()
+        self._contradicting: set[SceneKey] = set()
+        self._closing = threading.Event()
+        self._thread = ThreadPoolExecutor(1, "agreement")
+
+    def close(self) -> None:
+        """Ends what is being computed at its next step."""
+        self._closing.set()
+        self._thread.shutdown(wait=True, cancel_futures=True)
+
+    def known(self, scene_key: SceneKey) -> Agreement:
+        """The agreement as last computed, without waiting; brings it up to date in the background."""
+        self.touch(scene_key)
+        return self._agreement(scene_key)
+
+    def current(self, scene_key: SceneKey) -> Agreement:
+        """The agreement as it is now; waits some seconds at most for what must be computed."""
+        update = self.touch(scene_key)
+        if update is not None:
+            with suppress(TimeoutError):
+                update.result(LONGEST_WAIT_S)
+        return self._agreement(scene_key)
+
+    def touch(self, scene_key: SceneKey) -> "Future[None] | None":
+        """Brings the agreement of a scene up to date in the background, unless that was done a moment ago."""
+        with self._guard:
+            known = self._known(scene_key)
+            is_running = known.update is not None and not known.update.done()
+            if not is_running and not self._closing.is_set() and time.monotonic() >= known.rests_until_s:
+                known.update = self._thread.submit(self._update, scene_key, known)
+            return known.update
+
+    def changed(self, scene_key: SceneKey) -> None:
+        """Brings the agreement up to date in the background, however recent it is: references were added."""
+        with self._guard:
+            self._known(scene_key).rests_until_s = -math.inf
+        self.touch(scene_key)
+
+    def forget_references(self, keys: Collection[str]) -> None:
+        """Drops pairs of deleted references."""
+        gone = frozenset(keys)
+        with self._guard:
+            for known in self._scenes.values():
+                for pair in [it for it in known.errors_px if not gone.isdisjoint(it)]:
+                    del known.errors_px[pair]
+                known.sampled -= gone
+                known.rests_until_s = -math.inf
+
+    def forget_scene(self, scene_key: SceneKey) -> None:
+        """Drops what is known of a deleted scene."""
+        with self._guard:
+            self._scenes.pop(scene_key, None)
+            self._contradicting.discard(scene_key)
+        self._count()
+
+    def derive_all(self) -> None:
+        """Brings the scenes with stored pairs that do not agree up to date, for the metric and the log."""
+        for scene_key in self._pairs.list_scenes_with_errors(self._matching, MAX_ERROR_PX, _KNOWN_SCENES):
+            self.touch(scene_key)
+
+    def _known(self, scene_key: SceneKey) -> _Known:
+        """What is known of a scene, for a change; with the guard."""
+        return self._scenes.setdefault(scene_key, _Known())
+
+    def _agreement(self, scene_key: SceneKey) -> Agreement:
+        with self._guard:
+            known = self._scenes.get(scene_key)
+        return (known and known.agreement) or Agreement()
+
+    def _update(self, scene_key: SceneKey, known: _Known) -> None:
+        known.rests_until_s = time.monotonic() + STALE_S
+        try:
+            self._derive(scene_key, known)
+        except NotFound:
+            self.forget_scene(scene_key)
+        except Closed:
+            pass
+        except Exception as error:
+            log.warning("the pairs of scene %s could not be compared with its poses: %s", scene_key, error)
+
+    def _derive(self, scene_key: SceneKey, known: _Known) -> None:
+        begin_s = time.monotonic()
+        stored = self._pairs.list_errors(self._matching, scene_key, READ_PAIRS)
+        found = agreement_of(self._with_kept(known, stored))
+        with self._guard:
+            if known.rests_until_s > begin_s:  # nothing has changed meanwhile
+                took_s = time.monotonic() - begin_s
+                known.rests_until_s = max(known.rests_until_s, begin_s + REST_FACTOR * took_s)
+        # Known before it is explained, which takes a second or two.
+        self._settle(scene_key, known, found)
+        if len(stored) < ENOUGH_PAIRS:
+            self._sample(scene_key, known)
+            found = agreement_of(self._with_kept(known, stored))
+            self._settle(scene_key, known, found)
+        if found.contradicts_itself and found.pair_count >= 2 * known.explained_pairs:
+            known.explained_pairs = found.pair_count
+            explanation = self._explain(scene_key, self._with_kept(known, stored))
+            self._settle(scene_key, known, replace(found, explanation=explanation))
+
+    def _with_kept(self, known: _Known, stored: Mapping[Pair, float]) -> dict[Pair, float]:
+        """All errors that are known, of references that exist."""
+        with self._guard:
+            kept = {pair: it for pair, it in known.errors_px.items() if pair not in stored}
+        keys = {key for pair in kept for key in pair} - {key for pair in stored for key in pair}
+        existing = self._pairs.list_existing(keys) if keys else set()
+        gone = keys - existing
+        return {**stored, **{pair: it for pair, it in kept.items() if gone.isdisjoint(pair)}}
+
+    def _settle(self, scene_key: SceneKey, known: _Known, found: Agreement) -> None:
+        """Makes a result known; an explanation that was found before remains while the scene contradicts itself."""
+        before = known.agreement or Agreement()
+        if found.contradicts_itself and not found.explanation:
+            found = replace(found, explanation=before.explanation)
+        with self._guard:
+            known.agreement = found
+            if self._scenes.get(scene_key) is not known:  # deleted meanwhile
+                return
+            (self._contradicting.add if found.contradicts_itself else self._contradicting.discard)(scene_key)
+        if found.contradicts_itself != before.contradicts_itself:
+            self._count()
+            if found.contradicts_itself:
+                log.warning("scene %s: %s", scene_key, found.contradiction)
+            else:
+                log.info("scene %s does not contradict itself any more", scene_key)
+        elif found.explanation and not before.explanation:
+            log.warning("scene %s: likely: %s", scene_key, found.explanation)
+
+    def _count(self) -> None:
+        self._observer.waiting("contradicting_scenes", len(self._contradicting))
+
+    def _check(self) -> None:
+        if self._closing.is_set():
+            raise Closed
+
+    def _sample(self, scene_key: SceneKey, known: _Known) -> None:
+        """Matches a few references with those that look most similar."""
+        entries = self._indexes.entries(scene_key, StageContext(self._check))
+        rows = entries.rows()
+        is_small = len(rows) <= SAMPLED_REFERENCES
+        if len(rows) < MIN_GROUP or (not is_small and len(rows) < GROWTH * known.sampled_size):
+            return
+        known.sampled_size = len(rows)
+        spread = np.linspace(0, len(rows) - 1, min(len(rows), SAMPLED_REFERENCES)).round().astype(int)
+        for row in rows[np.unique(spread)]:
+            reference_id, key, _ = entries.reference(int(row))
+            if key in known.sampled:
+                continue
+            beside = rank_beside(entries, reference_id, SAMPLED_NEIGHBOURS)
+            if len(beside) == SAMPLED_NEIGHBOURS:  # of a smaller scene others may follow
+                known.sampled.add(key)
+            views = self._load(scene_key, [reference_id, *(it.reference_id for it in beside)])
+            for other in views[1:]:
+                self._check()
+                self._compare(known, *in_order(views[0], other))
+
+    def _compare(self, known: _Known, first: PosedView, second: PosedView) -> None:
+        pair = first.key, second.key
+        if pair not in known.errors_px:
+            self._matcher.match_references(first, second)
+            error_px = self._matcher.error_px(first, second)
+            if error_px is not None:
+                with self._guard:
+                    known.errors_px[pair] = error_px
+
+    def _load(self, scene_key: SceneKey, reference_ids: list[str]) -> tuple[PosedView, ...]:
+        return self._indexes.load_existing(
+            self._library, scene_key, reference_ids, self._extractor, StageContext(self._check)
+        )
+
+    def _explain(self, scene_key: SceneKey, errors_px: Mapping[Pair, float]) -> str:
+        """The mistake whose correction makes the poses fit best; empty if there is none."""
+        entries: Entries = self._indexes.entries(scene_key, StageContext(self._check))
+        id_of = {key: reference_id for reference_id, key, _ in map(entries.reference, map(int, entries.rows()))}
+        pairs = [pair for pair in sorted(errors_px) if set(pair) <= id_of.keys()]
+        pairs = pairs[:: -(-len(pairs) // EXPLAINED_PAIRS) or 1]
+        keys = sorted({key for pair in pairs for key in pair})
+        with suppress(DataLoss):
+            views = {it.key: it for it in self._load(scene_key, [id_of[key] for key in keys])}
+            indices = {key: i for i, key in enumerate(keys)}
+            matched = []
+            for pair in pairs:
+                self._check()
+                if set(pair) <= views.keys():
+                    ratio = self._matcher.options.distinct_ratio
+                    first, second = (views[key].view for key in pair)
+                    matches = consistent(first, second, mutual_matches(first.features, second.features, ratio, True))
+                    matched.append(MatchedPair((indices[pair[0]], indices[pair[1]]), matches))
+            matched = [it for it in matched if len(it.matches)]
+            return explain({indices[key]: view for key, view in views.items()}, matched).text
+        return ""
