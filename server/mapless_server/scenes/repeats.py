@@ -8,16 +8,14 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
-from mapless.geometry import RigidTransform, rotation_angle_deg
+from mapless.geometry import RigidTransform
+from mapless_server.method.readings import is_start, pose_difference, same_poses
 from mapless_server.store import ReferenceRecord
 
 SAME_POSITION_M, SAME_ROTATION_DEG = 1e-3, 0.01
 """Poses of one photograph that differ by less are the same: they are stored, and travel, rounded."""
 NAMED = 5
 """References that a sentence names, and sentences about photographs."""
-_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +35,7 @@ class PosedImage:
 def repeats(added: Sequence[PosedImage], stored: Sequence[ReferenceRecord]) -> list[str]:
     """Sentences about added references that have the image, or exactly the pose, of stored or other added ones."""
     known = [PosedImage(it.reference_id, it.image_sha256, it.world_from_camera) for it in stored]
-    return [*_same_photographs(added, known), *_same_poses(added, [*known, *added])]
+    return [*_same_photographs(added, known), *_same_poses(known, added)]
 
 
 def _same_photographs(added: Sequence[PosedImage], known: Sequence[PosedImage]) -> list[str]:
@@ -47,7 +45,7 @@ def _same_photographs(added: Sequence[PosedImage], known: Sequence[PosedImage]) 
     texts = []
     for it in added:
         other = first_of[it.image_sha256]
-        apart_m, turn_deg = _difference(it.world_from_camera, other.world_from_camera)
+        apart_m, turn_deg = pose_difference(it.world_from_camera, other.world_from_camera)
         if apart_m > SAME_POSITION_M or turn_deg > SAME_ROTATION_DEG:
             texts.append(
                 f"{it.reference_id} is the same photograph as {other.reference_id}, but its pose is {apart_m:.3g} m "
@@ -57,16 +55,14 @@ def _same_photographs(added: Sequence[PosedImage], known: Sequence[PosedImage]) 
     return texts[:NAMED] + more
 
 
-def _same_poses(added: Sequence[PosedImage], every: Sequence[PosedImage]) -> list[str]:
-    groups: dict[bytes, list[PosedImage]] = {}
-    for record in every:
-        groups.setdefault(_pose_bytes(record), []).append(record)
+def _same_poses(known: Sequence[PosedImage], added: Sequence[PosedImage]) -> list[str]:
+    every = [*known, *added]
     texts = []
-    for key in dict.fromkeys(_pose_bytes(record) for record in added):
-        group = groups.get(key, [])
-        if len({record.image_sha256 for record in group}) < 2:
+    for indices in same_poses({i: it.world_from_camera for i, it in enumerate(every)}):
+        group = [every[i] for i in indices]
+        if indices[-1] < len(known) or len({it.image_sha256 for it in group}) < 2:
             continue
-        names = ", ".join(record.reference_id for record in group[:NAMED])
+        names = ", ".join(it.reference_id for it in group[:NAMED])
         more = f" and {len(group) - NAMED} more" if len(group) > NAMED else ""
         why = (
             "the identity: had tracking not begun?"
@@ -77,19 +73,3 @@ def _same_poses(added: Sequence[PosedImage], every: Sequence[PosedImage]) -> lis
             f"{len(group)} references with different photographs have exactly the same pose ({names}{more}): {why}"
         )
     return texts
-
-
-def is_start(pose: RigidTransform) -> bool:
-    """Whether a pose is the identity, as that of a tracker that has not begun; possibly in other axes."""
-    axes = np.abs(pose.rotation)
-    return bool(np.abs(pose.translation).max() < _ROUNDING and np.abs(axes - np.round(axes)).max() < _ROUNDING)
-
-
-def _pose_bytes(record: PosedImage) -> bytes:
-    pose = record.world_from_camera
-    return np.concatenate([pose.rotation.ravel(), pose.translation]).tobytes()
-
-
-def _difference(first: RigidTransform, second: RigidTransform) -> tuple[float, float]:
-    apart_m = float(np.linalg.norm(first.translation - second.translation))
-    return apart_m, rotation_angle_deg(first.rotation.T @ second.rotation)

@@ -4,11 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 
-from mapless.geometry import RigidTransform
-from mapless_server.method.readings import Alignment, Verdict, similarity_text
+from mapless_server.method.readings import Alignment, Verdict, is_start, similarity_text
 from mapless_tools.dataset import Dataset, Frame, Refusal
 from mapless_tools.output_files import finite
 
@@ -21,7 +19,6 @@ WRONG_WORLD = (
     "--skip-check stores them all the same"
 )
 SHOWN, SHOWN_NAMES = 20, 5
-IDENTITY = 1e-9
 ALREADY_THERE = "already there"
 
 
@@ -119,16 +116,10 @@ def same_pose_text(verdict: Verdict, group: Sequence[int], frames: Sequence[Fram
     more = f" and {len(group) - SHOWN_NAMES} more" if len(group) > SHOWN_NAMES else ""
     identity = (
         "the identity: had tracking not begun?"
-        if is_identity(frames[group[0]].world_from_camera)
+        if is_start(frames[group[0]].world_from_camera)
         else "and one only can be right"
     )
     return f"{len(group)} references have exactly the same pose but show different things ({names}{more}): {identity}"
-
-
-def is_identity(pose: RigidTransform) -> bool:
-    """Whether a pose is the identity, as that of a tracker that has not begun; possibly in a format's other axes."""
-    axes = np.abs(pose.rotation)
-    return bool(np.abs(pose.translation).max() < IDENTITY and np.abs(axes - np.round(axes)).max() < IDENTITY)
 
 
 def print_report(report: ImportReport, console: Console) -> None:

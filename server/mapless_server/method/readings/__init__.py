@@ -24,7 +24,7 @@ from .errors import (
     summary,
 )
 from .explanation import Explanation, explain
-from .repeats import same_poses
+from .repeats import is_start, pose_difference, same_poses
 from .verdict import WRONG_SHARE, Verdict, judge, suspects_of
 
 __all__ = [
@@ -48,9 +48,11 @@ __all__ = [
     "errors_of",
     "explain",
     "implausible_depth",
+    "is_start",
     "judge",
     "median_depth",
     "pair_error_px",
+    "pose_difference",
     "same_poses",
     "sampson_px",
     "similarity_text",

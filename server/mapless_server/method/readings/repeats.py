@@ -23,6 +23,8 @@ SAME_COUNT_SHARE = 0.5
 SAME_TURN_DEG, SAME_BASELINE_SHARE = 1.0, 0.25
 """Differences of two poses of such a photograph that contradict each other; of the median distance of matched pairs. A
 camera that stands still takes nearly the same photograph at poses that differ by the tracking's noise."""
+_START = 1e-9
+"""Numbers of a pose that differ by less are equal but for rounding."""
 
 
 def same_poses(poses: Mapping[int, RigidTransform]) -> list[tuple[int, ...]]:
@@ -32,6 +34,12 @@ def same_poses(poses: Mapping[int, RigidTransform]) -> list[tuple[int, ...]]:
         numbers = np.concatenate([pose.rotation.ravel(), pose.translation])
         groups.setdefault(tuple((np.round(numbers, 8) + 0.0).tolist()), []).append(i)
     return [tuple(group) for group in groups.values() if len(group) > 1]
+
+
+def is_start(pose: RigidTransform) -> bool:
+    """Whether a pose is the identity, as that of a tracker that has not begun; possibly in a format's other axes."""
+    axes = np.abs(pose.rotation)
+    return bool(np.abs(pose.translation).max() < _START and np.abs(axes - np.round(axes)).max() < _START)
 
 
 def contradicting_groups(
@@ -53,25 +61,24 @@ def contradicting_groups(
 
 def same_photographs(views: Views, matched: Sequence[MatchedPair]) -> list[Pair]:
     """Pairs that are one photograph, with poses that differ."""
-    baselines = [_difference(views, item.pair)[0] for item in matched]
+    differences = [pose_difference(*(views[i].world_from_camera for i in item.pair)) for item in matched]
+    baselines = [apart for apart, _ in differences]
     typical = float(np.median([it for it in baselines if it > 0])) if any(baselines) else 0.0
     found = []
-    for item in matched:
+    for item, (apart, turn_deg) in zip(matched, differences, strict=True):
         first, second = (views[i].view for i in item.pair)
         if not first.has_camera_of(second) or len(item.matches) < SAME_COUNT_SHARE * min(
             len(first.features), len(second.features)
         ):
             continue
         ours, theirs = (view.features.keypoints[item.matches[:, side]] for side, view in enumerate((first, second)))
-        apart, turn_deg = _difference(views, item.pair)
         is_other = turn_deg > SAME_TURN_DEG or apart > SAME_BASELINE_SHARE * typical
         if is_other and np.median(np.linalg.norm(ours - theirs, axis=1)) < SAME_PX:
             found.append(item.pair)
     return found
 
 
-def _difference(views: Views, pair: Pair) -> tuple[float, float]:
+def pose_difference(first: RigidTransform, second: RigidTransform) -> tuple[float, float]:
     """Distance of two cameras, in the poses' unit, and the angle between them, degrees."""
-    first, second = (views[i].world_from_camera for i in pair)
     apart = float(np.linalg.norm(first.translation - second.translation))
     return apart, rotation_angle_deg(first.rotation.T @ second.rotation)
