@@ -31,7 +31,8 @@ ATTRIBUTES_BYTES = 2000
 """About the size of SceneAttributes in memory."""
 
 ALIKE_WITHIN = 2_000
-"""Newest references of a scene among which equal ones are searched, in 4 ms of processor time; 10,000 take 20."""
+"""Newest references of a scene among which equal ones are searched. In a scene of 10,000 that costs 6.5 ms of processor
+time for a call that adds one reference, and 0.18 ms for each in a call that adds 100."""
 
 UNWRITABLE = frozenset({"STORE_READ_ONLY", "STORE_FULL", "STORE_UNAVAILABLE"})
 """Reasons of faults after which the next change would most likely fail, too."""
