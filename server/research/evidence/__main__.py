@@ -10,7 +10,7 @@ from pathlib import Path
 from .page import PAGES, page
 
 MODULES = {"stationary": ("stationary-overlays", "stationary-contradicted-px", "stationary-support")}
-"""The keys that each module measures, by `measure(key, scenes)`, which returns the question and the table's rows."""
+"""The keys that each module measures, by `measure(key, scenes)`, which returns the question and its rows."""
 
 
 def main(arguments: list[str]) -> None:
@@ -22,7 +22,13 @@ def main(arguments: list[str]) -> None:
     key, scenes = arguments[0], Path(arguments[1] if len(arguments) > 1 else "../shared/data")
     measured = importlib.import_module(f".{module_of[key]}", __package__)
     PAGES.mkdir(exist_ok=True)
-    (PAGES / f"{key}.md").write_text(page(*measured.measure(key, scenes)))
+    question, rows = measured.measure(key, scenes)
+    done = []
+    for row in rows:
+        print(*row.values(), sep=" | ", flush=True)
+        done.append(row)
+        # After each row: what is measured in many minutes may be stopped.
+        (PAGES / f"{key}.md").write_text(page(question, done))
 
 
 if __name__ == "__main__":

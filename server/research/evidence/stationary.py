@@ -1,6 +1,7 @@
 """What is fixed to the camera: photographs of other places with the same overlay, and those of the place itself."""
 
-from collections.abc import Iterator, Sequence
+import os
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -14,7 +15,7 @@ from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.answer import Localization
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.correspond import make_matcher
-from mapless_server.method.features import FeatureExtractor, make_extractor
+from mapless_server.method.features import FeatureExtractor, SiftExtractor, SiftOptions, make_extractor
 from mapless_server.method.localize import localize
 from mapless_server.method.nearest import mutual_matches
 from mapless_server.method.options import LocalizeOptions
@@ -34,8 +35,14 @@ ROOM = Path(__file__).parents[2] / "mapless_tools" / "demo" / "room"
 KITCHEN, DRIVE = "7scenes-redkitchen-seq01-first600", "kitti-drive-a"
 REFERENCES = 10
 """References of a query."""
-QUERIES = 11
-"""Of other places, for each scene and overlay: 198 in all. Of the place itself at most 6."""
+QUERIES = 6
+"""Photographs of other places for each scene, overlay and features: 216 in all."""
+RIGHT_QUERIES = 4
+"""Photographs of the place itself for each of them: 144 in all."""
+UNCHECKED = 2
+"""How many of those of other places are asked with nothing ignored too."""
+MAX_KEYPOINTS = 1024
+"""Half of what a server takes, so that all is measured in minutes."""
 RIGHT_M = 0.25
 OFF = StationaryOptions(support=1_000_000)
 
@@ -72,18 +79,18 @@ class Drawn:
 
 
 def scenes_in(folder: Path, count: int = QUERIES) -> list[Scene]:
-    """The demo's room, the kitchen and the drive, each with photographs of other places."""
+    """The drive, the kitchen and the demo's room, each with photographs of other places."""
     room, kitchen, drive = (read_folder(it) for it in (ROOM, folder / KITCHEN, folder / DRIVE))
     elsewhere = [read_folder(folder / name) for name in ("tum-fr3-office", "meeting-room", "fountain-P11")]
     names = [frame.name for frame in room.frames]
     stations, asked = ([i for i, name in enumerate(names) if kind in name] for kind in ("reference", "query"))
-    every = evenly_spread(list(range(len(kitchen.frames))), 20)
-    between = evenly_spread([i for i in range(1, len(kitchen.frames) - 1) if i not in every], 6)
+    every = evenly_spread(list(range(len(kitchen.frames))), 14)
+    between = [i for i in range(1, len(kitchen.frames) - 1) if i not in every]
     numbers = list(range(len(drive.frames)))
     return [
-        _scene("room", room, 0.5, (stations, asked[:6]), [*elsewhere, kitchen], count),
-        _scene("kitchen", kitchen, 1.0, (every, between), [*elsewhere, room], count),
-        _scene("drive", drive, 0.8, (numbers[::2], evenly_spread(numbers[1:-1:2], 6)), [drive, elsewhere[2]], count),
+        _scene("drive", drive, 0.8, (numbers[::2], numbers[1:-1:2]), [drive, elsewhere[2]], count),
+        _scene("kitchen", kitchen, 0.8, (every, between), [*elsewhere, room], count),
+        _scene("room", room, 0.5, (stations, asked), [*elsewhere, kitchen], count),
     ]
 
 
@@ -95,7 +102,10 @@ def _scene(
     places: Sequence[Dataset],
     count: int,
 ) -> Scene:
-    references, queries = ([_posed(dataset, i, scale) for i in indices] for indices in chosen)
+    references, queries = (
+        [_posed(dataset, i, scale) for i in indices]
+        for indices in (chosen[0], evenly_spread(list(chosen[1]), RIGHT_QUERIES))
+    )
     camera = references[0].camera
     return Scene(name, references, queries, [_other(places, dataset, camera, i) for i in range(count)])
 
@@ -166,30 +176,21 @@ def on_mask(view: View, mask: Mask) -> NDArray[np.bool_]:
     return np.asarray(wide[row, column] > 0)
 
 
-@dataclass(frozen=True)
-class Outcomes:
-    """Which photographs of other places were localized, and which of the place itself rightly."""
-
-    others: Sequence[bool]
-    right: Sequence[bool]
-
-
-def ask(drawn: Drawn, features: str, options: StationaryOptions) -> Outcomes:
-    """Asks a scene whose photographs carry an overlay."""
+def pipeline_of(features: str, options: StationaryOptions) -> Pipeline:
+    """A pipeline with nothing cached."""
     pipeline = Pipeline(make_reconstructor("geometric", Path()), make_matcher(features, 1))
     pipeline.matcher.stationary = options
-    others = [localized(view, drawn.references, pipeline) is not None for view in drawn.others]
-    right = [_is_right(it, drawn.references, pipeline) for it in drawn.queries]
-    pipeline.matcher.close()
-    return Outcomes(others, right)
+    return pipeline
 
 
-def ask_black(drawn: Drawn, features: str) -> Sequence[bool]:
-    """Which photographs of the place are localized rightly with the overlay's pixels black and masked."""
-    pipeline = Pipeline(make_reconstructor("geometric", Path()), make_matcher(features, 1))
-    right = [_is_right(it, drawn.black_references, pipeline) for it in drawn.black_queries]
-    pipeline.matcher.close()
-    return right
+def accepted(views: Sequence[View], references: Sequence[PosedView], pipeline: Pipeline) -> list[bool]:
+    """Which photographs are localized."""
+    return [localized(view, references, pipeline) is not None for view in views]
+
+
+def right(queries: Sequence[PosedView], references: Sequence[PosedView], pipeline: Pipeline) -> list[bool]:
+    """Which photographs of the place are localized rightly."""
+    return [_is_right(it, references, pipeline) for it in queries]
 
 
 def _is_right(query: PosedView, references: Sequence[PosedView], pipeline: Pipeline) -> bool:
@@ -241,11 +242,13 @@ def clean(folder: Path, name: str, extractor: FeatureExtractor) -> list[PosedVie
 
 
 DATA = (
-    "The demo's room (480x360, 16 references), the kitchen of 7-Scenes (20 references) and the drive of KITTI (13), "
-    "SIFT, with the overlays of `research.evidence.overlays` on every photograph (badge, bonnet, gripper, time stamp "
-    "whose digits change, display, half-transparent watermark); asked with photographs of other places (office, "
-    "meeting room, fountain, kitchen, room; the drive also with its own mirrored ones) that carry the same overlay, "
-    "and with 6 of the place itself. A right one is within 0.25 m."
+    "The drive of KITTI (980 pixels wide, 13 references), the kitchen of 7-Scenes (512 pixels, 14 references) and the "
+    "demo's room (480 pixels, 16 references), at most 1024 keypoints, ten references of each photograph, with the "
+    "overlays of `research.evidence.overlays` on every photograph (badge, bonnet, gripper, time stamp whose digits "
+    "change, display, half-transparent watermark); asked with 6 photographs of other places (office, meeting room, "
+    "fountain, kitchen, room; the drive also with its own mirrored ones) that carry the same overlay, 2 of them with "
+    "nothing ignored too, and with 4 of the place itself. A right one is within 0.25 m. EdgePoint2 is measured where "
+    "`MAPLESS_WEIGHTS_DIR` has its weights, with nearest neighbours."
 )
 _DRIVE = (
     "The drive of KITTI as it is, 26 photographs ahead, SIFT: the share of keypoints that are ignored in ten "
@@ -261,7 +264,9 @@ QUESTIONS = {
             "How many photographs of other places are localized because they carry the same picture as the references, "
             "and how many of the place itself are lost by ignoring it?",
             DATA + " Beside it the same with the pixels of the overlay black, and their keypoints removed.",
-            "Two cells to each side, 2.5 of 160 columns: digits that change are as far from those that do not.",
+            "Two cells to each side, 2.5 of 160 columns: digits that change are as far from those that do not. On the "
+            "straight drive a display and a watermark still localize 3 of 12 photographs of other places with SIFT; the "
+            "cause is not found. The table is as far as it was measured: the other rows are open.",
         ),
         Question(
             "stationary-contradicted-px",
@@ -289,30 +294,46 @@ _ALTERNATIVES = {
 }
 
 
-def measure(key: str, folder: Path) -> tuple[Question, Sequence[Row]]:
-    """Measures one of `QUESTIONS` with the scenes of a folder."""
-    if key == "stationary-overlays":
-        return QUESTIONS[key], list(_overlays(folder))
-    return QUESTIONS[key], list(_alternatives(folder, key))
+def measure(key: str, folder: Path) -> tuple[Question, Iterable[Row]]:
+    """Measures one of `QUESTIONS` with the scenes of a folder, row by row."""
+    return QUESTIONS[key], _overlays(folder) if key == "stationary-overlays" else _alternatives(folder, key)
 
 
-def _overlays(folder: Path, features: str = "sift", weights: Path | None = None) -> Iterator[Row]:
-    extractor = make_extractor(features, weights)
+def _extractors() -> dict[str, FeatureExtractor]:
+    """The features that are measured, by their names: without the weights of EdgePoint2, SIFT alone."""
+    found: dict[str, FeatureExtractor] = {"sift": SiftExtractor(SiftOptions(max_keypoints=MAX_KEYPOINTS))}
+    weights = Path(os.environ.get("MAPLESS_WEIGHTS_DIR", "")) / "edgepoint2-l64.safetensors"
+    if weights.is_file():
+        from mapless_server.method.features.edgepoint2 import EdgePoint2Extractor
+        from mapless_server.method.features.network import LearnedOptions
+
+        options = LearnedOptions(max_keypoints=MAX_KEYPOINTS, min_score=0.0067)
+        found["edgepoint2-l64"] = EdgePoint2Extractor("l64", weights, options=options)
+    return found
+
+
+def _overlays(folder: Path) -> Iterator[Row]:
+    extractors = _extractors()
     for scene in scenes_in(folder):
-        for name, overlay in OVERLAYS.items():
-            drawn = draw(scene, overlay, extractor)
-            without, with_it = ask(drawn, features, OFF), ask(drawn, features, StationaryOptions())
-            dark = ask_black(drawn, features)
-            row = {
-                "scene": scene.name,
-                "overlay": name,
-                "other places localized, nothing ignored": _of(without.others),
-                "other places localized": _of(with_it.others),
-                "right, black and masked": _of(dark),
-                "right": _of(with_it.right),
-            }
-            print(row, flush=True)
-            yield row
+        for features, extractor in extractors.items():
+            for name, overlay in OVERLAYS.items():
+                yield {"features": features, "scene": scene.name, "overlay": name} | compared(
+                    draw(scene, overlay, extractor), features
+                )
+
+
+def compared(drawn: Drawn, features: str) -> Row:
+    """Figures of one scene with one overlay."""
+    checked = pipeline_of(features, StationaryOptions())
+    found = {
+        "other places localized": accepted(drawn.others, drawn.references, checked),
+        "the same, nothing ignored": accepted(drawn.others[:UNCHECKED], drawn.references, pipeline_of(features, OFF)),
+        "right": right(drawn.queries, drawn.references, checked),
+        "right, black and masked": right(
+            drawn.black_queries, drawn.black_references, pipeline_of(features, StationaryOptions())
+        ),
+    }
+    return {title: f"{sum(some)} of {len(some)}" for title, some in found.items()}
 
 
 def _alternatives(folder: Path, key: str) -> Iterator[Row]:
@@ -320,7 +341,3 @@ def _alternatives(folder: Path, key: str) -> Iterator[Row]:
     sets = windows(clean(folder, DRIVE, make_extractor("sift")))
     for options in _ALTERNATIVES[key]:
         yield {field: getattr(options, field), "ignored, %": f"{100 * ignored_share(sets, options):.2f}"}
-
-
-def _of(found: Sequence[bool]) -> str:
-    return f"{sum(found)} of {len(found)}"
