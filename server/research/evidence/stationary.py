@@ -265,8 +265,8 @@ QUESTIONS = {
             "and how many of the place itself are lost by ignoring it?",
             DATA + " Beside it the same with the pixels of the overlay black, and their keypoints removed.",
             "Two cells to each side, 2.5 of 160 columns: digits that change are as far from those that do not. On the "
-            "straight drive a display and a watermark still localize 3 of 12 photographs of other places with SIFT; the "
-            "cause is not found. The table is as far as it was measured: the other rows are open.",
+            "straight drive a display and a watermark still localize 3 of 12 photographs of other places by SIFT; "
+            "the cause is not found. The table is as far as it was measured: the other rows are open.",
         ),
         Question(
             "stationary-contradicted-px",
