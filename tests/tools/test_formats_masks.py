@@ -38,8 +38,9 @@ def folder(path: Path, layout: str) -> Path:
 def masks_of(dataset: Dataset, root: Path) -> dict[str, str | None]:
     """Paths of the masks by those of the photographs."""
     return {
-        it.image_path.relative_to(root / "images").as_posix(): it.mask_path
-        and it.mask_path.relative_to(root).as_posix()
+        it.image_path.relative_to(root / "images").as_posix(): (
+            None if it.mask_path is None else it.mask_path.relative_to(root).as_posix()
+        )
         for it in dataset.frames
     }
 

@@ -317,9 +317,8 @@ def _overlays(folder: Path) -> Iterator[Row]:
     for scene in scenes_in(folder):
         for features, extractor in extractors.items():
             for name, overlay in OVERLAYS.items():
-                yield {"features": features, "scene": scene.name, "overlay": name} | compared(
-                    draw(scene, overlay, extractor), features
-                )
+                found = compared(draw(scene, overlay, extractor), features)
+                yield {"features": features, "scene": scene.name, "overlay": name, **found}
 
 
 def compared(drawn: Drawn, features: str) -> Row:
