@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[2]
 VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
 NUMBERS = VERSION.partition(".dev")[0]
 """For what knows no development versions: CMake and package.xml."""
-SCHEMAS = {"0.2.0": 3, "0.3.0": 8}
+SCHEMAS = {"0.2.0": 3, "0.3.0": 9}
 """The schema of the store of each release. A release with another schema has another version, and so a line here."""
 
 
