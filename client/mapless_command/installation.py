@@ -1,6 +1,6 @@
 """The command that installs an extra of mapless where this program runs, by how mapless came here.
 
-No index is asked for a package "mapless": none is published, so whoever registered the name would be installed.
+No index is asked for a package "mapless": none is published, so a stranger who registered the name would be installed.
 """
 
 import json

@@ -93,7 +93,7 @@ def warn_of_readers(path: Path) -> None:
     try:
         mode = path.stat().st_mode
     except OSError:
-        return  # whoever reads it says so
+        return  # reading it raises the error
     if mode & _OF_OTHERS:
         log.warning("%s can be read or changed by every user of this machine (mode %o): chmod 600", path, mode & 0o777)
 

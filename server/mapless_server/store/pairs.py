@@ -95,6 +95,7 @@ class PairStore:
             select(column.first_key, column.second_key, column.error_px)
             .join(reference, reference.c.key == column.first_key)
             .where(reference.c.scene_id == scene_key, column.matching == matching, column.error_px.is_not(None))
+            .order_by(column.first_key, column.second_key)  # so that the same pairs are taken each time
         )
         with self._database.read() as connection:
             return {_pair(row): row.error_px for row in connection.execute(known.limit(at_most))}

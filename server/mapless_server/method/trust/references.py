@@ -48,11 +48,10 @@ def disagreeing_references(photographs: Iterable[Supporters]) -> Rejection | Non
         counts = photograph.inlier_counts
         if photograph.error_px is None or not counts:
             continue
-        least = max(MIN_INLIERS, MIN_SHARE * max(counts))
-        used = sorted((i for i, count in enumerate(counts) if count >= least), key=lambda i: -counts[i])
+        used = _most_supporting(counts)
         if used:
             best = max(best, (counts[used[0]], photograph.names[used[0]]))
-        found = (photograph.error_px(*sorted(pair)) for pair in combinations(used[:MOST_REFERENCES], 2))
+        found = (photograph.error_px(*sorted(pair)) for pair in combinations(used, 2))
         errors_px += [it for it in found if it is not None]
     agreeing = sum(it <= MAX_ERROR_PX for it in errors_px)
     if not errors_px or 2 * agreeing >= len(errors_px):
@@ -67,14 +66,20 @@ def disagreeing_references(photographs: Iterable[Supporters]) -> Rejection | Non
     )
 
 
+def _most_supporting(counts: Sequence[int]) -> list[int]:
+    """Indices of the references that a pose rests on, at most `MOST_REFERENCES`, those with the most inliers first."""
+    least = max(MIN_INLIERS, MIN_SHARE * max(counts, default=0))
+    return sorted((i for i, count in enumerate(counts) if count >= least), key=lambda i: -counts[i])[:MOST_REFERENCES]
+
+
 def without_agreement(photograph: Supporters) -> Rejection | None:
     """Rejects a pose in a scene that contradicts itself unless two of its supporting references agree.
 
     Elsewhere references of which nothing is known are taken to have right poses.
     """
     counts, error_px = photograph.inlier_counts, photograph.error_px
-    used = [i for i, count in enumerate(counts) if count >= max(MIN_INLIERS, MIN_SHARE * max(counts))]
-    found = [] if error_px is None else [error_px(i, j) for i, j in combinations(used, 2)]
+    used = _most_supporting(counts)
+    found = [] if error_px is None else [error_px(*sorted(pair)) for pair in combinations(used, 2)]
     if any(it is not None and it <= MAX_ERROR_PX for it in found):
         return None
     best = photograph.names[max(range(len(counts)), key=lambda i: counts[i])] if counts else None
