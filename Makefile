@@ -48,7 +48,9 @@ THREADS ?= 1
 # Three processes, for tests of servers wait a quarter of their time: two use 1.5 of two cores. The one that has finished takes
 # over tests of the others; WORKERS= for one process.
 WORKERS ?= -n 3 --dist worksteal
-test: setup $(PROTO_VENV)/.installed  ## Run the tests in at most five minutes; ARGS=... for pytest
+tools: setup $(PROTO_VENV)/.installed  ## Install all that tests need
+
+test: tools  ## Run the tests in at most five minutes; ARGS=... for pytest
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=$(THREADS) PROTO_PYTHON=$(PROTO_VENV)/bin/python $(BIN)/python -m pytest $(WORKERS) $(ARGS)
 
 nightly: weights  ## Run the tests that are slow and not specific to a change; TENTH=0 to 9 for a tenth of them, as CI does
