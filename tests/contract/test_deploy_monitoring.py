@@ -86,6 +86,7 @@ def everything_happened() -> Metrics:
     metrics.scraped.token_cache = TokenCacheCounters
     metrics.scraped.gpu_memory = lambda: {"allocated": 1.0, "reserved": 1.0, "peak": 1.0}
     metrics.scraped.certificate_expiry = lambda: 1.0
+    metrics.scraped.connections, metrics.scraped.most_connections = (lambda: 1), (lambda: 768)
     return metrics
 
 
