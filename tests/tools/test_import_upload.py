@@ -26,7 +26,6 @@ from mapless import (
 )
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_tools.dataset import Dataset, Frame
-from mapless_tools.ingest import upload as uploading
 from mapless_tools.ingest.existing import KnownReferences
 from mapless_tools.ingest.report import ImportReport
 from mapless_tools.ingest.upload import BATCH_COUNT, Uploader
@@ -206,12 +205,6 @@ def test_an_unnamed_refusal_is_located_by_sending_parts(tmp_path: Path, error: M
     assert (len(report.added), report.stopped) == (9, "")
 
 
-def test_a_server_that_restarts_is_waited_for(tmp_path: Path) -> None:
-    server = Server(lambda references, call: Unavailable("UNAVAILABLE", "starting") if call == 1 else None)
-    assert upload(server, frames_in(tmp_path, 4)).went_well
-    assert len(server.messages) == 2
-
-
 def test_what_another_caller_stores_meanwhile_is_refused_alone(tmp_path: Path) -> None:
     frames = frames_in(tmp_path, 4)
     server = Server()
@@ -237,9 +230,8 @@ def test_what_another_caller_stores_meanwhile_is_refused_alone(tmp_path: Path) -
     ],
 )
 def test_what_hits_all_ends_the_import_and_the_next_run_goes_on(
-    tmp_path: Path, error: MaplessError, message: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, error: MaplessError, message: str
 ) -> None:
-    monkeypatch.setattr(uploading, "AWAY_S", 0.0)
     server = Server(lambda references, call: error if call > 1 else None)
     frames = frames_in(tmp_path)
     report = upload(server, frames, 1)
