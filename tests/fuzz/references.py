@@ -9,6 +9,7 @@ from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import datetime, timezone
 from functools import cache, partial
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -28,6 +29,7 @@ from mapless_server.engine.query import Caller
 from mapless_server.method.views import Features, View
 from mapless_server.rpc import Call
 from mapless_server.scenes import Choice, Coverage, CoverageVerdict, Narrowing, Viewpoint
+from mapless_server.scenes.agreement import Agreement
 from mapless_server.scenes.plausibility import contradictions
 from mapless_server.security import Principal, SceneKey, key_of, scene_id_of, tenant_of
 from mapless_server.services import references as reference_service
@@ -60,10 +62,25 @@ class InlineExecutor(ThreadPoolExecutor):
         return future
 
 
+class _NothingCompared:
+    """Scenes of whose references nothing is known."""
+
+    def touch(self, key: SceneKey) -> None:
+        check_key(key)
+
+    def changed(self, key: SceneKey) -> None:
+        check_key(key)
+
+    def known(self, key: SceneKey) -> Agreement:
+        check_key(key)
+        return Agreement()
+
+
 class WatchfulEngine:
     """Finds nothing, and looks at what it is given."""
 
     options = EngineOptions()
+    references = SimpleNamespace(agreements=_NothingCompared())
 
     def forget_scene(self, key: SceneKey) -> None:
         check_key(key)
@@ -101,6 +118,10 @@ class WatchfulEngine:
 
 class WatchfulStore:
     """Has whatever it is asked for, keeps nothing, and looks at what it is given."""
+
+    def list_alike(self, key: SceneKey, *_: object) -> list[ReferenceRecord]:
+        check_key(key)
+        return []
 
     def get_generation(self, key: SceneKey) -> int:
         check_key(key)
@@ -140,7 +161,7 @@ class WatchfulStore:
         check_key(key)
         return _stored(key, NewReference(check_id(reference_id), b"", CAMERA, POSE, {"sift": _VIEW}))
 
-    def read_image(self, key: SceneKey, reference_id: str) -> bytes:
+    def read_image_of(self, key: str) -> bytes:
         return b""
 
     def delete_reference(self, key: SceneKey, reference_id: str) -> None:

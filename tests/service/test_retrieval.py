@@ -125,11 +125,12 @@ def test_a_store_without_descriptors_is_described_on_first_use(tmp_path: Path) -
 @pytest.mark.parametrize("what", ["features", "descriptor", "pose"])
 def test_a_damaged_reference_costs_itself_unless_it_is_named(tmp_path: Path, what: str) -> None:
     """A scene of four, whose first one the photograph resembles most."""
-    store = Store.open(tmp_path)
-    with serving(tmp_path, store=store) as server, Client(server.address) as client:
+    with serving(tmp_path) as server, Client(server.address) as client:
         client.create_scene("s")
         client.add_references("s", [NewReference(f"r{i}", PHOTOS[i], CAMERA, pose(float(i))) for i in range(4)])
-        damage(store, SceneKey("s"), "r0", what)
+    store = Store.open(tmp_path)
+    damage(store, SceneKey("s"), "r0", what)  # while nothing has it in memory
+    with serving(tmp_path, store=store) as server, Client(server.address) as client:
         answer = client.localize(PHOTOS[0], CAMERA, "s", reference_count=2)
         assert isinstance(answer, LocalizationResult)
         used = ids([use.name for use in answer.diagnostics.references])
