@@ -88,7 +88,8 @@ class RankedReference:
     Attributes:
         reference_id: its id, unique in its scene.
         key: its key, never used again.
-        similarity: cosine of the descriptors, -1 to 1; NaN if the reference or the photograph has none.
+        similarity: cosine of the descriptors, -1 to 1, to four decimals; NaN if the reference or the photograph has
+            none.
         world_from_camera: its pose, metric.
     """
 
@@ -254,7 +255,8 @@ def _best(score: Array, count: int) -> Rows:
 
 def _ranked(entries: Entries, row: int, similarity: float) -> RankedReference:
     reference_id, key, world_from_camera = entries.reference(row)
-    return RankedReference(reference_id, key, similarity, world_from_camera)
+    # Sums of float32 differ by the row at which a reference stands; quantized rows know no more than four decimals.
+    return RankedReference(reference_id, key, round(similarity, 4), world_from_camera)
 
 
 APART_M = 0.3
