@@ -54,12 +54,12 @@ def test_two_sessions_with_worlds_of_their_own_are_found() -> None:
     worlds = session("a", 9, GOOD) | session("b", 7, GOOD)
     found = agreement_of(worlds | between("a", "b", 3, BAD))
     assert 2 * found.agreeing_count > found.pair_count
-    assert found.group_sizes == (9, 7)
+    assert [len(it) for it in found.groups] == [9, 7]
     assert "9 and 7 references" in found.contradiction
     # A pair that agrees by chance joins no worlds; sessions that do agree, or share nothing, are no contradiction.
-    assert agreement_of(worlds | between("a", "b", 3, BAD) | {("a0", "b0"): GOOD}).group_sizes == (9, 7)
+    assert agreement_of(worlds | between("a", "b", 3, BAD) | {("a0", "b0"): GOOD}).groups == found.groups
     assert agreement_of(worlds | between("a", "b", 3, GOOD)) == Agreement(66, 66, GOOD)
-    assert agreement_of(worlds).group_sizes == ()
+    assert agreement_of(worlds).groups == ()
 
 
 def test_large_scenes_that_disagree_are_grouped_in_linear_time() -> None:
@@ -91,6 +91,19 @@ class Pairs:
         return self.errors_px
 
 
+class Explainer:
+    """The depth that a test plants."""
+
+    def __init__(self) -> None:
+        self.depth = 3.0
+
+    def explanation(self, *_: object) -> str:
+        return ""
+
+    def median_depth(self, *_: object) -> float:
+        return self.depth
+
+
 HALL = SceneKey("hall")
 
 
@@ -104,15 +117,19 @@ class TestScenes:
         return Pairs()
 
     @pytest.fixture
+    def explainer(self) -> Explainer:
+        return Explainer()
+
+    @pytest.fixture
     def agreements(
-        self, counts: Counts, pairs: Pairs, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+        self, counts: Counts, pairs: Pairs, explainer: Explainer, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
     ) -> Iterator[SceneAgreements]:
         nothing: Any = None
         matcher = make_matcher("sift")
         with Store.open(tmp_path) as store:
             made = SceneAgreements(store, nothing, nothing, SiftExtractor(), matcher, cast(Any, counts))
             monkeypatch.setattr(made, "_pairs", pairs)
-            monkeypatch.setattr(made, "_explain", lambda *_: "")
+            monkeypatch.setattr(made, "_explainer", explainer)
             yield made
             made.close()
         matcher.close()
@@ -143,3 +160,14 @@ class TestScenes:
         agreements.changed(HALL)
         agreements.current(HALL)
         assert pairs.reads == 2
+
+    def test_the_depth_is_measured_again_if_references_are_replaced(
+        self, agreements: SceneAgreements, pairs: Pairs, explainer: Explainer
+    ) -> None:
+        pairs.errors_px, explainer.depth = session("a", 8, GOOD), 3000.0
+        assert "millimetres" in str(agreements.current(HALL).warnings(arbitrary_unit=False))
+        assert agreements.current(HALL).warnings(arbitrary_unit=True) == []
+        explainer.depth = 3.0
+        pairs.errors_px = session("b", 8, GOOD)
+        agreements.changed(HALL)
+        assert agreements.current(HALL).warnings(arbitrary_unit=False) == []

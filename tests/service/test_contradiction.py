@@ -1,5 +1,6 @@
-"""A scene whose poses are of OpenGL's axes, or inverse, through a server: it is said, and no pose is answered."""
+"""Scenes whose poses are read otherwise than they were meant, through a server: what is said and what is answered."""
 
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -11,17 +12,23 @@ from support.waiting import wait_until
 
 import mapless_tools.demo
 from mapless import Client, NewReference, Rejected, RigidTransform
+from mapless.geometry import Similarity, rotation_from_vector
 from mapless_tools.ingest.formats.cameras import read_folder
 
 FRAMES = read_folder(Path(mapless_tools.demo.__file__).parent / "room").frames
-REFERENCES = [it for it in FRAMES if "query" not in it.name][:5]
+ALL = [it for it in FRAMES if "query" not in it.name]
+REFERENCES = ALL[:5]
 QUERIES = [it for it in FRAMES if "query" in it.name][:2]
 PATIENT_S = 120.0
 READINGS: dict[str, Callable[[RigidTransform], RigidTransform]] = {
     "right": lambda pose: pose,
     "opengl": lambda pose: RigidTransform(pose.rotation @ np.diag([1.0, -1.0, -1.0]), pose.translation),
     "inverse": lambda pose: pose.inverse(),
+    "millimetres": lambda pose: RigidTransform(pose.rotation, 1000 * pose.translation),
 }
+OTHER_ROTATION = np.array([0.1, 0.7, -0.2])
+OTHER_FROM_WORLD = Similarity(0.4, rotation_from_vector(OTHER_ROTATION), np.array([3.0, -2.0, 11.0]))
+"""Of a second session with half of the references."""
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +39,11 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
             for frame in REFERENCES:
                 pose = read(frame.world_from_camera)
                 client.add_reference(scene, NewReference(frame.name, frame.image_path, frame.camera, pose))
+        client.create_scene("sessions")
+        for session, pose_of in ((ALL[::2], READINGS["right"]), (ALL[1::2], OTHER_FROM_WORLD.transform_pose)):
+            for it in session:
+                pose = pose_of(it.world_from_camera)
+                client.add_reference("sessions", NewReference(it.name, it.image_path, it.camera, pose))
         yield server
 
 
@@ -56,9 +68,52 @@ def test_wrong_poses_are_said_and_answer_nothing(client: Client, scene: str, lik
         assert not answer.intrinsics_checks
 
 
+def test_a_second_session_is_said_with_the_similarity_that_aligns_it(client: Client) -> None:
+    wait_until(
+        lambda: (
+            re.search("groups of 8 and 8 references.*would fit the other", client.get_scene("sessions").contradiction)
+            is not None
+        )
+    )
+    (text,) = client.get_scene("sessions").warnings
+    named = re.search(r"that of (\S+), (\S+), (\S+) would", text)
+    assert named is not None
+    assert set(named.groups()) <= {it.name for it in ALL[1::2]}
+    numbers = re.search(r"scale (\S+), rotation by (\S+) degrees about \((.+?)\), translation \((.+?)\)", text)
+    assert numbers is not None
+    scale, angle_deg, axis, translation = (np.array([float(it) for it in part.split(",")]) for part in numbers.groups())
+    axis_angle = -np.radians(angle_deg) * axis  # of the similarity's inverse, which was planted
+    np.testing.assert_allclose(1 / scale, OTHER_FROM_WORLD.scale, rtol=0.01)
+    np.testing.assert_allclose(axis_angle, OTHER_ROTATION, atol=0.01)
+    moved = scale * rotation_from_vector(-axis_angle) @ OTHER_FROM_WORLD.translation + translation
+    np.testing.assert_allclose(moved, 0, atol=0.1)
+
+
+def test_millimetres_are_warned_of_and_reject_nothing(client: Client) -> None:
+    wait_until(lambda: len(client.get_scene("millimetres").warnings) > 0)
+    known = client.get_scene("millimetres")
+    assert known.contradiction == ""
+    assert any("are the poses in millimetres?" in it for it in known.warnings)
+    added = ALL[5], READINGS["millimetres"](ALL[5].world_from_camera)
+    again = client.add_reference(
+        "millimetres", NewReference(added[0].name, added[0].image_path, added[0].camera, added[1])
+    )
+    assert any("are the poses in millimetres?" in it for it in again.warnings)
+    for frame in QUERIES:
+        right, answer = (
+            client.localize(frame.image_path, frame.camera, scene, timeout_s=PATIENT_S)
+            for scene in ("right", "millimetres")
+        )
+        assert isinstance(answer, type(right))
+        hint = answer.hint if isinstance(answer, Rejected) else None
+        assert hint is None or hint.advice != "CHECK_REFERENCE_POSES"
+    client.update_scene("millimetres", arbitrary_unit=True)
+    assert not any("millimetres" in it for it in client.get_scene("millimetres").warnings)
+
+
 def test_right_poses_are_not_accused(client: Client) -> None:
     known = client.get_scene("right")
-    assert known.contradiction == ""
+    assert (known.contradiction, known.warnings) == ("", ())
     assert known.agreeing_pair_count == known.compared_pair_count > 0
     answers = [client.localize(it.image_path, it.camera, "right", timeout_s=PATIENT_S) for it in QUERIES]
     hints = [it.hint for it in answers if isinstance(it, Rejected)]
@@ -66,7 +121,7 @@ def test_right_poses_are_not_accused(client: Client) -> None:
 
 
 def test_the_metric_counts_the_scenes(server: RunningServer) -> None:
-    wait_until(lambda: server.value("mapless_contradicting_scenes") == 2)
+    wait_until(lambda: server.value("mapless_contradicting_scenes") == 3)
 
 
 def test_the_audit_says_it_first_and_fails(server: RunningServer) -> None:

@@ -10,65 +10,88 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mapless_server.errors import DataLoss, NotFound
+from mapless_server.errors import NotFound
 from mapless_server.method.agreement import MAX_ERROR_PX
 from mapless_server.method.correspond import Matcher
 from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.nearest import mutual_matches
 from mapless_server.method.options import StageContext
 from mapless_server.method.pairs import in_order
-from mapless_server.method.readings import MatchedPair, consistent, explain
 from mapless_server.method.views import PosedView
 from mapless_server.security import SceneKey
 from mapless_server.store import Store
 from mapless_server.store.pairs import Pair, PairStore
 
-from .agreement import MIN_GROUP, Agreement, agreement_of
+from .agreement import Agreement, agreement_of
+from .explaining import SceneExplainer, spread
 from .indexes import SceneIndexes
 from .library import Closed, ReferenceLibrary
 from .observer import BackgroundObserver
-from .retrieval.index import Entries
 from .retrieval.ranking import rank_beside
 from .stored import Matching
 
 log = logging.getLogger(__name__)
 
+LEAST_REFERENCES = 3
+"""Fewer are not compared with one another."""
 ENOUGH_PAIRS, SAMPLED_REFERENCES, SAMPLED_NEIGHBOURS = 12, 12, 3
 """If fewer pairs are stored, so many references are matched with so many others each, those that look most similar."""
 
 GROWTH = 1.5
 """A scene with so many times the references is sampled again."""
 
+KNOWN_GROWTH, UNKNOWN_GROWTH = 2.0, 1.2
+"""With so many times the pairs, a mistake or a depth that is known is sought again, and one that was not found."""
+
 READ_PAIRS = 20_000
-EXPLAINED_PAIRS = 24
 STALE_S, REST_FACTOR = 2.0, 50.0
 """What is known of a scene is derived again after so long, and after so many times what reading its pairs took: 20,000
 take a tenth of a second, which queries would have to share."""
 LONGEST_WAIT_S = 3.0
 """For what must be computed, by who asks for the agreement as it is now."""
 _KNOWN_SCENES = 10_000
+_REMEMBERED = 24
+
+
+@dataclass(frozen=True)
+class _Basis:
+    """The pairs by which something was found: their number, and some of them."""
+
+    count: int = 0
+    some: frozenset[Pair] = frozenset()
+
+    @staticmethod
+    def of(pairs: Iterable[Pair]) -> "_Basis":
+        ordered = sorted(pairs)
+        return _Basis(len(ordered), frozenset(spread(ordered, _REMEMBERED)))
+
+    def is_outdated(self, pairs: Collection[Pair], is_known: bool) -> bool:
+        """Whether there are many more pairs now, or half of those are gone."""
+        has_grown = len(pairs) >= max(1.0, self.count * (KNOWN_GROWTH if is_known else UNKNOWN_GROWTH))
+        return has_grown or 2 * sum(it in pairs for it in self.some) < len(self.some)
 
 
 @dataclass(eq=False)
 class _Known:
     """What is known of a scene: errors of sampled pairs, the references that were sampled, and the last result.
 
-    `sampled_size` is the number of its references when they were sampled; before `rests_until_s`, by `time.monotonic`,
-    nothing is derived again.
+    `sampled_size` is the number of its references when they were sampled, `explained` has the pairs by which it was
+    explained, `measured` those by which its depth was measured; before `rests_until_s`, by `time.monotonic`, nothing is
+    derived again.
     """
 
     errors_px: dict[Pair, float] = field(default_factory=dict)
     sampled: set[str] = field(default_factory=set)
     sampled_size: int = 0
     agreement: Agreement | None = None
-    explained_pairs: int = 0
+    explained: _Basis = _Basis()
+    measured: _Basis = _Basis()
     rests_until_s: float = -math.inf
     update: "Future[None] | None" = None
 
@@ -87,8 +110,8 @@ class SceneAgreements:
     ) -> None:
         """The extractor and the matcher are those of the first tier's queries."""
         self._pairs = PairStore(store.database)
-        self._indexes, self._library = indexes, library
-        self._extractor, self._matcher = extractor, matcher
+        self._indexes, self._matcher = indexes, matcher
+        self._explainer = SceneExplainer(indexes, library, extractor, matcher, self._check)
         self._matching = Matching(extractor, matcher).name
         self._observer = observer
         self._scenes: dict[SceneKey, _Known] = {}
@@ -186,10 +209,25 @@ class SceneAgreements:
             self._sample(scene_key, known)
             found = agreement_of(self._with_kept(known, stored))
             self._settle(scene_key, known, found)
-        if found.contradicts_itself and found.pair_count >= 2 * known.explained_pairs:
-            known.explained_pairs = found.pair_count
-            explanation = self._explain(scene_key, self._with_kept(known, stored))
+        if found.contradicts_itself:
+            self._explain(scene_key, known, found, self._with_kept(known, stored))
+        else:
+            self._measure(scene_key, known, found, self._with_kept(known, stored))
+
+    def _explain(self, scene_key: SceneKey, known: _Known, found: Agreement, errors_px: Mapping[Pair, float]) -> None:
+        """Finds the likely mistake, if the pairs are others than when that was tried."""
+        if known.explained.is_outdated(errors_px.keys(), bool(self._agreement(scene_key).explanation)):
+            known.explained = _Basis.of(errors_px)
+            explanation = self._explainer.explanation(scene_key, found, list(errors_px))
             self._settle(scene_key, known, replace(found, explanation=explanation))
+
+    def _measure(self, scene_key: SceneKey, known: _Known, found: Agreement, errors_px: Mapping[Pair, float]) -> None:
+        """Finds how far away is what the references show, if the pairs are others than when that was tried."""
+        agreeing = {pair for pair, error_px in errors_px.items() if error_px <= MAX_ERROR_PX}
+        if known.measured.is_outdated(agreeing, self._agreement(scene_key).median_depth is not None):
+            known.measured = _Basis.of(agreeing)
+            median_depth = self._explainer.median_depth(scene_key, list(agreeing))
+            self._settle(scene_key, known, replace(found, median_depth=median_depth))
 
     def _with_kept(self, known: _Known, stored: Mapping[Pair, float]) -> dict[Pair, float]:
         """All errors that are known, of references that exist."""
@@ -201,10 +239,15 @@ class SceneAgreements:
         return {**stored, **{pair: it for pair, it in kept.items() if gone.isdisjoint(pair)}}
 
     def _settle(self, scene_key: SceneKey, known: _Known, found: Agreement) -> None:
-        """Makes a result known; an explanation that was found before remains while the scene contradicts itself."""
+        """Makes a result known; an explanation that was found before remains while the scene contradicts itself.
+
+        So does a depth while pairs agree.
+        """
         before = known.agreement or Agreement()
         if found.contradicts_itself and not found.explanation:
             found = replace(found, explanation=before.explanation)
+        if found.agreeing_count and found.median_depth is None:
+            found = replace(found, median_depth=before.median_depth)
         with self._guard:
             known.agreement = found
             if self._scenes.get(scene_key) is not known:  # deleted meanwhile
@@ -231,7 +274,7 @@ class SceneAgreements:
         entries = self._indexes.entries(scene_key, StageContext(self._check))
         rows = entries.rows()
         is_small = len(rows) <= SAMPLED_REFERENCES
-        if len(rows) < MIN_GROUP or (not is_small and len(rows) < GROWTH * known.sampled_size):
+        if len(rows) < LEAST_REFERENCES or (not is_small and len(rows) < GROWTH * known.sampled_size):
             return
         known.sampled_size = len(rows)
         spread = np.linspace(0, len(rows) - 1, min(len(rows), SAMPLED_REFERENCES)).round().astype(int)
@@ -242,7 +285,7 @@ class SceneAgreements:
             beside = rank_beside(entries, reference_id, SAMPLED_NEIGHBOURS)
             if len(beside) == SAMPLED_NEIGHBOURS:  # of a smaller scene others may follow
                 known.sampled.add(key)
-            views = self._load(scene_key, [reference_id, *(it.reference_id for it in beside)])
+            views = self._explainer.load(scene_key, [reference_id, *(it.reference_id for it in beside)])
             for other in views[1:]:
                 self._check()
                 self._compare(known, *in_order(views[0], other))
@@ -255,30 +298,3 @@ class SceneAgreements:
             if error_px is not None:
                 with self._guard:
                     known.errors_px[pair] = error_px
-
-    def _load(self, scene_key: SceneKey, reference_ids: list[str]) -> tuple[PosedView, ...]:
-        return self._indexes.load_existing(
-            self._library, scene_key, reference_ids, self._extractor, StageContext(self._check)
-        )
-
-    def _explain(self, scene_key: SceneKey, errors_px: Mapping[Pair, float]) -> str:
-        """The mistake whose correction makes the poses fit best; empty if there is none."""
-        entries: Entries = self._indexes.entries(scene_key, StageContext(self._check))
-        id_of = {key: reference_id for reference_id, key, _ in map(entries.reference, map(int, entries.rows()))}
-        pairs = [pair for pair in sorted(errors_px) if set(pair) <= id_of.keys()]
-        pairs = pairs[:: -(-len(pairs) // EXPLAINED_PAIRS) or 1]
-        keys = sorted({key for pair in pairs for key in pair})
-        with suppress(DataLoss):
-            views = {it.key: it for it in self._load(scene_key, [id_of[key] for key in keys])}
-            indices = {key: i for i, key in enumerate(keys)}
-            matched = []
-            for pair in pairs:
-                self._check()
-                if set(pair) <= views.keys():
-                    ratio = self._matcher.options.distinct_ratio
-                    first, second = (views[key].view for key in pair)
-                    matches = consistent(first, second, mutual_matches(first.features, second.features, ratio, True))
-                    matched.append(MatchedPair((indices[pair[0]], indices[pair[1]]), matches))
-            matched = [it for it in matched if len(it.matches)]
-            return explain({indices[key]: view for key, view in views.items()}, matched).text
-        return ""

@@ -16,7 +16,7 @@ from mapless.v1 import reference_service_pb2_grpc as rpcs
 from mapless.wire import FieldError
 from mapless_server.engine.photos import Photo
 from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT
-from mapless_server.errors import AlreadyExists, DataLoss
+from mapless_server.errors import AlreadyExists, DataLoss, NotFound
 from mapless_server.rpc import Call
 from mapless_server.scenes import Viewpoint
 from mapless_server.security import SceneKey, key_of, scene_id_of
@@ -93,10 +93,9 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         key = scene_key_from_name(request.name, "name", call.principal.tenant)
         scene = await self._stored(self._store.get_scene, key)
         agreement = await self._agreement(key)
-        if agreement.contradicts_itself:  # what its references say of lenses is of no use then
-            warnings = {agreement.contradiction: None}
-        else:
-            warnings = await self._stored(self._lens_warnings, key)
+        warnings = dict.fromkeys(agreement.warnings(scene.attributes.arbitrary_unit))
+        if not agreement.contradicts_itself:  # else what its references say of lenses is of no use
+            warnings |= await self._stored(self._lens_warnings, key)
         return pb.GetSceneResponse(
             scene=scene_to_message(scene),
             warnings=warnings,
@@ -336,9 +335,18 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
             call.note(references_without_features=blank[:MAX_NOTED])
         agreements = self._engine().references.agreements
         agreements.changed(scene_key)
-        contradiction = agreements.known(scene_key).contradiction
+        warnings += await self._stored(self._said_of, scene_key, agreements.known(scene_key))
         shares = {it.reference_id: found.ignored_share for it, found in zip(records, described, strict=True)}
-        return records, [*warnings, *([contradiction] if contradiction else []), *nearly_ignored(shares)]
+        return records, [*warnings, *nearly_ignored(shares)]
+
+    def _said_of(self, scene_key: SceneKey, agreement: Agreement) -> list[str]:
+        """Returns what is said of a scene's agreement; nothing of a unit that cannot be read."""
+        if not agreement.warnings(arbitrary_unit=False):
+            return []
+        try:
+            return agreement.warnings(self._store.get_attributes(scene_key).arbitrary_unit)
+        except (DataLoss, NotFound):
+            return agreement.warnings(arbitrary_unit=True)
 
     def _repeats(self, scene_key: SceneKey, drafts: Sequence[Draft], call: Call) -> list[str]:
         """Returns and logs which poses or photographs the references to be added repeat."""

@@ -7,7 +7,7 @@ given several times, `sessions` photographs in two worlds, `alignment` the simil
 unit is plausible.
 """
 
-from .alignment import Alignment, align, similarity_text
+from .alignment import Alignment, align, align_sessions, similarity_text
 from .conventions import CONVENTIONS, RARE, STRANGE, USUAL, Convention
 from .depth import implausible_depth, median_depth
 from .errors import (
@@ -25,6 +25,7 @@ from .errors import (
 )
 from .explanation import Explanation, explain
 from .repeats import is_start, pose_difference, same_poses
+from .sessions import sessions_of
 from .verdict import WRONG_SHARE, Verdict, judge, suspects_of
 
 __all__ = [
@@ -42,6 +43,7 @@ __all__ = [
     "Verdict",
     "Views",
     "align",
+    "align_sessions",
     "consistent",
     "consistent_matches",
     "distinct_matches",
@@ -55,6 +57,7 @@ __all__ = [
     "pose_difference",
     "same_poses",
     "sampson_px",
+    "sessions_of",
     "similarity_text",
     "summary",
     "suspects_of",

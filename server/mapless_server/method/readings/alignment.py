@@ -11,7 +11,7 @@ refined by the distances of all matches (see `errors`).
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -107,6 +107,22 @@ def align(views: Views, matched: Sequence[MatchedPair]) -> Alignment | None:
     worlds = _Worlds.of(sample, [it.pair for it in matched])
     start = _start(worlds, _relative_poses(views, matched))
     return None if start is None else worlds.refined(start)
+
+
+def align_sessions(
+    views: Views, matched: Sequence[MatchedPair], first: Collection[int], second: Collection[int]
+) -> Alignment | None:
+    """Finds the similarity from the world of the `second` photographs to that of the `first`, by pairs between them.
+
+    None unless the pairs determine all of it.
+    """
+    between = [
+        item if item.pair[0] in first else MatchedPair((item.pair[1], item.pair[0]), item.matches[:, ::-1])
+        for item in matched
+        if len(item.matches) and any(a in first and b in second for a, b in (item.pair, item.pair[::-1]))
+    ]
+    found = align(views, between)
+    return found if found is not None and found.is_unique else None
 
 
 @dataclass(frozen=True, eq=False)

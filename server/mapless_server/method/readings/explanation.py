@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..views import PosedView
-from .alignment import align
+from .alignment import align_sessions
 from .conventions import CONVENTIONS, RARE, STRANGE, USUAL, ViewCorrection, on_view
 from .errors import MatchedPair, PairError, PairSample, Views, summary
 from .intrinsics import FIELDS_DEG, camera_mistakes, focal_scaled, is_unset, of_field, scaled, with_camera
@@ -31,6 +31,8 @@ MIXED_BAD_SHARE = 0.2
 """The same where each pair is given the choice of which of its two to correct."""
 EQUAL_SHARE, EQUAL_PX = 1.25, 0.1
 """Errors that differ by less than this factor, and this distance, are equal: noise of medians."""
+COVERED_SHARE = 0.8
+"""Of the photographs, that two sessions explain."""
 MOST_NAMED = 2
 """Explanations that are named beside one another."""
 _REFINEMENTS = 3
@@ -74,7 +76,7 @@ def explain(views: Views, matched: Sequence[MatchedPair], given_px: float | None
     text = rounding_text(sample, summary(sample.measure())[0] if given_px is None else given_px)
     if text:
         return Explanation(text)
-    if apart := _sessions(views, matched):
+    if apart := _sessions(views, matched, sample.measure()):
         return apart
     mixed = [
         (_mixed(sample, text, correct), rarity) for text, correct, rarity in corrections if rarity < STRANGE
@@ -84,25 +86,18 @@ def explain(views: Views, matched: Sequence[MatchedPair], given_px: float | None
     return min((it for it, rarity in found if rarity == least), key=lambda it: it.error_px, default=Explanation())
 
 
-def _sessions(views: Views, matched: Sequence[MatchedPair]) -> Explanation | None:
+def _sessions(views: Views, matched: Sequence[MatchedPair], errors: Sequence[PairError]) -> Explanation | None:
     """Explains pairs by two sessions, with the similarity that aligns the smaller one, if the pairs determine it."""
-    groups = sessions_of(PairSample(views, matched, _ENOUGH_MATCHES).measure())
-    if groups is None:
+    groups = sessions_of({it.pair: not it.is_bad for it in errors})
+    if groups is None or sum(map(len, groups)) < COVERED_SHARE * len({i for it in errors for i in it.pair}):
         return None
     first, second = groups
-    between = [
-        item if item.pair[0] in first else MatchedPair((item.pair[1], item.pair[0]), item.matches[:, ::-1])
-        for item in matched
-        if len(item.matches)
-        and {i in first for i in item.pair} == {True, False}
-        and set(item.pair) <= {*first, *second}
-    ]
     text = (
         f"two sessions, {len(first)} and {len(second)} photographs that agree among themselves but not with each "
         "other, each in a world of its own"
     )
-    found = align(views, between)
-    if found is None or not found.is_unique:
+    found = align_sessions(views, matched, first, second)
+    if found is None:
         return Explanation(text, photographs=second)
     return Explanation(f"{text}: the smaller one fits with {found.text}", found.median_px, second)
 

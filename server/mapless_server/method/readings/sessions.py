@@ -1,58 +1,82 @@
-"""Photographs of several sessions in one scene, each in a world of its own.
+"""Photographs of two sessions in one scene, each in a world of its own.
 
-Photographs of one session agree with one another. So they are grouped: two groups are joined if more pairs between them
-agree than contradict. Two large groups that remain, most pairs between which are bad, are sessions.
+Photographs of one session agree with one another, and not with those of another world. So they are grouped by the votes
+of their pairs: two large groups that remain, most pairs between which do not agree, are sessions.
 """
 
-from collections import Counter
-from collections.abc import Sequence
+from collections import Counter, deque
+from collections.abc import Mapping
+from typing import TypeVar
 
-from .errors import Pair, PairError
+K = TypeVar("K", int, str)
+"""A photograph: its index, or the key of its reference."""
 
-LEAST_PHOTOGRAPHS = 3
-LEAST_PAIRS = 3
-"""Of a session, and of pairs between two."""
-COVERED_SHARE = 0.8
-"""Of the photographs, in the two largest sessions."""
-BAD_SHARE = 0.8
-"""Of the pairs between two sessions; and least share of good ones inside."""
+MIN_GROUP, MIN_BETWEEN, MAX_BETWEEN_SHARE = 3, 6, 0.25
+"""Photographs of a session; pairs between two; how many of these may agree: docs/evidence/scene-agreement.md."""
+
+_ROUNDS = 3
 
 
-def sessions_of(errors: Sequence[PairError]) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
-    """The photographs of two sessions, the larger first; None if there are not two."""
-    photographs = sorted({i for error in errors for i in error.pair})
-    groups = sorted(_grouped(photographs, errors), key=len, reverse=True)[:2]
-    if len(groups) < 2 or len(groups[1]) < LEAST_PHOTOGRAPHS:
+def sessions_of(agrees: Mapping[tuple[K, K], bool]) -> tuple[tuple[K, ...], tuple[K, ...]] | None:
+    """The photographs of the two largest sessions, the larger first; None if there are not two.
+
+    Args:
+        agrees: for each pair of photographs that can be compared, whether it agrees with their poses.
+    """
+    links: dict[K, dict[K, int]] = {}
+    for (first, second), is_good in agrees.items():
+        links.setdefault(first, {})[second] = links.setdefault(second, {})[first] = 1 if is_good else -1
+    group = _grouped(links)
+    members: dict[int, list[K]] = {}
+    for key in sorted(group):
+        members.setdefault(group[key], []).append(key)
+    large = sorted((it for it in members if len(members[it]) >= MIN_GROUP), key=lambda it: (-len(members[it]), it))
+    if len(large) < 2:
         return None
-    if sum(map(len, groups)) < COVERED_SHARE * len(photographs):
+    first_group, second_group = large[:2]
+    between = [
+        vote for key in members[first_group] for other, vote in links[key].items() if group[other] == second_group
+    ]
+    if len(between) < MIN_BETWEEN or between.count(1) > MAX_BETWEEN_SHARE * len(between):
         return None
-    group_of = {i: number for number, group in enumerate(groups) for i in group}
-    inside = [e.is_bad for e in errors if _groups(e.pair, group_of) in ((0, 0), (1, 1))]
-    between = [e.is_bad for e in errors if set(_groups(e.pair, group_of)) == {0, 1}]
-    if len(between) < LEAST_PAIRS or sum(between) < BAD_SHARE * len(between):
-        return None
-    if not inside or sum(inside) > (1 - BAD_SHARE) * len(inside):
-        return None
-    return tuple(groups[0]), tuple(groups[1])
+    return tuple(members[first_group]), tuple(members[second_group])
 
 
-def _groups(pair: Pair, group_of: dict[int, int]) -> tuple[int, int]:
-    return group_of.get(pair[0], -1), group_of.get(pair[1], -1)
-
-
-def _grouped(photographs: Sequence[int], errors: Sequence[PairError]) -> list[list[int]]:
-    group_of = {i: i for i in photographs}
-    while True:
-        balance: Counter[tuple[int, int]] = Counter()
-        for error in errors:
-            first, second = sorted(group_of[i] for i in error.pair)
-            if first != second:
-                balance[first, second] += -1 if error.is_bad else 1
-        best, surplus = max(balance.items(), key=lambda it: (it[1], it[0]), default=((0, 0), 0))
-        if surplus <= 0:
+def _grouped(links: Mapping[K, Mapping[K, int]]) -> dict[K, int]:
+    """Groups of photographs: each is in the group with which most of its pairs agree, by the number of votes."""
+    group: dict[K, int] = {}
+    order = _along_agreeing(links)
+    for _ in range(_ROUNDS):
+        before = dict(group)
+        for number, key in enumerate(order):
+            votes: Counter[int] = Counter()
+            for other, vote in links[key].items():
+                if other in group and other != key:
+                    votes[group[other]] += vote
+            best = max(votes, key=lambda it: (votes[it], -it), default=-1)
+            if best >= 0 and votes[best] > 0:
+                group[key] = best
+            elif key not in group:
+                group[key] = len(order) + number
+        if group == before:
             break
-        group_of = {i: best[0] if group == best[1] else group for i, group in group_of.items()}
-    groups: dict[int, list[int]] = {}
-    for i, group in group_of.items():
-        groups.setdefault(group, []).append(i)
-    return list(groups.values())
+    return group
+
+
+def _along_agreeing(links: Mapping[K, Mapping[K, int]]) -> list[K]:
+    """All photographs, along pairs that agree as far as these lead, from the one with the most of them on."""
+    if not links:
+        return []
+    begin = max(links, key=lambda key: (sum(links[key].values()), key))
+    waiting, order, seen = deque([begin]), [begin], {begin}
+    left = iter(sorted(links))
+    while len(order) < len(links):
+        if waiting:
+            key = waiting.popleft()
+            found = [other for other in sorted(links[key]) if links[key][other] > 0 and other not in seen]
+        else:
+            found = [next(key for key in left if key not in seen)]
+        seen.update(found)
+        order += found
+        waiting += found
+    return order
