@@ -31,8 +31,8 @@ _MISCONFIGURED = {
 """What another attempt does not change, by a sign in gRPC's text."""
 _NOT_CONNECTED_BECAUSE = _MISCONFIGURED | {
     "HTTP proxy returned response code": "the proxy refuses or does not reach the server",
-    "Socket closed": "the server closes the connection at once; if it uses TLS, give --tls or --ca FILE (Python: tls, "
-    "root_certificates), and --cert if it requires a client certificate",
+    "Socket closed": "the server closes the connection at once: all of its connections are taken, or it uses TLS "
+    "(give --tls or --ca FILE; Python: tls, root_certificates), or requires a client certificate (--cert)",
     "Connection refused": f"{REFUSED} (connection refused)",
 }
 _BROKEN = re.compile(

@@ -5,11 +5,13 @@ import math
 import socket
 import sys
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import uvicorn
+from starlette.types import ASGIApp
 from uvicorn.protocols.http.auto import AutoHTTPProtocol
 
 from mapless import Client, ConnectOptions, Unauthenticated
@@ -21,12 +23,15 @@ from .app import GatewayOptions, gateway
 from .client import ServerClient
 
 _GRACE_S = 10
-_REQUEST_LIMIT_S = 15.0
-"""For the head of a request; the guard limits the time of its body."""
+REQUEST_LIMIT_S = 15.0
+"""For a TLS handshake, and then for the head of a request; the guard limits the time of its body."""
 
 
 class _EndingIdle(AutoHTTPProtocol):  # type: ignore[misc,valid-type]
-    """Ends a connection whose next request does not arrive: uvicorn would wait for its first for ever."""
+    """Ends a connection whose next request does not arrive: uvicorn would wait for its first for ever.
+
+    It ends between one and two limits after its last request; one with a request that is being answered does not end.
+    """
 
     _ends: asyncio.TimerHandle | None = None
     _last: Any = None
@@ -34,7 +39,7 @@ class _EndingIdle(AutoHTTPProtocol):  # type: ignore[misc,valid-type]
     def connection_made(self, transport: Any) -> None:
         """Extends the library's."""
         super().connection_made(transport)
-        self._ends = self.loop.call_later(_REQUEST_LIMIT_S, self._end_unless_busy)
+        self._ends = self.loop.call_later(REQUEST_LIMIT_S, self._end_unless_busy)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Extends the library's."""
@@ -47,7 +52,18 @@ class _EndingIdle(AutoHTTPProtocol):  # type: ignore[misc,valid-type]
         if self.cycle is None or (self.cycle.response_complete and not is_new):
             self.transport.close()
         else:
-            self._ends = self.loop.call_later(_REQUEST_LIMIT_S, self._end_unless_busy)
+            self._ends = self.loop.call_later(REQUEST_LIMIT_S, self._end_unless_busy)
+
+
+class _Server(uvicorn.Server):
+    """Limits the time of TLS handshakes, too, which asyncio gives a minute and uvicorn leaves as it is."""
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Extends the library's."""
+        loop: Any = asyncio.get_running_loop()
+        if self.config.is_ssl:
+            loop.create_server = partial(loop.create_server, ssl_handshake_timeout=REQUEST_LIMIT_S)
+        await super().startup(sockets)
 
 
 @dataclass(frozen=True)
@@ -108,6 +124,18 @@ def run(server: str, connect: ConnectOptions, options: GatewayOptions, binding: 
     else:
         print("gRPC-Web is not served: connectrpc is not installed, which needs Python 3.11", file=sys.stderr)
     application = gateway(lambda: ServerClient(server, connect), options, rpc)
+    host, is_v6 = binding.host, ":" in binding.host
+    family = socket.AF_INET6 if is_v6 else socket.AF_INET
+    with socket.create_server((host, binding.port), family=family, backlog=128) as listening:
+        scheme = "http" if binding.certificate is None else "https"
+        name = f"[{host}]" if is_v6 else host
+        # Read by programs that take any port: keep its form.
+        print(f"mapless-server gateway is on {scheme}://{name}:{listening.getsockname()[1]}", flush=True)
+        http_server(application, binding).run([listening])
+
+
+def http_server(application: ASGIApp, binding: Binding) -> uvicorn.Server:
+    """The server of an application, which ends connections that make no request; `run` takes the listening socket."""
     config = uvicorn.Config(
         application,
         http=_EndingIdle,
@@ -117,14 +145,7 @@ def run(server: str, connect: ConnectOptions, options: GatewayOptions, binding: 
         ssl_certfile=binding.certificate,
         ssl_keyfile=binding.key,
     )
-    host, is_v6 = binding.host, ":" in binding.host
-    family = socket.AF_INET6 if is_v6 else socket.AF_INET
-    with socket.create_server((host, binding.port), family=family, backlog=128) as listening:
-        scheme = "http" if binding.certificate is None else "https"
-        name = f"[{host}]" if is_v6 else host
-        # Read by programs that take any port: keep its form.
-        print(f"mapless-server gateway is on {scheme}://{name}:{listening.getsockname()[1]}", flush=True)
-        uvicorn.Server(config).run([listening])
+    return _Server(config)
 
 
 def _check_tokens(server: str, connect: ConnectOptions) -> None:
