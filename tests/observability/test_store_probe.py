@@ -4,8 +4,10 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import pytest
 from support.waiting import wait_until
 
+from mapless_server.errors import Unavailable
 from mapless_server.observability.store_probe import StoreProbe
 
 
@@ -36,12 +38,18 @@ def test_an_answer_is_kept_for_its_time() -> None:
     assert len(asked) == 1
 
 
-def test_a_fault_is_one_line_and_ends_with_the_fault() -> None:
-    faults = [ValueError("first\nsecond"), KeyError(), None]
+def test_what_the_database_says_is_for_the_log_alone(caplog: pytest.LogCaptureFixture) -> None:
+    """Once for each fault, however often it is asked for."""
+    secret = ValueError('connection to "10.1.2.3", user "mapless" failed\npassword')
+    faults = [secret, secret, KeyError(), Unavailable("the store is busy"), None, secret]
 
     def check() -> None:
         if (fault := faults.pop(0)) is not None:
             raise fault
 
     probe = StoreProbe(check, kept_s=0.0)
-    assert [probe.fault() for _ in range(3)] == ["first", "KeyError", ""]
+    found = [probe.fault() for _ in range(6)]
+    away = "the store is away"
+    assert found == [away, away, away, "the store is busy", "", away]
+    assert caplog.text.count("10.1.2.3") >= 2
+    assert len(caplog.records) == 3

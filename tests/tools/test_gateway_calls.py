@@ -336,3 +336,20 @@ async def test_a_call_is_repeated_whose_server_was_lost(method: str, error: Any,
             answer = await gateway.web(b"", f"/mapless.v1.{method}")
     assert len(server.tries) == attempts
     assert ends in answer.body
+
+
+async def test_an_error_does_not_name_the_servers_address(caplog: pytest.LogCaptureFixture) -> None:
+    """It is in the gateway's log."""
+    with socket.create_server(("127.0.0.1", 0)) as unused:
+        address = f"127.0.0.1:{unused.getsockname()[1]}"
+    async with gateway_of(address, ConnectOptions(timeout_s=0.5)) as gateway:
+        answers = [
+            await gateway.get("/geopose"),
+            await gateway.form(image=PHOTO, intrinsics=INTRINSICS),
+            await gateway.web(b""),
+        ]
+    assert [it.status for it in answers] == [503, 503, 200]
+    for answer in answers:
+        assert b"127.0.0.1" not in answer.body
+        assert b"the server behind this gateway is away" in answer.body.replace(b"%20", b" ")
+    assert caplog.text.count(address) >= 3

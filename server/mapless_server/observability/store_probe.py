@@ -7,6 +7,8 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as StillWaiting
 
+from mapless_server.errors import RequestError
+
 log = logging.getLogger(__name__)
 
 ANSWER_LIMIT_S = 3.0
@@ -32,9 +34,10 @@ class StoreProbe:
         self._lock = threading.Lock()
         self._asked: Future[str] | None = None
         self._asked_s = 0.0
+        self._logged = ""
 
     def fault(self) -> str:
-        """Why the store is away, on one line; empty if it is there. Takes `limit_s` at most."""
+        """Why the store is away, in words that strangers may read; empty if it is there. Takes `limit_s` at most."""
         with self._lock:
             now_s = time.monotonic()
             if self._asked is None or (self._asked.done() and now_s - self._asked_s >= self._kept_s):
@@ -50,7 +53,12 @@ class StoreProbe:
         try:
             self._check()
         except Exception as error:
-            log.debug("the store is away", exc_info=error)
-            asked.set_result(str(error).partition("\n")[0] or type(error).__name__)
+            # The database's own text names hosts, users and files; that of a RequestError is written for callers.
+            fault = str(error) if isinstance(error, RequestError) else "the store is away"
+            if fault != self._logged:
+                log.warning("the store is away: %s", error, exc_info=error)
+            asked.set_result(fault)
         else:
-            asked.set_result("")
+            fault = ""
+            asked.set_result(fault)
+        self._logged = fault

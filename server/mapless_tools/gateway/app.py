@@ -16,7 +16,7 @@ from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
-from mapless import MaplessError, Rejected, Unavailable
+from mapless import MaplessError, Rejected
 from mapless.aio import Client
 from mapless.names import parse_scene_name, scene_name
 
@@ -136,7 +136,7 @@ class _Handlers:
     @_handler
     async def status(self, request: Request) -> Response:
         if not await self._client_for(request).is_serving():
-            raise of_server(Unavailable("UNAVAILABLE", "the server does not serve", retry_after_s=1.0))
+            raise Failure("the server does not serve", 503, reason="UNAVAILABLE", retry_after_s=1.0)
         return JSONResponse({"status": "running"})
 
     @_handler

@@ -2,6 +2,7 @@
 
 import asyncio
 import codecs
+import logging
 import math
 import time
 from collections.abc import Sequence
@@ -12,6 +13,8 @@ from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from mapless import MaplessError
+
+log = logging.getLogger(__name__)
 
 _STATUS = {
     "INVALID_ARGUMENT": 400,
@@ -25,6 +28,17 @@ _STATUS = {
     "DEADLINE_EXCEEDED": 504,
 }
 """By the name of a gRPC status; all others are 502, faults of the server behind the gateway."""
+
+
+_AWAY = "the server behind this gateway is away"
+_OF_CONNECTION = {
+    "UNAVAILABLE": _AWAY,
+    "CANCELLED": _AWAY,
+    "DEADLINE_EXCEEDED": "no answer of the server behind this gateway in time",
+    "INTERNAL": "the server behind this gateway gave no answer that can be read",
+    "UNKNOWN": "the server behind this gateway gave no answer that can be read",
+}
+"""By the name of a gRPC status that no server has sent."""
 
 
 class Failure(Exception):
@@ -57,10 +71,22 @@ class Failure(Exception):
         return JSONResponse({"error": content}, self.status, after)
 
 
+def public_message(code: str, message: str, request_id: str) -> str:
+    """The message of a call's error for callers of the gateway.
+
+    It is the server's own if the error has a request id. Otherwise the connection failed, whose text names the server's
+    address, or a proxy: it goes to the log.
+    """
+    if request_id or code not in _OF_CONNECTION:
+        return message
+    log.warning("a call of the server failed, %s: %s", code, message)
+    return _OF_CONNECTION[code]
+
+
 def of_server(error: MaplessError, field: str | None = None) -> Failure:
     """Makes the failure of a call; `field` replaces the error's own."""
     return Failure(
-        error.message,
+        public_message(error.code, error.message, error.request_id),
         _STATUS.get(error.code, 502),
         reason=error.reason,
         field=field or error.field,

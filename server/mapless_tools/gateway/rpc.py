@@ -28,7 +28,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from mapless.v1 import localization_service_pb2, reference_service_pb2
 
 from .client import ServerClient
-from .guard import Failure, checked_json
+from .guard import Failure, checked_json, public_message
 
 _PASSED_METADATA = ("authorization", "x-client-id", "x-mapless-scene", "x-request-id")
 _CONTENT_TYPES = ("application/grpc-web", "application/connect+", "application/proto", "application/json")
@@ -158,12 +158,13 @@ def _timeout_s(context: RequestContext[Any, Any]) -> float | None:
 
 def _error(error: grpc.aio.AioRpcError, context: RequestContext[Any, Any]) -> ConnectError:
     metadata = dict(error.trailing_metadata() or ())
-    if request_id := metadata.get("x-request-id"):
-        context.response_trailers["x-request-id"] = str(request_id)
+    if request_id := str(metadata.get("x-request-id", "")):
+        context.response_trailers["x-request-id"] = request_id
     try:
         status = status_pb2.Status.FromString(metadata.get(_DETAILS, b""))
     except DecodeError:  # of a proxy in between
         status = status_pb2.Status()
     details = [ErrorDetail(AnyMessage(type_url=it.type_url, value=it.value)) for it in status.details]
     name = error.code().name
-    return ConnectError(_CODES.get(name) or Code(name.lower()), error.details() or "", details)
+    message = public_message(name, error.details() or "", request_id)
+    return ConnectError(_CODES.get(name) or Code(name.lower()), message, details)
