@@ -5,10 +5,11 @@ from collections import Counter
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapless_server.scheduling import Flow
+from mapless_server.scheduling.expected import LATELY_S, MUCH_SHORTER, Expected
 from mapless_server.scheduling.fair_queue import FairQueue
 from mapless_server.scheduling.shares import CREDIT_S, MAX_IDLE, Shares
 
@@ -196,3 +197,33 @@ def test_a_prediction_is_corrected_when_the_step_has_ended() -> None:
     shares.charge(one, 4.0)
     assert shares.lead_s(one, other) == pytest.approx(4.0)
     assert sorted((one, other), key=shares.turn) == [other, one]
+
+
+@settings(deadline=None)
+@given(
+    entered=st.lists(st.tuples(st.sampled_from("tu"), st.sampled_from("abc"), st.sampled_from("xy")), max_size=12),
+    charged=st.lists(st.tuples(st.integers(0, 11), st.sampled_from([0.5, 1.0, 2.0])), max_size=12),
+    arrivals=st.lists(st.tuples(st.integers(0, 17), st.sampled_from([0.1, 0.3, 1.0]), st.floats(0, 3)), max_size=8),
+    step_s=st.sampled_from([0.2, 0.5, 2.0]),
+)
+def test_what_is_expected_is_that_of_the_plain_search(
+    entered: list[tuple[str, str, str]],
+    charged: list[tuple[int, float]],
+    arrivals: list[tuple[int, float, float]],
+    step_s: float,
+) -> None:
+    shares, now_s = Shares(), 3.0
+    for it in entered:
+        shares.enter(Flow(*it))
+    for index, seconds in charged:
+        if index < len(entered):
+            shares.charge(Flow(*entered[index]), seconds)
+    every = [Flow(tenant, caller, "z") for tenant in "tuv" for caller in "abc" for _ in "12"]
+    came = [(every[index], its_s, came_s) for index, its_s, came_s in arrivals]
+    expected = Expected(came, shares, now_s)
+    for flow in set(every):
+        others = [it for it in came if it[0].group != flow.group]
+        is_shorter = [MUCH_SHORTER * its_s <= step_s and now_s - came_s <= step_s for _, its_s, came_s in others]
+        is_first = [now_s - came_s <= LATELY_S and shares.lead_s(flow, it) > 0 for it, _, came_s in others]
+        assert expected.shorter(flow, step_s) == any(is_shorter)
+        assert expected.first(flow) == any(is_first)

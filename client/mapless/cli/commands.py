@@ -214,9 +214,14 @@ def delete_reference(client: Client, arguments: argparse.Namespace) -> int:
 def retrieve(client: Client, arguments: argparse.Namespace) -> int:
     """Finds the references most similar to a photograph."""
     camera = read_camera(arguments.camera, arguments.photo)
-    given = limits(arguments)
-    asked = arguments.photo, camera, arguments.scene, arguments.count
-    found = client.retrieve_references(*asked, priors=given, mask=arguments.mask)
+    found = client.retrieve_references(
+        arguments.photo,
+        camera,
+        arguments.scene,
+        count=arguments.count,
+        priors=limits(arguments),
+        mask=arguments.mask,
+    )
     rows = [(it.name.rpartition("/")[2], f"{it.similarity:.3f}", *_position(it.world_from_camera)) for it in found]
     return show(arguments, found, table(("REFERENCE", "SIMILARITY", "X", "Y", "Z"), rows))
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, Similarity
 
-from .intrinsics import IntrinsicsEvidence
 from .observations import KeypointNoise, Tracks
 from .options import IntrinsicsSigma
 from .priors.known import PriorCheck
@@ -20,6 +19,7 @@ from .views import Matches, PosedView, View
 
 if TYPE_CHECKING:  # services do not load what computes
     from .agreement import ReferenceErrors
+    from .intrinsics import IntrinsicsEvidence
 
 
 class ScaleStage(str, Enum):

@@ -288,8 +288,6 @@ class Batch:
 
 
 _ARRIVALS = 64
-_MUCH_SHORTER = 4
-"""A job that takes so many times less than the steps of others does not wait for them, if a lane has two threads."""
 
 
 @dataclass
@@ -322,16 +320,6 @@ class Lane:
     def has_one_left(self) -> bool:
         """Whether all threads but one compute long steps."""
         return len(self.long) >= self.threads - 1 > 0
-
-    def expects_shorter(self, flow: Flow, seconds: float, now_s: float) -> bool:
-        """Whether much shorter jobs are likely to come while a caller's step of this time is computed.
-
-        They are if one of another caller has come within as long a time.
-        """
-        return any(
-            _MUCH_SHORTER * its_s <= seconds and now_s - came_s <= seconds and other.group != flow.group
-            for other, its_s, came_s in self.arrivals
-        )
 
 
 _TRY_LARGER_AFTER = 64

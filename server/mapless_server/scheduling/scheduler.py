@@ -13,6 +13,7 @@ from typing import Any
 
 from .admission import Admission, Ledger, WorkQueueOptions
 from .costs import MAX_OF_CALLERS, CostModel, StageCosts
+from .expected import Expected
 from .fair_queue import FairQueue
 from .jobs import (
     Abandoned,
@@ -41,9 +42,6 @@ from .timers import Timers
 
 FIRST_STAGE_INTERVAL = 4
 """One of so many batches of a lane is of the first stage, if several stages wait."""
-
-LATELY_S = 1.0
-"""While others that have been given less have asked within this time, a caller's long steps leave them one thread."""
 
 _TRY_ONE_IN = 8
 
@@ -170,13 +168,18 @@ class Scheduler:
         if not lane.free:
             return None
 
+        has_one_left = lane.has_one_left
+        expected: Expected | None = None
+
         def is_allowed(job: Job) -> bool:
-            if not lane.has_one_left:
+            nonlocal expected
+            if not has_one_left:
                 return True
             step_s = self._stage_costs.of_step(job, now_s)
             if step_s <= self._options.quantum_s:
                 return True
-            return not (lane.expects_shorter(job.flow, step_s, now_s) or self._expects_first(lane, job.flow, now_s))
+            expected = expected or Expected(lane.arrivals, self._shares, now_s)
+            return not (expected.shorter(job.flow, step_s) or expected.first(job.flow))
 
         waiting = [it for it, queue in zip(lane.stages, lane.queues, strict=True) if any(map(is_allowed, queue))]
         if not waiting:
@@ -189,13 +192,6 @@ class Scheduler:
         for job in jobs:
             self._observer.waited(stage.name, now_s - job.waits_since_s)
         return self._begin(lane, stage, jobs, now_s)
-
-    def _expects_first(self, lane: Lane, flow: Flow, now_s: float) -> bool:
-        """Whether one who comes before a caller is likely to need a thread soon, because it has asked lately."""
-        return any(
-            now_s - came_s <= LATELY_S and other.group != flow.group and self._shares.lead_s(flow, other) > 0
-            for other, _, came_s in lane.arrivals
-        )
 
     def _take_spare(self, lane: Lane, is_allowed: Callable[[Job], bool], now_s: float) -> Batch | None:
         """Selects, for a thread that nothing else waits for, steps that need more room than there was."""

@@ -114,6 +114,14 @@ class Shares:
         """Sorts clients that have jobs in the order in which they are served."""
         return tuple(key for it in self._members(flow) for key in (it.served_s, it.number))
 
+    def given_s(self, flow: Flow) -> tuple[float, float]:
+        """Computing time that a client's tenant, and its caller among that tenant's, have been given or begin with.
+
+        Neither needs to have jobs; the caller of an unknown tenant begins with nothing.
+        """
+        tenant = self._all.active.get(flow.tenant) or self._all.idle.get(flow.tenant)
+        return self._all.begin_s(flow.tenant), 0.0 if tenant is None else tenant.begin_s(flow.caller)
+
     def lead_s(self, flow: Flow, other: Flow) -> float:
         """Computing time by which a client's tenant, caller or client is ahead of another's, at their first difference.
 

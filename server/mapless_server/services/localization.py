@@ -209,7 +209,11 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         engine = self._engine()
         with engine.hold(queries, call.caller):
             return await localize_group(
-                engine, queries, call, list_name, lambda *asked: engine.join(partial(pose, *asked), call.caller)
+                engine,
+                queries,
+                call,
+                list_name,
+                lambda asked, results: engine.join(partial(pose, asked, results), call.caller),
             )
 
     def _finish_group(

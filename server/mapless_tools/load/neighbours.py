@@ -134,10 +134,10 @@ async def _measure(
     def of_neighbour() -> Metadata:
         return ("authorization", f"Bearer {neighbour}"), ("x-client-id", f"id-{next(numbers)}")
 
-    asked = server.address, METHOD
+    address = server.address
     async with (
-        connected(*asked, options.clients, options.deadline_s, read_answer, of_fleet) as target,
-        connected(*asked, options.callers, options.deadline_s, read_answer, of_neighbour) as other,
+        connected(address, METHOD, options.clients, options.deadline_s, read_answer, of_fleet) as target,
+        connected(address, METHOD, options.callers, options.deadline_s, read_answer, of_neighbour) as other,
     ):
         ramp, saturation_per_s = await find_saturation(server, target, options.ramp_s, progress)
         records: list[CallRecord] = []

@@ -7,6 +7,7 @@ their covariances, map > odom and odom > base, what the recording has of /tf_sta
 from collections import Counter
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +102,7 @@ def replay_bag(
         report = BagReport()
         writer = stack.enter_context(_Output(out, recording, options))
         writer.copy_static(images)
-        localizer = Localizer(client, options, lambda *asked: _looked_up(images, tree, *asked))
+        localizer = Localizer(client, options, partial(_looked_up, images, tree))
         failures, total = 0, recording.counts[images.topic]
         try:
             for stamp_ns, time_ns, message in images:

@@ -1,0 +1,51 @@
+"""Who is likely to need a thread soon, by the jobs that came last, and so would wait for a caller's long step."""
+
+import math
+from collections.abc import Iterable
+
+from .jobs import Flow
+from .shares import Shares
+
+LATELY_S = 1.0
+"""While others that have been given less have asked within this time, a caller's long steps leave them one thread."""
+MUCH_SHORTER = 4
+"""A job that takes so many times less than the steps of others does not wait for them, if a lane has two threads."""
+
+
+class Expected:
+    """What is expected of a lane at one moment. Each answer takes microseconds, however many have come and wait."""
+
+    def __init__(self, arrivals: Iterable[tuple[Flow, float, float]], shares: Shares, now_s: float) -> None:
+        """`arrivals` are jobs that have come to wait: owner, predicted time with later stages, time of arrival."""
+        self._shares = shares
+        long_from_s: dict[tuple[str, ...], float] = {}
+        lately = set[tuple[str, ...]]()
+        for flow, its_s, came_s in arrivals:  # without `min` and `max`, which take most of the time here
+            ago_s, from_s, group = now_s - came_s, MUCH_SHORTER * its_s, flow[:2]
+            if ago_s > from_s:
+                from_s = ago_s
+            known_s = long_from_s.get(group)
+            if known_s is None or from_s < known_s:
+                long_from_s[group] = from_s
+            if ago_s <= LATELY_S:
+                lately.add(group)
+        # That of a caller itself does not count, so two are enough.
+        self._long_from_s = sorted((it, group) for group, it in long_from_s.items())[:2]
+        self._least_tenant_s = math.inf
+        self._least_caller_s: dict[str, float] = {}
+        for group in lately:
+            tenant_s, caller_s = shares.given_s(Flow(*group))
+            self._least_tenant_s = min(self._least_tenant_s, tenant_s)
+            self._least_caller_s[group[0]] = min(self._least_caller_s.get(group[0], math.inf), caller_s)
+
+    def shorter(self, flow: Flow, seconds: float) -> bool:
+        """Whether much shorter jobs are likely to come while a caller's step of this time is computed.
+
+        They are if one of another caller has come within as long a time.
+        """
+        return any(it <= seconds and group != flow.group for it, group in self._long_from_s)
+
+    def first(self, flow: Flow) -> bool:
+        """Whether one who comes before a caller is likely to need a thread soon, because it has asked lately."""
+        tenant_s, caller_s = self._shares.given_s(flow)
+        return self._least_tenant_s < tenant_s or self._least_caller_s.get(flow.tenant, math.inf) < caller_s
