@@ -3,9 +3,10 @@
 `python -m research.scene_agreement SCENES [--features sift] [--references 16] [--queries 6] [--only NAME ...]`: each
 folder of SCENES with `cameras.json` becomes a scene in an engine of this process, with its poses as given, in OpenGL's
 axes, inverse, and in millimetres. References are added one at a time. The table has, for each reading, after how many
-references the scene is said to contradict itself, the pairs that agree, and the queries that are answered: rightly,
-wrongly, and rejected with the advice to check the references' poses. Axes and inverse must be said, and nothing
-answered; the others must not be said.
+references the scene is said to contradict itself, the pairs that agree, the median depth of what these show and whether
+the unit is warned of, and the queries that are answered: rightly, wrongly, and rejected with the advice to check the
+references' poses. Axes and inverse must be said, and nothing answered; the others must not be said. Of scenes in
+metres, millimetres must be warned of, and nothing else.
 """
 
 import argparse
@@ -30,6 +31,7 @@ from mapless_server.method.answer import Localization
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.rejection import Advice
 from mapless_server.scenes import ANYWHERE
+from mapless_server.scenes.agreement import Agreement
 from mapless_server.scheduling import Flow
 from mapless_server.security import SceneKey
 from mapless_server.serve.assembly import engine_over, make_tiers
@@ -51,11 +53,28 @@ READINGS: dict[str, Reading] = {
 }
 
 
+COLUMNS = (
+    "scene",
+    "reading",
+    "references",
+    "said at",
+    "pairs that agree",
+    "median depth",
+    "unit",
+    "right",
+    "wrong",
+    "advised",
+    "rejected",
+    "cpu s",
+)
+
+
 @dataclass(frozen=True)
 class Sample:
     """References and queries of a folder, evenly spread and disjoint, and the photographs' features."""
 
     name: str
+    is_metric: bool
     references: Sequence[Frame]
     queries: Sequence[Frame]
     described: Sequence[Description]
@@ -63,12 +82,11 @@ class Sample:
 
 @dataclass
 class Found:
-    """What was said of a scene: after how many references, or 0, and the outcomes of its queries."""
+    """What was said of a scene: after how many references, or 0, in the end, and the outcomes of its queries."""
 
     said_at: int
-    agreeing: int
-    pairs: int
-    text: str
+    agreement: Agreement
+    warns_of_unit: bool
     outcomes: Counter[str]
     cpu_s: float
 
@@ -85,19 +103,20 @@ def caller() -> Caller:
 
 async def sample_of(engine: QueueEngine, folder: Path, references: int, queries: int) -> Sample:
     """Reads a folder, and describes its references."""
-    frames = list(read_folder(folder).frames)[:MAX_FRAMES]
+    dataset = read_folder(folder)
+    frames = list(dataset.frames)[:MAX_FRAMES]
     asked = sorted(set(np.linspace(1, len(frames) - 2, queries).round().astype(int).tolist()))
     others = [i for i in range(len(frames)) if i not in asked]
     chosen = np.unique(np.linspace(0, len(others) - 1, min(references, len(others))).round().astype(int))
     kept = [frames[others[i]] for i in chosen]
     described = await engine.describe([photo_of(it) for it in kept], caller())
-    return Sample(folder.name, kept, [frames[i] for i in asked], described)
+    return Sample(folder.name, dataset.metric, kept, [frames[i] for i in asked], described)
 
 
 async def examine(engine: QueueEngine, store: Store, sample: Sample, reading: Reading, name: str) -> Found:
     """Adds the references one by one, then asks with the queries."""
     key = SceneKey(f"/{name}")
-    store.create_scene(key, SceneAttributes(arbitrary_unit=True))
+    store.create_scene(key, SceneAttributes(arbitrary_unit=not sample.is_metric))
     agreements, said_at = engine.references.agreements, 0
     for i, (frame, found) in enumerate(zip(sample.references, sample.described, strict=True)):
         pose = reading(frame.world_from_camera)
@@ -115,7 +134,8 @@ async def examine(engine: QueueEngine, store: Store, sample: Sample, reading: Re
     seconds = time.process_time() - begin_s
     agreements.changed(key)
     now = agreements.current(key)
-    return Found(said_at, now.agreeing_count, now.pair_count, now.contradiction, outcomes, seconds)
+    warns_of_unit = not now.contradicts_itself and bool(now.warnings(arbitrary_unit=not sample.is_metric))
+    return Found(said_at, now, warns_of_unit, outcomes, seconds)
 
 
 def outcome_of(outcome: object, true: RigidTransform, sample: Sample, reading: Reading) -> str:
@@ -134,8 +154,7 @@ async def main(arguments: argparse.Namespace) -> None:
     """Prints the table, a row at a time."""
     settings = load_settings({"features": arguments.features}).settings
     limits = ImageLimits(max_bytes=2**28, max_pixels=200_000_000)
-    print("| scene | reading | references | said at | pairs that agree | right | wrong | advised | rejected | cpu s |")
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}")
     for folder in sorted(it for it in arguments.scenes.iterdir() if (it / "cameras.json").exists()):
         if arguments.only and folder.name not in arguments.only:
             continue
@@ -149,10 +168,13 @@ async def main(arguments: argparse.Namespace) -> None:
                 found = await examine(engine, store, sample, change, f"scene-{i}")
                 counts = (found.outcomes[it] for it in ("right", "wrong", "advised", "rejected"))
                 cells: list[object] = [sample.name, reading, len(sample.references), found.said_at or "-"]
-                cells += [f"{found.agreeing}/{found.pairs}", *counts, f"{found.cpu_s:.1f}"]
+                depth = found.agreement.median_depth
+                cells += [f"{found.agreement.agreeing_count}/{found.agreement.pair_count}"]
+                cells += ["-" if depth is None else f"{depth:.3g}", "warned" if found.warns_of_unit else "-"]
+                cells += [*counts, f"{found.cpu_s:.1f}"]
                 print("| " + " | ".join(map(str, cells)) + " |", flush=True)
                 if arguments.verbose:
-                    print(f"<!-- {found.text} -->", flush=True)
+                    print(f"<!-- {found.agreement.contradiction} -->", flush=True)
             await engine.close()
             store.close()
 

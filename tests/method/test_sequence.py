@@ -190,12 +190,26 @@ def test_a_session_in_another_unit_is_no_series_of_jumps(unit_m: float) -> None:
     assert "contradict the photographs between all 6" in rejection(outcome).message
 
 
+def turned(rotation: Array, pose: RigidTransform) -> RigidTransform:
+    return RigidTransform(pose.rotation @ rotation.T, pose.translation)
+
+
 SENT: dict[str, tuple[Callable[[RigidTransform], RigidTransform], str]] = {
-    "OpenGL": (partial(pose_to, Axes.ARCORE), "y and z of the cameras reversed"),
-    "inverse": (RigidTransform.inverse, "as inverses, camera_from_session"),
-    "view matrix": (lambda pose: pose_to(Axes.ARCORE, pose).inverse(), "as inverses, with y and z"),
-    "ROS": (partial(pose_to, Axes.ROS), "in the axes of ROS"),
-    "Unity": (partial(pose_to, Axes.UNITY), "in the axes of Unity"),
+    "OpenGL": (partial(pose_to, Axes.ARCORE), "the camera axes are OpenGL's"),
+    "inverse": (RigidTransform.inverse, "camera_from_session, not session_from_camera"),
+    "view matrix": (lambda pose: pose_to(Axes.ARCORE, pose).inverse(), "camera_from_session with OpenGL's"),
+    "ROS": (partial(pose_to, Axes.ROS), "a robot's body axes (REP 103"),
+    "Unity": (partial(pose_to, Axes.UNITY), "left-handed (y up, as in Unity)"),
+    "transposed": (lambda pose: RigidTransform(pose.rotation.T, pose.translation), "the rotations are transposed"),
+    "view matrix's translation": (
+        lambda pose: RigidTransform(pose.rotation, pose.inverse().translation),
+        "the positions are the translations of camera_from_session",
+    ),
+    "portrait": (partial(turned, np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])), "turned by 90"),
+    "y and z exchanged": (
+        lambda pose: RigidTransform(pose.rotation, pose.translation[[0, 2, 1]] * [1, 1, -1]),
+        "(x, -z, y) of the given",
+    ),
 }
 
 
@@ -208,7 +222,7 @@ def climb(count: int) -> list[RigidTransform]:
 @pytest.mark.parametrize("sent", SENT)
 @pytest.mark.parametrize("count", [3, 6])
 def test_wrong_axes_of_a_session_are_named(sent: str, count: int) -> None:
-    """From three photographs on; no others are named."""
+    """From three photographs on; at most one other that fits as well is named beside them."""
     random = random_for("axes", count)
     truth = climb(count)
     images = images_of(random, truth, alone=True, own_noise_m=0.002)
@@ -216,7 +230,7 @@ def test_wrong_axes_of_a_session_are_named(sent: str, count: int) -> None:
     session = [as_sent(it) for it in drifting(random, truth, 0.01)]
     outcome = rejection(check_tracking(estimate(solve_sequence(images, session, False)), session))
     assert words in outcome.message
-    assert outcome.message.count(" or ") == 0
+    assert outcome.message.count("; or ") <= (count == 3)
 
 
 def test_a_single_step_names_no_axes() -> None:
@@ -234,11 +248,11 @@ def test_axes_that_contradict_one_photograph_are_not_named() -> None:
     truth = climb(6)
     session = [pose_to(Axes.ARCORE, it) for it in drifting(random, truth, 0.01)]
     found = estimate(solve_sequence(images_of(random, truth, alone=True, own_noise_m=0.002), session, False))
-    assert "y and z of the cameras reversed" in rejection(check_tracking(found, session)).message
+    assert "OpenGL" in rejection(check_tracking(found, session)).message
     *others, last = found.world_from_camera
     others[2] = others[2].shifted(np.array([0.5, 0.0, 0.0]))
     message = rejection(check_tracking(replace(found, world_from_camera=(*others, last)), session)).message
-    assert "read" not in message
+    assert "likely" not in message
 
 
 def test_jumps_that_no_other_axes_explain_name_none() -> None:

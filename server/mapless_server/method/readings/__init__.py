@@ -23,13 +23,14 @@ from .errors import (
     sampson_px,
     summary,
 )
-from .explanation import Explanation, explain
+from .explanation import MOST_NAMED, Explanation, explain
 from .repeats import is_start, pose_difference, same_poses
 from .sessions import sessions_of
 from .verdict import WRONG_SHARE, Verdict, judge, suspects_of
 
 __all__ = [
     "CONVENTIONS",
+    "MOST_NAMED",
     "RARE",
     "STRANGE",
     "USUAL",

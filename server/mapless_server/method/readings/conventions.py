@@ -29,6 +29,10 @@ class Convention:
     correct: PoseCorrection
     rarity: int
 
+    def text_in(self, frame: str) -> str:
+        """How it is named where the poses are not in the world, but in another frame, such as a session."""
+        return self.text.replace("world", frame)
+
 
 MIRROR = np.diag([1.0, -1.0, 1.0])
 """From a left-handed world to a right-handed one; which axis is mirrored changes no relative pose."""
