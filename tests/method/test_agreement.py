@@ -113,9 +113,9 @@ def test_a_pose_on_references_that_disagree_is_rejected() -> None:
 
 def test_in_a_contradicting_scene_two_references_must_agree() -> None:
     names, counts = ["a", "b", "c"], [90, 80, 2]
-    assert without_agreement(Supporters(names, counts, lambda i, j: 0.5 if j == 1 else None)) is None
+    assert without_agreement([Supporters(names, counts, lambda i, j: 0.5 if j == 1 else None)]) is None
     for errors in (lambda i, j: None, lambda i, j: 0.5 if j == 2 else 9.0, None):
-        found = without_agreement(Supporters(names, counts, errors))
+        found = without_agreement([Supporters(names, counts, errors)])
         assert found is not None
         assert found.hint is not None
         assert (found.hint.advice, found.hint.best_reference) == (Advice.CHECK_REFERENCE_POSES, "a")
@@ -128,4 +128,5 @@ def test_rejections_of_a_contradicting_scene_accuse_nothing_else() -> None:
     assert found.hint is not None
     assert found.hint.advice is Advice.CHECK_REFERENCE_POSES
     assert found.intrinsics_checks == ()
+    assert with_contradiction(found, "the scene contradicts itself").message == found.message
     assert with_contradiction(rejected, "") is rejected

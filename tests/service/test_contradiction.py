@@ -11,8 +11,9 @@ from support.servers import RunningServer, serving_really
 from support.waiting import wait_until
 
 import mapless_tools.demo
-from mapless import Client, NewReference, Rejected, RigidTransform
+from mapless import Client, GroupRejected, NewReference, Rejected, RigidTransform, RigImage, SequenceFrame
 from mapless.geometry import Similarity, rotation_from_vector
+from mapless_tools.dataset import Frame
 from mapless_tools.ingest.formats.cameras import read_folder
 
 FRAMES = read_folder(Path(mapless_tools.demo.__file__).parent / "room").frames
@@ -20,7 +21,8 @@ ALL = [it for it in FRAMES if "query" not in it.name]
 REFERENCES = ALL[:5]
 QUERIES = [it for it in FRAMES if "query" in it.name][:2]
 PATIENT_S = 120.0
-READINGS: dict[str, Callable[[RigidTransform], RigidTransform]] = {
+Reading = Callable[[RigidTransform], RigidTransform]
+READINGS: dict[str, Reading] = {
     "right": lambda pose: pose,
     "opengl": lambda pose: RigidTransform(pose.rotation @ np.diag([1.0, -1.0, -1.0]), pose.translation),
     "inverse": lambda pose: pose.inverse(),
@@ -31,19 +33,19 @@ OTHER_FROM_WORLD = Similarity(0.4, rotation_from_vector(OTHER_ROTATION), np.arra
 """Of a second session with half of the references."""
 
 
+def reference(frame: Frame, read: Reading) -> NewReference:
+    return NewReference(frame.name, frame.image_path, frame.camera, read(frame.world_from_camera))
+
+
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
     with serving_really(tmp_path_factory.mktemp("data")) as server, Client(server.address) as client:
         for scene, read in READINGS.items():
             client.create_scene(scene)
-            for frame in REFERENCES:
-                pose = read(frame.world_from_camera)
-                client.add_reference(scene, NewReference(frame.name, frame.image_path, frame.camera, pose))
+            client.add_references(scene, [reference(it, read) for it in REFERENCES])
         client.create_scene("sessions")
         for session, pose_of in ((ALL[::2], READINGS["right"]), (ALL[1::2], OTHER_FROM_WORLD.transform_pose)):
-            for it in session:
-                pose = pose_of(it.world_from_camera)
-                client.add_reference("sessions", NewReference(it.name, it.image_path, it.camera, pose))
+            client.add_references("sessions", [reference(it, pose_of) for it in session])
         yield server
 
 
@@ -66,6 +68,24 @@ def test_wrong_poses_are_said_and_answer_nothing(client: Client, scene: str, lik
         assert answer.hint.advice == "CHECK_REFERENCE_POSES"
         assert known.contradiction.partition(":")[0] in answer.message
         assert not answer.intrinsics_checks
+
+
+def test_joint_rejections_say_the_contradiction(client: Client) -> None:
+    scene = "opengl"
+    wait_until(lambda: bool(client.get_scene(scene).contradiction))
+    rig = [
+        RigImage(it.image_path, it.camera, QUERIES[0].world_from_camera.inverse().compose(it.world_from_camera))
+        for it in QUERIES
+    ]
+    sequence = [SequenceFrame(it.image_path, it.camera, it.world_from_camera) for it in QUERIES]
+    for joint in (
+        client.localize_rig(rig, scene, timeout_s=PATIENT_S),
+        client.localize_sequence(sequence, scene, timeout_s=PATIENT_S),
+    ):
+        assert isinstance(joint, GroupRejected)
+        assert joint.hint is not None
+        assert joint.hint.advice == "CHECK_REFERENCE_POSES"
+        assert joint.message.count("the scene contradicts itself") == 1
 
 
 def test_a_second_session_is_said_with_the_similarity_that_aligns_it(client: Client) -> None:
@@ -94,10 +114,7 @@ def test_millimetres_are_warned_of_and_reject_nothing(client: Client) -> None:
     known = client.get_scene("millimetres")
     assert known.contradiction == ""
     assert any("are the poses in millimetres?" in it for it in known.warnings)
-    added = ALL[5], READINGS["millimetres"](ALL[5].world_from_camera)
-    again = client.add_reference(
-        "millimetres", NewReference(added[0].name, added[0].image_path, added[0].camera, added[1])
-    )
+    again = client.add_reference("millimetres", reference(ALL[5], READINGS["millimetres"]))
     assert any("are the poses in millimetres?" in it for it in again.warnings)
     for frame in QUERIES:
         right, answer = (

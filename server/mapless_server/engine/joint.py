@@ -4,11 +4,13 @@ from collections.abc import Mapping, Sequence
 
 from mapless.geometry import RigidTransform
 from mapless_server.method.groups.checks import check_mounting, check_tracking, check_unit, hinted_group
-from mapless_server.method.groups.images import GroupImage
+from mapless_server.method.groups.images import GroupImage, PosedImage
 from mapless_server.method.groups.rig import RigEstimate, solve_rig
 from mapless_server.method.groups.sequence import SequenceEstimate, solve_sequence
+from mapless_server.method.groups.trust import supporters_of_group
 from mapless_server.method.options import Variant
 from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.trust.references import with_contradiction, without_agreement
 
 from .query import Query, Result
 
@@ -17,13 +19,8 @@ def pose_rig(
     queries: Sequence[Query], results: Sequence[Result], rig_from_camera: Sequence[RigidTransform]
 ) -> RigEstimate | Rejection:
     """Estimates the pose of the rig that took the photographs, given in order."""
-    found = solve_rig(_images(queries, results), rig_from_camera, queries[0].options.coverage)
-    if not isinstance(found, Rejection):
-        found = check_mounting(found, [result.answer for result in results])
-    if isinstance(found, Rejection):
-        return _hinted(found, results)
-    poses = {i: found.world_from_rig.compose(it) for i, it in enumerate(rig_from_camera)}
-    return _beyond_limits(queries, poses, "images", results[0].attributes.unit) or found
+    found = _rig(queries, results, rig_from_camera)
+    return with_contradiction(found, _contradiction(results)) if isinstance(found, Rejection) else found
 
 
 def pose_sequence(
@@ -33,6 +30,30 @@ def pose_sequence(
     estimate_scale: bool,
 ) -> SequenceEstimate | Rejection:
     """Estimates the poses of a sequence's frames, in order, in OpenCV's axes."""
+    found = _sequence(queries, results, session_from_camera, estimate_scale)
+    return with_contradiction(found, _contradiction(results)) if isinstance(found, Rejection) else found
+
+
+def _rig(
+    queries: Sequence[Query], results: Sequence[Result], rig_from_camera: Sequence[RigidTransform]
+) -> RigEstimate | Rejection:
+    found = solve_rig(_images(queries, results), rig_from_camera, queries[0].options.coverage)
+    if not isinstance(found, Rejection):
+        found = check_mounting(found, [result.answer for result in results])
+    if isinstance(found, Rejection):
+        return _hinted(found, results)
+    if disagreement := _disagreement(results, found.matched):
+        return disagreement
+    poses = {i: found.world_from_rig.compose(it) for i, it in enumerate(rig_from_camera)}
+    return _beyond_limits(queries, poses, "images", results[0].attributes.unit) or found
+
+
+def _sequence(
+    queries: Sequence[Query],
+    results: Sequence[Result],
+    session_from_camera: Sequence[RigidTransform],
+    estimate_scale: bool,
+) -> SequenceEstimate | Rejection:
     unit = results[0].attributes.unit
     coverage = queries[0].options.coverage
     found = solve_sequence(_images(queries, results), session_from_camera, estimate_scale, coverage, unit)
@@ -43,8 +64,20 @@ def pose_sequence(
     if isinstance(found, Rejection):
         return _hinted(found, results, is_sequence=True)
     since = max((jump.after for jump in found.jumps), default=0)
+    if disagreement := _disagreement(results, [it for it in found.matched if it.source.image >= since]):
+        return disagreement
     poses = {i: pose for i, pose in enumerate(found.world_from_camera) if i >= since}
     return _beyond_limits(queries, poses, "frames", unit) or found
+
+
+def _contradiction(results: Sequence[Result]) -> str:
+    """The sentence that the scene contradicts itself, as soon as one of the photographs knew it; else empty."""
+    return next((it.attributes.contradiction for it in results if it.attributes.contradiction), "")
+
+
+def _disagreement(results: Sequence[Result], matched: Sequence[PosedImage]) -> Rejection | None:
+    """Rejects joint poses in a scene that contradicts itself unless references that they rest on agree."""
+    return without_agreement(supporters_of_group(matched)) if _contradiction(results) else None
 
 
 def _beyond_limits(

@@ -382,7 +382,7 @@ class QueryStages:
             if beyond:
                 answer = replace(answer, outcome=Rejection(RejectionReason.PRIOR_CONFLICT, beyond))
         if run.attributes.contradiction and isinstance(answer.outcome, Localization) and answer.support is not None:
-            answer = replace(answer, outcome=without_agreement(supporters_of(answer.support)) or answer.outcome)
+            answer = replace(answer, outcome=without_agreement([supporters_of(answer.support)]) or answer.outcome)
         if isinstance(answer.outcome, Rejection):
             answer = hinted(answer, run.view, run.references, is_searched(run) and not narrowing.is_empty)
         if run.attributes.contradiction and isinstance(answer.outcome, Rejection):

@@ -150,9 +150,8 @@ def _matched_image(index: int, image: GroupImage, support: Support, origin: Arra
     if isinstance(outcome, Localization):
         own_pose, own_covariance = outcome.world_from_camera.shifted(-origin), outcome.covariance
     query = support.query
-    return MatchedImage(
-        index, query, references, structure, tracked, own_pose, own_covariance, image.match, support.query_matches
-    )
+    matched = support.query_matches, support.reference_error_px
+    return MatchedImage(index, query, references, structure, tracked, own_pose, own_covariance, image.match, *matched)
 
 
 def priors_of(images: Sequence[GroupImage], origin: Array) -> dict[int, Priors]:

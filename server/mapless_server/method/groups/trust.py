@@ -61,15 +61,17 @@ def trust_of_group(matched: Sequence[PosedImage], coverage: float) -> tuple[floa
         _references_apart(matched, distance_m),
     )
     trust = trust_of(evidence, JudgeOptions())
-    supporters = [
+    return trust, disagreeing_references(supporters_of_group(matched)) or low_trust(evidence, trust, coverage)
+
+
+def supporters_of_group(matched: Sequence[PosedImage]) -> list[Supporters]:
+    """The references that support the joint poses of photographs."""
+    return [
         Supporters(
-            [reference.name for reference in it.source.references],
-            it.inliers_by_reference(),
-            it.source.reference_error_px,
+            [it.name for it in posed.source.references], posed.inliers_by_reference(), posed.source.reference_error_px
         )
-        for it in matched
+        for posed in matched
     ]
-    return trust, disagreeing_references(supporters) or low_trust(evidence, trust, coverage)
 
 
 def _distance_m(matched: Sequence[PosedImage]) -> float:

@@ -72,19 +72,24 @@ def _most_supporting(counts: Sequence[int]) -> list[int]:
     return sorted((i for i, count in enumerate(counts) if count >= least), key=lambda i: -counts[i])[:MOST_REFERENCES]
 
 
-def without_agreement(photograph: Supporters) -> Rejection | None:
-    """Rejects a pose in a scene that contradicts itself unless two of its supporting references agree.
+def without_agreement(photographs: Sequence[Supporters]) -> Rejection | None:
+    """Rejects a pose in a scene that contradicts itself unless two references that support it agree.
 
-    Elsewhere references of which nothing is known are taken to have right poses.
+    The pose is that of one photograph, or of several together. Elsewhere references of which nothing is known are taken
+    to have right poses.
     """
-    counts, error_px = photograph.inlier_counts, photograph.error_px
-    used = _most_supporting(counts)
-    found = [] if error_px is None else [error_px(*sorted(pair)) for pair in combinations(used, 2)]
-    if any(it is not None and it <= MAX_ERROR_PX for it in found):
-        return None
-    best = photograph.names[max(range(len(counts)), key=lambda i: counts[i])] if counts else None
+    best: tuple[int, str] = (0, "")
+    for photograph in photographs:
+        counts, error_px = photograph.inlier_counts, photograph.error_px
+        used = _most_supporting(counts)
+        found = [] if error_px is None else [error_px(*sorted(pair)) for pair in combinations(used, 2)]
+        if any(it is not None and it <= MAX_ERROR_PX for it in found):
+            return None
+        best = max([best, *zip(counts, photograph.names, strict=True)])
     message = "no two of the references that the pose rests on agree with their own poses"
-    return Rejection(RejectionReason.GATE, message, Hint("judge", Advice.CHECK_REFERENCE_POSES, ADVICE, best))
+    return Rejection(
+        RejectionReason.GATE, message, Hint("judge", Advice.CHECK_REFERENCE_POSES, ADVICE, best[1] or None)
+    )
 
 
 ADVICE = (
@@ -101,6 +106,7 @@ def with_contradiction(rejection: Rejection, contradiction: str) -> Rejection:
     hint = rejection.hint
     stage, best = ("", None) if hint is None else (hint.stage, hint.best_reference)
     advice = Hint(stage, Advice.CHECK_REFERENCE_POSES, ADVICE, best)
-    return Rejection(
-        rejection.reason, f"{rejection.message}; {contradiction}", advice, rejection.hypotheses, rejection.tried
-    )
+    # The message of a group's rejection may be that of one of its photographs.
+    is_said = contradiction in rejection.message
+    message = rejection.message if is_said else f"{rejection.message}; {contradiction}"
+    return Rejection(rejection.reason, message, advice, rejection.hypotheses, rejection.tried)
