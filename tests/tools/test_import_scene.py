@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
+import cv2
 import numpy as np
 import pytest
 
@@ -23,12 +24,16 @@ WORLD_FROM_SESSION = Similarity(2.5, rotation_from_vector([0.3, -1.0, 0.2]), np.
 class Scene:
     """A client of a scene with references; of some of its calls the server cannot do."""
 
-    def __init__(self, damaged: str = "", unreadable: str = "") -> None:
+    def __init__(self, damaged: str = "", unreadable: str = "", stored: Sequence[Frame] = STORED) -> None:
         self.damaged = damaged
         self.unreadable = unreadable
-        self.references: list[Reference] = [cast(Any, _Stored(it)) for it in STORED]
+        self.masks: list[Path | None] = []
+        self.references: list[Reference] = [cast(Any, _Stored(it)) for it in stored]
 
-    def retrieve_references(self, image: Path, camera: object, scene: str, count: int) -> Sequence[object]:
+    def retrieve_references(
+        self, image: Path, camera: object, scene: str, count: int, *, mask: Path | None
+    ) -> Sequence[object]:
+        self.masks.append(mask)
         if image.stem == self.unreadable:
             raise InvalidArgument("INVALID_ARGUMENT", "truncated", reason="IMAGE_UNDECODABLE", field="image")
         return self.references[:count]
@@ -44,6 +49,7 @@ class _Stored:
         self.reference_id, self.name = frame.name, f"scenes/hall/references/{frame.name}"
         self.camera, self.world_from_camera = frame.camera, frame.world_from_camera
         self.image = frame.image_path.read_bytes()
+        self.mask = None if frame.mask_path is None else frame.mask_path.read_bytes()
 
 
 def checked(scene: Scene, frames: Sequence[Frame]) -> SceneVerdict:
@@ -70,3 +76,33 @@ def test_photographs_that_fit_do_so_beside_damaged_ones() -> None:
     found = checked(Scene(damaged=STORED[0].name, unreadable=NEW[0].image_path.stem), NEW)
     assert not found.is_wrong
     assert set(found.fitting) >= {it.name for it in NEW[1:3]}
+
+
+def with_passer_by(frame: Frame, number: int, folder: Path) -> Frame:
+    """The photograph with something in it that moves from one to the next, and its mask."""
+    image = cv2.imread(str(frame.image_path))
+    assert image is not None
+    height, width = image.shape[:2]
+    texture = np.random.default_rng(3).integers(0, 256, (height // 12, width // 16, 3), dtype=np.uint8)
+    shown = cv2.resize(texture, None, fx=10, fy=10, interpolation=cv2.INTER_CUBIC)
+    top, left = number * 7 % (height - len(shown)), number * 13 % (width - shown.shape[1])
+    mask = np.full((height, width), 255, np.uint8)
+    for whole, part in ((image, shown), (mask, 0)):
+        whole[top : top + len(shown), left : left + shown.shape[1]] = part
+    path, mask_path = folder / f"{frame.name}.png", folder / f"{frame.name}.mask.png"
+    cv2.imwrite(str(path), image)
+    cv2.imwrite(str(mask_path), mask)
+    return replace(frame, image_path=path, mask_path=mask_path)
+
+
+def test_what_masks_ignore_decides_nothing(tmp_path: Path) -> None:
+    frames = [with_passer_by(it, i, tmp_path) for i, it in enumerate([*STORED[:3], *NEW[:3]])]
+    stored, new = frames[:3], frames[3:]
+    unmasked = [replace(it, mask_path=None) for it in new]
+    assert checked(Scene(stored=[replace(it, mask_path=None) for it in stored]), unmasked).is_wrong
+    scene = Scene(stored=stored)
+    assert not checked(scene, unmasked).is_wrong
+    assert scene.masks == [None] * len(new)
+    scene = Scene(stored=[replace(it, mask_path=None) for it in stored])
+    assert not checked(scene, new).is_wrong
+    assert scene.masks == [it.mask_path for it in new]

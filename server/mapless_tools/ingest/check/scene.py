@@ -131,7 +131,7 @@ def _partners(
     progress("comparing with the scene", number + 1, count)
     names: list[str] = []
     try:
-        similar = client.retrieve_references(frame.image_path, frame.camera, scene, SIMILAR)
+        similar = client.retrieve_references(frame.image_path, frame.camera, scene, SIMILAR, mask=frame.mask_path)
     except (OSError, InvalidArgument):  # refused where it is stored
         return names
     for found in similar:
@@ -147,7 +147,12 @@ def _partners(
 
 def _frame(client: Client, scene: str, reference: Reference, file: Path) -> Frame | None:
     try:
-        file.write_bytes(client.get_reference(scene, reference.reference_id, include_image=True).image or b"")
+        found = client.get_reference(scene, reference.reference_id, include_image=True)
     except (DataLoss, NotFound):
         return None
-    return Frame(reference.reference_id, file, reference.camera, reference.world_from_camera)
+    file.write_bytes(found.image or b"")
+    mask_path = None
+    if found.mask is not None:
+        mask_path = file.with_suffix(".mask.png")
+        mask_path.write_bytes(found.mask)
+    return Frame(reference.reference_id, file, reference.camera, reference.world_from_camera, mask_path=mask_path)
