@@ -14,9 +14,10 @@ from support.scenes import CAMERA, SceneOptions, make_scene, random_for, unit_ro
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method import correspond, matching, nearest
 from mapless_server.method.correspond import Matcher, make_matcher
+from mapless_server.method.epipolar import epipolar_distance_px, epipolar_distances_px
 from mapless_server.method.features import FEATURES
 from mapless_server.method.matching import OPTIONS, CorrespondOptions, SharedThreads, StoredPair
-from mapless_server.method.nearest import best_of_both, epipolar_distance_px, epipolar_distances_px, mutual_matches
+from mapless_server.method.nearest import best_of_both, mutual_matches
 from mapless_server.method.views import Features, Matches, PosedView, View
 
 

@@ -10,14 +10,14 @@ from support.posed_views import matched, planted
 from support.scenes import CAMERA, SceneOptions, make_scene, random_for
 
 from mapless.geometry import Quaternion, RigidTransform, Similarity, rotation_from_vector
+from mapless_server.method.epipolar import sampson_px
 from mapless_server.method.readings import (
     MatchedPair,
     Verdict,
     align,
     consistent_matches,
+    errors_of,
     judge,
-    pair_error_px,
-    sampson_px,
     suspects_of,
 )
 from mapless_server.method.views import Features, PosedView, View
@@ -295,7 +295,8 @@ def test_a_moved_keypoints_error_is_its_displacement() -> None:
 def test_photographs_at_one_place_are_compared_by_rotation() -> None:
     first, second = make_scene(random_for("one place"), SceneOptions(reference_count=2)).references
     matches = consistent_matches(first.view, second.view)
-    assert pair_error_px(first, replace(second, world_from_camera=first.world_from_camera), matches) > 10
+    one_place = replace(second, world_from_camera=first.world_from_camera)
+    assert np.median(sampson_px(first, one_place, matches)) > 10
     turned_pose = RigidTransform(first.world_from_camera.rotation @ rotation_from_vector([0.0, 0.2, 0.1]), np.zeros(3))
     camera = first.view.camera
     rays = camera.rays(first.view.features.keypoints) @ first.world_from_camera.rotation.T @ turned_pose.rotation
@@ -303,5 +304,5 @@ def test_photographs_at_one_place_are_compared_by_rotation() -> None:
     here = replace(first, world_from_camera=RigidTransform(first.world_from_camera.rotation, np.zeros(3)))
     there = replace(first, view=replace(first.view, features=features), world_from_camera=turned_pose)
     same = np.repeat(np.arange(len(features), dtype=np.int32)[:, None], 2, axis=1)
-    assert pair_error_px(here, there, same) < 1e-3
-    assert np.isnan(pair_error_px(first, second, matches[:0]))
+    assert np.median(sampson_px(here, there, same)) < 1e-3
+    assert errors_of({0: first, 1: second}, [MatchedPair((0, 1), matches[:0])]) == []

@@ -15,6 +15,7 @@ from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.answer import Localization
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.correspond import Correspondences, Matcher
+from mapless_server.method.epipolar import sampson_px
 from mapless_server.method.localize import localize
 from mapless_server.method.match import MatchOptions
 from mapless_server.method.options import IntrinsicsSigma, LocalizeOptions
@@ -22,7 +23,6 @@ from mapless_server.method.perturbation import moved, rotation_vector
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.pose_problem import AdjustOptions
 from mapless_server.method.priors.known import PosePrior, Priors
-from mapless_server.method.readings import sampson_px
 from mapless_server.method.rejection import Advice, IntrinsicsParameter, Rejection, RejectionReason
 from mapless_server.method.results import Support
 from mapless_server.method.structure import StructureOptions

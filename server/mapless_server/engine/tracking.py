@@ -22,8 +22,8 @@ import numpy as np
 from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.coarse.geometric import GeometricReconstructor
 from mapless_server.method.correspond import Matcher
+from mapless_server.method.epipolar import epipolar_distance_px
 from mapless_server.method.localize import prepare, solve
-from mapless_server.method.nearest import epipolar_distance_px
 from mapless_server.method.options import LocalizeOptions, StageContext
 from mapless_server.method.pipeline import Pipeline, reconstruct
 from mapless_server.method.priors.known import Priors

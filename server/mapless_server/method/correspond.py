@@ -24,6 +24,7 @@ import numpy as np
 
 from .agreement import ReferenceErrors, pair_error_px, thinned
 from .cache import LruCache
+from .epipolar import epipolar_distance_px, epipolar_distances_px
 from .matching import (
     OPTIONS,
     CorrespondOptions,
@@ -33,7 +34,7 @@ from .matching import (
     SharedThreads,
     StoredPairs,
 )
-from .nearest import best_of_both, epipolar_distance_px, epipolar_distances_px, mutual_matches_of_ratios
+from .nearest import best_of_both, mutual_matches_of_ratios
 from .observations import Tracks, build_tracks
 from .pairs import PairKey, PairMatches, in_order, is_one_photograph
 from .stationary import IgnoredKeypoints, StationaryOptions, stationary_matches, without_ignored

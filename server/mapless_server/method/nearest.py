@@ -1,4 +1,4 @@
-"""Two photographs: nearest neighbours of their descriptors, and the epipolar lines that their matches must lie on."""
+"""Two photographs: nearest neighbours of their descriptors."""
 
 import sys
 from collections import deque
@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, cross_matrix
-
-from .views import Features, Matches, PosedView
+from .views import Features, Matches
 
 _ROWS_AT_ONCE = 128
 _FLOAT_ROWS_AT_ONCE = 256
@@ -129,61 +127,3 @@ def _best_of_both(
     mutual &= best > smallest
     kept = [mutual & (1 - best < ratio**2 * (1 - second_best)) for ratio in ratios]
     return [np.stack([rows[keep], nearest[keep]], axis=1).astype(np.int32) for keep in kept]
-
-
-def epipolar_distance_px(first: PosedView, second: PosedView, matches: Matches) -> Array:
-    """Distance (M,) of matches from the epipolar lines of the known poses, the larger of both images.
-
-    The distance is 0 without a baseline, where there is no epipolar line.
-    """
-    fundamental = fundamental_matrix(first, second)
-    x_first = _homogeneous(first.view.features.keypoints[matches[:, 0]])
-    x_second = _homogeneous(second.view.features.keypoints[matches[:, 1]])
-    in_first = (x_first * _lines(x_second @ fundamental.T)).sum(axis=1)
-    in_second = (x_second * _lines(x_first @ fundamental)).sum(axis=1)
-    return np.asarray(np.maximum(np.abs(in_first), np.abs(in_second)))
-
-
-def epipolar_distances_px(first: PosedView, second: PosedView) -> NDArray[np.float32]:
-    """The same distances (N, M) for every keypoint of the first view with every keypoint of the second."""
-    fundamental = fundamental_matrix(first, second)
-    x_first, x_second = (_homogeneous(v.view.features.keypoints) for v in (first, second))
-    in_first = x_first.astype(np.float32) @ _lines(x_second @ fundamental.T).T.astype(np.float32)
-    in_second = _lines(x_first @ fundamental).astype(np.float32) @ x_second.T.astype(np.float32)
-    # In place: with 2,000 keypoints each of these matrices has 16 MB, in every thread that matches.
-    for distances in (in_first, in_second):
-        np.abs(distances, out=distances)
-    return np.maximum(in_first, in_second, out=in_first)
-
-
-def fundamental_matrix(first: PosedView, second: PosedView) -> Array:
-    """F (3, 3) of the known poses, x_first^T F x_second = 0 in homogeneous pixels; a zero matrix without a baseline."""
-    first_from_world = first.world_from_camera.rotation.T
-    # The difference first: world coordinates may be millions of metres.
-    baseline = first_from_world @ (second.world_from_camera.translation - first.world_from_camera.translation)
-    if np.linalg.norm(baseline) < 1e-6:
-        return np.zeros((3, 3))
-    essential = cross_matrix(baseline) @ first_from_world @ second.world_from_camera.rotation
-    k_first_inv, k_second_inv = (np.linalg.inv(v.view.camera.matrix()) for v in (first, second))
-    return np.asarray(k_first_inv.T @ essential @ k_second_inv)
-
-
-def sampson_px(fundamental: Array, x_first: Array, x_second: Array) -> Array:
-    """Sampson distances (M,) of matched pixels (M, 2) from x_first^T F x_second = 0, pixels; NaN if F is zero.
-
-    To first order, how far both keypoints together must be moved to satisfy it.
-    """
-    one, other = (np.column_stack([pixels, np.ones(len(pixels))]) for pixels in (x_first, x_second))
-    lines_first, lines_second = other @ fundamental.T, one @ fundamental
-    slope = np.sqrt((lines_first[:, :2] ** 2).sum(axis=1) + (lines_second[:, :2] ** 2).sum(axis=1))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(np.abs((one * lines_first).sum(axis=1)) / slope)
-
-
-def _lines(lines: Array) -> Array:
-    """Scales lines (N, 3) so that the product with a homogeneous pixel is a distance in pixels."""
-    return np.asarray(lines / np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12))
-
-
-def _homogeneous(pixels: NDArray[np.float32]) -> Array:
-    return np.concatenate([pixels.astype(np.float64), np.ones((len(pixels), 1))], axis=1)

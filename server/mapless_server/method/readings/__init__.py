@@ -19,8 +19,6 @@ from .errors import (
     consistent_matches,
     distinct_matches,
     errors_of,
-    pair_error_px,
-    sampson_px,
     summary,
 )
 from .explanation import MOST_NAMED, Explanation, explain
@@ -54,10 +52,8 @@ __all__ = [
     "is_start",
     "judge",
     "median_depth",
-    "pair_error_px",
     "pose_difference",
     "same_poses",
-    "sampson_px",
     "sessions_of",
     "similarity_text",
     "summary",

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..agreement import MAX_ERROR_PX
 from .depth import median_depth
-from .errors import THRESHOLD_PX, MatchedPair, Pair, PairError, Views, errors_of, summary
+from .errors import MatchedPair, Pair, PairError, Views, errors_of, summary
 from .explanation import explain
 from .repeats import contradicting_groups, same_photographs
 
@@ -64,7 +65,7 @@ def judge(
     excluded = {i for group in groups for i in group}
     matched = [item for item in matched if not excluded & set(item.pair)]
     errors = [error for error in errors if not excluded & set(error.pair)]
-    verdict = Verdict((), unmatched_count, math.nan, math.nan, THRESHOLD_PX, same_pose=tuple(groups))
+    verdict = Verdict((), unmatched_count, math.nan, math.nan, MAX_ERROR_PX, same_pose=tuple(groups))
     if not errors:
         return verdict
     median_px, bad_share = summary(errors)

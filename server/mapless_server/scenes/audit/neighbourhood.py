@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless_server.method.correspond import Correspondences
+from mapless_server.method.epipolar import epipolar_distance_px
 from mapless_server.method.match import vote
-from mapless_server.method.nearest import epipolar_distance_px, mutual_matches
+from mapless_server.method.nearest import mutual_matches
 from mapless_server.method.observations import Tracks, build_tracks, triangulate
 from mapless_server.method.results import PointMatches, Structure
 from mapless_server.method.stationary import IgnoredKeypoints, fixed_in, without_ignored
