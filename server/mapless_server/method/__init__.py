@@ -11,7 +11,8 @@ rejection                    "no pose" is a result
 features/                    local features of a photograph
 cache                        results that are kept within a bound, here and by the server
 observations                 observations of the same point; metric points
-nearest                      nearest neighbours of two photographs' descriptors, and their epipolar lines
+nearest                      nearest neighbours of two photographs' descriptors
+epipolar                     the epipolar lines of two photographs with poses, and how far matches are from them
 agreement                    (ours) whether two references agree with their poses, by matches that these took no part in
 matching, lightglue          how two photographs are matched: nearest neighbours, or a network
 stationary                   (ours) what is fixed to the camera, such as a bonnet, and no place

@@ -16,14 +16,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from .epipolar import (
-    BEHIND_SHARE,
-    MIN_MATCHES,
-    QUICK_ITERATIONS,
-    are_at_one_place,
-    fundamental_inliers,
-    measured_pair,
-)
+from .epipolar import BEHIND_SHARE, MIN_MATCHES, QUICK_ITERATIONS, PosedMatches, fundamental_inliers
 from .views import Matches, PosedView
 
 MAX_ERROR_PX = 3.0
@@ -69,9 +62,10 @@ def pair_error_px(first: PosedView, second: PosedView, matches: Matches) -> floa
         return None
     matches = thinned(matches)
     per_px = _SIDE_PX / max(max(it.view.camera.width_px, it.view.camera.height_px) for it in (first, second))
-    is_one_place = are_at_one_place(first, second)
+    posed = PosedMatches.of_pair(first, second, matches)
+    (is_one_place,) = posed.are_at_one_place
     scale = per_px * MAX_ERROR_PX / STATIONARY_PX if is_one_place else per_px
-    errors_px = scale * np.nan_to_num(np.abs(measured_pair(first, second, matches)[0]), nan=np.inf)
+    errors_px = scale * np.nan_to_num(np.abs(posed.distances_px()[0]), nan=np.inf)
     agreeing: NDArray[np.bool_] = errors_px <= MAX_ERROR_PX
     consistent = agreeing
     if agreeing.sum() < max(MIN_MATCHES, MAJORITY * len(matches)):
@@ -82,8 +76,7 @@ def pair_error_px(first: PosedView, second: PosedView, matches: Matches) -> floa
         if not is_satisfied and agreeing.sum() > AMBIGUOUS_SHARE * consistent.sum():
             return None
     error_px = float(np.median(errors_px[consistent]))
-    if error_px <= MAX_ERROR_PX and not is_one_place:
-        _, behind_share = measured_pair(first, second, matches[consistent & agreeing])
-        if behind_share > BEHIND_SHARE:
-            return LARGEST_ERROR_PX
-    return min(error_px, LARGEST_ERROR_PX)
+    if error_px > MAX_ERROR_PX or is_one_place:
+        return min(error_px, LARGEST_ERROR_PX)
+    (behind_share,) = PosedMatches.of_pair(first, second, matches[consistent & agreeing]).behind_shares()
+    return LARGEST_ERROR_PX if behind_share > BEHIND_SHARE else error_px

@@ -13,6 +13,7 @@ world axes, which changes no relative pose.
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import poselib
@@ -73,11 +74,6 @@ def fundamental_matrix(first: PosedView, second: PosedView) -> Array:
     return np.asarray(k_first_inv.T @ essential[0] @ k_second_inv)
 
 
-def are_at_one_place(first: PosedView, second: PosedView) -> bool:
-    """Whether two cameras have no baseline, so that only their rotation can be compared."""
-    return not fundamental_matrix(first, second).any()
-
-
 def fundamental_inliers(
     first: View, second: View, matches: Matches, iterations: tuple[int, int] | None = None
 ) -> NDArray[np.bool_]:
@@ -102,54 +98,80 @@ def fundamental_inliers(
 
 def sampson_px(first: PosedView, second: PosedView, matches: Matches) -> Array:
     """Sampson distances (M,) of matches (M, 2), pixels; at one place, those from what the rotation predicts."""
-    return np.abs(measured_pair(first, second, matches)[0])
+    return np.asarray(np.abs(PosedMatches.of_pair(first, second, matches).distances_px()[0]))
 
 
-def measured_pair(first: PosedView, second: PosedView, matches: Matches) -> tuple[Array, float]:
-    """`measured` of matches (M, 2) of one pair: signed distances (M,), pixels, and the share behind a camera."""
-    x = [view.view.features.keypoints[matches[:, side]][None] for side, view in enumerate((first, second))]
-    distances_px, behind = measured([first, second], np.array([[0, 1]]), np.stack(x).astype(np.float64))
-    return np.asarray(distances_px[0]), float(behind[0])
+@dataclass(frozen=True, eq=False)
+class PosedMatches:
+    """Matches of P pairs of photographs with poses, M or fewer of each pair.
 
-
-def measured(views: Sequence[PosedView], ends: NDArray[np.intp], x: Array) -> tuple[Array, Array]:
-    """How far matches of pairs are from satisfying the poses, pixels, and whether what they show is behind a camera.
-
-    Args:
-        views: photographs.
-        ends: (P, 2) indices of the two photographs of each pair.
-        x: (2, P, M, 2) matched pixels in the first and the second photograph of each pair; NaN where it has fewer.
-
-    Returns:
-        The signed Sampson distances (P, M), pixels; at one place, the distances from what the rotation predicts. The
-        shares (P,) of points behind a camera, of those with a parallax; NaN if these are too few.
+    Attributes:
+        pixels: (2, P, M, 2) in the first and the second photograph of each pair; NaN where a pair has fewer.
+        rays: (2, P, M, 3) of these, of depth 1, in either camera.
+        focal, principal: (P, 2, 1, 2) of both cameras, pixels.
+        baseline: (P, 3) from the first to the second camera, in the first.
+        turned: (P, 3, 3) rotations from the second camera to the first.
+        essential: (P, 3, 3).
     """
-    baseline, turned, essential = _relative(views, ends)
-    cameras = np.array(
-        [
-            (it.focal_x_px, it.focal_y_px, it.principal_x_px, it.principal_y_px)
-            for it in (view.view.camera for view in views)
+
+    pixels: Array
+    rays: Array
+    focal: Array
+    principal: Array
+    baseline: Array
+    turned: Array
+    essential: Array
+
+    @staticmethod
+    def of(views: Sequence[PosedView], ends: NDArray[np.intp], pixels: Array) -> "PosedMatches":
+        """Takes the pairs (P, 2) of views, by their indices."""
+        pinholes = [view.view.camera for view in views]
+        cameras = np.array([(it.focal_x_px, it.focal_y_px, it.principal_x_px, it.principal_y_px) for it in pinholes])
+        focal, principal = cameras[ends][:, :, None, :2], cameras[ends][:, :, None, 2:]
+        rays = np.ones((*pixels.shape[:3], 3))
+        for side in (0, 1):
+            rays[side, ..., :2] = (pixels[side] - principal[:, side]) / focal[:, side]
+        baseline, turned, essential = _relative(views, ends)
+        return PosedMatches(pixels, rays, focal, principal, baseline, turned, essential)
+
+    @staticmethod
+    def of_pair(first: PosedView, second: PosedView, matches: Matches) -> "PosedMatches":
+        """Takes the matches (M, 2) of one pair."""
+        x = [view.view.features.keypoints[matches[:, side]][None] for side, view in enumerate((first, second))]
+        return PosedMatches.of([first, second], np.array([[0, 1]]), np.stack(x).astype(np.float64))
+
+    @property
+    def are_at_one_place(self) -> NDArray[np.bool_]:
+        """Which pairs (P,) have no baseline, so that only their rotation can be compared."""
+        return np.asarray(np.linalg.norm(self.baseline, axis=1) < SAME_PLACE)
+
+    def distances_px(self) -> Array:
+        """Signed Sampson distances (P, M), pixels; at one place, the distances from what the rotation predicts."""
+        rays, focal = self.rays, self.focal
+        lines_first, lines_second = rays[1] @ np.swapaxes(self.essential, 1, 2), rays[0] @ self.essential
+        constraint = np.einsum("pmi,pmi->pm", rays[0], lines_first)
+        slopes = [
+            ((lines[..., :2] / focal[:, side]) ** 2).sum(axis=-1)
+            for side, lines in enumerate((lines_first, lines_second))
         ]
-    )[ends]
-    focal, principal = cameras[:, :, None, :2], cameras[:, :, None, 2:]
-    ideal = np.stack([(x[side] - principal[:, side]) / focal[:, side] for side in (0, 1)])
-    rays = np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1)
-    lines_first, lines_second = rays[1] @ np.swapaxes(essential, 1, 2), rays[0] @ essential
-    constraint = (rays[0] * lines_first).sum(axis=-1)
-    slope = np.hypot(
-        np.hypot(*np.moveaxis(lines_first[..., :2] / focal[:, 0], -1, 0)),
-        np.hypot(*np.moveaxis(lines_second[..., :2] / focal[:, 1], -1, 0)),
-    )
-    with np.errstate(invalid="ignore", divide="ignore"):
-        distance_px = constraint / slope
-    for row in np.flatnonzero(np.linalg.norm(baseline, axis=1) < SAME_PLACE):
-        predicted = rays[0][row] @ turned[row]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            distance_px = constraint / np.sqrt(slopes[0] + slopes[1])
+        for row in np.flatnonzero(self.are_at_one_place):
+            distance_px[row] = self._turned_distances_px(row)
+        return np.asarray(distance_px)
+
+    def _turned_distances_px(self, row: int) -> Array:
+        predicted = self.rays[0][row] @ self.turned[row]
         depth = np.where(predicted[:, 2:] > 0, predicted[:, 2:], np.nan)
-        moved = predicted[:, :2] / depth * focal[row, 1] + principal[row, 1] - x[1, row]
+        x = self.pixels[1, row]
+        moved = predicted[:, :2] / depth * self.focal[row, 1] + self.principal[row, 1] - x
         moved_px = np.nan_to_num(np.linalg.norm(moved, axis=-1) / math.sqrt(2), nan=np.inf)
-        distance_px[row] = np.where(np.isfinite(x[1, row, :, 0]), moved_px, np.nan)
-    second = rays[1] @ np.swapaxes(turned, 1, 2)
-    return distance_px, _behind(rays[0], second, baseline, PARALLAX_PX / focal[:, 0].min(axis=-1))
+        return np.where(np.isfinite(x[:, 0]), moved_px, np.nan)
+
+    def behind_shares(self) -> Array:
+        """Shares (P,) of points behind a camera, of those with a parallax; NaN if these are too few."""
+        second = self.rays[1] @ np.swapaxes(self.turned, 1, 2)
+        return _behind(self.rays[0], second, self.baseline, PARALLAX_PX / self.focal[:, 0].min(axis=-1))
 
 
 def _cross_matrices(vectors: Array) -> Array:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array
 
 from ..agreement import MAX_ERROR_PX
-from ..epipolar import BEHIND_SHARE, fundamental_inliers, measured
+from ..epipolar import BEHIND_SHARE, PosedMatches, fundamental_inliers
 from ..nearest import mutual_matches
 from ..views import Features, Matches, PosedView, View
 
@@ -108,8 +108,8 @@ class PairSample:
         """
         if not self.pairs:
             return []
-        distances_px, behind, thresholds_px = self._measured(views, seconds)
-        errors_px = _medians(np.abs(distances_px))
+        posed, thresholds_px = self._posed(views, seconds)
+        errors_px, behind = _medians(np.abs(posed.distances_px())), posed.behind_shares()
         return [
             PairError(pair, float(error), float(threshold), count, float(share))
             for pair, error, threshold, count, share in zip(
@@ -119,10 +119,10 @@ class PairSample:
 
     def distances_px(self, views: Views, seconds: Views) -> Array:
         """Signed distances (N,) of all matches of all pairs."""
-        return np.asarray(self._measured(views, seconds)[0][self._is_match])
+        return np.asarray(self._posed(views, seconds)[0].distances_px()[self._is_match])
 
-    def _measured(self, views: Views | None, seconds: Views | None) -> tuple[Array, Array, Array]:
-        """Signed distances (P, M), shares behind the cameras and thresholds (P,)."""
+    def _posed(self, views: Views | None, seconds: Views | None) -> tuple[PosedMatches, Array]:
+        """The pairs' matches with poses, and the largest errors (P,) of good pairs, pixels."""
         views = self.views if views is None else views
         sides_views = (views, views if seconds is None else seconds)
         ordered = [its[i] for its in sides_views for i in self._position]
@@ -131,7 +131,7 @@ class PairSample:
         x = np.where(self._is_match[..., None], pixels.astype(np.float64), np.nan)
         ends = self._ends + np.array([0, len(self._position)])
         sides = np.array([max(it.view.camera.width_px, it.view.camera.height_px) for it in ordered])
-        return *measured(ordered, ends, x), MAX_ERROR_PX * sides[ends].max(axis=1) / 1024
+        return PosedMatches.of(ordered, ends, x), MAX_ERROR_PX * sides[ends].max(axis=1) / 1024
 
 
 def _with_rows(posed: PosedView, rows: NDArray[np.intp]) -> PosedView:
