@@ -10,6 +10,7 @@ from mapless_server.method.readings import is_start
 from mapless_server.scenes.repeats import PosedImage, repeats
 from mapless_server.security import SceneKey
 from mapless_server.store import ReferenceRecord
+from mapless_server.store.reader import ALIKE_MOST
 
 
 def moved(x: float) -> RigidTransform:
@@ -55,3 +56,12 @@ def test_many_sentences_are_cut() -> None:
     texts = repeats(added, [stored("a", "1", moved(0))])
     assert len(texts) == 6
     assert texts[-1] == "so are 3 more"
+
+
+def test_the_number_of_many_equal_poses_is_a_least_one() -> None:
+    """The store reads no more of them."""
+    there = [stored(f"a{i}", f"{i}", moved(0)) for i in range(ALIKE_MOST)]
+    (text,) = repeats([PosedImage("c", "c", moved(0))], there)
+    assert text.startswith(f"at least {ALIKE_MOST + 1} references")
+    (text,) = repeats([PosedImage("c", "c", moved(0))], there[1:])
+    assert text.startswith(f"{ALIKE_MOST} references")

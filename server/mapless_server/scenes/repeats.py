@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from mapless.geometry import RigidTransform
 from mapless_server.method.readings import is_start, pose_difference, same_poses
 from mapless_server.store import ReferenceRecord
+from mapless_server.store.reader import ALIKE_MOST
 
 SAME_POSITION_M, SAME_ROTATION_DEG = 1e-3, 0.01
 """Poses of one photograph that differ by less are the same: they are stored, and travel, rounded."""
@@ -62,6 +63,9 @@ def _same_poses(known: Sequence[PosedImage], added: Sequence[PosedImage]) -> lis
         group = [every[i] for i in indices]
         if indices[-1] < len(known) or len({it.image_sha256 for it in group}) < 2:
             continue
+        # Of many, the store gives only some.
+        is_cut = sum(i < len(known) for i in indices) >= ALIKE_MOST
+        count = f"{'at least ' if is_cut else ''}{len(group)}"
         names = ", ".join(it.reference_id for it in group[:NAMED])
         more = f" and {len(group) - NAMED} more" if len(group) > NAMED else ""
         why = (
@@ -70,6 +74,6 @@ def _same_poses(known: Sequence[PosedImage], added: Sequence[PosedImage]) -> lis
             else "unless the camera stood still, all but one are wrong"
         )
         texts.append(
-            f"{len(group)} references with different photographs have exactly the same pose ({names}{more}): {why}"
+            f"{count} references with different photographs have exactly the same pose ({names}{more}): {why}"
         )
     return texts

@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial, wraps
 from typing import Any, Concatenate, NamedTuple, NoReturn, ParamSpec, Protocol, TypeVar
 
-from sqlalchemy import Connection, Row, Select, or_, select
+from sqlalchemy import Connection, Row, Select, bindparam, select
 
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.errors import AlreadyExists, NotFound, RequestError
@@ -30,9 +30,15 @@ RECORD_BYTES = 700
 ATTRIBUTES_BYTES = 2000
 """About the size of SceneAttributes in memory."""
 
-ALIKE_WITHIN = 2_000
-"""Newest references of a scene among which equal ones are searched. In a scene of 10,000 that costs 6.5 ms of processor
-time for a call that adds one reference, and 0.18 ms for each in a call that adds 100."""
+ALIKE_MOST = 10
+"""References that are read of those with one image, or with one camera and pose: a sentence names fewer. All of them
+would be the whole scene where a tracker gave every photograph its start."""
+
+_IN_SCENE = select(tables.reference).where(tables.reference.c.scene_id == bindparam("scene_key")).limit(ALIKE_MOST)
+_BY_IMAGE, _BY_GEOMETRY = (
+    _IN_SCENE.where(column == bindparam("value"))
+    for column in (tables.reference.c.image_sha256, tables.reference.c.geometry)
+)
 
 UNWRITABLE = frozenset({"STORE_READ_ONLY", "STORE_FULL", "STORE_UNAVAILABLE"})
 """Reasons of faults after which the next change would most likely fail, too."""
@@ -219,23 +225,18 @@ class StoreReader:
     def list_alike(
         self, scene_key: SceneKey, images_sha256: Collection[str], posed: Sequence[tuple[Camera, RigidTransform]]
     ) -> list[ReferenceRecord]:
-        """References with one of these images, or one of these cameras and poses, among the `ALIKE_WITHIN` newest.
+        """References with one of these images, or one of these cameras and poses; `ALIKE_MOST` of each.
 
         Ordered by id. DataLoss if camera and pose of one of them are damaged.
         """
-        column = tables.reference.c
-        newest = (
-            select(tables.reference)
-            .where(column.scene_id == scene_key)
-            .order_by(column.generation.desc())
-            .limit(ALIKE_WITHIN)
-            .subquery()
-        )
         geometries = {codec.encode_geometry(*it) for it in posed}
-        is_alike = or_(newest.c.image_sha256.in_(images_sha256), newest.c.geometry.in_(geometries))
+        found: dict[str, Row[Any]] = {}
         with self.database.read() as connection:
-            found = connection.execute(select(newest).where(is_alike).order_by(newest.c.reference_id)).all()
-        return [rows.reference_record(row) for row in found]
+            for statement, values in ((_BY_IMAGE, images_sha256), (_BY_GEOMETRY, geometries)):
+                for value in values:
+                    alike = connection.execute(statement, {"scene_key": scene_key, "value": value})
+                    found |= {row.reference_id: row for row in alike}
+        return [rows.reference_record(found[it]) for it in sorted(found)]
 
     @observed
     def list_reference_ids(self, scene_key: SceneKey, limit: int, after: str = "") -> list[str]:

@@ -16,7 +16,7 @@ from sqlalchemy import (
     text,
 )
 
-SCHEMA_VERSION = 9
+SCHEMA_VERSION = 10
 
 metadata = MetaData()
 
@@ -79,6 +79,8 @@ reference = Table(
     Column("mask_sha256", _Sha256),  # null without a mask
     UniqueConstraint("scene_id", "reference_id"),
     Index("reference_by_generation", "scene_id", "generation"),
+    Index("reference_by_image", "scene_id", "image_sha256"),
+    Index("reference_by_geometry", "scene_id", "geometry"),
 )
 
 # Tombstones: references that were deleted in the latest generations of a scene, see store.GENERATIONS_REMEMBERED.
