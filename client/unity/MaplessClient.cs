@@ -6,6 +6,7 @@
 using System;
 using System.Collections.Generic;
 using System.Net.Http;
+using System.Net.Sockets;
 using System.Threading;
 using System.Threading.Tasks;
 using Cysharp.Net.Http;
@@ -139,12 +140,20 @@ namespace Mapless
         /// </param>
         /// <param name="token">Sent to the server, if it requires one. Only over https.</param>
         /// <param name="clientId">Which device this is; the server is fair between them.</param>
-        /// <param name="handler">Handler of HTTP/2, of all servers; a YetAnotherHttpHandler for each if null.</param>
+        /// <param name="handler">
+        /// Handler of HTTP/2, of all servers; a YetAnotherHttpHandler for each if null, which uses no proxy. .NET's own handlers
+        /// use that of the environment, and NO_PROXY; if all servers are on this machine, this turns it off.
+        /// </param>
         public MaplessClient(string address, string token = null, string clientId = null, HttpMessageHandler handler = null)
         {
-            foreach (string one in address.Split(','))
+            string[] addresses = Array.ConvertAll(address.Split(','), one => one.Trim());
+            if (handler != null && Array.TrueForAll(addresses, one => new Uri(one).IsLoopback))
             {
-                var channel = GrpcChannel.ForAddress(one.Trim(), new GrpcChannelOptions
+                UseNoProxy(handler);
+            }
+            foreach (string one in addresses)
+            {
+                var channel = GrpcChannel.ForAddress(one, new GrpcChannelOptions
                 {
                     HttpHandler = handler ?? new YetAnotherHttpHandler { Http2Only = true },
                     DisposeHttpClient = true,
@@ -161,6 +170,20 @@ namespace Mapless
             {
                 headers.Add("x-client-id", clientId);
             }
+        }
+
+        private static void UseNoProxy(HttpMessageHandler handler)
+        {
+            if (handler is HttpClientHandler client)
+            {
+                client.UseProxy = false;
+            }
+#if NET5_0_OR_GREATER
+            if (handler is SocketsHttpHandler sockets)
+            {
+                sockets.UseProxy = false;
+            }
+#endif
         }
 
         /// <summary>Asks where a photograph was taken.</summary>
@@ -543,9 +566,36 @@ namespace Mapless
                 }
                 // A server that returns shortly before the deadline is found, too.
                 pauseS = Math.Max(Math.Min(pauseS, leftS / 2), FirstPauseS) * jitter;
-                MayBeDone |= pauseS < leftS;
+                MayBeDone |= pauseS < leftS && !IsUnsent(error);
                 return pauseS < leftS;
             }
+
+            /// <summary>
+            /// Whether no connection was made, so that the call has reached no server: by the system's error, where .NET made the
+            /// connection, or by the words of YetAnotherHttpHandler.
+            /// </summary>
+            private static bool IsUnsent(RpcException error)
+            {
+                for (Exception cause = error.Status.DebugException; cause != null; cause = cause.InnerException)
+                {
+                    if (cause is SocketException socket && Array.IndexOf(Unconnected, socket.SocketErrorCode) >= 0)
+                    {
+                        return true;
+                    }
+                }
+                return Array.Exists(UnconnectedSigns, sign => error.Status.Detail.IndexOf(sign, StringComparison.Ordinal) >= 0);
+            }
+
+            private static readonly SocketError[] Unconnected =
+            {
+                SocketError.ConnectionRefused, SocketError.HostNotFound, SocketError.TryAgain, SocketError.NoData,
+                SocketError.HostUnreachable, SocketError.NetworkUnreachable, SocketError.AddressNotAvailable,
+            };
+
+            private static readonly string[] UnconnectedSigns =
+            {
+                "client error (Connect)", "error trying to connect", "Error connecting to subchannel", "Connection refused",
+            };
 
             public Task PauseAsync()
             {

@@ -2,8 +2,12 @@
 
 import re
 import shlex
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from mapless.v1 import geometry_pb2, localization_service_pb2, reference_service_pb2
 
@@ -71,3 +75,61 @@ def test_the_recipe_names_all_protos_and_they_are_there() -> None:
     (line,) = re.findall(r"^ {4}(protoc .*)$", recipe, re.MULTILINE)
     named = {part for part in shlex.split(line) if part.endswith(".proto")}
     assert named == {str(path.relative_to(ROOT)) for path in (ROOT / "proto").rglob("*.proto")}
+
+
+_STAND_INS = """
+using System; using System.Net.Http; using System.Net.Sockets; using Grpc.Core;
+namespace System.Net.Http {
+  public class HttpMessageHandler {}
+  public class HttpClientHandler : HttpMessageHandler { public bool UseProxy = true; }
+}
+namespace Grpc.Core {
+  public struct Status {
+    public readonly Exception DebugException; public readonly string Detail;
+    public Status(string detail, Exception exception) { Detail = detail; DebugException = exception; }
+  }
+  public class RpcException : Exception { public Status Status; }
+}
+class Program {
+  PARTS
+  static void Show(string detail, Exception cause) {
+    Console.WriteLine(IsUnsent(new RpcException { Status = new Status(detail, cause) }));
+  }
+  static Exception Of(SocketError error) { return new Exception("sending", new SocketException((int)error)); }
+  static void Main() {
+    Show("Error starting gRPC call.", Of(SocketError.ConnectionRefused));
+    Show("Error starting gRPC call.", Of(SocketError.HostNotFound));
+    Show("Error starting gRPC call. HttpRequestException: client error (Connect): tcp connect error", null);
+    Show("Error starting gRPC call.", Of(SocketError.ConnectionReset));
+    Show("Error starting gRPC call. HttpRequestException: client error (SendRequest)", null);
+    Show("the server is stopping", null);
+    var handler = new HttpClientHandler(); UseNoProxy(handler); Console.WriteLine(handler.UseProxy);
+  }
+}
+"""
+"""In place of what is not at hand, for the parts of the client that need nothing else."""
+
+
+def part(begin: str, end: str) -> str:
+    """The source from a declaration to the end of its block."""
+    start = SOURCE.index(begin)
+    return SOURCE[start : SOURCE.index(end, start) + len(end)]
+
+
+@pytest.mark.skipif(not (shutil.which("mcs") and shutil.which("mono")), reason="needs mono-mcs and mono-runtime")
+def test_a_call_that_reached_no_server_is_not_done(tmp_path: Path) -> None:
+    """And no proxy is used for this machine."""
+    parts = [
+        part("private static bool IsUnsent", "\n            }\n"),
+        part("private static readonly SocketError[]", "};"),
+        part("private static readonly string[] UnconnectedSigns", "};"),
+        part("private static void UseNoProxy", "\n        }\n"),
+    ]
+    (tmp_path / "parts.cs").write_text(_STAND_INS.replace("PARTS", "\n".join(parts)))
+    program = tmp_path / "parts.exe"
+    command = ["mcs", "-langversion:7.2", f"-out:{program}", str(tmp_path / "parts.cs")]
+    subprocess.run(command, check=True, timeout=120)
+    ran = subprocess.run(["mono", str(program)], check=True, capture_output=True, text=True, timeout=120)
+    assert ran.stdout.split() == ["True", "True", "True", "False", "False", "False", "False"]
+    assert "MayBeDone |= pauseS < leftS && !IsUnsent(error);" in SOURCE
+    assert "new Uri(one).IsLoopback" in SOURCE
