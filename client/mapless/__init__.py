@@ -58,6 +58,7 @@ from .groups import (
     TrackingJump,
 )
 from .lenses import Fisheye, RadialTangential
+from .masks import IgnoredMask
 from .options import ConnectOptions
 from .priors import GeoPositionPrior, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
 from .requests import IntrinsicsUncertainty, NewReference
@@ -89,6 +90,7 @@ __all__ = [
     "HeadingPrior",
     "Hint",
     "Hypothesis",
+    "IgnoredMask",
     "ImageReport",
     "Internal",
     "IntrinsicsCheck",

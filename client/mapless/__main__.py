@@ -3,6 +3,7 @@
 import argparse
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,6 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             parser.print_help(sys.stderr)
             sys.exit(EXIT_USAGE)
         parsed = parser.parse_args(arguments)
+        warnings.showwarning = _show_warning
         with Client(parsed.address, connect_options(parsed)) as client, suggesting(client):
             sys.exit(parsed.run(client, parsed))
     except MaplessError as error:
@@ -41,6 +43,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(EXIT_USAGE)
     except KeyboardInterrupt:
         sys.exit(EXIT_INTERRUPTED)
+
+
+def _show_warning(message: Warning | str, *_: object) -> None:
+    print(f"mapless: warning: {message}", file=sys.stderr)
 
 
 def _source_of(error: MaplessError, parsed: argparse.Namespace) -> str:

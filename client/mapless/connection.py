@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import random
 import time
+import warnings
 from collections.abc import AsyncGenerator, AsyncIterable, AsyncIterator, Awaitable, Callable, Iterable, Iterator
 from contextlib import aclosing, contextmanager
 from copy import copy
@@ -27,12 +28,15 @@ from google.protobuf.message import Message
 from . import names
 from .addresses import addresses_of
 from .errors import DeadlineExceeded, Internal, MaplessError, from_rpc_error, is_misconfigured, is_unconnected
+from .masks import IgnoredMask, carries_mask
 from .options import ConnectOptions
 from .reaching import explained
 from .servers import Server, Servers
 from .wire import FieldError
 
 SCENE_KEY = "x-mapless-scene"
+VERSION_KEY = "x-mapless-version"
+"""In the trailers of servers since 0.3.0."""
 _FIELDS = ("scene", "name", "scene_id")
 """Fields of requests that contain it: the scene's name, the name of a scene or reference, or the id of a new scene."""
 
@@ -199,8 +203,12 @@ class Connection:
         """Makes one attempt of a call."""
         server = self._servers.next(self._now_s())
         try:
-            started = self._start(server, method, request, timeout_s)
-            response = await started if isawaitable(started) else started
+            if isinstance(server.methods[method], grpc.UnaryUnaryMultiCallable):  # blocking
+                response, started = self._start(server, method, request, timeout_s, "with_call")
+            else:
+                started = self._start(server, method, request, timeout_s)
+                response = await started
+            await self._check_masks(server, request, started)
         except grpc.RpcError as error:
             raise self._failed(server, error) from error
         self._answered(server)
@@ -219,15 +227,26 @@ class Connection:
                 for response in started:
                     self._answered(server)
                     yield response
+            await self._check_masks(server, request, started)
         except grpc.RpcError as error:
             raise self._failed(server, error) from error
         finally:
             if started is not None:
                 started.cancel()
 
-    def _start(self, server: Server, method: str, request: Message, timeout_s: float) -> Any:
+    def _start(self, server: Server, method: str, request: Message, timeout_s: float, how: str = "__call__") -> Any:
         metadata = self.options.metadata() + scene_metadata(request)
-        return server.methods[method](request, timeout=timeout_s, metadata=metadata)
+        return getattr(server.methods[method], how)(request, timeout=timeout_s, metadata=metadata)
+
+    async def _check_masks(self, server: Server, request: Message, call: Any) -> None:
+        """Warns once if a server has ignored masks because it is too old to know them; it did not say its version."""
+        if server.has_warned or not carries_mask(request):
+            return
+        trailers = call.trailing_metadata()
+        trailers = await trailers if isawaitable(trailers) else trailers
+        if VERSION_KEY not in dict(trailers or ()):
+            server.has_warned = True
+            warnings.warn(IgnoredMask(server.address), stacklevel=2)
 
     def _answered(self, server: Server) -> None:
         self._servers.were_reached = True

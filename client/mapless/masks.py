@@ -1,7 +1,10 @@
-"""Masks in files: a PNG for each photograph, in which 0 means ignore, under COLMAP's names."""
+"""Masks: in files a PNG for each photograph, in which 0 means ignore, under COLMAP's names; and in requests."""
 
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
+from typing import Any
+
+from google.protobuf.message import Message
 
 FOLDER = "masks"
 """Where exports put them."""
@@ -30,3 +33,29 @@ def find_mask(masks: Path, names: Iterable[str]) -> Path | None:
             if file.is_file():
                 return file
     return None
+
+
+class IgnoredMask(UserWarning):
+    """A server that is older than masks has ignored that of a call: it has used, or stored, the whole photograph."""
+
+    def __init__(self, address: str) -> None:
+        super().__init__(
+            f"the server {address} has ignored the mask, and used the whole photograph: it says no version, so it is "
+            "older than 0.3.0, from which on servers know masks"
+        )
+
+
+def carries_mask(request: Message) -> bool:
+    """Whether a request has the mask of a photograph."""
+    fields: Any = request.DESCRIPTOR
+    message: Any = request
+    if "mask" in fields.fields_by_name and message.HasField("mask"):
+        return True
+    parts = [part for name in _WITH_PHOTOGRAPHS if name in fields.fields_by_name for part in getattr(message, name)]
+    if "reference" in fields.fields_by_name and isinstance(message.reference, Message):
+        parts.append(message.reference)
+    return any(map(carries_mask, parts))
+
+
+_WITH_PHOTOGRAPHS = ("images", "frames", "requests")
+"""Fields with the parts of a request that have a photograph each."""

@@ -19,7 +19,7 @@ HealthRequest, _HealthResponse = _WRAPPERS.StringValue, _WRAPPERS.UInt32Value
 
 
 class Server:
-    """One server, or several behind one name: its address, channel and methods."""
+    """One server, or several behind one name: its address, channel and methods, and what was noticed of it."""
 
     def __init__(self, address: str, channel: Any) -> None:
         self.address = address
@@ -34,6 +34,7 @@ class Server:
             ),
         }
         self.lost_until_s = -math.inf
+        self.has_warned = False
 
 
 class Servers:

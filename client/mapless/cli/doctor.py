@@ -13,6 +13,7 @@ import numpy as np
 from ..addresses import addresses_of, host_and_port, is_loopback
 from ..answers import Rejected
 from ..client import Client
+from ..connection import VERSION_KEY
 from ..errors import DeadlineExceeded, MaplessError, from_rpc_error
 from ..options import ConnectOptions
 from ..proxies import Proxy, proxy_of
@@ -32,7 +33,7 @@ _MAX_OFFSET_S = 5.0
 """Of two clocks. Certificates and tokens expire, and times of captures are compared, by minutes at the least."""
 _MAX_ERROR = 0.05
 """Of a reference's photograph, which is matched with itself, from its stored pose; metres or units."""
-_TIME_KEY, _VERSION_KEY, _CONNECTIONS_KEY = "x-mapless-time", "x-mapless-version", "x-mapless-connections"
+_TIME_KEY, _CONNECTIONS_KEY = "x-mapless-time", "x-mapless-connections"
 _FEW_CONNECTIONS = 4096
 
 
@@ -215,7 +216,7 @@ def _check_clock(session: _Session) -> _Result:
 
 def _check_version(session: _Session) -> _Result:
     libraries = f"grpcio {version('grpcio')}, protobuf {version('protobuf')}"
-    client, server = version("mapless"), session.trailers.get(_VERSION_KEY, "")
+    client, server = version("mapless"), session.trailers.get(VERSION_KEY, "")
     if not server:
         return NOTE, f"client {client} ({libraries}); the server's is not known", ""
     if server == client:
