@@ -73,7 +73,5 @@ def _same_poses(known: Sequence[PosedImage], added: Sequence[PosedImage]) -> lis
             if is_start(group[0].world_from_camera)
             else "unless the camera stood still, all but one are wrong"
         )
-        texts.append(
-            f"{count} references with different photographs have exactly the same pose ({names}{more}): {why}"
-        )
+        texts.append(f"{count} references with different photographs have exactly the same pose ({names}{more}): {why}")
     return texts

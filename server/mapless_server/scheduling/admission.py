@@ -19,7 +19,8 @@ class WorkQueueOptions:
     Attributes:
         max_queued_s: largest predicted computing time of the admitted jobs, seconds per thread of a lane, of a
             caller and of those who come first (see `Admission.check_queue`). The result of a job admitted beyond it
-            would be late, and a longer queue has no higher throughput.
+            would be late, and a longer queue has no higher throughput. Together, any number of callers book more only
+            by a logarithm: of equal ones, the k-th a k-th of it.
         max_bytes: largest memory of admitted jobs, and of calls that consist of several jobs, together.
         quantum_s: a step that is predicted to take longer is a long one, of which one thread is kept free; about what
             one job of a stage takes.

@@ -9,7 +9,11 @@ from pathlib import Path
 
 from .page import PAGES, page
 
-MODULES = {"stationary": ("stationary-overlays", "stationary-contradicted-px", "stationary-support")}
+MODULES = {
+    "stationary": ("stationary-overlays", "stationary-contradicted-px", "stationary-support"),
+    "fairness": ("queue-credit", "queue-lately", "queue-client-share"),
+    "handshake": ("handshake",),
+}
 """The keys that each module measures, by `measure(key, scenes)`, which returns the question and its rows."""
 
 
@@ -23,12 +27,12 @@ def main(arguments: list[str]) -> None:
     measured = importlib.import_module(f".{module_of[key]}", __package__)
     PAGES.mkdir(exist_ok=True)
     question, rows = measured.measure(key, scenes)
-    done = []
+    value, done = question.value, []  # rows may set the constant
     for row in rows:
         print(*row.values(), sep=" | ", flush=True)
         done.append(row)
         # After each row: what is measured in many minutes may be stopped.
-        (PAGES / f"{key}.md").write_text(page(question, done))
+        (PAGES / f"{key}.md").write_text(page(question, value, done))
 
 
 if __name__ == "__main__":

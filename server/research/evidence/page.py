@@ -42,14 +42,14 @@ Row = Mapping[str, object]
 """Figures of one alternative, by the titles of the table's columns."""
 
 
-def page(question: Question, rows: Sequence[Row]) -> str:
-    """The page in Markdown, with today's date."""
+def page(question: Question, value: object, rows: Sequence[Row]) -> str:
+    """The page in Markdown, with the constant's value and today's date."""
     titles = list(rows[0])
     lines = [titles, ["---"] * len(titles), *([str(row[title]) for title in titles] for row in rows)]
     table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     command = f"PYTHONPATH=client:server python -m research.evidence {question.key}"
     return (
-        f"# {question.key}\n\n`{question.constant}` = `{question.value!r}`\n\n"
+        f"# {question.key}\n\n`{question.constant}` = `{value!r}`\n\n"
         f"**Question.** {question.question}\n\n**Data.** {question.data}\n\n"
         f"**Command.** `{command}`, {date.today().isoformat()}.\n\n{table}\n\n**Decision.** {question.decision}\n"
     )
