@@ -77,7 +77,7 @@ def written_secret(path: Path) -> Iterator[TextIO]:
     except OSError as error:
         raise SecurityError(f"{path}: {error.strerror}") from error
     try:
-        with open(descriptor, "w") as file:
+        with open(descriptor, "w", encoding="utf-8") as file:
             yield file
             file.flush()
             os.fsync(descriptor)
@@ -141,7 +141,7 @@ def _write(file: Path, tokens: Tokens) -> None:
     new = file.with_name(f".{file.name}.{secrets.token_hex(4)}")
     descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, _FILE_MODE)
     try:
-        with open(descriptor, "w") as stream:
+        with open(descriptor, "w", encoding="utf-8") as stream:
             if file.exists() and os.geteuid() == 0:  # the server, which is not root, must be able to read it
                 os.fchown(descriptor, file.stat().st_uid, file.stat().st_gid)
             stream.write(tokens.model_dump_json(indent=2, exclude_none=True) + "\n")

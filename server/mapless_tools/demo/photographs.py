@@ -63,7 +63,7 @@ def room() -> Place:
     photographs = [_read(frame) for frame in read_folder(ROOM).frames]
     references = [it for it in photographs if it.name.startswith("reference")]
     queries = [it for it in photographs if it.name.startswith("query")]
-    content = json.loads((ROOM / "outline.json").read_text())
+    content = json.loads((ROOM / "outline.json").read_text("utf-8"))
     visible = {name: np.array(edges) for name, edges in content["visible_edges"].items()}
     outline = Outline(np.array(content["edges"]), visible)
     return Place("a room rendered from nothing but code", references, queries, metric=True, outline=outline)

@@ -31,7 +31,7 @@ _WELL_KNOWN = {
 @cache
 def description() -> dict[str, Any]:
     """The OpenAPI document: openapi.json, with the messages' schemas and the paths of scenes."""
-    document: dict[str, Any] = json.loads((files(__package__) / "openapi.json").read_text())
+    document: dict[str, Any] = json.loads((files(__package__) / "openapi.json").read_text("utf-8"))
     document["info"]["version"] = __version__
     schemas, paths = document["components"]["schemas"], document["paths"]
     _, models = models_json_schema(
@@ -53,7 +53,7 @@ def page() -> str:
     import jinja2
 
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    template = environment.from_string((files(__package__) / "docs.html.j2").read_text())
+    template = environment.from_string((files(__package__) / "docs.html.j2").read_text("utf-8"))
     return template.render(description())
 
 
