@@ -20,6 +20,7 @@ from mapless_server.method.readings import (
     judge,
     suspects_of,
 )
+from mapless_server.method.readings.rounding import steps_of
 from mapless_server.method.views import Features, PosedView, View
 
 BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -306,3 +307,14 @@ def test_photographs_at_one_place_are_compared_by_rotation() -> None:
     same = np.repeat(np.arange(len(features), dtype=np.int32)[:, None], 2, axis=1)
     assert np.median(sampson_px(here, there, same)) < 1e-3
     assert errors_of({0: first, 1: second}, [MatchedPair((0, 1), matches[:0])]) == []
+
+
+def test_a_pose_that_is_given_several_times_shows_no_rounding() -> None:
+    different = [view.world_from_camera for view in planted(5)]
+    start = [RigidTransform.identity()] * 5
+    assert steps_of([*start, *different]).rotation == 0
+    rounded = [
+        RigidTransform(rotation_from_vector([0.1 * i, 0.2, 0]), np.round(it.translation, 1))
+        for i, it in enumerate(different)
+    ]
+    np.testing.assert_allclose(steps_of([*start, *rounded]).position, 0.1)

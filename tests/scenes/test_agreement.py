@@ -11,6 +11,7 @@ import pytest
 from mapless_server.method.correspond import make_matcher
 from mapless_server.method.features import SiftExtractor
 from mapless_server.scenes.agreement import Agreement, agreement_of
+from mapless_server.scenes.explaining import SamePose
 from mapless_server.scenes.scene_agreements import SceneAgreements
 from mapless_server.security import SceneKey
 from mapless_server.store import Store
@@ -99,6 +100,9 @@ class Explainer:
 
     def explanation(self, *_: object) -> str:
         return ""
+
+    def same_poses(self, *_: object) -> list[SamePose]:
+        return []
 
     def median_depth(self, *_: object) -> float:
         return self.depth

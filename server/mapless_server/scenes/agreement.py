@@ -25,6 +25,7 @@ class Agreement:
             without such groups.
         explanation: the likely mistake, as `method.readings` names it; empty if there is none, or it is not known yet.
         median_depth: median depth of what pairs that agree show, in the scene's unit; None if it is not known.
+        same_pose: one sentence each about references with exactly one pose that show different things.
     """
 
     pair_count: int = 0
@@ -34,6 +35,7 @@ class Agreement:
     groups: tuple[tuple[str, ...], ...] = ()
     explanation: str = ""
     median_depth: float | None = None
+    same_pose: tuple[str, ...] = ()
 
     @property
     def contradicts_itself(self) -> bool:
@@ -57,9 +59,12 @@ class Agreement:
         return f"{text}; likely: {self.explanation}" if self.explanation else text
 
     def warnings(self, arbitrary_unit: bool) -> list[str]:
-        """What is said of the scene: its contradiction or, without one and unless its unit is arbitrary, its unit."""
+        """What is said of the scene: its contradiction or, without one and unless its unit is arbitrary, its unit.
+
+        Also references with exactly one pose that show different things.
+        """
         unit = "" if arbitrary_unit else implausible_depth(self.median_depth)
-        return [it for it in (self.contradiction or unit,) if it]
+        return [it for it in (self.contradiction or unit, *self.same_pose) if it]
 
 
 def agreement_of(errors_px: Mapping[Pair, float]) -> Agreement:

@@ -1,14 +1,23 @@
-"""Why references of a scene do not agree with their poses, and how far away is what they show where they do."""
+"""Why references of a scene do not agree with their poses, and how far away is what they show where they do.
 
-from collections.abc import Callable, Sequence
+References with exactly one pose that show different things are those of a tracker that had not begun. They explain
+nothing else, so other mistakes are sought without them.
+"""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
 
 from mapless_server.errors import DataLoss
+from mapless_server.method.agreement import MAX_ERROR_PX
 from mapless_server.method.correspond import Matcher
+from mapless_server.method.epipolar import SAME_PLACE
 from mapless_server.method.features import FeatureExtractor
 from mapless_server.method.nearest import mutual_matches
 from mapless_server.method.options import StageContext
-from mapless_server.method.readings import MatchedPair, align_sessions, consistent, explain, median_depth
+from mapless_server.method.readings import MatchedPair, align_sessions, consistent, explain, median_depth, same_poses
 from mapless_server.method.stationary import stationary_matches
 from mapless_server.method.views import Matches, PosedView
 from mapless_server.security import SceneKey
@@ -17,6 +26,7 @@ from mapless_server.store.pairs import Pair
 from .agreement import Agreement
 from .indexes import SceneIndexes
 from .library import ReferenceLibrary
+from .repeats import same_pose_text
 from .retrieval.index import Entries
 
 EXPLAINED_PAIRS, MEASURED_PAIRS = 24, 12
@@ -24,6 +34,15 @@ EXPLAINED_PAIRS, MEASURED_PAIRS = 24, 12
 
 NAMED = 3
 """References of a session that are named: more may be added, and belong to it."""
+
+
+@dataclass(frozen=True)
+class SamePose:
+    """References, by their keys, with exactly one pose that show different things, and one sentence about them."""
+
+    keys: frozenset[str]
+    text: str
+
 
 Match = Callable[[PosedView, PosedView], Matches]
 
@@ -66,7 +85,7 @@ class SceneExplainer:
         group_of = {key: number for number, keys in enumerate(groups) for key in keys}
         between = [pair for pair in sorted(pairs) if {group_of.get(key) for key in pair} == {0, 1}]
         views, matched = self._matched(scene_key, spread(between, EXPLAINED_PAIRS), self._free_matches)
-        id_of = self._ids(scene_key)
+        id_of = self._ids(scene_key, {key for keys in groups for key in keys})
         added = {key: row for row, key in enumerate(id_of)}
         first, second = sorted(groups, key=lambda keys: min(added.get(key, len(added)) for key in keys))
         of_keys = [[i for i, view in views.items() if view.key in keys] for keys in (first, second)]
@@ -79,16 +98,39 @@ class SceneExplainer:
             f"other with {found.text}"
         )
 
-    def _ids(self, scene_key: SceneKey) -> dict[str, str]:
-        """The ids of a scene's references by their keys, in the order in which they were added."""
-        entries: Entries = self._indexes.entries(scene_key, StageContext(self._check))
-        return {key: reference_id for reference_id, key, _ in map(entries.reference, map(int, entries.rows()))}
+    def same_poses(self, scene_key: SceneKey, errors_px: Mapping[Pair, float]) -> list[SamePose]:
+        """References with exactly one pose most of whose pairs do not agree with it."""
+        entries = self._entries(scene_key)
+        bad = [pair for pair, error_px in errors_px.items() if error_px > MAX_ERROR_PX]
+        row_of = entries.rows_of_keys({key for pair in bad for key in pair})
+        bad = [pair for pair in bad if set(pair) <= row_of.keys()]
+        first, second = (entries.centres(np.array([row_of[pair[side]] for pair in bad], np.intp)) for side in (0, 1))
+        at_one_place = np.flatnonzero((np.abs(first - second) < SAME_PLACE).all(axis=1)).tolist()
+        keys = sorted({key for i in at_one_place for key in bad[i]}, key=lambda key: row_of[key])
+        known = {key: entries.reference(row_of[key]) for key in keys}
+        found = []
+        for indices in same_poses({i: known[key][2] for i, key in enumerate(keys)}):
+            group = {keys[i] for i in indices}
+            inside = [it <= MAX_ERROR_PX for pair, it in errors_px.items() if group.issuperset(pair)]
+            if 2 * sum(inside) < len(inside):
+                ids = [known[keys[i]][0] for i in indices]
+                text = same_pose_text("that show different things", ids, known[keys[indices[0]]][2])
+                found.append(SamePose(frozenset(group), text))
+        return found
+
+    def _entries(self, scene_key: SceneKey) -> Entries:
+        return self._indexes.entries(scene_key, StageContext(self._check))
+
+    def _ids(self, scene_key: SceneKey, keys: Collection[str]) -> dict[str, str]:
+        """The ids of references by their keys, in the order in which they were added."""
+        entries = self._entries(scene_key)
+        return {key: entries.reference(row)[0] for key, row in entries.rows_of_keys(keys).items()}
 
     def _matched(
         self, scene_key: SceneKey, pairs: Sequence[Pair], match: Match
     ) -> tuple[dict[int, PosedView], list[MatchedPair]]:
         """The views of the pairs' references that exist, by an index, and the matches of pairs that have some."""
-        id_of = self._ids(scene_key)
+        id_of = self._ids(scene_key, {key for pair in pairs for key in pair})
         pairs = [pair for pair in pairs if set(pair) <= id_of.keys()]
         keys = sorted({key for pair in pairs for key in pair})
         loaded: dict[str, PosedView] = {}

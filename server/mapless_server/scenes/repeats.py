@@ -65,13 +65,21 @@ def _same_poses(known: Sequence[PosedImage], added: Sequence[PosedImage]) -> lis
             continue
         # Of many, the store gives only some.
         is_cut = sum(i < len(known) for i in indices) >= ALIKE_MOST
-        count = f"{'at least ' if is_cut else ''}{len(group)}"
-        names = ", ".join(it.reference_id for it in group[:NAMED])
-        more = f" and {len(group) - NAMED} more" if len(group) > NAMED else ""
-        why = (
-            "the identity: had tracking not begun?"
-            if is_start(group[0].world_from_camera)
-            else "unless the camera stood still, all but one are wrong"
-        )
-        texts.append(f"{count} references with different photographs have exactly the same pose ({names}{more}): {why}")
+        ids = [it.reference_id for it in group]
+        texts.append(same_pose_text("with different photographs", ids, group[0].world_from_camera, is_cut))
     return texts
+
+
+def same_pose_text(
+    what: str, reference_ids: Sequence[str], world_from_camera: RigidTransform, is_cut: bool = False
+) -> str:
+    """One sentence about references with exactly this pose; `what` they are else, in words; if it `is_cut`, of more."""
+    count = f"{'at least ' if is_cut else ''}{len(reference_ids)}"
+    names = ", ".join(reference_ids[:NAMED])
+    more = f" and {len(reference_ids) - NAMED} more" if len(reference_ids) > NAMED else ""
+    why = (
+        "the identity: had tracking not begun?"
+        if is_start(world_from_camera)
+        else "unless the camera stood still, all but one are wrong"
+    )
+    return f"{count} references {what} have exactly the same pose ({names}{more}): {why}"

@@ -10,7 +10,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -198,27 +198,32 @@ class SceneAgreements:
     def _derive(self, scene_key: SceneKey, known: _Known) -> None:
         begin_s = time.monotonic()
         stored = self._pairs.list_errors(self._matching, scene_key, READ_PAIRS)
-        found = agreement_of(self._with_kept(known, stored))
+        errors_px = self._with_kept(known, stored)
+        found = agreement_of(errors_px)
         with self._guard:
             if known.rests_until_s > begin_s:  # nothing has changed meanwhile
                 took_s = time.monotonic() - begin_s
                 known.rests_until_s = max(known.rests_until_s, begin_s + REST_FACTOR * took_s)
         # Known before it is explained, which takes a second or two.
-        self._settle(scene_key, known, found)
+        self._settle(scene_key, known, replace(found, same_pose=self._agreement(scene_key).same_pose))
         if len(stored) < ENOUGH_PAIRS:
             self._sample(scene_key, known)
-            found = agreement_of(self._with_kept(known, stored))
-            self._settle(scene_key, known, found)
+            errors_px = self._with_kept(known, stored)
+            found = agreement_of(errors_px)
+        groups = self._explainer.same_poses(scene_key, errors_px) if found.agreeing_count < found.pair_count else []
+        found = replace(found, same_pose=tuple(it.text for it in groups))
+        self._settle(scene_key, known, found)
         if found.contradicts_itself:
-            self._explain(scene_key, known, found, self._with_kept(known, stored))
+            excluded = frozenset().union(*(it.keys for it in groups))
+            self._explain(scene_key, known, found, [it for it in errors_px if excluded.isdisjoint(it)])
         else:
-            self._measure(scene_key, known, found, self._with_kept(known, stored))
+            self._measure(scene_key, known, found, errors_px)
 
-    def _explain(self, scene_key: SceneKey, known: _Known, found: Agreement, errors_px: Mapping[Pair, float]) -> None:
+    def _explain(self, scene_key: SceneKey, known: _Known, found: Agreement, pairs: Sequence[Pair]) -> None:
         """Finds the likely mistake, if the pairs are others than when that was tried."""
-        if known.explained.is_outdated(errors_px.keys(), bool(self._agreement(scene_key).explanation)):
-            known.explained = _Basis.of(errors_px)
-            explanation = self._explainer.explanation(scene_key, found, list(errors_px))
+        if known.explained.is_outdated(set(pairs), bool(self._agreement(scene_key).explanation)):
+            known.explained = _Basis.of(pairs)
+            explanation = self._explainer.explanation(scene_key, found, pairs)
             self._settle(scene_key, known, replace(found, explanation=explanation))
 
     def _measure(self, scene_key: SceneKey, known: _Known, found: Agreement, errors_px: Mapping[Pair, float]) -> None:

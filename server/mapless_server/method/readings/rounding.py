@@ -40,7 +40,8 @@ class Steps:
 
 
 def steps_of(poses: Sequence[RigidTransform]) -> Steps:
-    """Finds the steps of the numbers of poses."""
+    """Finds the steps of the numbers of poses; a pose that is given several times counts once."""
+    poses = list({pose.matrix().round(8).tobytes(): pose for pose in poses}.values())
     if len(poses) < LEAST_COUNT:
         return Steps(np.zeros(3), 0.0)
     positions = np.array([pose.translation for pose in poses])

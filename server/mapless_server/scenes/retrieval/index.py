@@ -116,6 +116,12 @@ class Entries:
         found = (self._find(reference_id) for reference_id in among)
         return np.array(sorted({row for row in found if row is not None}), np.intp)
 
+    def rows_of_keys(self, keys: Collection[str]) -> dict[str, int]:
+        """Rows of the references with these keys, as far as they are here, ascending."""
+        found = ((key, self._table.row_of_key.get(key, len(self._alive))) for key in keys)
+        here = ((key, row) for key, row in found if row < len(self._alive) and self._alive[row])
+        return dict(sorted(here, key=lambda it: it[1]))
+
     def similarities(self, vector: Vector, rows: Rows) -> NDArray[np.float32]:
         """Similarity (N,) of a unit vector (D,) with rows; NaN for references without a descriptor."""
         vectors = self._table.vectors
