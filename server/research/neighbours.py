@@ -216,7 +216,7 @@ def most_booked(given_s: Sequence[float], cost_s: float, in_turns: bool = False)
     shares = Shares()
     ledger = Ledger(shares)
     admission = Admission(WorkQueueOptions(), {"host": THREADS}, ledger)
-    cost = Counter[str]({"host": cost_s})  # type: ignore[dict-item]  # not int
+    cost = Counter[str]({"host": cost_s})
     flows = [Flow("t", f"token-{i}") for i in range(len(given_s))]
     for flow in flows:
         shares.enter(flow)

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from support.certificates import authority, options_of, signed
@@ -70,7 +71,7 @@ def test_connections_that_are_never_ready_end_and_disturb_nobody(
     """With any part of TLS and HTTP/2's preface, but without HTTP/2's settings."""
     monkeypatch.setattr(descriptors, "HANDSHAKE_S", 2.0)
     monkeypatch.setattr(descriptors, "SHORT_HANDSHAKE_S", 2.0)
-    root, files, options = authority(), dict[str, Path](), ConnectOptions()
+    root, files, options = authority(), dict[str, Any](), ConnectOptions()
     if uses_tls:
         files = {"tls_certificate": tmp_path / "certificate.pem", "tls_key": tmp_path / "key.pem"}
         signed(root, "server").write(*files.values())

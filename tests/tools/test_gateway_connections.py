@@ -32,7 +32,7 @@ async def slow(scope: Any, receive: Any, send: Any) -> None:
 
 
 @asynccontextmanager
-async def listening(monkeypatch: pytest.MonkeyPatch, **tls: Path) -> AsyncIterator[int]:
+async def listening(monkeypatch: pytest.MonkeyPatch, **tls: Any) -> AsyncIterator[int]:
     """The port of such a server."""
     monkeypatch.setattr(serving, "REQUEST_LIMIT_S", LIMIT_S)
     server = http_server(slow, Binding("127.0.0.1", 0, **tls))

@@ -87,11 +87,12 @@ def fundamental_inliers(
     """
     if len(matches) < MIN_MATCHES:
         return np.zeros(len(matches), bool)
-    x = (view.features.keypoints[matches[:, side]].astype(np.float64) for side, view in enumerate((first, second)))
+    x_first = first.features.keypoints[matches[:, 0]].astype(np.float64)
+    x_second = second.features.keypoints[matches[:, 1]].astype(np.float64)
     options = {"max_epipolar_error": FUNDAMENTAL_PX}
     if iterations is not None:
         options |= {"min_iterations": iterations[0], "max_iterations": iterations[1]}
-    _, info = poselib.estimate_fundamental(*x, options, {})
+    _, info = poselib.estimate_fundamental(x_first, x_second, options, {})
     inliers: NDArray[np.bool_] = np.asarray(info["inliers"], bool)
     return inliers if inliers.sum() >= MIN_MATCHES else np.zeros(len(matches), bool)
 
@@ -156,7 +157,7 @@ class PosedMatches:
         ]
         with np.errstate(invalid="ignore", divide="ignore"):
             distance_px = constraint / np.sqrt(slopes[0] + slopes[1])
-        for row in np.flatnonzero(self.are_at_one_place):
+        for row in np.flatnonzero(self.are_at_one_place).tolist():
             distance_px[row] = self._turned_distances_px(row)
         return np.asarray(distance_px)
 

@@ -18,8 +18,8 @@ class Expected:
     def __init__(self, arrivals: Iterable[tuple[Flow, float, float]], shares: Shares, now_s: float) -> None:
         """`arrivals` are jobs that have come to wait: owner, predicted time with later stages, time of arrival."""
         self._shares = shares
-        long_from_s: dict[tuple[str, ...], float] = {}
-        lately = set[tuple[str, ...]]()
+        long_from_s: dict[tuple[str, str], float] = {}
+        lately = set[tuple[str, str]]()
         for flow, its_s, came_s in arrivals:  # without `min` and `max`, which take most of the time here
             ago_s, from_s, group = now_s - came_s, MUCH_SHORTER * its_s, flow[:2]
             if ago_s > from_s:
