@@ -11,7 +11,7 @@ from typing import TextIO
 from .cli.arguments import connect_options, make_parser
 from .cli.folder import EXIT_FAILED, EXIT_USAGE
 from .cli.output import suggesting
-from .client import Client
+from .cli.waiting import WaitingClient
 from .errors import MaplessError
 
 EXIT_INTERRUPTED = 130  # as in shells
@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             sys.exit(EXIT_USAGE)
         parsed = parser.parse_args(arguments)
         warnings.showwarning = _show_warning
-        with Client(parsed.address, connect_options(parsed)) as client, suggesting(client):
+        with WaitingClient(parsed.address, connect_options(parsed)) as client, suggesting(client):
             sys.exit(parsed.run(client, parsed))
     except MaplessError as error:
         print(f"mapless: {_source_of(error, parsed)}{error}", file=sys.stderr)

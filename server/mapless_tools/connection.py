@@ -103,10 +103,14 @@ def connected(connection: Connection, settings: Settings) -> Iterator[Client]:
 
     ValueError if the connection's options do not fit together, or the settings' server would reject the client.
     """
-    from mapless import Client
     from mapless.cli.output import suggesting
+    from mapless.cli.waiting import WaitingClient
 
-    with reachable(connection, settings) as (address, options), Client(address, options) as client, suggesting(client):
+    with (
+        reachable(connection, settings) as (address, options),
+        WaitingClient(address, options, "mapless-server") as client,
+        suggesting(client),
+    ):
         yield client
 
 

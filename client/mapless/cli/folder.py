@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from ..answers import LocalizationResult, Rejected
-from ..client import Client
 from ..errors import MaplessError, ResourceExhausted
 from ..options import ConnectOptions
+from .waiting import WaitingClient
 
 EXIT_FAILED, EXIT_USAGE, EXIT_REJECTED = 1, 2, 3
 Outcome = LocalizationResult | Rejected | MaplessError
@@ -57,7 +57,7 @@ class Concurrency:
                 self._limit = max(self._limit / 2, 1.0)
 
 
-class LimitedClient(Client):
+class LimitedClient(WaitingClient):
     """A client that reports each refused attempt, not only calls that fail, to a limit of concurrency."""
 
     def __init__(self, address: str, options: ConnectOptions, concurrency: Concurrency) -> None:
