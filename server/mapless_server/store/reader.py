@@ -32,7 +32,8 @@ ATTRIBUTES_BYTES = 2000
 
 ALIKE_MOST = 10
 """References that are read of those with one image, or with one camera and pose: a sentence names fewer. All of them
-would be the whole scene where a tracker gave every photograph its start."""
+would be the whole scene where a tracker gave every photograph its start. In a scene of 10,000 a search costs 0.6 ms of
+processor time for one reference, and 0.3 for each of a hundred (`research.equal_references`)."""
 
 _IN_SCENE = select(tables.reference).where(tables.reference.c.scene_id == bindparam("scene_key")).limit(ALIKE_MOST)
 _BY_IMAGE, _BY_GEOMETRY = (
