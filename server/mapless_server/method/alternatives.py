@@ -15,6 +15,7 @@ from .trust.two_view import (
     two_view_evidence,
     two_view_failure,
     two_view_trust,
+    without_unmoved,
 )
 from .two_view.solve import solve_two_view
 from .views import Reconstruction
@@ -26,7 +27,8 @@ def from_one_reference(coarse: Coarse, scale: MetricScale) -> Answer:
     assert isinstance(coarse.reconstruction, Reconstruction)
     given = prepared.query, prepared.references, coarse.reconstruction, scale, prepared.correspondences.query_matches
     with prepared.context.stage("pnp"):
-        found = solve_one_reference(*given, prepared.origin, options.one_reference)
+        fixed = prepared.pipeline.matcher.stationary
+        found = solve_one_reference(*given, prepared.origin, options.one_reference, fixed)
     if isinstance(found, Rejection):
         return coarse.answer(found)
     estimate = found.support.estimate
@@ -52,7 +54,8 @@ def or_from_two_views(coarse: Coarse, answer: Answer) -> Answer:
     prepared, options = coarse.prepared, coarse.prepared.pipeline.options
     query_matches, estimate = prepared.correspondences.query_matches, support.estimate
     with prepared.context.stage("judge"):
-        evidence = two_view_evidence(support, query_matches)
+        moved = without_unmoved(support, query_matches, prepared.pipeline.matcher.stationary)
+        evidence = two_view_evidence(moved, query_matches)
         doubt, trust = two_view_failure(evidence), two_view_trust(evidence)
         votes = votes_of(support, query_matches)
         rejection = None if doubt else contradiction(support, votes, options.judge, unit=prepared.unit)

@@ -18,6 +18,7 @@ from .pnp import gate_failure, solve_pose
 from .priors.known import NO_PRIORS, Priors
 from .rejection import Rejection, RejectionReason
 from .results import ScaleStage, Support
+from .trust.fixed import unmoved_failure
 from .trust.intrinsics import intrinsics_checks
 from .trust.judge import judge
 from .uncertainty.radii import with_halves
@@ -130,8 +131,11 @@ def solve(coarse: Coarse, counts_agreement: bool = False) -> Answer:
     pose, inliers = estimate.world_from_camera, estimate.inliers
     chance = priors.log10_chance(pose) if counts_agreement else 0.0
     failure = gate_failure(query.camera, matches, inliers, options.pnp.inlier_px, chance)
+    support = replace(support, estimate=estimate)
+    fixed = prepared.pipeline.matcher.stationary
+    failure = failure or unmoved_failure(support, options.pnp.inlier_px, fixed, chance)
     if failure:
-        return coarse.answer(Rejection(RejectionReason.GATE, failure), replace(support, estimate=estimate))
+        return coarse.answer(Rejection(RejectionReason.GATE, failure), support)
     if prepared.options.variant is Variant.BEST:
         with stage("adjust"):
             given = query, references, structure, matches, estimate, options.adjust, priors, sigma

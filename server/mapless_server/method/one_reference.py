@@ -27,6 +27,8 @@ from .perturbation import motion_jacobian, perturbed, world_covariance
 from .pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, false_alarms, format_false_alarms, ransac
 from .rejection import Rejection, RejectionReason
 from .results import MetricScale, PointMatches, PoseEstimate, PoseStage, Structure, Support
+from .stationary import StationaryOptions
+from .trust.fixed import are_moved
 from .trust.judge import LEVELS
 from .uncertainty.dispersion import scale_covariance
 from .views import Matches, PosedView, Reconstruction, View
@@ -89,10 +91,12 @@ class Found:
     Attributes:
         support: support with the estimate; its points have their predicted depths.
         score: the larger, the less likely are so many inliers among wrong matches.
+        moved_score: the same for those matches that are at other pixels than in the reference; see `trust.fixed`.
     """
 
     support: Support
     score: float
+    moved_score: float
 
 
 def solve_one_reference(
@@ -103,12 +107,13 @@ def solve_one_reference(
     query_matches: Sequence[Matches],
     origin: Array,
     options: OneReferenceOptions,
+    stationary: StationaryOptions,
 ) -> Found | Rejection:
     """Estimates the pose of a query from its matches with a single reference.
 
     TOO_FEW_MATCHES or PNP_FAILED if there is none. The reconstruction has predicted depths; the scale is metres per
     unit of it, with the relative standard deviation; `origin` (3,) is that of the reference's world in the caller's
-    world.
+    world; `stationary` says what is at the same pixels.
     """
     (reference,), (matches,) = references, query_matches
     points = _predicted(reference, reconstruction, scale, matches)
@@ -136,7 +141,8 @@ def solve_one_reference(
     )
     found = PointMatches(rows, matches[:, 0].astype(np.intp), np.zeros(len(rows), bool), 0.0)
     support = Support(query, tuple(references), structure, found, estimate, origin)
-    return Found(support, score_of(problem, solved, options))
+    moved = are_moved(query, reference, matches, matches, stationary)
+    return Found(support, score_of(problem, solved, options), score_of(*_of_rows(problem, solved, moved), options))
 
 
 def trust_of_score(score: float, options: OneReferenceOptions) -> float:
@@ -151,6 +157,9 @@ def one_reference_failure(found: Found, trust: float, coverage: float) -> str | 
     count = f"{inliers.sum()} of {len(inliers)} matches agree on a pose"
     if -found.score > MAX_LOG10_FALSE_ALARMS:
         return f"{count}, which chance could do ({format_false_alarms(-found.score, MAX_LOG10_FALSE_ALARMS)})"
+    if -found.moved_score > MAX_LOG10_FALSE_ALARMS:
+        chance = format_false_alarms(-found.moved_score, MAX_LOG10_FALSE_ALARMS)
+        return f"{count}, at the same pixels as in the reference, as if fixed to the camera; without them {chance}"
     if trust < 1 - coverage:
         required = f"the {round(1 - coverage, 6):g} that a coverage of {coverage:g} requires"
         return f"its trust of {np.floor(1000 * trust) / 1000:g} is below {required}: {count} with a single reference"
@@ -197,6 +206,12 @@ class _Rows:
         """Areas (M,) of the residuals' ellipses of one standard deviation, square pixels."""
         along_px = np.sqrt(sigma_px**2 + np.square(depth_sigma * self.by_depth).sum(axis=1))
         return np.asarray(np.pi * sigma_px * along_px)
+
+
+def _of_rows(problem: _Problem, solved: _Solved, rows: NDArray[np.bool_]) -> tuple[_Problem, _Solved]:
+    """The problem and its solution with some of the matches; `rows` is (M,)."""
+    some = replace(problem, x_in_world=problem.x_in_world[rows], pixels=problem.pixels[rows])
+    return some, replace(solved, inliers=solved.inliers[rows], errors_px=solved.errors_px[rows])
 
 
 def _predicted(reference: PosedView, reconstruction: Reconstruction, scale: MetricScale, matches: Matches) -> Array:
@@ -300,6 +315,8 @@ def score_of(problem: _Problem, solved: _Solved, options: OneReferenceOptions) -
 
     A wrong match agrees by chance if it falls into the ellipse of its residual.
     """
+    if not solved.inliers.any():
+        return -np.inf
     rows = _linearize(problem, solved.world_from_camera)
     areas = options.inlier_sigma**2 * rows.areas(solved.sigma_px, solved.depth_sigma)
     image = problem.camera.width_px * problem.camera.height_px

@@ -177,6 +177,10 @@ class PointMatches:
     def __len__(self) -> int:
         return len(self.point)
 
+    def select(self, rows: NDArray[np.bool_]) -> PointMatches:
+        """Some of the matches; `rows` is (M,)."""
+        return PointMatches(self.point[rows], self.keypoint[rows], self.guided[rows], self.radius_px)
+
     def and_last(
         self, point: NDArray[np.intp], keypoint: NDArray[np.intp], guided: NDArray[np.bool_] | None = None
     ) -> PointMatches:

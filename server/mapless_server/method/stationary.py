@@ -37,8 +37,11 @@ class StationaryOptions:
         same_px: largest distance between the pixels of a match that are the same.
         contradicted_px: smallest distance of a pixel from all those that the poses can explain; greater than what poses
             and intrinsics of references are off.
-        same_view_share: of a photograph's keypoints, if so many match another's at the same pixels, both show the same
-            from the same place.
+        unmoved_px: largest distance between the pixels of a match that what is fixed to the camera may have: strokes of
+            half-transparent letters are found less exactly than corners.
+        same_view_share: if two photographs match at the same pixels in so many of the parts where either has keypoints,
+            both show the same from the same place. Parts, because a badge in a corner may have most of the keypoints.
+        parts: number of columns of the grid of these parts.
         support: number of matches, of different pairs or at different pixels, that show that a part of the image is
             fixed.
         cells: number of columns of the grid on which they are counted.
@@ -48,7 +51,9 @@ class StationaryOptions:
 
     same_px: float = 1.0
     contradicted_px: float = 4.0
-    same_view_share: float = 0.35
+    unmoved_px: float = 4.0
+    same_view_share: float = 0.4
+    parts: int = 12
     support: int = 3
     cells: int = 160
     reach: int = 2
@@ -56,8 +61,8 @@ class StationaryOptions:
     def __post_init__(self) -> None:
         check_bounds(self, "same_px contradicted_px", above=0)
         check_bounds(self, "same_view_share", above=0, at_most=1)
-        check_bounds(self, "support cells", at_least=1)
-        check_bounds(self, "reach", at_least=0)
+        check_bounds(self, "support cells parts", at_least=1)
+        check_bounds(self, "unmoved_px reach", at_least=0)
 
 
 _COLUMNS = 1024.0
@@ -67,18 +72,39 @@ def stationary_matches(
     first: PosedView, second: PosedView, matches: Matches, options: StationaryOptions
 ) -> NDArray[np.bool_]:
     """Which matches (M,) of two references are at the same pixels, where their poses allow no point at any depth."""
-    none = np.zeros(len(matches), bool)
-    if not _have_same_size(first.view.camera, second.view.camera) or not len(matches):
-        return none
-    scale = first.view.camera.width_px / _COLUMNS
-    pixels, others = (it.view.features.keypoints[matches[:, side]] for side, it in enumerate((first, second)))
-    same = np.flatnonzero(np.abs(pixels - others).max(axis=1) <= options.same_px * scale)
-    fewer = min(len(first.view.features), len(second.view.features))
-    if not len(same) or len(same) > options.same_view_share * fewer:
-        return none
-    off_px = distance_from_explained_px(first, second, *(it[same].astype(np.float64) for it in (pixels, others)))
-    none[same[off_px > options.contradicted_px * scale]] = True
-    return none
+    found = np.zeros(len(matches), bool)
+    moved_px = displacements_px(first.view, second.view, matches)
+    same = np.flatnonzero(moved_px <= options.same_px)
+    if not len(same):
+        return found
+    pixels, others = (it.view.features.keypoints[matches[same, side]] for side, it in enumerate((first, second)))
+    off_px = distance_from_explained_px(first, second, pixels.astype(np.float64), others.astype(np.float64))
+    same = same[off_px > options.contradicted_px * second.view.camera.width_px / _COLUMNS]
+    if len(same) and not show_same_view(first.view, second.view, matches[moved_px <= options.unmoved_px], options):
+        found[same] = True
+    return found
+
+
+def displacements_px(first: View, second: View, matches: Matches) -> Array:
+    """How far apart the pixels of matches (M,) of two photographs are, along the farther axis, of 1024 columns.
+
+    Photographs may have been reduced to different sizes; infinite if their sides have different ratios.
+    """
+    ours, theirs = first.camera, second.camera
+    if not _have_same_shape(ours, theirs):
+        return np.full(len(matches), np.inf)
+    a, b = (it.features.keypoints[matches[:, side]] for side, it in enumerate((first, second)))
+    return np.asarray(np.abs(a * (_COLUMNS / ours.width_px) - b * (_COLUMNS / theirs.width_px)).max(axis=1))
+
+
+def show_same_view(first: View, second: View, unmoved: Matches, options: StationaryOptions) -> bool:
+    """Whether two photographs show the same from the same place, by their matches at the same pixels (M, 2)."""
+    shape = _grid_shape(first.camera, options.parts)
+    matched, occupied = np.zeros(shape[0] * shape[1], bool), np.zeros(shape[0] * shape[1], bool)
+    for view in (first, second):
+        occupied[_cells(view.features.keypoints, view.camera, shape)] = True
+    matched[_cells(first.features.keypoints[unmoved[:, 0]], first.camera, shape)] = True
+    return bool(matched.sum() > options.same_view_share * occupied.sum())
 
 
 def distance_from_explained_px(first: PosedView, second: PosedView, pixels: Array, others: Array) -> Array:
@@ -138,7 +164,7 @@ class IgnoredKeypoints:
         """Which keypoints (N,) of a reference or of a photograph are ignored; none of another camera."""
         for example, fixed in self._fixed:
             if view.has_camera_of(example):
-                return np.asarray(fixed.ravel()[_cells(view.features.keypoints, view.camera, self._options)])
+                return np.asarray(fixed.ravel()[_cells(view.features.keypoints, view.camera, fixed.shape)])
         return np.zeros(len(view.features), bool)
 
 
@@ -149,18 +175,15 @@ def _fixed_cells(
     options: StationaryOptions,
 ) -> NDArray[np.bool_]:
     """The cells of one camera's images that are fixed to it."""
-    camera = references[members[0]].view.camera
-    shape = _grid_shape(camera, options)
-    pixels, pairs = [np.empty((0, 2), np.float32)], [0]
+    shape = _grid_shape(references[members[0]].view.camera, options.cells)
+    count = np.zeros(shape[0] * shape[1], np.float32)
     for (i, j), matches in stationary.items():
         one, side = (i, 0) if i in members else (j, 1)
         if one in members:
-            pixels.append(references[one].view.features.keypoints[matches[:, side]])
-            pairs.append(len(matches))
-    # Of each pair a cell counts once, however many keypoints are at one place.
-    cells, size = _cells(np.concatenate(pixels), camera, options), shape[0] * shape[1]
-    once = np.unique(np.repeat(np.arange(len(pairs)), pairs) * size + cells) % size
-    count = np.bincount(once, minlength=size).reshape(shape).astype(np.float32)
+            view = references[one].view
+            # A cell counts once for a pair, however many keypoints are at one place.
+            count[np.unique(_cells(view.features.keypoints[matches[:, side]], view.camera, shape))] += 1
+    count = count.reshape(shape)
     side = 2 * options.reach + 1
     around = cv2.boxFilter(count, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
     fixed = ((count > 0) & (np.rint(around) >= options.support)).astype(np.uint8)
@@ -199,17 +222,19 @@ def _by_camera(references: Sequence[PosedView]) -> list[list[int]]:
     return groups
 
 
-def _have_same_size(first: Camera, second: Camera) -> bool:
-    return (first.width_px, first.height_px) == (second.width_px, second.height_px)
+def _have_same_shape(first: Camera, second: Camera) -> bool:
+    """Whether the sides of two images have the same ratio, as far as their reduced sizes are whole pixels."""
+    across = abs(first.width_px * second.height_px - second.width_px * first.height_px)
+    return across <= max(first.width_px, second.width_px)
 
 
-def _grid_shape(camera: Camera, options: StationaryOptions) -> tuple[int, int]:
-    return max(1, round(options.cells * camera.height_px / camera.width_px)), options.cells
+def _grid_shape(camera: Camera, columns: int) -> tuple[int, int]:
+    return max(1, round(columns * camera.height_px / camera.width_px)), columns
 
 
-def _cells(pixels: NDArray[np.float32], camera: Camera, options: StationaryOptions) -> NDArray[np.intp]:
+def _cells(pixels: NDArray[np.float32], camera: Camera, shape: tuple[int, ...]) -> NDArray[np.intp]:
     """Indices (N,) of the cells of pixels (N, 2), row by row; the nearest of pixels outside, which lenses have."""
-    rows, columns = _grid_shape(camera, options)
+    rows, columns = shape
     x, y = pixels.T
     column = np.clip((x + 0.5) * (columns / camera.width_px), 0, columns - 1).astype(np.intp)
     row = np.clip((y + 0.5) * (rows / camera.height_px), 0, rows - 1).astype(np.intp)

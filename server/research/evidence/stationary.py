@@ -44,7 +44,7 @@ UNCHECKED = 2
 MAX_KEYPOINTS = 1024
 """Half of what a server takes, so that all is measured in minutes."""
 RIGHT_M = 0.25
-OFF = StationaryOptions(support=1_000_000)
+OFF = StationaryOptions(support=1_000_000, unmoved_px=0.0)
 
 
 @dataclass(frozen=True)

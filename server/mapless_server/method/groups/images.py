@@ -3,6 +3,8 @@
 A photograph that was rejected alone still has matches, and those of the group together may be enough for a pose.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -19,8 +21,10 @@ from ..pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, false_alarms, format_false
 from ..priors.known import NO_PRIORS, Priors
 from ..rejection import Rejection, RejectionReason
 from ..results import PointMatches, ScaleSource, Structure, Support
+from ..stationary import StationaryOptions
 from ..structure import StructureOptions, triangulated_structure
 from ..trust.evidence import findable_count, hull_share
+from ..trust.fixed import moved_matches, without
 from ..views import Matches, PosedView, View
 from .generalized import CameraMatches
 
@@ -121,6 +125,15 @@ class PosedImage:
         seen = structure.tracks.view[agreeing[structure.tracks.point]]
         return tuple(np.bincount(seen, minlength=count).tolist())
 
+    def moved(self) -> PosedImage:
+        """Without matches at the same pixels as in the references, see `trust.fixed`."""
+        it = self.source
+        given = it.query, it.references, it.structure, self.matches, it.query_matches
+        kept = moved_matches(*given, StationaryOptions())
+        return replace(
+            self, matches=self.matches.select(kept), inliers=self.inliers[kept], errors_px=self.errors_px[kept]
+        )
+
 
 def matched_images_of(images: Sequence[GroupImage]) -> tuple[Array, list[MatchedImage]]:
     """Returns the photographs that have matches, in one world, and that world's origin (3,), metres."""
@@ -180,12 +193,13 @@ def group_gate_failure(matched: Sequence[PosedImage]) -> str | None:
     corner of the image.
     """
     inlier_total = sum(int(it.inliers.sum()) for it in matched)
-    count = (
-        f"{inlier_total} of {sum(len(it.matches) for it in matched)} matches in {len(matched)} images agree on a pose"
-    )
-    expected = group_log10_false_alarms(matched)
-    if expected > MAX_LOG10_FALSE_ALARMS:
-        return f"{count}, which chance could do ({format_false_alarms(expected, MAX_LOG10_FALSE_ALARMS)})"
+    count = f"{_agreeing(matched)} in {len(matched)} images agree on a pose"
+    moved = [it.moved() for it in matched]
+    unmoved_count = inlier_total - sum(int(it.inliers.sum()) for it in moved)
+    for some, begin in ((matched, count), (moved, f"{count}; {without(unmoved_count)} {_agreeing(moved)}")):
+        expected = group_log10_false_alarms(some)
+        if expected > MAX_LOG10_FALSE_ALARMS:
+            return f"{begin}, which chance could do ({format_false_alarms(expected, MAX_LOG10_FALSE_ALARMS)})"
     visible = sum(
         findable_count(it.source.query, it.source.structure.x_in_world, it.world_from_camera) for it in matched
     )
@@ -196,6 +210,11 @@ def group_gate_failure(matched: Sequence[PosedImage]) -> str | None:
     if covered < MIN_HULL_SHARE:
         return f"{count}, but they cover only {100 * covered:.1f} % of an image"
     return None
+
+
+def _agreeing(matched: Sequence[PosedImage]) -> str:
+    """How many of the matches are inliers, for a message."""
+    return f"{sum(int(it.inliers.sum()) for it in matched)} of {sum(len(it.matches) for it in matched)} matches"
 
 
 def group_log10_false_alarms(matched: Sequence[PosedImage]) -> float:

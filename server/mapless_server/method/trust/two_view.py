@@ -15,17 +15,19 @@ its own matches. This share gives the trust: the share of right answers with one
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from ..pnp import false_alarms, format_false_alarms, log10_tail
 from ..rejection import Advice, Hint, Rejection, RejectionReason
-from ..results import Support
+from ..results import Support, TwoViewSupport
+from ..stationary import StationaryOptions
 from ..two_view.matches import TwoViewMatches
 from ..two_view.pose import band_chance, disc_chance
 from ..views import Matches
 from .evidence import hull_px2
+from .fixed import are_moved, moved_matches
 
 MAX_LOG10_POSE = -15.0
 """Largest log10 of the expected number of such poses among wrong matches. Of 220 photographs with references of other
@@ -111,6 +113,27 @@ def two_view_evidence(support: Support, query_matches: Sequence[Matches]) -> Two
         float(counts[second] / max(1, len(query_matches[second]))),
         hull_px2(support.query.features.keypoints[keypoint]) / (camera.width_px * camera.height_px),
     )
+
+
+def without_unmoved(support: Support, query_matches: Sequence[Matches], options: StationaryOptions) -> Support:
+    """The support without matches at the same pixels as in the references, which may be fixed to the camera.
+
+    The arguments are those of `two_view_evidence`, and the largest displacement of what is fixed.
+    """
+    estimate, lines, query, references = support.estimate, support.two_view, support.query, support.references
+    if estimate is None or lines is None:
+        raise ValueError("support.estimate and support.two_view must not be None")
+    points = moved_matches(query, references, support.structure, support.matches, query_matches, options)
+    rows = np.ones(len(lines.reference), bool)
+    for i, reference in enumerate(references):
+        own = np.flatnonzero(lines.reference == i)
+        pairs = np.stack([lines.keypoint[own], lines.reference_keypoint[own]], axis=1).astype(np.int32)
+        rows[own] = are_moved(query, reference, pairs, query_matches[i], options)
+    if points.all() and rows.all():
+        return support
+    kept = replace(estimate, inliers=estimate.inliers[points], errors_px=estimate.errors_px[points])
+    moved = TwoViewSupport(*(getattr(lines, it.name)[rows] for it in fields(lines)))
+    return replace(support, matches=support.matches.select(points), estimate=kept, two_view=moved)
 
 
 def lacks_distance(evidence: TwoViewEvidence) -> bool:
