@@ -17,6 +17,7 @@ agreement                    (ours) whether two references agree with their pose
 matching, lightglue          how two photographs are matched: nearest neighbours, or a network
 stationary                   (ours) what is fixed to the camera, such as a bonnet, and no place
 pairs                        pairs of references: their order, their matches as they are cached
+stationary_filter            (ours) matches without what is fixed to the camera
 correspond                   matches among references, and of the query with them
 priors/                      what is known of the query's pose beforehand
 intrinsics                   errors of the query's intrinsics, and the evidence of them

@@ -37,13 +37,14 @@ from .matching import (
 from .nearest import best_of_both, mutual_matches_of_ratios
 from .observations import Tracks, build_tracks
 from .pairs import PairKey, PairMatches, in_order, is_one_photograph
-from .stationary import IgnoredKeypoints, StationaryOptions, stationary_matches, without_ignored
+from .stationary import StationaryOptions, stationary_matches
+from .stationary_filter import references_without_fixed, without_fixed
 from .views import Matches, PosedView, View
 
 _PAIRS_THAT_COUNT = 10
 """For `Matcher.pair_s`, about."""
 
-PAIR_RULE = 3
+PAIR_RULE = 4
 """Version of how two references are matched; to be raised by every change that can change a match."""
 
 
@@ -141,17 +142,20 @@ class Matcher:
         Calls `check` before each pair and does not catch what it raises. `query_matches`, if known already from
         `match_query` or another call with the same references, are used as they are.
         """
+        pairs = list(combinations(range(len(references)), 2))
+        self._look_up([in_order(references[i], references[j]) for i, j in pairs], wide)
+        keys = {(i, j): self._key(in_order(references[i], references[j]), wide) for i, j in pairs}
 
         def of_pair(pair: tuple[int, int]) -> PairMatches:
             check()
-            return self._pair(references[pair[0]], references[pair[1]], wide)
+            return self._pair(references[pair[0]], references[pair[1]], keys[pair])
 
-        pairs = list(combinations(range(len(references)), 2))
-        self._look_up([in_order(references[i], references[j]) for i, j in pairs], wide)
         found = dict(zip(pairs, self._threads.map(of_pair, pairs), strict=True))
         if query_matches is None:
             query_matches = self.match_query(query, references, check)
-        kept = _without_stationary(query, references, found, query_matches, self.stationary)
+        fixed = references_without_fixed(references, found, frozenset(keys.values()), self.stationary, self._structures)
+        of_pairs, matches, count = without_fixed(query, references, found, query_matches, fixed)
+        kept = Correspondences(of_pairs, matches, stationary_count=count)
         # Strong matches of a pair may be stored at any time, so that its matches are not determined.
         source = MatchedReferences(tuple(references), self.matching(wide), self._structures)
         known = source if self.pair_matching is None else None
@@ -256,15 +260,20 @@ class Matcher:
 
         They are strong ones if the strict matches have been looked up as such; otherwise from nearest neighbours.
         """
-        return self._pair(first, second, wide).agreeing
+        return self._pair(first, second, self._key(in_order(first, second), wide)).agreeing
 
-    def _pair(self, first: PosedView, second: PosedView, wide: bool) -> PairMatches:
+    def _key(self, pair: tuple[PosedView, PosedView], wide: bool) -> PairKey:
+        """The key of the matches of a pair, given `in_order`: strong ones, where they have been looked up."""
+        return PairKey.of(pair, wide, self._remembered.get(PairKey.of(pair, False, True)) is not None)
+
+    def _pair(self, first: PosedView, second: PosedView, key: PairKey) -> PairMatches:
         pair = in_order(first, second)
-        strong = self._remembered.get(PairKey.of(pair, False, True)) is not None
-        key = PairKey.of(pair, wide, strong)
         matches = self._remembered.get(key)
         if matches is None:
-            made = self._widened(*pair, self._pair(*pair, False).all) if wide else self._match_strictly(*pair)
+            if key.strong and not key.wide:  # not cached any more
+                return self._pair(first, second, key._replace(strong=False))
+            strict = self._pair(*pair, self._key(pair, False)).all if key.wide else self._match_strictly(*pair)
+            made = self._widened(*pair, strict) if key.wide else strict
             matches = PairMatches.of(*pair, made, self.stationary)
             self._remembered.put(key, matches)
         return matches if pair[0] is first else matches.swapped()
@@ -377,25 +386,6 @@ class Matcher:
         added = best_of_both(similarity, self.options.wide_ratio, self.options.wide_similarity)
         taken = np.isin(added[:, 0], strict[:, 0]) | np.isin(added[:, 1], strict[:, 1])
         return np.concatenate([strict, added[~taken]])
-
-
-def _without_stationary(
-    query: View,
-    references: Sequence[PosedView],
-    pairs: Mapping[tuple[int, int], PairMatches],
-    query_matches: Sequence[Matches],
-    options: StationaryOptions,
-) -> Correspondences:
-    """The correspondences without those of keypoints that are fixed to the camera."""
-    of_pairs = {pair: it.agreeing for pair, it in pairs.items()}
-    ignored = IgnoredKeypoints(references, {pair: it.stationary for pair, it in pairs.items()}, options)
-    if not ignored:
-        return Correspondences(of_pairs, tuple(query_matches))
-    of_query, of_reference = ignored.of(query), [ignored.of(reference.view) for reference in references]
-    of_pairs = {(i, j): without_ignored(it, of_reference[i], of_reference[j]) for (i, j), it in of_pairs.items()}
-    kept = tuple(without_ignored(it, of_query, theirs) for it, theirs in zip(query_matches, of_reference, strict=True))
-    before, after = (np.unique(np.concatenate([it[:, 0] for it in some])) for some in (query_matches, kept))
-    return Correspondences(of_pairs, kept, stationary_count=len(before) - len(after))
 
 
 def make_matcher(features: str, threads: int = 1, weights: Path | None = None, device: str = "cpu") -> Matcher:

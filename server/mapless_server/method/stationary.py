@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, Camera
 
 from .options import check_bounds
-from .views import Matches, PosedView, View
+from .views import Matches, PosedView, View, grid_shape
 
 
 @dataclass(frozen=True)
@@ -91,19 +91,24 @@ def displacements_px(first: View, second: View, matches: Matches) -> Array:
     Photographs may have been reduced to different sizes; infinite if their sides have different ratios.
     """
     ours, theirs = first.camera, second.camera
-    if not _have_same_shape(ours, theirs):
+    if not have_same_shape(ours, theirs):
         return np.full(len(matches), np.inf)
-    a, b = (it.features.keypoints[matches[:, side]] for side, it in enumerate((first, second)))
-    return np.asarray(np.abs(a * (_COLUMNS / ours.width_px) - b * (_COLUMNS / theirs.width_px)).max(axis=1))
+    a, b = (in_columns(it.camera, it.features.keypoints[matches[:, side]]) for side, it in enumerate((first, second)))
+    return np.asarray(np.abs(a - b).max(axis=1))
+
+
+def in_columns(camera: Camera, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Pixels (N, 2) of an image as those of an image of 1024 columns, which photographs of any size share."""
+    return np.asarray((pixels + np.float32(0.5)) * np.float32(_COLUMNS / camera.width_px))
 
 
 def show_same_view(first: View, second: View, unmoved: Matches, options: StationaryOptions) -> bool:
     """Whether two photographs show the same from the same place, by their matches at the same pixels (M, 2)."""
-    shape = _grid_shape(first.camera, options.parts)
-    matched, occupied = np.zeros(shape[0] * shape[1], bool), np.zeros(shape[0] * shape[1], bool)
-    for view in (first, second):
-        occupied[_cells(view.features.keypoints, view.camera, shape)] = True
-    matched[_cells(first.features.keypoints[unmoved[:, 0]], first.camera, shape)] = True
+    ours, theirs = first.cells(options.parts), second.cells(options.parts)
+    size = 1 + max(ours.max(initial=0), theirs.max(initial=0))
+    matched, occupied = np.zeros(size, bool), np.zeros(size, bool)
+    occupied[ours] = occupied[theirs] = True
+    matched[ours[unmoved[:, 0]]] = True
     return bool(matched.sum() > options.same_view_share * occupied.sum())
 
 
@@ -160,11 +165,17 @@ class IgnoredKeypoints:
     def __bool__(self) -> bool:
         return bool(self._fixed)
 
+    @property
+    def size_bytes(self) -> int:
+        """Memory of the grids, bytes."""
+        return sum(fixed.nbytes for _, fixed in self._fixed)
+
     def of(self, view: View) -> NDArray[np.bool_]:
         """Which keypoints (N,) of a reference or of a photograph are ignored; none of another camera."""
         for example, fixed in self._fixed:
             if view.has_camera_of(example):
-                return np.asarray(fixed.ravel()[_cells(view.features.keypoints, view.camera, fixed.shape)])
+                # The sides of reduced images are rounded, so that one may have a row more.
+                return np.asarray(fixed.ravel()[np.minimum(view.cells(self._options.cells), fixed.size - 1)])
         return np.zeros(len(view.features), bool)
 
 
@@ -175,15 +186,17 @@ def _fixed_cells(
     options: StationaryOptions,
 ) -> NDArray[np.bool_]:
     """The cells of one camera's images that are fixed to it."""
-    shape = _grid_shape(references[members[0]].view.camera, options.cells)
-    count = np.zeros(shape[0] * shape[1], np.float32)
+    shape = grid_shape(references[members[0]].view.camera, options.cells)
+    size, own = shape[0] * shape[1], frozenset(members)
+    cells, pairs = [np.empty(0, np.int32)], [0]
     for (i, j), matches in stationary.items():
-        one, side = (i, 0) if i in members else (j, 1)
-        if one in members:
-            view = references[one].view
-            # A cell counts once for a pair, however many keypoints are at one place.
-            count[np.unique(_cells(view.features.keypoints[matches[:, side]], view.camera, shape))] += 1
-    count = count.reshape(shape)
+        one, side = (i, 0) if i in own else (j, 1)
+        if one in own:
+            cells.append(references[one].view.cells(options.cells)[matches[:, side]])
+            pairs.append(len(matches))
+    # A cell counts once for a pair, however many keypoints are at one place.
+    seen = np.repeat(np.arange(len(pairs)) * size, pairs) + np.minimum(np.concatenate(cells), size - 1)
+    count = np.bincount(np.unique(seen) % size, minlength=size).reshape(shape).astype(np.float32)
     side = 2 * options.reach + 1
     around = cv2.boxFilter(count, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
     fixed = ((count > 0) & (np.rint(around) >= options.support)).astype(np.uint8)
@@ -222,20 +235,7 @@ def _by_camera(references: Sequence[PosedView]) -> list[list[int]]:
     return groups
 
 
-def _have_same_shape(first: Camera, second: Camera) -> bool:
+def have_same_shape(first: Camera, second: Camera) -> bool:
     """Whether the sides of two images have the same ratio, as far as their reduced sizes are whole pixels."""
     across = abs(first.width_px * second.height_px - second.width_px * first.height_px)
     return across <= max(first.width_px, second.width_px)
-
-
-def _grid_shape(camera: Camera, columns: int) -> tuple[int, int]:
-    return max(1, round(columns * camera.height_px / camera.width_px)), columns
-
-
-def _cells(pixels: NDArray[np.float32], camera: Camera, shape: tuple[int, ...]) -> NDArray[np.intp]:
-    """Indices (N,) of the cells of pixels (N, 2), row by row; the nearest of pixels outside, which lenses have."""
-    rows, columns = shape
-    x, y = pixels.T
-    column = np.clip((x + 0.5) * (columns / camera.width_px), 0, columns - 1).astype(np.intp)
-    row = np.clip((y + 0.5) * (rows / camera.height_px), 0, rows - 1).astype(np.intp)
-    return np.asarray(row * columns + column)

@@ -135,17 +135,42 @@ class View:
     photograph: Photograph | None = None
     distortion: Distortion | None = None
 
+    @cached_property
+    def _cells(self) -> dict[int, NDArray[np.int32]]:
+        return {}
+
+    def cells(self, columns: int) -> NDArray[np.int32]:
+        """Indices (N,) of the keypoints' cells, row by row, in a grid of so many columns; see `grid_shape`.
+
+        Those of keypoints outside, which lenses have, are the nearest ones. They are computed once: references stay in
+        memory for many queries.
+        """
+        found = self._cells.get(columns)
+        if found is None:
+            rows, _ = grid_shape(self.camera, columns)
+            at = ((self.features.keypoints + 0.5) * (columns / self.camera.width_px)).astype(np.int32)
+            column, row = at[:, 0].clip(0, columns - 1), at[:, 1].clip(0, rows - 1)
+            found = self._cells[columns] = np.asarray(row * columns + column, np.int32)
+        return found
+
     def has_camera_of(self, other: "View") -> bool:
         """Whether both have the same intrinsics, to a thousandth of the width, and so the same errors of them.
 
         The photographs may have been reduced to different sizes.
         """
         ours, theirs = self.camera, other.camera
+        if ours == theirs:
+            return True
         widest_px = max(ours.width_px, theirs.width_px)  # reduced sides are rounded to whole pixels
         if abs(ours.width_px * theirs.height_px - theirs.width_px * ours.height_px) > widest_px:
             return False
         resized = theirs.resized(ours.width_px, ours.height_px)
         return bool(np.abs(ours.matrix() - resized.matrix()).max() < 1e-3 * ours.width_px)
+
+
+def grid_shape(camera: Camera, columns: int) -> tuple[int, int]:
+    """Rows and columns of a grid of about square cells over a camera's images."""
+    return max(1, round(columns * camera.height_px / camera.width_px)), columns
 
 
 @dataclass(frozen=True, eq=False)

@@ -82,16 +82,21 @@ def scenes_in(folder: Path, count: int = QUERIES) -> list[Scene]:
     """The drive, the kitchen and the demo's room, each with photographs of other places."""
     room, kitchen, drive = (read_folder(it) for it in (ROOM, folder / KITCHEN, folder / DRIVE))
     elsewhere = [read_folder(folder / name) for name in ("tum-fr3-office", "meeting-room", "fountain-P11")]
-    names = [frame.name for frame in room.frames]
-    stations, asked = ([i for i, name in enumerate(names) if kind in name] for kind in ("reference", "query"))
     every = evenly_spread(list(range(len(kitchen.frames))), 14)
     between = [i for i in range(1, len(kitchen.frames) - 1) if i not in every]
     numbers = list(range(len(drive.frames)))
     return [
         _scene("drive", drive, 0.8, (numbers[::2], numbers[1:-1:2]), [drive, elsewhere[2]], count),
         _scene("kitchen", kitchen, 0.8, (every, between), [*elsewhere, room], count),
-        _scene("room", room, 0.5, (stations, asked), [*elsewhere, kitchen], count),
+        scene_of_room([*elsewhere, kitchen], count),
     ]
+
+
+def scene_of_room(places: Sequence[Dataset] = (), count: int = 0) -> Scene:
+    """The demo's room, with so many photographs of other places."""
+    room = read_folder(ROOM)
+    chosen = [[i for i, it in enumerate(room.frames) if kind in it.name] for kind in ("reference", "query")]
+    return _scene("room", room, 0.5, (chosen[0], chosen[1]), places, count)
 
 
 def _scene(

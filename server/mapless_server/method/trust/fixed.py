@@ -12,9 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..observations import keypoint_offsets
 from ..pnp import gate_failure
 from ..results import PointMatches, Structure, Support
-from ..stationary import StationaryOptions, displacements_px, show_same_view
+from ..stationary import StationaryOptions, displacements_px, have_same_shape, in_columns, show_same_view
 from ..views import Matches, PosedView, View
 
 
@@ -28,13 +29,18 @@ def unmoved_failure(
     query, estimate = support.query, support.estimate
     assert estimate is not None
     given = query, support.references, support.structure, support.matches, support.query_matches
-    moved = moved_matches(*given, options)
-    unmoved_count = int((estimate.inliers & ~moved).sum())
-    if not unmoved_count:
-        return None
-    kept, inliers = support.matches.select(moved), estimate.inliers[moved]
-    failure = gate_failure(query.camera, kept, inliers, inlier_px, log10_chance)
-    return f"{without(unmoved_count)} {failure}" if failure else None
+    said = None
+    for knows_same_view in (False, True):  # the comparison of whole photographs is seldom needed
+        moved = moved_matches(*given, options, knows_same_view)
+        unmoved_count = int((estimate.inliers & ~moved).sum())
+        if not unmoved_count:
+            return None
+        kept, inliers = support.matches.select(moved), estimate.inliers[moved]
+        failure = gate_failure(query.camera, kept, inliers, inlier_px, log10_chance)
+        if failure is None:
+            return None
+        said = f"{without(unmoved_count)} {failure}"
+    return said
 
 
 def without(unmoved_count: int) -> str:
@@ -51,6 +57,7 @@ def moved_matches(
     matches: PointMatches,
     query_matches: Sequence[Matches],
     options: StationaryOptions,
+    knows_same_view: bool = True,
 ) -> NDArray[np.bool_]:
     """Which 2D-3D matches (M,) are evidence: of points that some reference sees at other pixels than the photograph.
 
@@ -61,26 +68,54 @@ def moved_matches(
         matches: of the photograph with the points.
         query_matches: of the photograph with each reference; they say whether both show the same view.
         options: largest displacement of what is fixed.
+        knows_same_view: whether matches at the same pixels as in a reference count if both show the same view.
     """
     keypoint_of = np.full(len(structure.x_in_world), -1)
     keypoint_of[matches.point] = matches.keypoint
-    tracks = structure.tracks
-    rows = np.flatnonzero(keypoint_of[tracks.point] >= 0)
+    keypoint = keypoint_of[structure.tracks.point]
+    rows = np.flatnonzero(keypoint >= 0)
+    point, view, theirs = (
+        it[rows] for it in (structure.tracks.point, structure.tracks.view, structure.tracks.keypoint)
+    )
+    is_moved = _are_moved(query, references, view, keypoint[rows], theirs, options)
+    if knows_same_view:
+        for i in np.unique(view[~is_moved]):
+            is_moved[view == i] |= _shows_view_of(query, references[i], query_matches[i], options)
     moved = np.zeros(len(structure.x_in_world), bool)
-    for view in np.unique(tracks.view[rows]):
-        of_view = rows[tracks.view[rows] == view]
-        point = tracks.point[of_view]
-        pairs = np.stack([keypoint_of[point], tracks.keypoint[of_view]], axis=1).astype(np.int32)
-        moved[point[are_moved(query, references[view], pairs, query_matches[view], options)]] = True
+    moved[point[is_moved]] = True
     return np.asarray(moved[matches.point])
 
 
-def are_moved(
-    query: View, reference: PosedView, pairs: Matches, query_matches: Matches, options: StationaryOptions
+def _are_moved(
+    query: View,
+    references: Sequence[PosedView],
+    view: NDArray[np.intp],
+    keypoint: NDArray[np.intp],
+    reference_keypoint: NDArray[np.intp],
+    options: StationaryOptions,
 ) -> NDArray[np.bool_]:
-    """Which matches (M, 2) of a photograph with a reference are at other pixels; all, if both show the same view."""
+    """Which keypoints (N,) of a photograph are elsewhere in references, all of these at once."""
+    offsets = keypoint_offsets(references)
+    scaled = [in_columns(it.view.camera, it.view.features.keypoints) for it in references]
+    pixels = np.concatenate(scaled)[offsets[view] + reference_keypoint]
+    apart = np.abs(in_columns(query.camera, query.features.keypoints[keypoint]) - pixels).max(axis=1)
+    alike = np.array([have_same_shape(query.camera, it.view.camera) for it in references])
+    return np.asarray((apart >= options.unmoved_px) | ~alike[view])
+
+
+def are_moved(
+    query: View, reference: PosedView, pairs: Matches, query_matches: Matches | None, options: StationaryOptions
+) -> NDArray[np.bool_]:
+    """Which matches (M, 2) of a photograph with a reference are at other pixels.
+
+    All, if both show the same view, as all their matches, `query_matches`, say; None is not asked.
+    """
     moved = displacements_px(query, reference.view, pairs) >= options.unmoved_px
-    if moved.all():
+    if query_matches is None or moved.all():
         return moved
+    return moved | _shows_view_of(query, reference, query_matches, options)
+
+
+def _shows_view_of(query: View, reference: PosedView, query_matches: Matches, options: StationaryOptions) -> bool:
     unmoved = query_matches[displacements_px(query, reference.view, query_matches) <= options.unmoved_px]
-    return moved | show_same_view(query, reference.view, unmoved, options)
+    return show_same_view(query, reference.view, unmoved, options)
