@@ -108,9 +108,10 @@ QUESTIONS = {
             f"beside another that always did. The most that is booked is that of {MAX_IDLE} tokens, of which as "
             "many are remembered, with credits in equal steps, when each asks until it is refused, the one with the "
             "least credit first; 1 bound is what the queue of one caller holds.",
-            "10 s. With less the fleet's 95th percentile is longer; 30 s are no better for it, and with 100 s two "
-            "tokens that return keep a regular one waiting for ten seconds. The most that can be booked grows with "
-            "it: the tokens would need histories that are made for it, and equal ones book less than 3 bounds.",
+            "10 s. With less the fleet's 95th percentile is longer; 30 s are no better for it. With 100 s two tokens "
+            "that return keep a regular one waiting for ten seconds, and ten leave it half of its answers. The most "
+            "that can be booked grows with it: the tokens would need histories that are made for it, and equal ones "
+            "book less than 3 bounds.",
         ),
         _credit,
     ),
