@@ -87,8 +87,8 @@ def with_passer_by(frame: Frame, number: int, folder: Path) -> Frame:
     shown = cv2.resize(texture, None, fx=10, fy=10, interpolation=cv2.INTER_CUBIC)
     top, left = number * 7 % (height - len(shown)), number * 13 % (width - shown.shape[1])
     mask = np.full((height, width), 255, np.uint8)
-    for whole, part in ((image, shown), (mask, 0)):
-        whole[top : top + len(shown), left : left + shown.shape[1]] = part
+    covered = slice(top, top + len(shown)), slice(left, left + shown.shape[1])
+    image[covered], mask[covered] = shown, 0
     path, mask_path = folder / f"{frame.name}.png", folder / f"{frame.name}.mask.png"
     cv2.imwrite(str(path), image)
     cv2.imwrite(str(mask_path), mask)

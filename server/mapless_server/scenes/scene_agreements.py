@@ -214,7 +214,7 @@ class SceneAgreements:
         found = replace(found, same_pose=tuple(it.text for it in groups))
         self._settle(scene_key, known, found)
         if found.contradicts_itself:
-            excluded = frozenset().union(*(it.keys for it in groups))
+            excluded = {key for it in groups for key in it.keys}
             self._explain(scene_key, known, found, [it for it in errors_px if excluded.isdisjoint(it)])
         else:
             self._measure(scene_key, known, found, errors_px)
