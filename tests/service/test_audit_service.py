@@ -68,7 +68,7 @@ def test_what_is_wrong_with_an_audit_is_named(client: Client) -> None:
     "what", ["features", *(pytest.param(it, marks=pytest.mark.nightly) for it in ("descriptor", "pose"))]
 )
 def test_a_damaged_reference_is_reported_by_page_and_by_name(tmp_path: Path, what: str) -> None:
-    store = Store.open(tmp_path)
+    store = Store.open(tmp_path, cache_bytes=0)  # the comparison of references has read their features before
     with serving_really(tmp_path, store) as server, Client(server.address) as client:
         client.create_scene("s")
         added = [NewReference(f"r{i}", encode(".png", pixels), CAMERA, pose) for i, (pixels, pose) in enumerate(SHOTS)]
