@@ -18,6 +18,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from mapless import ConnectOptions, MaplessError, aio
 from mapless.names import scene_name
+from mapless.proxies import is_exempt
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import localization_service_pb2_grpc as rpcs
 from mapless.v1 import reference_service_pb2 as reference_pb
@@ -210,7 +211,11 @@ async def churning(workers: Workers, seed: int) -> AsyncIterator[Outcomes]:
 
 
 def _channel(address: str) -> grpc.aio.Channel:
-    options = [("grpc.use_local_subchannel_pool", 1), ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES)]
+    options = [
+        ("grpc.use_local_subchannel_pool", 1),
+        ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
+        ("grpc.enable_http_proxy", int(not is_exempt(address))),
+    ]
     return grpc.aio.insecure_channel(address, options)
 
 

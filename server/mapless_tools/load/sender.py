@@ -13,6 +13,7 @@ from typing import Any
 import grpc
 
 from mapless.errors import MaplessError, from_rpc_error
+from mapless.proxies import is_exempt
 
 from .calls import CallRecord, Fate, Kind, PlannedCall
 
@@ -49,6 +50,7 @@ async def connected(
     options = [
         # Channels to one address share a connection otherwise, and the server would see one client.
         ("grpc.use_local_subchannel_pool", 1),
+        ("grpc.enable_http_proxy", int(not is_exempt(address))),
         ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
         ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
         # A refusal is measured, not the outcome of a retry.
