@@ -10,8 +10,6 @@ from collections.abc import Callable, Mapping
 from itertools import combinations
 from statistics import median
 
-import numpy as np
-
 from mapless_server.method.answer import Answer
 from mapless_server.method.cache import LruCache
 from mapless_server.method.features import SiftExtractor
@@ -24,7 +22,7 @@ from mapless_server.method.stationary import StationaryOptions, stationary_match
 from mapless_server.method.stationary_filter import references_without_fixed, without_fixed
 from mapless_server.method.trust.fixed import unmoved_failure
 
-from .evidence.overlays import OVERLAYS, Image, Mask, Overlay
+from .evidence.overlays import OVERLAYS, Overlay
 from .evidence.stationary import draw, scene_of_room
 
 REPEATS = 50
@@ -39,11 +37,6 @@ def cost_ms(work: Callable[[], object]) -> float:
         work()
         spent.append(1e3 * (time.thread_time() - begin_s))
     return median(spent)
-
-
-def nothing(image: Image, number: int) -> tuple[Image, Mask]:
-    """Leaves the photograph as it is."""
-    return image, np.zeros(image.shape[:2], bool)
 
 
 def measured(overlay: Overlay) -> Mapping[str, float]:

@@ -104,12 +104,17 @@ def in_columns(camera: Camera, pixels: NDArray[np.float32]) -> NDArray[np.float3
 
 def show_same_view(first: View, second: View, unmoved: Matches, options: StationaryOptions) -> bool:
     """Whether two photographs show the same from the same place, by their matches at the same pixels (M, 2)."""
-    ours, theirs = first.cells(options.parts), second.cells(options.parts)
+    return share_of_parts(first, second, unmoved, options.parts) > options.same_view_share
+
+
+def share_of_parts(first: View, second: View, matches: Matches, columns: int) -> float:
+    """Share of the cells with matches (M, 2), among those where either photograph has keypoints."""
+    ours, theirs = first.cells(columns), second.cells(columns)
     size = 1 + max(ours.max(initial=0), theirs.max(initial=0))
     matched, occupied = np.zeros(size, bool), np.zeros(size, bool)
     occupied[ours] = occupied[theirs] = True
-    matched[ours[unmoved[:, 0]]] = True
-    return bool(matched.sum() > options.same_view_share * occupied.sum())
+    matched[ours[matches[:, 0]]] = True
+    return float(matched.sum() / max(1, occupied.sum()))
 
 
 def distance_from_explained_px(first: PosedView, second: PosedView, pixels: Array, others: Array) -> Array:

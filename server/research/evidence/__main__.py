@@ -10,7 +10,14 @@ from pathlib import Path
 from .page import PAGES, page
 
 MODULES = {
-    "stationary": ("stationary-overlays", "stationary-contradicted-px", "stationary-support"),
+    "stationary": (
+        "stationary-overlays",
+        "stationary-contradicted-px",
+        "stationary-support",
+        "stationary-unmoved-px",
+        "stationary-same-view-share",
+    ),
+    "stationary_auto": ("stationary-overlays-auto",),
     "fairness": ("queue-credit", "queue-lately", "queue-client-share"),
     "handshake": ("handshake",),
 }

@@ -14,6 +14,11 @@ Overlay = Callable[[Image, int], tuple[Image, Mask]]
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
+def nothing(image: Image, number: int) -> tuple[Image, Mask]:
+    """Leaves the photograph as it is."""
+    return image, np.zeros(image.shape[:2], bool)
+
+
 def badge(image: Image, number: int) -> tuple[Image, Mask]:
     """An opaque badge with marks, 22 x 16 % of the image, in the upper left corner."""
     h, w = image.shape[:2]

@@ -20,7 +20,7 @@ from mapless_server.method.localize import localize
 from mapless_server.method.nearest import mutual_matches
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.stationary import StationaryOptions, fixed_in
+from mapless_server.method.stationary import StationaryOptions, displacements_px, fixed_in, share_of_parts
 from mapless_server.method.views import Features, Matches, PosedView, View
 from mapless_tools.dataset import Dataset
 from mapless_tools.evaluate.metrics import pose_error
@@ -28,8 +28,9 @@ from mapless_tools.evaluate.plan import evenly_spread
 from mapless_tools.evaluate.references import choose_references
 from mapless_tools.ingest.formats.cameras import read_folder
 
-from .overlays import OVERLAYS, Image, Mask, Overlay, black
+from .overlays import OVERLAYS, Image, Mask, Overlay, black, nothing
 from .page import Question, Row
+from .stationary_questions import QUESTIONS
 
 ROOM = Path(__file__).parents[2] / "mapless_tools" / "demo" / "room"
 KITCHEN, DRIVE = "7scenes-redkitchen-seq01-first600", "kitti-drive-a"
@@ -246,51 +247,6 @@ def clean(folder: Path, name: str, extractor: FeatureExtractor) -> list[PosedVie
     return found
 
 
-DATA = (
-    "The drive of KITTI (980 pixels wide, 13 references), the kitchen of 7-Scenes (512 pixels, 14 references) and the "
-    "demo's room (480 pixels, 16 references), at most 1024 keypoints, ten references of each photograph, with the "
-    "overlays of `research.evidence.overlays` on every photograph (badge, bonnet, gripper, time stamp whose digits "
-    "change, display, half-transparent watermark); asked with 6 photographs of other places (office, meeting room, "
-    "fountain, kitchen, room; the drive also with its own mirrored ones) that carry the same overlay, 2 of them with "
-    "nothing ignored too, and with 4 of the place itself. A right one is within 0.25 m. EdgePoint2 is measured where "
-    "`MAPLESS_WEIGHTS_DIR` has its weights, with nearest neighbours."
-)
-_DRIVE = (
-    "The drive of KITTI as it is, 26 photographs ahead, SIFT: the share of keypoints that are ignored in ten "
-    "references that follow one another, by all matches of their descriptors."
-)
-_CODE = "mapless_server.method.stationary:StationaryOptions"
-QUESTIONS = {
-    it.key: it
-    for it in (
-        Question(
-            "stationary-overlays",
-            f"{_CODE}.reach",
-            "How many photographs of other places are localized because they carry the same picture as the references, "
-            "and how many of the place itself are lost by ignoring it?",
-            DATA + " Beside it the same with the pixels of the overlay black, and their keypoints removed.",
-            "Two cells to each side, 2.5 of 160 columns: digits that change are as far from those that do not. On the "
-            "straight drive a display and a watermark still localize 3 of 12 photographs of other places by SIFT; "
-            "the cause is not found. The table is as far as it was measured: the other rows are open.",
-        ),
-        Question(
-            "stationary-contradicted-px",
-            f"{_CODE}.contradicted_px",
-            "How far must the pixels of a match be from all that the poses explain, so that it is of no place?",
-            _DRIVE,
-            "Four pixels of an image of 1024 columns: the drive has nothing fixed to its camera, so all that is "
-            "ignored is wrong, and at most 1 % may be. Its turns are a tenth of a degree between photographs; with "
-            "greater bounds more of a bonnet on a straight drive is explained as far away.",
-        ),
-        Question(
-            "stationary-support",
-            f"{_CODE}.support",
-            "How many matches at the same pixels show that a part of the image is fixed to the camera?",
-            _DRIVE,
-            "Three: single wrong matches are at the same pixels by chance, and more would leave small texts.",
-        ),
-    )
-}
 _ALTERNATIVES = {
     "stationary-contradicted-px": [
         replace(StationaryOptions(), contradicted_px=value) for value in (1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
@@ -301,7 +257,12 @@ _ALTERNATIVES = {
 
 def measure(key: str, folder: Path) -> tuple[Question, Iterable[Row]]:
     """Measures one of `QUESTIONS` with the scenes of a folder, row by row."""
-    return QUESTIONS[key], _overlays(folder) if key == "stationary-overlays" else _alternatives(folder, key)
+    rows = {
+        "stationary-overlays": _overlays,
+        "stationary-unmoved-px": _unmoved,
+        "stationary-same-view-share": _same_view,
+    }
+    return QUESTIONS[key], rows[key](folder) if key in rows else _alternatives(folder, key)
 
 
 def _extractors() -> dict[str, FeatureExtractor]:
@@ -338,6 +299,61 @@ def compared(drawn: Drawn, features: str) -> Row:
         ),
     }
     return {title: f"{sum(some)} of {len(some)}" for title, some in found.items()}
+
+
+def _unmoved(folder: Path) -> Iterator[Row]:
+    extractor, drive = SiftExtractor(SiftOptions(max_keypoints=MAX_KEYPOINTS)), scenes_in(folder)[0]
+    drawn = [draw(drive, OVERLAYS[name], extractor) for name in ("display", "watermark")]
+    for value in (0.0, 1.0, 2.0, 4.0, 8.0):
+        wrong, rightly = [], []
+        for it in drawn:
+            # A pipeline of its own: references have the same keys with each overlay.
+            checked = pipeline_of("sift", replace(StationaryOptions(), unmoved_px=value))
+            wrong += accepted(it.others, it.references, checked)
+            rightly += right(it.queries, it.references, checked)
+        yield {
+            "unmoved_px": value,
+            "other places localized": f"{sum(wrong)} of {len(wrong)}",
+            "right": f"{sum(rightly)} of {len(rightly)}",
+        }
+
+
+def _same_view(folder: Path) -> Iterator[Row]:
+    extractor, options = SiftExtractor(SiftOptions(max_keypoints=MAX_KEYPOINTS)), StationaryOptions()
+
+    def share(first: View, second: View) -> float:
+        matches = mutual_matches(first.features, second.features, 0.9, True)
+        unmoved = matches[displacements_px(first, second, matches) <= options.unmoved_px]
+        return share_of_parts(first, second, unmoved, options.parts)
+
+    def seen(image: Image, overlay: Overlay, number: int) -> View:
+        return with_overlay(image, camera, overlay, number, extractor, False)
+
+    same, other = [], []
+    for scene in scenes_in(folder, 3):
+        camera = scene.references[0].camera
+        for it in scene.references[::4]:
+            view = seen(it.image, nothing, 0)
+            same += [share(view, seen(worse(it.image, *how), nothing, 0)) for how in WORSE]
+        for overlay in OVERLAYS.values():
+            first = seen(scene.references[0].image, overlay, 0)
+            other += [share(first, seen(it, overlay, 500)) for it in scene.others]
+    for value in (0.2, 0.3, 0.4, 0.5, 0.6):
+        yield {
+            "same_view_share": value,
+            "the same view, recognized": f"{sum(it > value for it in same)} of {len(same)}",
+            "another place with the same overlay, taken for it": f"{sum(it > value for it in other)} of {len(other)}",
+        }
+
+
+WORSE = ((1.3, 4.0, 0.5), (2.0, 8.0, 0.5), (0.6, 6.0, 1.0))
+"""Exponents of brightness, noise and blur of photographs from the same place."""
+
+
+def worse(image: Image, exponent: float, noise: float, blur_px: float) -> Image:
+    """The photograph in another light, blurred, with noise."""
+    lit = cv2.GaussianBlur(255 * (image / 255.0) ** exponent, (0, 0), blur_px)
+    return np.clip(lit + np.random.default_rng(0).normal(0, noise, lit.shape), 0, 255).astype(np.uint8)
 
 
 def _alternatives(folder: Path, key: str) -> Iterator[Row]:
