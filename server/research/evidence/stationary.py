@@ -305,7 +305,8 @@ def _unmoved(folder: Path) -> Iterator[Row]:
     extractor, drive = SiftExtractor(SiftOptions(max_keypoints=MAX_KEYPOINTS)), scenes_in(folder)[0]
     drawn = [draw(drive, OVERLAYS[name], extractor) for name in ("display", "watermark")]
     for value in (0.0, 1.0, 2.0, 4.0, 8.0):
-        wrong, rightly = [], []
+        wrong: list[bool] = []
+        rightly: list[bool] = []
         for it in drawn:
             # A pipeline of its own: references have the same keys with each overlay.
             checked = pipeline_of("sift", replace(StationaryOptions(), unmoved_px=value))
@@ -329,7 +330,8 @@ def _same_view(folder: Path) -> Iterator[Row]:
     def seen(image: Image, overlay: Overlay, number: int) -> View:
         return with_overlay(image, camera, overlay, number, extractor, False)
 
-    same, other = [], []
+    same: list[float] = []
+    other: list[float] = []
     for scene in scenes_in(folder, 3):
         camera = scene.references[0].camera
         for it in scene.references[::4]:
