@@ -5,7 +5,7 @@ import re
 import socket
 
 _SCHEMES = ("dns", "ipv4", "ipv6", "unix", "unix-abstract", "vsock", "xds")
-"""Of gRPC's own forms of an address."""
+"""Schemes of gRPC's own forms of an address."""
 _DEFAULT_PORT = "443"  # gRPC's
 _LOCAL_NAMES = ("localhost", "localhost.localdomain", "ip6-localhost", "ip6-loopback")
 _LOCAL_SCHEMES = ("unix:", "unix-abstract:", "vsock:")

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 CLIPPED_SHARE = 0.001
-"""Of the values, at each end of the range: hot and dead pixels do not set it."""
+"""Share of the values that is clipped at each end of the range: hot and dead pixels do not set it."""
 
 _LEVELS = 65536
 _BLOCK = 2**20  # values counted at a time: numpy converts them to eight bytes each

@@ -28,7 +28,7 @@ _MISCONFIGURED = {
     "root_certificates)",
     "HTTP proxy returned response code 407": "the proxy requires a user and a password: http://user:password@host:port",
 }
-"""What another attempt does not change, by a sign in gRPC's text."""
+"""Failures that another attempt does not change, by a sign in gRPC's text."""
 _NOT_CONNECTED_BECAUSE = _MISCONFIGURED | {
     "HTTP proxy returned response code": "the proxy refuses or does not reach the server",
     "Socket closed": "the server closes the connection at once: all of its connections are taken, or it uses TLS "

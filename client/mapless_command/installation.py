@@ -67,7 +67,7 @@ def _source(direct_url: dict[str, object], extra: str) -> list[str]:
 
 
 def _requirements(installed: Distribution, extra: str) -> Iterator[str]:
-    """What the extra brings, package by package; its own extras of mapless resolved."""
+    """Requirements of the extra, package by package; extras of mapless in it are resolved."""
     for requirement in installed.requires or ():
         what, _, marker = requirement.partition(";")
         of_extra = _EXTRA_MARKER.search(marker)

@@ -21,7 +21,7 @@ _ANNOUNCEMENT = "mapless-server listening on "
 
 
 ATTEMPTS = 4
-"""Of a call of its clients: a child that has ended does not come back."""
+"""Attempts of each call of its clients: a child that has ended does not come back."""
 
 CONNECT = ConnectOptions(timeout_s=600.0, upload_timeout_s=3600.0, batch_count=8, max_attempts=ATTEMPTS)
 """For measuring: a late answer is measured, too, and photographs may be large."""

@@ -1,4 +1,4 @@
-"""What the search for equal references costs in a large scene: `python -m research.equal_references [COUNT]`.
+"""Cost of the search for equal references in a large scene: `python -m research.equal_references [COUNT]`.
 
 All of the scene's poses differ, or all are the same, as of a tracker that had not begun.
 """

@@ -1,4 +1,4 @@
-"""What servers say of scenes whose poses are read otherwise than they were meant, and which answers they give there.
+"""Warnings and answers of servers about scenes whose poses are read otherwise than they were meant.
 
 `python -m research.scene_agreement SCENES [--features sift] [--references 16] [--queries 6] [--only NAME ...]`: each
 folder of SCENES with `cameras.json` becomes a scene in an engine of this process, with its poses as given, in OpenGL's
@@ -82,7 +82,7 @@ class Sample:
 
 @dataclass
 class Found:
-    """What was said of a scene: after how many references, or 0, in the end, and the outcomes of its queries."""
+    """A scene's result: after how many references it was said, or 0, in the end, and the outcomes of its queries."""
 
     said_at: int
     agreement: Agreement
@@ -139,7 +139,7 @@ async def examine(engine: QueueEngine, store: Store, sample: Sample, reading: Re
 
 
 def outcome_of(outcome: object, true: RigidTransform, sample: Sample, reading: Reading) -> str:
-    """What became of a query, in a word."""
+    """Names the outcome of a query."""
     if isinstance(outcome, Localization):
         centres = np.array([reading(it.world_from_camera).translation for it in sample.references])
         reach = float(np.median(np.linalg.norm(centres - np.median(centres, axis=0), axis=1)))

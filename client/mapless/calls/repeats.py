@@ -57,7 +57,7 @@ async def stored_reference(wanted: pb.CreateReferenceRequest, connection: Connec
 
 
 def difference(wanted: pb.Reference, stored: Reference) -> str:
-    """What distinguishes references of one name: "photograph", "mask", "intrinsics", "pose"; empty if none does."""
+    """First difference between references of one name: "photograph", "mask", "intrinsics", "pose"; empty if none."""
     if stored.image_sha256 != hashlib.sha256(wanted.image).hexdigest():
         return "photograph"
     if stored.mask_sha256 != (hashlib.sha256(wanted.mask).hexdigest() if wanted.HasField("mask") else ""):

@@ -28,7 +28,7 @@ STATIONARY_PX = 35.0
 does not turn about its centre, and what is near moves by some per cent of the image."""
 
 MAJORITY = 0.5
-"""Of distinct matches that satisfy the poses: then no matrix need be estimated, it would be that of the poses."""
+"""Share of distinct matches that satisfy the poses; then no matrix is estimated: it would be that of the poses."""
 
 AMBIGUOUS_SHARE = 0.25
 """Matches that satisfy the poses, as a share of those that contradict them, from which the pair says nothing."""

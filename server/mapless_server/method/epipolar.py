@@ -34,7 +34,7 @@ PARALLAX_PX = 4.0
 MIN_BEFORE = 8
 """Points that say whether they lie before the cameras."""
 BEHIND_SHARE = 0.5
-"""Of these points, above which the cameras face or move the other way. It is a few per cent for good poses."""
+"""Share of these points above which the cameras face or move the other way; a few per cent for good poses."""
 
 QUICK_ITERATIONS = 30, 300
 """Least and most, of an estimate for pairs of references that a query uses: a millisecond."""
@@ -77,7 +77,7 @@ def fundamental_matrix(first: PosedView, second: PosedView) -> Array:
 def fundamental_inliers(
     first: View, second: View, matches: Matches, iterations: tuple[int, int] | None = None
 ) -> NDArray[np.bool_]:
-    """Which of the matches (M,) satisfy one fundamental matrix, estimated from them; none if they are too few.
+    """Returns whether each match (M,) satisfies one fundamental matrix, estimated from them; none if they are too few.
 
     Args:
         first: a photograph.
@@ -143,7 +143,7 @@ class PosedMatches:
 
     @property
     def are_at_one_place(self) -> NDArray[np.bool_]:
-        """Which pairs (P,) have no baseline, so that only their rotation can be compared."""
+        """Whether each pair (P,) has no baseline, so that only its rotation can be compared."""
         return np.asarray(np.linalg.norm(self.baseline, axis=1) < SAME_PLACE)
 
     def distances_px(self) -> Array:

@@ -130,7 +130,7 @@ class PairMatching(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class StoredPair:
-    """What is stored of a pair of references.
+    """A pair of references as it is stored.
 
     Attributes:
         matches: (M, 2), within the distance from the epipolar lines that the matching allows.

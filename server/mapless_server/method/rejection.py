@@ -44,7 +44,7 @@ class Advice(str, Enum):
     CHECK_PRIOR = "check_prior"
     """The prior contradicts the photograph, or leaves no reference."""
     CHECK_REFERENCE_POSES = "check_reference_poses"
-    """What the references show in common does not agree with their poses."""
+    """The references' poses do not agree with the matches between their photographs."""
 
 
 class IntrinsicsParameter(str, Enum):

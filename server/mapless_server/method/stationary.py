@@ -71,7 +71,7 @@ _COLUMNS = 1024.0
 def stationary_matches(
     first: PosedView, second: PosedView, matches: Matches, options: StationaryOptions
 ) -> NDArray[np.bool_]:
-    """Which matches (M,) of two references are at the same pixels, where their poses allow no point at any depth."""
+    """Returns which matches (M,) of two references are at one pixel, where their poses allow no point at any depth."""
     found = np.zeros(len(matches), bool)
     moved_px = displacements_px(first.view, second.view, matches)
     same = np.flatnonzero(moved_px <= options.same_px)
@@ -176,7 +176,7 @@ class IgnoredKeypoints:
         return sum(fixed.nbytes for _, fixed in self._fixed)
 
     def of(self, view: View) -> NDArray[np.bool_]:
-        """Which keypoints (N,) of a reference or of a photograph are ignored; none of another camera."""
+        """Returns which keypoints (N,) of a reference or of a photograph are ignored; none of another camera."""
         for example, fixed in self._fixed:
             if view.has_camera_of(example):
                 # The sides of reduced images are rounded, so that one may have a row more.

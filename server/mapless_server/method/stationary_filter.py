@@ -69,7 +69,7 @@ def references_without_fixed(
     options: StationaryOptions,
     cache: LruCache[Any],
 ) -> ReferencesWithoutFixed | None:
-    """What is fixed to the cameras of references; None where no pair shows anything.
+    """Finds what is fixed to the cameras of references; None where no pair shows anything.
 
     Args:
         references: the references.

@@ -15,14 +15,14 @@ from pathlib import Path
 MOST_DESCRIPTORS = 2**20
 """No limit is raised beyond: some programs go through all possible descriptors."""
 RESERVED_SHARE, MOST_RESERVED = 0.25, 512
-"""Of the descriptors, that connections leave to the store, the log, the metrics and probes."""
+"""Share of the descriptors that connections leave to the store, the log, the metrics and probes, and its maximum."""
 FEW_CONNECTIONS = 4096
 """A server with fewer connections is said to have too few: strangers that open them can keep others out."""
 HANDSHAKE_S, SHORT_HANDSHAKE_S = 10.0, 3.0
 """Time for TLS and the preface of HTTP/2; the short one where there are few connections."""
 CHECK_INTERVAL_S = 5.0
 FULL_SHARE = 0.8
-"""Of the connections, from which on the log warns."""
+"""Share of the allowed connections from which on the log warns."""
 
 _TABLES = ("/proc/self/net/tcp", "/proc/self/net/tcp6")
 _OPEN_STATES = frozenset({"01", "08"})

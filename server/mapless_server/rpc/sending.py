@@ -105,7 +105,7 @@ UNREAD_BYTES = 256 * 2**20
 """Answers that a tenant's callers have not read yet; grpc keeps them in memory as long as the connection lasts, though
 their handlers have ended. As many as sixteen of the largest photographs."""
 UNREAD_SHARE = 0.75
-"""Of that, what one token may have of what the tenant's others leave."""
+"""Share that one token may have of what the tenant's other tokens leave."""
 SMALL_ANSWER_BYTES = 256 * 1024
 """Such an answer is sent all the same: callers that read nothing must not keep others from being localized."""
 

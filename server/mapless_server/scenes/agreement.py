@@ -59,7 +59,7 @@ class Agreement:
         return f"{text}; likely: {self.explanation}" if self.explanation else text
 
     def warnings(self, arbitrary_unit: bool) -> list[str]:
-        """What is said of the scene: its contradiction or, without one and unless its unit is arbitrary, its unit.
+        """Sentences about the scene: its contradiction or, without one and unless its unit is arbitrary, its unit.
 
         Also references with exactly one pose that show different things.
         """

@@ -21,7 +21,7 @@ NAMED = 5
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """What may be repeated of a reference: its image, by the hash of its bytes, and its pose."""
+    """The parts of a reference that may be repeated: its image, by the hash of its bytes, and its pose."""
 
     reference_id: str
     image_sha256: str

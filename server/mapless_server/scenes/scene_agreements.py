@@ -51,7 +51,7 @@ KNOWN_GROWTH, UNKNOWN_GROWTH = 2.0, 1.2
 
 READ_PAIRS = 20_000
 STALE_S, REST_FACTOR = 2.0, 50.0
-"""What is known of a scene is derived again after so long, and after so many times what reading its pairs took: 20,000
+"""An agreement is derived again after so long, and after so many times what reading its pairs took: 20,000
 take a tenth of a second, which queries would have to share."""
 LONGEST_WAIT_S = 3.0
 """For what must be computed, by who asks for the agreement as it is now."""
@@ -79,7 +79,7 @@ class _Basis:
 
 @dataclass(eq=False)
 class _Known:
-    """What is known of a scene: errors of sampled pairs, the references that were sampled, and the last result.
+    """A scene's state: errors of sampled pairs, the references that were sampled, and the last result.
 
     `sampled_size` is the number of its references when they were sampled, `explained` has the pairs by which it was
     explained, `measured` those by which its depth was measured; before `rests_until_s`, by `time.monotonic`, nothing is
@@ -176,7 +176,7 @@ class SceneAgreements:
             self.touch(scene_key)
 
     def _known(self, scene_key: SceneKey) -> _Known:
-        """What is known of a scene, for a change; with the guard."""
+        """Returns a scene's state, to be changed by whoever holds the guard."""
         return self._scenes.setdefault(scene_key, _Known())
 
     def _agreement(self, scene_key: SceneKey) -> Agreement:

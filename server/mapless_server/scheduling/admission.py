@@ -191,7 +191,7 @@ class Ledger:
         return self._all if flow is None else self._clients.get(flow, _NOTHING)
 
     def _holding(self, flow: Flow) -> tuple["_Holdings", "_Holdings", "_Holdings"]:
-        """What the client, its caller and all hold, to be changed."""
+        """Returns the holdings of the client, of its caller and of all, to be changed."""
         of_client = self._clients.setdefault(flow, _Holdings())
         return of_client, self._callers.setdefault(flow.group, _Holdings()), self._all
 

@@ -80,7 +80,7 @@ class _Mean(NamedTuple):
 
 
 class _OfCaller:
-    """What the jobs of a caller's clients took in a stage, those of each and of all together."""
+    """Times of the jobs of a caller's clients in a stage: of each client, and of all together."""
 
     def __init__(self) -> None:
         self._all: _Mean | None = None

@@ -1,4 +1,4 @@
-"""Who is likely to need a thread soon, by the jobs that came last, and so would wait for a caller's long step."""
+"""Callers that are likely to need a thread soon, by the jobs that came last, and so would wait for a long step."""
 
 import math
 from collections.abc import Iterable
@@ -13,7 +13,7 @@ MUCH_SHORTER = 4
 
 
 class Expected:
-    """What is expected of a lane at one moment. Each answer takes microseconds, however many have come and wait."""
+    """Expected jobs of a lane at one moment. Each answer takes microseconds, however many have come and wait."""
 
     def __init__(self, arrivals: Iterable[tuple[Flow, float, float]], shares: Shares, now_s: float) -> None:
         """`arrivals` are jobs that have come to wait: owner, predicted time with later stages, time of arrival."""

@@ -1,4 +1,4 @@
-"""What each tenant, caller and client has been given of the computing time, and so whose turn it is."""
+"""Shares of the computing time that each tenant, caller and client has been given, and so whose turn it is."""
 
 import itertools
 from collections import OrderedDict

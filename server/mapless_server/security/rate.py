@@ -24,7 +24,7 @@ class _Bucket:
         self.used_s = 0.0
 
     def level_s(self, rate: float, burst_s: float, now_s: float) -> float:
-        """What is left now."""
+        """Returns the time that is left now, seconds."""
         return burst_s - max(0.0, self._missing_s - rate * max(0.0, now_s - self.used_s))
 
     def wait_s(self, cost_s: float, rate: float, burst_s: float, now_s: float) -> float:

@@ -48,7 +48,7 @@ class View:
 
 
 _LIMITS = ImageLimits(max_bytes=2**31, max_pixels=2**30, min_side_px=1, max_side_px=2**20)
-"""What a server stores has passed its own."""
+"""As good as none: images that a server stores have passed its own limits."""
 
 
 def export_gltf(client: Client, scene: str, folder: Path, progress: Progress) -> Export:

@@ -12,7 +12,7 @@ PAGES = Path(__file__).parents[3] / "docs" / "evidence"
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked of a constant.
+    """A question about a constant.
 
     Attributes:
         key: name of the page.

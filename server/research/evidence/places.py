@@ -174,7 +174,7 @@ def answered(pairs: Iterable[Pair], options: LocalizeOptions | None = None) -> I
 
 
 def _error(pair: Pair, answer: Answer) -> tuple[float, float] | None:
-    """Of the pose that is answered, or that was found and rejected."""
+    """Errors of the pose that is answered, or that was found and rejected; None without a pose."""
     if isinstance(answer.outcome, Localization):
         pose = answer.outcome.world_from_camera
     elif answer.support is not None and answer.support.estimate is not None:

@@ -1,4 +1,4 @@
-"""What is fixed to the camera: photographs of other places with the same overlay, and those of the place itself."""
+"""Overlays that are fixed to the camera: photographs of other places with the same one, and of the place itself."""
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
@@ -173,7 +173,7 @@ def with_overlay(
 
 
 def on_mask(view: View, mask: Mask) -> NDArray[np.bool_]:
-    """Which keypoints (N,) lie on the covered pixels or within 1 % of the width of them."""
+    """Returns whether each keypoint (N,) lies on a covered pixel or within 1 % of the width of one."""
     camera, (h, w) = view.camera, mask.shape
     side = 2 * round(0.01 * w) + 1
     wide = cv2.dilate(mask.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
@@ -190,12 +190,12 @@ def pipeline_of(features: str, options: StationaryOptions) -> Pipeline:
 
 
 def accepted(views: Sequence[View], references: Sequence[PosedView], pipeline: Pipeline) -> list[bool]:
-    """Which photographs are localized."""
+    """Returns whether each photograph is localized."""
     return [localized(view, references, pipeline) is not None for view in views]
 
 
 def right(queries: Sequence[PosedView], references: Sequence[PosedView], pipeline: Pipeline) -> list[bool]:
-    """Which photographs of the place are localized rightly."""
+    """Returns whether each photograph of the place is localized rightly."""
     return [_is_right(it, references, pipeline) for it in queries]
 
 

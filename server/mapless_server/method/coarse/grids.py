@@ -219,7 +219,7 @@ class Layout:
         return None if shown.all() else shown
 
     def shown_without(self, ignored: Ignored | None) -> NDArray[np.bool_] | None:
-        """Which pixels (H, W) of the picture show the photograph and nothing ignored; None if all do."""
+        """Returns whether each pixel (H, W) of the picture shows the photograph and is not ignored; None if all do."""
         if ignored is None:
             return self.shown
         painted = self.picture(np.repeat(ignored[:, :, None] * np.uint8(255), 3, axis=2))

@@ -33,7 +33,7 @@ def usable_pixels(ignored: Ignored, width_px: int, height_px: int) -> NDArray[np
 
 
 def are_usable(usable: NDArray[np.bool_], pixels: Array) -> NDArray[np.bool_]:
-    """Which keypoints (N, 2) lie in usable pixels, (N,)."""
+    """Returns whether each keypoint (N, 2) lies in a usable pixel, (N,)."""
     last = usable.shape[1] - 1, usable.shape[0] - 1
     columns, rows = np.clip(np.rint(np.reshape(pixels, (-1, 2))), 0, last).astype(np.intp).T
     return np.asarray(usable[rows, columns], bool)

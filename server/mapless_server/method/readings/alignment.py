@@ -27,21 +27,21 @@ from .errors import MatchedPair, PairSample, Views, summary
 
 MOST_PAIRS = 24
 MOST_MATCHES = 64
-"""Of a pair; the similarity is then known better than a session's own poses."""
+"""Matches of a pair that are used; the similarity is then known better than a session's own poses."""
 MOST_TRIED = 60
 """Solutions of two pairs."""
 AGREEING_DEG = 5.0
 """Between the rotations of two pairs. Relative poses of few matches are off by a degree or two."""
 LEAST_PAIRS = 3
 LEAST_PHOTOGRAPHS = 2
-"""Of either world."""
+"""Photographs of either world that must take part."""
 MOST_BAD = 0.25
 """Share of the pairs that may not fit."""
 SCALE_SIGMA, ROTATION_SIGMA_DEG, POSITION_SIGMA = 0.03, 1.0, 0.03
 """Largest standard deviations of a unique similarity: of the scale, relative; of the rotation; and of the position of
 the other session's middle, as a share of its extent or, if that is more, of the distance between paired cameras."""
 LOSS_PX = 1.0
-"""Of the robust loss: keypoints are accurate to about a pixel."""
+"""Scale of the robust loss: keypoints are accurate to about a pixel."""
 STEPS = MinimizeOptions(30, 1e-6)
 _DIFFERENCE = 1e-6
 _INFLATION = 3.0  # errors of matches of a pair, and of poses of a session, are not independent

@@ -8,7 +8,7 @@ from ..scale import triangulate_depths
 from .errors import MatchedPair, Views
 
 MIN_PARALLAX_DEG = 1.0
-"""Of rays that are intersected: at a pixel's error a fiftieth of the depth, or so."""
+"""Smallest angle between intersected rays: an error of a pixel then changes the depth by about a fiftieth."""
 MIN_POINTS = 100
 """Fewer give no typical depth."""
 MIN_DEPTH_M, MAX_DEPTH_M = 0.05, 500.0

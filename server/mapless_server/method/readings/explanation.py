@@ -26,13 +26,13 @@ FOCAL_TOLERANCE = 0.03
 GAIN = 0.4
 """Share of the error that an explanation may leave."""
 BAD_SHARE = 0.5
-"""Of the pairs, that may stay bad."""
+"""Share of the pairs that may stay bad."""
 MIXED_BAD_SHARE = 0.2
 """The same where each pair is given the choice of which of its two to correct."""
 EQUAL_SHARE, EQUAL_PX = 1.25, 0.1
 """Errors that differ by less than this factor, and this distance, are equal: noise of medians."""
 COVERED_SHARE = 0.8
-"""Of the photographs, that two sessions explain."""
+"""Share of the photographs that two sessions must explain."""
 MOST_NAMED = 2
 """Explanations that are named beside one another."""
 _REFINEMENTS = 3

@@ -16,9 +16,9 @@ from ..views import PosedView, undistort_pixels
 from .conventions import RARE, USUAL, ViewCorrection, turned_camera
 
 LEAST_FOCAL_SHARE = 0.1
-"""Of the image's longer side: a shorter focal length means 157 degrees of view and more through a pinhole."""
+"""Share of the image's longer side; a shorter focal length would be a pinhole with more than 157 degrees of view."""
 SAME_SHARE = 0.01
-"""Of the image's longer side: coordinates that differ by less cannot be distinguished, nor from the first pixel."""
+"""Share of the image's longer side; coordinates that differ by less cannot be distinguished."""
 FIELDS_DEG = (30.0, 45.0, 60.0, 75.0, 90.0, 110.0, 130.0)
 """Horizontal fields of view from which a focal length that is unknown is searched."""
 

@@ -18,7 +18,7 @@ from .errors import PairSample, summary
 LEAST_COUNT = 4
 """Poses whose numbers say something."""
 DIGITS = (1, 2, 3, 4)
-"""Of rotations, after the point."""
+"""Digits after the point that are tried for rotations."""
 POSITION_DIGITS = range(-4, 7)
 """The same of positions; negative before it."""
 _ROUNDED_SHARE = 0.3  # of rotations that come of a rounded matrix, which is not one before it is made one
@@ -85,7 +85,7 @@ def _is_of_rounded_quaternion(pose: RigidTransform, digits: int) -> bool:
 
 
 def rounding_text(sample: PairSample, given_px: float) -> str:
-    """What is rounded, if that makes errors like the given median of the sample's pairs; else empty."""
+    """Names the rounded numbers if rounding gives errors like the given median of the sample's pairs; else empty."""
     steps = steps_of([view.world_from_camera for view in sample.views.values()])
     parts = []
     if steps.position.any() and _explains(sample, replace(steps, rotation=0.0), given_px):

@@ -16,7 +16,7 @@ from .repeats import contradicting_groups, same_photographs
 WRONG_SHARE = 0.4
 """More bad pairs than one photograph in five could make."""
 LEFT_SHARE = 0.25
-"""Of the pairs of a wrong scene, that are left without the suspects if these are the reason."""
+"""Share of a wrong scene's bad pairs that may remain without the suspects, if these are the reason."""
 _SUSPECT_SHARE = 0.6
 _SUSPECT_PAIRS = 2
 

@@ -1,4 +1,4 @@
-"""What is fixed to the camera is no evidence for a pose, also where references do not show that it is fixed.
+"""Matches that may be fixed to the camera are no evidence for a pose, also where references do not show it.
 
 Matches at the same pixels as in a reference say "the pose of the reference". On a straight drive poses explain them as
 points that are far away, and a single reference, or several at one pose, cannot show that they are anything else; but a
@@ -59,7 +59,7 @@ def moved_matches(
     options: StationaryOptions,
     knows_same_view: bool = True,
 ) -> NDArray[np.bool_]:
-    """Which 2D-3D matches (M,) are evidence: of points that some reference sees at other pixels than the photograph.
+    """Returns which 2D-3D matches (M,) are evidence: their points are at other pixels in some reference.
 
     Args:
         query: the photograph.
@@ -94,7 +94,7 @@ def _are_moved(
     reference_keypoint: NDArray[np.intp],
     options: StationaryOptions,
 ) -> NDArray[np.bool_]:
-    """Which keypoints (N,) of a photograph are elsewhere in references, all of these at once."""
+    """Returns whether each keypoint (N,) of a photograph is elsewhere in its reference, for all references at once."""
     offsets = keypoint_offsets(references)
     scaled = [in_columns(it.view.camera, it.view.features.keypoints) for it in references]
     pixels = np.concatenate(scaled)[offsets[view] + reference_keypoint]
@@ -106,7 +106,7 @@ def _are_moved(
 def are_moved(
     query: View, reference: PosedView, pairs: Matches, query_matches: Matches | None, options: StationaryOptions
 ) -> NDArray[np.bool_]:
-    """Which matches (M, 2) of a photograph with a reference are at other pixels.
+    """Returns whether each match (M, 2) of a photograph with a reference is at other pixels.
 
     All, if both show the same view, as all their matches, `query_matches`, say; None is not asked.
     """

@@ -96,7 +96,7 @@ ADVICE = (
     "Check the references' poses, not the photograph: world_from_camera (not its inverse) with OpenCV's axes (x right, "
     "y down, z forward), all in one world; `mapless-server audit` compares all of a scene."
 )
-"""Of hints with CHECK_REFERENCE_POSES."""
+"""The hint beside CHECK_REFERENCE_POSES."""
 
 
 def with_contradiction(rejection: Rejection, contradiction: str) -> Rejection:

@@ -15,7 +15,7 @@ from mapless_tools.dataset import Frame
 from mapless_tools.progress import Progress
 
 LIMITS = ImageLimits(max_bytes=2**28, max_pixels=200_000_000)
-"""Of photographs that are compared here; the server has limits of its own."""
+"""Limits of photographs that are compared here; the server has its own."""
 
 
 @dataclass

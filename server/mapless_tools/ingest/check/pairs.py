@@ -1,4 +1,4 @@
-"""Which photographs of a folder are compared."""
+"""Choice of the photographs of a folder that are compared."""
 
 from collections.abc import Iterable, Sequence
 from itertools import chain
@@ -14,7 +14,7 @@ PAIR_COUNT = 24
 MAX_TURN_DEG = 40.0
 """Beyond it SIFT finds few matches, and the views may share nothing."""
 BASELINE_SHARE = 0.05
-"""Of the scene's extent: neighbours in a video stand so close together that almost any pose would fit."""
+"""Least baseline as a share of the scene's extent: for neighbours in a video almost any pose would fit."""
 SAME_POSE_GROUPS, SAME_POSE_PAIRS = 6, 6
 """Groups with the same pose that are compared, and pairs of each."""
 ORDER_STEPS = (1, 3, 10, 30)
