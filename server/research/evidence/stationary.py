@@ -355,7 +355,8 @@ WORSE = ((1.3, 4.0, 0.5), (2.0, 8.0, 0.5), (0.6, 6.0, 1.0))
 def worse(image: Image, exponent: float, noise: float, blur_px: float) -> Image:
     """The photograph in another light, blurred, with noise."""
     lit = cv2.GaussianBlur(255 * (image / 255.0) ** exponent, (0, 0), blur_px)
-    return np.clip(lit + np.random.default_rng(0).normal(0, noise, lit.shape), 0, 255).astype(np.uint8)
+    darker: Image = np.clip(lit + np.random.default_rng(0).normal(0, noise, lit.shape), 0, 255).astype(np.uint8)
+    return darker
 
 
 def _alternatives(folder: Path, key: str) -> Iterator[Row]:

@@ -40,7 +40,7 @@ def _rows(folder: Path) -> Iterator[Row]:
         for turn in range(len(scenes)):
             for i, (name, overlay) in enumerate(OVERLAYS.items()):
                 scene = scenes[(i + turn) % len(scenes)]
-                yield {"scene": scene.name, "overlay": name} | _asked(client, scene, overlay)
+                yield {"scene": scene.name, "overlay": name, **_asked(client, scene, overlay)}
 
 
 def _asked(client: Client, scene: Scene, overlay: Overlay) -> Row:
