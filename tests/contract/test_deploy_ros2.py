@@ -222,7 +222,9 @@ def test_the_launch_file_starts_the_program_of_the_package(monkeypatch: pytest.M
     used = {value.positional[0] for value in (*node.parameters[1].values(), *dict(node.remappings).values())}
     assert used | {node.parameters[0].positional[0]} == declared
     installed: dict[str, Any] = {}
-    monkeypatch.setattr("setuptools.setup", installed.update)
+    setuptools = ModuleType("setuptools")  # the real one cannot be imported after the standard library's distutils
+    vars(setuptools).update(setup=installed.update)
+    monkeypatch.setitem(sys.modules, "setuptools", setuptools)
     monkeypatch.chdir(PACKAGE)
     runpy.run_path(str(PACKAGE / "setup.py"))
     assert any(it.startswith(f"{node.executable} = ") for it in installed["entry_points"]["console_scripts"])
