@@ -8,28 +8,36 @@ import pytest
 NAN = float("nan")
 OUTSIDE: dict[str, list[tuple[str, Any]]] = {
     "engine.options.EscalationOptions": [("doubtful_trust", -1.0), ("doubtful_radius_m", NAN)],
-    "method.pose_problem.AdjustOptions": [("max_error_px", 0.0), ("iterations", 0), ("loss_scale_sigma", -1.0)],
+    "method.bundle.pose_problem.AdjustOptions": [("max_error_px", 0.0), ("iterations", 0), ("loss_scale_sigma", -1.0)],
     "method.coarse.grids.GridOptions": [("pixel_limit", 10), ("aspects", ()), ("max_stretch", 0.9)]
     + [("max_half_field_deg", 90)],
     "method.coarse.token_cache.TokenCacheOptions": [("device_bytes", -1)],
-    "method.matching.CorrespondOptions": [("reference_ratio", 1.1), ("query_ratio", 0.0), ("epipolar_px", NAN)]
+    "method.features.matching.CorrespondOptions": [("reference_ratio", 1.1), ("query_ratio", 0.0), ("epipolar_px", NAN)]
     + [("wide_ratio", 2.0), ("guided_similarity", -2.0)],
-    "method.features.network.LearnedOptions": [("max_keypoints", 0), ("max_side_px", 8), ("min_score", 1.0)]
+    "method.features.extractors.network.LearnedOptions": [("max_keypoints", 0), ("max_side_px", 8), ("min_score", 1.0)]
     + [("min_score", NAN)],
-    "method.features.sift.SiftOptions": [("max_keypoints", 0), ("max_side_px", 8), ("contrast_threshold", NAN)],
-    "method.lightglue.LightGlueOptions": [("min_score", 1.0), ("max_keypoints", 0), ("pairs_at_once", 0)],
-    "method.match.MatchOptions": [("radius_px", -1.0), ("min_similarity", 2.0), ("radius_px", NAN)],
-    "method.one_reference.OneReferenceOptions": [("scores", (1.0, 0.0)), ("first_depth_sigma", 0.5)],
+    "method.features.extractors.sift.SiftOptions": [
+        ("max_keypoints", 0),
+        ("max_side_px", 8),
+        ("contrast_threshold", NAN),
+    ],
+    "method.features.lightglue.LightGlueOptions": [("min_score", 1.0), ("max_keypoints", 0), ("pairs_at_once", 0)],
+    "method.structure.match.MatchOptions": [("radius_px", -1.0), ("min_similarity", 2.0), ("radius_px", NAN)],
+    "method.pose.one_reference.OneReferenceOptions": [("scores", (1.0, 0.0)), ("first_depth_sigma", 0.5)],
     "method.options.IntrinsicsSigma": [("focal_share", 0.0), ("principal_share", -1.0), ("k1", NAN), ("k1", 2.0)],
-    "method.pnp.PnpOptions": [("inlier_px", 0.0), ("loss_scale_px", NAN), ("min_matches", 3)]
+    "method.pose.pnp.PnpOptions": [("inlier_px", 0.0), ("loss_scale_px", NAN), ("min_matches", 3)]
     + [("min_iterations", 10**6)],
-    "method.scale.ScaleOptions": [("min_baseline_m", 11.0), ("min_ratios", 0), ("max_deviation", NAN)]
+    "method.coarse.scale.ScaleOptions": [("min_baseline_m", 11.0), ("min_ratios", 0), ("max_deviation", NAN)]
     + [("max_pair_cameras", 1)],
-    "method.structure.StructureOptions": [("iterations", 0), ("loss_scale_sigma", 0.0), ("max_residual_sigma", -1.0)]
+    "method.structure.structure.StructureOptions": [
+        ("iterations", 0),
+        ("loss_scale_sigma", 0.0),
+        ("max_residual_sigma", -1.0),
+    ]
     + [("min_parallax_deg", 90.0)],
-    "method.trust.judge.JudgeOptions": [("scores", (1.0, 0.0) * 10), ("scores", (0.0,))],
-    "method.two_view.pose.RelativePoseOptions": [("epipolar_px", 0)],
-    "method.uncertainty.dispersion.UncertaintyOptions": [("region_factor", -0.1), ("rotation_factor", 0.0)]
+    "method.judge.judge.JudgeOptions": [("scores", (1.0, 0.0) * 10), ("scores", (0.0,))],
+    "method.pose.relative.RelativePoseOptions": [("epipolar_px", 0)],
+    "method.bundle.dispersion.UncertaintyOptions": [("region_factor", -0.1), ("rotation_factor", 0.0)]
     + [("max_matches", 0), ("position_factor", 0.0)],
     "scenes.retrieval.ranking.RankOptions": [("apart_m", -1.0), ("apart_deg", 181.0), ("nearby_weight", 1.5)]
     + [("nearby_weight", NAN), ("same_place_m", -1.0), ("per_place", 0), ("pool", 0), ("smallest_pool", 0)],

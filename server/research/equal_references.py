@@ -14,7 +14,7 @@ from statistics import median
 import numpy as np
 
 from mapless.geometry import Camera, RigidTransform
-from mapless_server.method.views import Features, View
+from mapless_server.method.features.views import Features, View
 from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, Store
 

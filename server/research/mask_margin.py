@@ -21,13 +21,14 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Camera
 from mapless_server.images import ImageLimits, decode_image
-from mapless_server.method.answer import Localization
-from mapless_server.method.correspond import Matcher
-from mapless_server.method.features import FeatureExtractor, make_extractor, masks
+from mapless_server.method.features import masks
+from mapless_server.method.features.extractors import FeatureExtractor, make_extractor
+from mapless_server.method.features.views import PosedView
+from mapless_server.method.judge.answer import Localization
 from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.pairs.correspond import Matcher
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.views import PosedView
 from mapless_tools.dataset import Frame
 from mapless_tools.demo.photographs import ROOM
 from mapless_tools.ingest.formats.cameras import read_folder

@@ -27,7 +27,7 @@ from mapless_server.engine.photos import Description, Photo
 from mapless_server.engine.query import Caller, Query
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.images import ImageLimits
-from mapless_server.method.answer import Localization
+from mapless_server.method.judge.answer import Localization
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.rejection import Advice
 from mapless_server.scenes import ANYWHERE

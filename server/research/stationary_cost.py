@@ -10,17 +10,17 @@ from collections.abc import Callable, Mapping
 from itertools import combinations
 from statistics import median
 
-from mapless_server.method.answer import Answer
-from mapless_server.method.cache import LruCache
-from mapless_server.method.features import SiftExtractor
+from mapless_server.cache import LruCache
+from mapless_server.method.features.extractors import SiftExtractor
+from mapless_server.method.features.nearest import mutual_matches
+from mapless_server.method.judge.answer import Answer
+from mapless_server.method.judge.fixed import unmoved_failure
 from mapless_server.method.localize import localize
-from mapless_server.method.nearest import mutual_matches
 from mapless_server.method.options import LocalizeOptions
-from mapless_server.method.pairs import PairKey, PairMatches
+from mapless_server.method.pairs.pair import PairKey, PairMatches
+from mapless_server.method.pairs.stationary import StationaryOptions, stationary_matches
+from mapless_server.method.pairs.stationary_filter import references_without_fixed, without_fixed
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.stationary import StationaryOptions, stationary_matches
-from mapless_server.method.stationary_filter import references_without_fixed, without_fixed
-from mapless_server.method.trust.fixed import unmoved_failure
 
 from .evidence.overlays import OVERLAYS, Overlay
 from .evidence.stationary import draw, scene_of_room

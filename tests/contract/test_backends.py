@@ -14,14 +14,14 @@ pytest.importorskip("torch", reason="the networks' extra is not installed")
 from support.images import textured
 
 from mapless.geometry import Camera, RigidTransform
-from mapless_server.method.answer import Localization
 from mapless_server.method.coarse.grids import GridOptions
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
-from mapless_server.method.features import SiftExtractor
+from mapless_server.method.features.extractors import SiftExtractor
+from mapless_server.method.features.views import Photograph, PosedView, View
+from mapless_server.method.judge.answer import Localization
 from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions, Variant
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.views import Photograph, PosedView, View
 from mapless_server.networks.runner import NetworkRunner
 
 PAGE = Path(__file__).parents[2] / "docs" / "architecture" / "backends.md"

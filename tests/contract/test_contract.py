@@ -22,10 +22,11 @@ import mapless_server
 from mapless import wire
 from mapless.axes import Axes
 from mapless.v1 import localization_service_pb2, reference_service_pb2
+from mapless_server.method.bundle.estimate import PoseStage
+from mapless_server.method.bundle.priors import PriorKind
 from mapless_server.method.options import ScaleStrategy, Variant
-from mapless_server.method.priors.known import PriorKind
 from mapless_server.method.rejection import Advice, IntrinsicsParameter, RejectionReason
-from mapless_server.method.results import PoseStage, ScaleStage
+from mapless_server.method.structure.model import ScaleStage
 from mapless_server.services.localization import LocalizationService
 from mapless_server.services.references import ReferenceService
 

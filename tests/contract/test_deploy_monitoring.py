@@ -17,7 +17,7 @@ import pytest
 import yaml  # type: ignore[import-untyped]
 from prometheus_client import generate_latest
 
-from mapless_server.method.cache import LruCache
+from mapless_server.cache import LruCache
 from mapless_server.method.coarse.token_cache import TokenCacheCounters
 from mapless_server.observability.metrics import LOCALIZED, STAGES, Metrics
 from mapless_server.settings import Settings

@@ -26,10 +26,10 @@ from mapless.connection import MALFORMED_ANSWER
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server import errors
 from mapless_server.errors import Unavailable
-from mapless_server.method.features import SiftOptions
+from mapless_server.method.features.extractors import SiftOptions
+from mapless_server.method.features.views import Features, View
 from mapless_server.method.options import Variant
 from mapless_server.method.rejection import RejectionReason
-from mapless_server.method.views import Features, View
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling import Refusal
 from mapless_server.settings import CLIENT_ADDRESS_VARIABLE, CLIENT_TOKEN_VARIABLE, Settings, load_settings

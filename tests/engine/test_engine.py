@@ -35,10 +35,10 @@ from mapless_server.engine.photos import Photo
 from mapless_server.engine.query import Result, Tier
 from mapless_server.engine.stages import MAX_LISTINGS, QueryStages
 from mapless_server.errors import InvalidArgument, Unavailable
-from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.features.views import PosedView, View
+from mapless_server.method.judge.answer import Answer, Localization
+from mapless_server.method.judge.judge import LEVELS, JudgeOptions
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
-from mapless_server.method.trust.judge import LEVELS, JudgeOptions
-from mapless_server.method.views import PosedView, View
 from mapless_server.scenes import Narrowing, Sphere
 from mapless_server.scheduling import CostModel, Done, Job
 from mapless_server.serve.assembly import engine_over

@@ -15,9 +15,9 @@ from mapless_server.engine.photos import Photo
 from mapless_server.engine.query import Caller, Query, Result, Tier
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, decode_image
-from mapless_server.method.answer import Localization
-from mapless_server.method.features import SiftExtractor
-from mapless_server.method.hints import FEW_MATCHES
+from mapless_server.method.features.extractors import SiftExtractor
+from mapless_server.method.judge.answer import Localization
+from mapless_server.method.judge.hints import FEW_MATCHES
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Rejection, RejectionReason

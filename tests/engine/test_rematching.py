@@ -11,9 +11,9 @@ from support.planted_engine import ESCALATION, SURE_INLIERS, Setting, caller, lo
 from support.servers import whole
 
 from mapless_server.engine.stages import QueryStages
-from mapless_server.method.correspond import Matcher
+from mapless_server.method.features.views import Matches, View
+from mapless_server.method.pairs.correspond import Matcher
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.views import Matches, View
 from mapless_server.scheduling import CostModel, Next
 
 

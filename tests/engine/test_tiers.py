@@ -23,10 +23,12 @@ from mapless_server.engine.tiers import (
     of_two_places,
     place_of_priors,
 )
-from mapless_server.method.answer import Answer, Localization
-from mapless_server.method.observations import KeypointNoise, Tracks
+from mapless_server.method.bundle.estimate import PoseEstimate, PoseStage, Support, TwoViewSupport
+from mapless_server.method.bundle.priors import PositionPrior, Priors
+from mapless_server.method.bundle.radii import accuracy_from_covariance, error_radii
+from mapless_server.method.features.tracks import Tracks
+from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.priors.known import PositionPrior, Priors
 from mapless_server.method.rejection import (
     Advice,
     Hint,
@@ -36,8 +38,8 @@ from mapless_server.method.rejection import (
     Rejection,
     RejectionReason,
 )
-from mapless_server.method.results import PointMatches, PoseEstimate, PoseStage, Structure, Support, TwoViewSupport
-from mapless_server.method.uncertainty.radii import accuracy_from_covariance, error_radii
+from mapless_server.method.structure.model import PointMatches, Structure
+from mapless_server.method.structure.observations import KeypointNoise
 from mapless_server.scheduling import Failure
 from mapless_server.store import SceneAttributes
 

@@ -18,13 +18,13 @@ from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.photos import Photo
 from mapless_server.engine.query import TRACK, Caller, Query, Result, Tier
 from mapless_server.errors import DataLoss
-from mapless_server.method.answer import Localization
-from mapless_server.method.features import SiftExtractor
+from mapless_server.method.bundle.priors import NO_PRIORS, HeadingPrior, PosePrior, PositionPrior, Priors
+from mapless_server.method.bundle.radii import accuracy_from_covariance
+from mapless_server.method.features.extractors import SiftExtractor
+from mapless_server.method.judge.answer import Localization
 from mapless_server.method.options import LocalizeOptions, Variant
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.priors.known import NO_PRIORS, HeadingPrior, PosePrior, PositionPrior, Priors
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
-from mapless_server.method.uncertainty.radii import accuracy_from_covariance
 from mapless_server.scenes import Narrowing
 from mapless_server.scheduling import Flow
 from mapless_server.security import SceneKey

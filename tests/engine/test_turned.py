@@ -24,11 +24,11 @@ from mapless_server.engine.options import EngineOptions, EscalationOptions
 from mapless_server.engine.photos import Photo, QueryViews
 from mapless_server.engine.query import TURN, Caller, Query, QueryRun, Result, Tier
 from mapless_server.images import ImageLimits, decode_image
-from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.features.views import Ignored, View, view_of
+from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
-from mapless_server.method.views import Ignored, View, view_of
 from mapless_server.scenes import ANYWHERE, Narrowing, Sphere
 from mapless_server.scheduling import Flow
 from mapless_server.security import SceneKey

@@ -22,7 +22,7 @@ from mapless_server.engine.groups import MAX_FRAMES, MAX_RIG_IMAGES, MIN_FRAMES
 from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.query import Query
 from mapless_server.images import image_size
-from mapless_server.method.priors.known import DirectionPrior, PosePrior, PositionPrior, Prior
+from mapless_server.method.bundle.priors import DirectionPrior, PosePrior, PositionPrior, Prior
 from mapless_server.security import scene_id_of, tenant_of
 from mapless_server.services.messages.answers import MAX_SESSION_COORDINATE_M, answer_frames_of, set_frames
 from mapless_server.services.messages.groups import (

@@ -26,7 +26,7 @@ from mapless.v1 import reference_service_pb2 as pb
 from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.photos import Description, Photo
 from mapless_server.engine.query import Caller
-from mapless_server.method.views import Features, View
+from mapless_server.method.features.views import Features, View
 from mapless_server.rpc import Call
 from mapless_server.scenes import Choice, Coverage, CoverageVerdict, Narrowing, Viewpoint
 from mapless_server.scenes.agreement import Agreement

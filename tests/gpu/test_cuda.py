@@ -32,7 +32,7 @@ from mapless_server.method.choices import NETWORKS
 from mapless_server.method.coarse import Outcome, Request, reconstruct_one
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.method.coarse.token_cache import TokenCacheOptions
-from mapless_server.method.views import Reconstruction
+from mapless_server.method.features.views import Reconstruction
 from mapless_server.networks import blocks
 from mapless_server.networks.lightglue import LightGlue
 from mapless_server.networks.network import NetworkOutput

@@ -24,14 +24,15 @@ from support.planted import moved_references
 from support.scenes import SceneOptions, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg, rotation_from_vector
-from mapless_server.method.correspond import Correspondences, Matcher
+from mapless_server.method.bundle.estimate import PoseEstimate, PoseStage
+from mapless_server.method.bundle.radii import JACKKNIFE_SHARE, accuracy_from_covariance, with_halves
+from mapless_server.method.features.views import Matches, PosedView, View
+from mapless_server.method.judge.evidence import evidence_of, votes_of
 from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions, ScaleStrategy, StageContext, Variant
+from mapless_server.method.pairs.correspond import Correspondences, Matcher
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.results import PoseEstimate, PoseStage, ScaleStage
-from mapless_server.method.trust.evidence import evidence_of, votes_of
-from mapless_server.method.uncertainty.radii import JACKKNIFE_SHARE, accuracy_from_covariance, with_halves
-from mapless_server.method.views import Matches, PosedView, View
+from mapless_server.method.structure.model import ScaleStage
 
 # Accuracy
 

@@ -24,15 +24,15 @@ from support.localizing import (
     weak_below,
 )
 
-from mapless_server.method.answer import Answer
+from mapless_server.method.bundle.estimate import PoseStage
 from mapless_server.method.coarse import Outcome, Request
-from mapless_server.method.correspond import Matcher
+from mapless_server.method.features.views import View
+from mapless_server.method.judge.answer import Answer
 from mapless_server.method.localize import localize, prepare, refine
 from mapless_server.method.options import LocalizeOptions, StageContext, Variant
+from mapless_server.method.pairs.correspond import Matcher
 from mapless_server.method.pipeline import Coarse, Pipeline, Prepared, coarse_answer, reconstruct
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.results import PoseStage
-from mapless_server.method.views import View
 
 
 def prepared_of(pipeline: Pipeline, options: LocalizeOptions | None = None, query: View | None = None) -> Prepared:

@@ -26,16 +26,17 @@ from support.scenes import CAMERA, SceneOptions, make_scene, random_for
 
 import mapless_server.method.localize as method
 from mapless.geometry import RigidTransform
-from mapless_server.method import alternatives, pnp
-from mapless_server.method.answer import Answer, Localization
+from mapless_server.method import alternatives
+from mapless_server.method.bundle.estimate import PoseStage
 from mapless_server.method.coarse import Outcome, Request
-from mapless_server.method.correspond import Matcher
+from mapless_server.method.features.views import Features, Reconstruction, View
+from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.localize import MIN_FEATURES, localize
 from mapless_server.method.options import LocalizeOptions, ScaleStrategy, Variant
+from mapless_server.method.pairs.correspond import Matcher
 from mapless_server.method.pipeline import Pipeline
+from mapless_server.method.pose import pnp
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.results import PoseStage
-from mapless_server.method.views import Features, Reconstruction, View
 
 
 @pytest.mark.parametrize("backend", ["geometric", "network"])

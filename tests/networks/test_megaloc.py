@@ -18,7 +18,7 @@ from support.small_networks import SMALL_MEGALOC, photograph, ruled_megaloc, vie
 from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
-from mapless_server.method.views import View
+from mapless_server.method.features.views import View
 from mapless_server.networks.megaloc import signed_groups, transport
 from mapless_server.networks.weights import CheckpointError, named
 from mapless_server.networks.weights.install import add

@@ -15,7 +15,7 @@ from functools import partial
 import pytest
 from prometheus_client import generate_latest
 
-from mapless_server.method.cache import LruCache
+from mapless_server.cache import LruCache
 from mapless_server.method.coarse.token_cache import TokenCacheCounters
 from mapless_server.method.rejection import RejectionReason
 from mapless_server.observability import exporter

@@ -12,7 +12,7 @@ import pytest
 from support.audits import audit_references, finder_of
 
 from mapless.geometry import RigidTransform, rotation_from_vector
-from mapless_server.method.views import PosedView
+from mapless_server.method.features.views import PosedView
 from mapless_server.scenes import AuditVerdict, CoverageVerdict, ReferenceAudit
 from mapless_server.scenes.audit.coverage import check_coverage
 from mapless_server.scenes.audit.neighbourhood import PairMatches

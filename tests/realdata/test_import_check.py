@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from support.bags import BASE_FROM_CAMERA, at, image, info, odometry, transforms, write_bag
 
 from mapless.geometry import Camera, RigidTransform
-from mapless_server.method.features import SiftExtractor
-from mapless_server.method.readings import Verdict, implausible_depth
-from mapless_server.method.views import Ignored, View
+from mapless_server.method.features.extractors import SiftExtractor
+from mapless_server.method.features.views import Ignored, View
+from mapless_server.method.pairs.readings import Verdict, implausible_depth
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.ingest.check import check_frames
 from mapless_tools.ingest.formats import KeyframeOptions, ReadOptions, read_dataset

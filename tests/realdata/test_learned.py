@@ -11,10 +11,10 @@ from mapless_server.engine.options import EscalationOptions
 from mapless_server.engine.query import Tier
 from mapless_server.engine.tiers import is_doubtful
 from mapless_server.images import ImageLimits, decode_image
-from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.features.views import PosedView, View
+from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions
-from mapless_server.method.views import PosedView, View
 from mapless_server.serve.assembly import make_tiers
 from mapless_server.settings import Settings
 from mapless_tools.dataset import Dataset

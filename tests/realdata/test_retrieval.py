@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mapless_server.images import ImageLimits, decode_image
-from mapless_server.method.features import SiftExtractor
+from mapless_server.method.features.extractors import SiftExtractor
 from mapless_server.scenes import RankedReference, RankOptions, Selection, Vector, rank_references
 from mapless_server.scenes.retrieval.index import SceneIndex
 from mapless_server.scenes.retrieval.vlad import VladDescriptor

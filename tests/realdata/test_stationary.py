@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import pytest
 
-from mapless_server.method.features import SiftExtractor
-from mapless_server.method.stationary import StationaryOptions
+from mapless_server.method.features.extractors import SiftExtractor
+from mapless_server.method.pairs.stationary import StationaryOptions
 from mapless_tools.dataset import Dataset
 from research.evidence.stationary import DRIVE, clean, ignored_share, windows
 

@@ -8,8 +8,8 @@ from typing import Any, cast
 
 import pytest
 
-from mapless_server.method.correspond import make_matcher
-from mapless_server.method.features import SiftExtractor
+from mapless_server.method.features.extractors import SiftExtractor
+from mapless_server.method.pairs.correspond import make_matcher
 from mapless_server.scenes.agreement import Agreement, agreement_of
 from mapless_server.scenes.explaining import SamePose
 from mapless_server.scenes.scene_agreements import SceneAgreements

@@ -8,8 +8,8 @@ from support.audits import audit_references, finder_of
 from support.scenes import SceneOptions, SyntheticScene, look_at, make_scene
 
 from mapless.geometry import RigidTransform, rotation_from_vector
-from mapless_server.method.trust.judge import JudgeOptions
-from mapless_server.method.views import Features, PosedView
+from mapless_server.method.features.views import Features, PosedView
+from mapless_server.method.judge.judge import JudgeOptions
 from mapless_server.scenes import AuditVerdict, Coverage, CoverageVerdict, ReferenceAudit
 from mapless_server.scenes.audit import comparison
 from mapless_server.scenes.audit.coverage import REPEATABILITY, check_coverage

@@ -20,12 +20,13 @@ from support.stores import DATABASES, Folder, Place, damage, let_pass, place_on
 from support.waiting import wait_until
 
 from mapless_server.errors import Unavailable
-from mapless_server.method import correspond, matching, nearest
-from mapless_server.method.correspond import Matcher
-from mapless_server.method.matching import CorrespondOptions, PairMatching, StoredPair
+from mapless_server.method.features import matching, nearest
+from mapless_server.method.features.matching import CorrespondOptions, PairMatching, StoredPair
+from mapless_server.method.features.views import Features, Matches, PosedView, View
 from mapless_server.method.options import StageContext
-from mapless_server.method.pairs import in_order
-from mapless_server.method.views import Features, Matches, PosedView, View
+from mapless_server.method.pairs import correspond
+from mapless_server.method.pairs.correspond import Matcher
+from mapless_server.method.pairs.pair import in_order
 from mapless_server.scenes import background
 from mapless_server.scenes.background import BackgroundMatching, BackgroundOptions
 from mapless_server.scenes.indexes import SceneIndexes

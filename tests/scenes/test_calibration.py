@@ -15,11 +15,11 @@ from support.stores import Folder, Place, let_pass
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.errors import Unavailable
-from mapless_server.method.intrinsics import corrected_view
+from mapless_server.method.bundle.intrinsics import corrected_view
+from mapless_server.method.bundle.radii import USUAL_GAP, Accuracy, growth
+from mapless_server.method.features.views import PosedView
+from mapless_server.method.judge.judge import LEVELS, trust_in_scene
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.trust.judge import LEVELS, trust_in_scene
-from mapless_server.method.uncertainty.radii import USUAL_GAP, Accuracy, growth
-from mapless_server.method.views import PosedView
 from mapless_server.scenes.calibration.calibrator import MAX_CPU_S, Calibrator, SceneCalibrations
 from mapless_server.scenes.calibration.fit import FitOptions, LeftOut, fit
 from mapless_server.scenes.calibration.lens import SharedErrors, lens_contradiction, without_errors
@@ -171,7 +171,7 @@ def mirrored(it: RigidTransform) -> RigidTransform:
 
 
 def with_errors(references: Sequence[PosedView], errors: Sequence[float]) -> list[PosedView]:
-    """The same photographs with intrinsics that are off by these errors of `method.intrinsics`, stored as pinholes."""
+    """The same photographs with intrinsics that are off by these errors of `bundle.intrinsics`, stored as pinholes."""
     wrong = [corrected_view(it.view, np.array(errors)) for it in references]
     return [replace(it, view=replace(view, distortion=None)) for it, view in zip(references, wrong, strict=True)]
 

@@ -18,8 +18,8 @@ from support.stores import damage
 from mapless.geometry import Camera
 from mapless_server.errors import DataLoss, NotFound, RequestError
 from mapless_server.images import ImageLimits
+from mapless_server.method.features.views import Ignored, View
 from mapless_server.method.options import StageContext
-from mapless_server.method.views import Ignored, View
 from mapless_server.scenes.library import STORED_IMAGES, FeaturesMissing, Loaded, ReferenceLibrary, load_usable
 from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, Store

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from support.scenes import CAMERA, SceneOptions, make_scene, random_for, unit_rows
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method.features import SiftExtractor
-from mapless_server.method.priors.known import PosePrior
-from mapless_server.method.views import Features, PosedView, View
+from mapless_server.method.bundle.priors import PosePrior
+from mapless_server.method.features.extractors import SiftExtractor
+from mapless_server.method.features.views import Features, PosedView, View
 from mapless_server.scenes import Cone, Narrowing, RankedReference, RankOptions, Selection, Sphere, rank_references
 from mapless_server.scenes.retrieval.index import Entries, SceneIndex
 from mapless_server.scenes.retrieval.ranking import nearest_references, spread, spread_choice

@@ -12,7 +12,7 @@ from support.scenes import SceneOptions, make_scene
 from support.stores import damage
 
 from mapless_server.errors import NotFound, Unavailable
-from mapless_server.method.views import PosedView, View
+from mapless_server.method.features.views import PosedView, View
 from mapless_server.scenes import AuditVerdict, CoverageVerdict, Viewpoint
 from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.audit.scene_auditor import SceneAuditor, SceneTools

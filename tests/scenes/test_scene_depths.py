@@ -14,9 +14,9 @@ from support.stores import EXTRACTOR, let_pass, make_reference
 
 from mapless.geometry import Array, Camera, RigidTransform, Similarity, rotation_from_vector
 from mapless_server.errors import DataLoss, NotFound, Unavailable
-from mapless_server.method.correspond import Correspondences, Matcher
-from mapless_server.method.results import MetricScale, ScaleStage
-from mapless_server.method.views import KeptDepth, PosedView, ReconstructedView, Reconstruction
+from mapless_server.method.features.views import KeptDepth, PosedView, ReconstructedView, Reconstruction
+from mapless_server.method.pairs.correspond import Correspondences, Matcher
+from mapless_server.method.structure.model import MetricScale, ScaleStage
 from mapless_server.scenes.depth import check
 from mapless_server.scenes.depth.check import MIN_SIGMA, checked_depths
 from mapless_server.scenes.depth.scene_depths import SceneDepths

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from support.programs import printed
 
-from mapless_server.method.correspond import make_matcher
-from mapless_server.method.features import make_extractor
+from mapless_server.method.features.extractors import make_extractor
+from mapless_server.method.pairs.correspond import make_matcher
 from mapless_server.networks.weights import WeightsMissing
 from mapless_server.observability.metrics import Metrics
 from mapless_server.serve import assembly

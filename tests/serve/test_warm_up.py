@@ -35,10 +35,10 @@ from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.query import Result, Tier
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.stages import Method
-from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.bundle.estimate import PoseStage
+from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.results import PoseStage
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling import CostModel, Flow, Job
 from mapless_server.security import RateLimiter

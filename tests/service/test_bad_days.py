@@ -43,8 +43,8 @@ from mapless import (
     Unavailable,
 )
 from mapless.geometry import Camera
-from mapless_server.method.answer import Answer
-from mapless_server.method.views import PosedView, View
+from mapless_server.method.features.views import PosedView, View
+from mapless_server.method.judge.answer import Answer
 from mapless_server.serve import running
 from mapless_server.serve.running import watch_store
 from mapless_server.services.handlers import SERVICE_NAMES

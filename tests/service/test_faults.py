@@ -54,7 +54,7 @@ from mapless import (
 )
 from mapless.geometry import Camera
 from mapless.v1 import reference_service_pb2 as reference_pb
-from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.rpc import receiving, sending
 from mapless_server.serve import running as grpc_server
 from mapless_tools.load.driving import free_port

@@ -29,7 +29,7 @@ from mapless_server.engine.stages import Method
 from mapless_server.method import pipeline
 from mapless_server.method.choices import NETWORKS
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
-from mapless_server.method.features import SiftExtractor
+from mapless_server.method.features.extractors import SiftExtractor
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.networks.network import Network
 from mapless_server.networks.runner import NetworkRunner

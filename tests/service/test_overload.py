@@ -32,7 +32,7 @@ from mapless import Client, ConnectOptions, DeadlineExceeded, LocalizationResult
 from mapless.errors import from_rpc_error
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.engine.stages import Method
-from mapless_server.method.answer import Answer
+from mapless_server.method.judge.answer import Answer
 
 COST_S = 0.04
 WORKERS = 2

@@ -20,9 +20,9 @@ from support.waiting import wait_until
 from mapless import Client, LocalizationResult, NewReference
 from mapless.geometry import RigidTransform
 from mapless_server.engine.queue_engine import QueueEngine
-from mapless_server.method import kept_depth
 from mapless_server.method.coarse import Outcome, Reconstructor, Request
-from mapless_server.method.views import PosedView, ReconstructedView, Reconstruction, View
+from mapless_server.method.features.views import PosedView, ReconstructedView, Reconstruction, View
+from mapless_server.method.structure import kept_depth
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security import RateLimiter
 from mapless_server.serve.assembly import engine_options, engine_over, make_tiers

@@ -44,7 +44,7 @@ from mapless.v1 import localization_service_pb2
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.images import ImageLimits, decode_image
-from mapless_server.method.features import make_extractor
+from mapless_server.method.features.extractors import make_extractor
 
 SERVICE = "mapless.v1.LocalizationService"
 RUN_BYTES = 16

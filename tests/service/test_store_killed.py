@@ -24,7 +24,7 @@ from support.waiting import wait_until
 
 from mapless.geometry import Camera, RigidTransform
 from mapless_server import errors
-from mapless_server.method.views import Features, View
+from mapless_server.method.features.views import Features, View
 from mapless_server.security import DEFAULT_TENANT, SceneKey
 from mapless_server.store import NewReference, Store, StoreError, deletion
 from mapless_server.store.verification import verify

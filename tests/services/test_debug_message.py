@@ -13,10 +13,10 @@ from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, ran
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless.lenses import Fisheye, RadialTangential
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_server.method.perturbation import reprojection_errors_px
-from mapless_server.method.pnp import PnpOptions
-from mapless_server.method.results import PoseEstimate, PoseStage, Support
-from mapless_server.method.views import Photograph, PosedView, View
+from mapless_server.method.bundle.estimate import PoseEstimate, PoseStage, Support
+from mapless_server.method.features.views import Photograph, PosedView, View
+from mapless_server.method.optim.perturbation import reprojection_errors_px
+from mapless_server.method.pose.pnp import PnpOptions
 from mapless_server.services.messages.debug import MAX_MATCHES, debug_to_message
 
 ORIGIN = np.array([4000.0, -200.0, 30.0])

@@ -23,7 +23,7 @@ from mapless import Client, wire
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.errors import DataLoss, NotFound, Unavailable
-from mapless_server.method.views import Features, PosedView, View
+from mapless_server.method.features.views import Features, PosedView, View
 from mapless_server.rpc import Call
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.scenes.scene_agreements import SceneAgreements

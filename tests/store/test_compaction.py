@@ -9,7 +9,7 @@ from support.stores import EXTRACTOR, Place, assert_same_bits, faults_of, make_f
 
 from mapless.geometry import Camera
 from mapless_server.errors import AlreadyExists
-from mapless_server.method.views import Features, View, rounded_descriptors
+from mapless_server.method.features.views import Features, View, rounded_descriptors
 from mapless_server.security import SceneKey
 from mapless_server.store import Store, codec
 from mapless_server.store.compaction import compact_features, in_8_bits

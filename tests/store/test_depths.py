@@ -7,7 +7,7 @@ import pytest
 from support.stores import Place, faults_of, let_pass, make_reference
 
 from mapless.geometry import Camera
-from mapless_server.method.views import KeptDepth
+from mapless_server.method.features.views import KeptDepth
 from mapless_server.security import SceneKey
 from mapless_server.store import Store, codec, depths, pairs
 from mapless_server.store.depths import (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.stores import Place, assert_same_bits, faults_of, let_pass, make_reference
 
-from mapless_server.method.matching import StoredPair
+from mapless_server.method.features.matching import StoredPair
 from mapless_server.security import SceneKey
 from mapless_server.store import Store, pairs
 from mapless_server.store.backup import back_up, restore

@@ -25,7 +25,7 @@ from support.stores import (
 from mapless.geometry import RigidTransform
 from mapless.lenses import Distortion, Fisheye, RadialTangential
 from mapless_server import errors
-from mapless_server.method.views import Features, View
+from mapless_server.method.features.views import Features, View
 from mapless_server.security import DEFAULT_TENANT, SceneKey
 from mapless_server.store import LruCache, NewReference, Store
 

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from mapless.names import parse_reference_name
-from mapless_server.method.views import PosedView
+from mapless_server.method.features.views import PosedView
 from mapless_server.scenes import ReferenceAudit
 from mapless_server.scenes.audit.auditor import Auditor
 from mapless_server.scenes.audit.finder import ReferenceFinder

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, Similarity, resized_pixel, rotation_from_vector
 from mapless_server.method.coarse import Outcome, Request
-from mapless_server.method.views import PosedView, ReconstructedView, Reconstruction, View
+from mapless_server.method.features.views import PosedView, ReconstructedView, Reconstruction, View
 from support.scenes import SyntheticScene, random_for
 
 

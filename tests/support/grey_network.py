@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mapless_server.method.coarse import Outcome
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.method.coarse.token_cache import TokenCacheOptions
-from mapless_server.method.views import PosedView, Reconstruction, View
+from mapless_server.method.features.views import PosedView, Reconstruction, View
 from mapless_server.networks.network import NetworkOutput
 from mapless_server.networks.runner import NetworkRunner
 from support.small_networks import GRIDS, photograph, references_of, view_of

@@ -6,13 +6,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.bundle.estimate import PoseStage, Support
+from mapless_server.method.features.views import Matches
 from mapless_server.method.groups.images import GroupImage
-from mapless_server.method.match import MatchOptions
-from mapless_server.method.observations import KeypointNoise
+from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.results import PointMatches, PoseStage, Structure, Support
-from mapless_server.method.views import Matches
+from mapless_server.method.structure.match import MatchOptions
+from mapless_server.method.structure.model import PointMatches, Structure
+from mapless_server.method.structure.observations import KeypointNoise
 from support.planted import true_structure
 from support.scenes import SceneOptions, SyntheticScene, look_at, make_scene, observe
 

@@ -8,15 +8,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapless.geometry import RigidTransform
-from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.coarse import Outcome, Request
 from mapless_server.method.coarse.geometric import GeometricReconstructor
-from mapless_server.method.correspond import Matcher
+from mapless_server.method.features.views import Features, PosedView, Reconstruction, View
+from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.pairs.correspond import Matcher
 from mapless_server.method.pipeline import Pipeline, StageOptions
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.views import Features, PosedView, Reconstruction, View
 from support.fake_network import FakeNetwork, FakeNetworkOptions
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for, unit_rows
 

@@ -8,20 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
-from mapless_server.method.correspond import Correspondences
-from mapless_server.method.nearest import mutual_matches
-from mapless_server.method.observations import (
+from mapless_server.method.bundle.estimate import PoseEstimate
+from mapless_server.method.features.nearest import mutual_matches
+from mapless_server.method.features.tracks import Tracks
+from mapless_server.method.features.views import Matches, PosedView, View
+from mapless_server.method.pairs.correspond import Correspondences
+from mapless_server.method.pose.pnp import PnpOptions, solve_pose
+from mapless_server.method.structure.model import MetricScale, PointMatches, ScaleStage, Structure
+from mapless_server.method.structure.observations import (
     ONE_PIXEL,
     KeypointNoise,
-    Tracks,
     adjust_points,
     estimate_noise,
     triangulate,
 )
-from mapless_server.method.pnp import PnpOptions, solve_pose
-from mapless_server.method.results import MetricScale, PointMatches, PoseEstimate, ScaleStage, Structure
-from mapless_server.method.structure import observe
-from mapless_server.method.views import Matches, PosedView, View
+from mapless_server.method.structure.structure import observe
 from support.scenes import SyntheticScene
 
 

@@ -13,13 +13,13 @@ from mapless_server.engine.options import EngineOptions, EscalationOptions
 from mapless_server.engine.photos import Description, Photo
 from mapless_server.engine.query import Caller, Query, Result, Tier
 from mapless_server.images import ImageLimits, decode_image
-from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.bundle.estimate import PoseStage
+from mapless_server.method.features.views import Features, PosedView, View
+from mapless_server.method.judge.answer import Answer, Localization
+from mapless_server.method.judge.judge import JudgeOptions
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Hint, Rejection, RejectionReason
-from mapless_server.method.results import PoseStage
-from mapless_server.method.trust.judge import JudgeOptions
-from mapless_server.method.views import Features, PosedView, View
 from mapless_server.scenes import Narrowing, Sphere
 from mapless_server.scheduling import Flow, Job
 from mapless_server.security import SceneKey

@@ -3,9 +3,10 @@
 import numpy as np
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method.observations import ONE_PIXEL, Tracks
-from mapless_server.method.results import PointMatches, Structure
-from mapless_server.method.views import Features, View
+from mapless_server.method.features.tracks import Tracks
+from mapless_server.method.features.views import Features, View
+from mapless_server.method.structure.model import PointMatches, Structure
+from mapless_server.method.structure.observations import ONE_PIXEL
 from support.scenes import CAMERA
 
 POSE = RigidTransform(rotation_from_vector([0.2, -0.3, 0.1]), np.array([0.4, -0.2, -4.0]))

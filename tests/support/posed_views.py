@@ -6,8 +6,8 @@ from itertools import combinations
 import numpy as np
 
 from mapless.geometry import RigidTransform, rotation_from_vector
-from mapless_server.method.readings import MatchedPair, consistent_matches
-from mapless_server.method.views import PosedView
+from mapless_server.method.features.views import PosedView
+from mapless_server.method.pairs.readings import MatchedPair, consistent_matches
 
 from .scenes import SceneOptions, look_at, observe, random_for, unit_rows
 

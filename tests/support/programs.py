@@ -20,7 +20,7 @@ from typing import Any, cast
 
 from mapless_server.engine.query import Tier
 from mapless_server.engine.queue_engine import QueueEngine
-from mapless_server.method.answer import Answer
+from mapless_server.method.judge.answer import Answer
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.observability.logs import configure_logging
 from mapless_server.observability.metrics import Metrics

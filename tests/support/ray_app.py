@@ -17,9 +17,10 @@ from mapless_ray.app import deployed
 from mapless_ray.replica import MaplessReplica
 from mapless_server.engine.query import Tier
 from mapless_server.engine.queue_engine import QueueEngine
-from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.bundle.estimate import PoseStage
+from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.results import MetricScale, PoseStage, ScaleStage
+from mapless_server.method.structure.model import MetricScale, ScaleStage
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security import RateLimiter
 from mapless_server.serve.assembly import engine_options, engine_over

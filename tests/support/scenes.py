@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform
-from mapless_server.method.views import Features, PosedView, View
+from mapless_server.method.features.views import Features, PosedView, View
 
 SUITE_SEED = 20261121
 

@@ -24,12 +24,13 @@ from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
 from mapless_server.engine.query import Tier
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.stages import Method
-from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.bundle.estimate import PoseStage
+from mapless_server.method.features.views import Features, Ignored, PosedView, View
+from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Rejection
-from mapless_server.method.results import MetricScale, PoseStage, ScaleStage
-from mapless_server.method.views import Features, Ignored, PosedView, View
+from mapless_server.method.structure.model import MetricScale, ScaleStage
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling import Abandoned
 from mapless_server.security import RateLimiter

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_server.method.coarse.grids import GridOptions
-from mapless_server.method.views import Features, Photograph, PosedView, View
+from mapless_server.method.features.views import Features, Photograph, PosedView, View
 from mapless_server.networks.mapanything import MapAnything
 from mapless_server.networks.megaloc import MegaLoc, MegaLocSizes
 from mapless_server.networks.network import Network

@@ -12,7 +12,7 @@ import pytest
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless.lenses import Distortion
-from mapless_server.method.views import Features, View
+from mapless_server.method.features.views import Features, View
 from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, Store, rows, sqlite
 from mapless_server.store.postgresql import PostgresqlDatabase

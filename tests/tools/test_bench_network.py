@@ -16,7 +16,7 @@ from mapless.geometry import Camera
 from mapless_server.method.choices import NETWORKS
 from mapless_server.method.coarse import reconstruct_one
 from mapless_server.method.coarse.network import NetworkReconstructor
-from mapless_server.method.views import Features, Reconstruction, View
+from mapless_server.method.features.views import Features, Reconstruction, View
 from mapless_tools.bench.turns import Measured, main, ratio_with_interval, report
 from mapless_tools.bench_network import command
 from mapless_tools.bench_network.command import bench_network

@@ -16,7 +16,7 @@ from support.images import textured
 
 from mapless import Internal
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
-from mapless_server.method.views import Features, View
+from mapless_server.method.features.views import Features, View
 from mapless_server.settings import Settings
 from mapless_tools.dataset import Dataset, Frame, Refusal
 from mapless_tools.evaluate import suite as suite_module

@@ -12,7 +12,7 @@ from support.posed_views import planted
 from support.scenes import CAMERA
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
-from mapless_server.method.views import Ignored, PosedView, View
+from mapless_server.method.features.views import Ignored, PosedView, View
 from mapless_tools.dataset import Frame
 from mapless_tools.ingest.check import check_frames
 from mapless_tools.ingest.check.pairs import more_pairs, pairs_by_order, pairs_by_pose

@@ -18,7 +18,7 @@ from mapless.geometry import Camera, RigidTransform
 from mapless.lenses import LENS_MODELS
 from mapless.report.sections import provenance_section
 from mapless.v1 import geometry_pb2 as pb
-from mapless_server.method.views import undistort_pixels
+from mapless_server.method.features.views import undistort_pixels
 from mapless_server.store.codec import decode_geometry, encode_geometry, sha256_for
 from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.ingest.formats.colmap.cameras import from_camera

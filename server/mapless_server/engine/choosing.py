@@ -10,7 +10,7 @@ from functools import partial
 from scipy.special import bdtrc
 
 from mapless_server.errors import DataLoss
-from mapless_server.method.answer import Answer
+from mapless_server.method.judge.answer import Answer
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.scenes.library import Loaded, load_usable
 from mapless_server.scenes.retrieval.ranking import spread_choice

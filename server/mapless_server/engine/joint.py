@@ -8,9 +8,9 @@ from mapless_server.method.groups.images import GroupImage, PosedImage
 from mapless_server.method.groups.rig import RigEstimate, solve_rig
 from mapless_server.method.groups.sequence import SequenceEstimate, solve_sequence
 from mapless_server.method.groups.trust import supporters_of_group
+from mapless_server.method.judge.references import with_contradiction, without_agreement
 from mapless_server.method.options import Variant
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.trust.references import with_contradiction, without_agreement
 
 from .query import Query, Result
 

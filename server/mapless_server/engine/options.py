@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from mapless_server.images import ImageLimits
-from mapless_server.method.options import check_bounds
+from mapless_server.method.optim.bounds import check_bounds
 from mapless_server.scheduling import WorkQueueOptions
 
 

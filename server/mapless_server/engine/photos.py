@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mapless_server.images import ImageLimits, decode_image, decode_mask
-from mapless_server.method.features.turned import extract_turned
-from mapless_server.method.views import Photograph, reduce_image
+from mapless_server.method.features.extractors.turned import extract_turned
+from mapless_server.method.features.views import Photograph, reduce_image
 
 if TYPE_CHECKING:  # services need not load what computes
     from mapless.geometry import Camera
-    from mapless_server.method.features import FeatureExtractor
+    from mapless_server.method.features.extractors import FeatureExtractor
+    from mapless_server.method.features.views import Ignored, View
     from mapless_server.method.options import StageContext
-    from mapless_server.method.views import Ignored, View
     from mapless_server.scenes import Vector
 
 

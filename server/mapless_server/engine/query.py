@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from mapless_server import __version__
+from mapless_server.method.bundle.priors import NO_PRIORS, Priors
 from mapless_server.method.options import StageContext, Variant
-from mapless_server.method.priors.known import NO_PRIORS, Priors
 from mapless_server.scenes import Selection
 from mapless_server.scenes.retrieval.ranking import THINNED_LATER
 from mapless_server.scheduling import Step
@@ -22,11 +22,11 @@ from .photos import Photo, QueryViews
 
 if TYPE_CHECKING:  # services need not load what computes
     from mapless.geometry import Camera
-    from mapless_server.method.answer import Answer
-    from mapless_server.method.features import FeatureExtractor
+    from mapless_server.method.features.extractors import FeatureExtractor
+    from mapless_server.method.features.views import Matches, PosedView, View
+    from mapless_server.method.judge.answer import Answer
     from mapless_server.method.options import LocalizeOptions
     from mapless_server.method.pipeline import Pipeline
-    from mapless_server.method.views import Matches, PosedView, View
     from mapless_server.scenes import Choice, Narrowing
     from mapless_server.scenes.library import Loaded
     from mapless_server.scheduling import Flow

@@ -6,7 +6,7 @@ from dataclasses import replace
 from mapless.names import reference_name
 from mapless_server.errors import DataLoss, InvalidArgument, NotFound
 from mapless_server.images import ImageLimits
-from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.options import StageContext
 from mapless_server.scenes import Choice, Selection, rank_references
 from mapless_server.scenes.audit.scene_auditor import SceneAuditor, SceneTools

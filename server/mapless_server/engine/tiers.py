@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 
 from mapless.geometry import RigidTransform, rotation_angle_deg
-from mapless_server.method.answer import Answer, Localization
-from mapless_server.method.priors.known import Priors
+from mapless_server.method.bundle.priors import Priors
+from mapless_server.method.bundle.radii import Accuracy, accuracy_from_covariance
+from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.rejection import Advice, Hint, Hypothesis, Rejection, RejectionReason
-from mapless_server.method.uncertainty.radii import Accuracy, accuracy_from_covariance
 
 from .options import EscalationOptions
 from .query import QueryRun, Result, Tier

@@ -19,16 +19,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.bundle.priors import Priors
 from mapless_server.method.coarse.geometric import GeometricReconstructor
-from mapless_server.method.correspond import Matcher
-from mapless_server.method.epipolar import epipolar_distance_px
+from mapless_server.method.features.views import PosedView, View
+from mapless_server.method.judge.answer import Answer, Localization
+from mapless_server.method.judge.evidence import EPIPOLAR_PX
 from mapless_server.method.localize import prepare, solve
 from mapless_server.method.options import LocalizeOptions, StageContext
+from mapless_server.method.pairs.correspond import Matcher
+from mapless_server.method.pairs.epipolar import epipolar_distance_px
 from mapless_server.method.pipeline import Pipeline, reconstruct
-from mapless_server.method.priors.known import Priors
-from mapless_server.method.trust.evidence import EPIPOLAR_PX
-from mapless_server.method.views import PosedView, View
 from mapless_server.scenes import Choice, RankedReference
 
 from .options import EscalationOptions

@@ -2,14 +2,12 @@
 
 from dataclasses import replace
 
-from .answer import Answer, Localization
-from .one_reference import one_reference_failure, solve_one_reference, trust_of_score
-from .pipeline import Coarse
-from .rejection import Rejection, RejectionReason
-from .results import MetricScale, Support
-from .trust.evidence import votes_of
-from .trust.judge import contradiction
-from .trust.two_view import (
+from .bundle.estimate import Support
+from .features.views import Reconstruction
+from .judge.answer import Answer, Localization
+from .judge.evidence import votes_of
+from .judge.judge import contradiction
+from .judge.two_view import (
     lacks_distance,
     one_reference_rejection,
     two_view_evidence,
@@ -17,8 +15,11 @@ from .trust.two_view import (
     two_view_trust,
     without_unmoved,
 )
-from .two_view.solve import solve_two_view
-from .views import Reconstruction
+from .pipeline import Coarse
+from .pose.one_reference import one_reference_failure, solve_one_reference, trust_of_score
+from .pose.two_view import solve_two_view
+from .rejection import Rejection, RejectionReason
+from .structure.model import MetricScale
 
 
 def from_one_reference(coarse: Coarse, scale: MetricScale) -> Answer:

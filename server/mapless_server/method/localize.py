@@ -9,20 +9,21 @@ Where one reference is given, or the references share too little with one anothe
 from collections.abc import Sequence
 from dataclasses import replace
 
-from .adjust import adjust_pose, with_covariance
 from .alternatives import from_one_reference, or_from_two_views
-from .answer import Answer, Localization, is_better
+from .bundle.adjust import adjust_pose, with_covariance
+from .bundle.estimate import Support
+from .bundle.priors import NO_PRIORS, Priors
+from .bundle.radii import with_halves
+from .features.views import Matches, PosedView, View
+from .judge.answer import Answer, Localization, is_better
+from .judge.fixed import unmoved_failure
+from .judge.intrinsics import intrinsics_checks
+from .judge.judge import judge
 from .options import LocalizeOptions, StageContext, Variant
 from .pipeline import Coarse, Pipeline, Prepared, reconstruct, structure_and_matches, with_wide_correspondences
-from .pnp import gate_failure, solve_pose
-from .priors.known import NO_PRIORS, Priors
+from .pose.pnp import gate_failure, solve_pose
 from .rejection import Rejection, RejectionReason
-from .results import ScaleStage, Support
-from .trust.fixed import unmoved_failure
-from .trust.intrinsics import intrinsics_checks
-from .trust.judge import judge
-from .uncertainty.radii import with_halves
-from .views import Matches, PosedView, View
+from .structure.model import ScaleStage
 
 MIN_FEATURES = 12
 """A photograph with fewer local features is blank, black or blurred."""

@@ -10,23 +10,24 @@ from typing import Any, TypeVar
 
 from mapless.geometry import Array
 
-from .answer import Answer, Localization, shifted
+from .bundle.estimate import PoseStage, Support
+from .bundle.pose_problem import AdjustOptions
+from .bundle.priors import NO_PRIORS, Priors
 from .coarse import Outcome, Reconstructor, Request, Triangulation, reconstruct_one
 from .coarse.geometric import GeometricReconstructor, point_maps
-from .correspond import Correspondences, Matcher
-from .kept_depth import with_kept_depths
-from .match import PAPER_MATCH, MatchOptions, match_points
-from .one_reference import OneReferenceOptions
+from .coarse.scale import ScaleOptions, estimate_scale, known_scale, network_scale
+from .features.views import PosedView, Reconstruction, View
+from .judge.answer import Answer, Localization, shifted
+from .judge.judge import JudgeOptions
 from .options import LocalizeOptions, StageContext, Variant
-from .pnp import PnpOptions
-from .pose_problem import AdjustOptions
-from .priors.known import NO_PRIORS, Priors
+from .pairs.correspond import Correspondences, Matcher
+from .pose.one_reference import OneReferenceOptions
+from .pose.pnp import PnpOptions
 from .rejection import Rejection, RejectionReason
-from .results import MetricScale, PointMatches, PoseStage, Structure, Support
-from .scale import ScaleOptions, estimate_scale, known_scale, network_scale
-from .structure import PAPER_STRUCTURE, StructureOptions, build_structure
-from .trust.judge import JudgeOptions
-from .views import PosedView, Reconstruction, View
+from .structure.kept_depth import with_kept_depths
+from .structure.match import PAPER_MATCH, MatchOptions, match_points
+from .structure.model import MetricScale, PointMatches, Structure
+from .structure.structure import PAPER_STRUCTURE, StructureOptions, build_structure
 
 T = TypeVar("T")
 

@@ -1,4 +1,4 @@
-"""Whether a scene contradicts itself, from the errors of its pairs of references (`method.agreement`)."""
+"""Whether a scene contradicts itself, from the errors of its pairs of references (`method.pairs.agreement`)."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapless_server.method.agreement import MAX_ERROR_PX
-from mapless_server.method.readings import implausible_depth, sessions_of
+from mapless_server.method.pairs.agreement import MAX_ERROR_PX
+from mapless_server.method.pairs.readings import implausible_depth, sessions_of
 from mapless_server.store.pairs import Pair
 
 
@@ -23,7 +23,7 @@ class Agreement:
             may have a wrong pose, or show what looks like something else.
         groups: keys of two groups of references, where pairs within each agree and pairs between them do not; empty
             without such groups.
-        explanation: the likely mistake, as `method.readings` names it; empty if there is none, or it is not known yet.
+        explanation: the likely mistake, as `pairs.readings` names it; empty if there is none, or it is not known yet.
         median_depth: median depth of what pairs that agree show, in the scene's unit; None if it is not known.
         same_pose: one sentence each about references with exactly one pose that show different things.
     """

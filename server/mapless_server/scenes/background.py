@@ -16,10 +16,11 @@ from dataclasses import dataclass
 from functools import partial
 
 from mapless_server.errors import DataLoss, NotFound
-from mapless_server.method.matching import StoredPair
-from mapless_server.method.options import StageContext, check_bounds
-from mapless_server.method.pairs import in_order
-from mapless_server.method.views import PosedView
+from mapless_server.method.features.matching import StoredPair
+from mapless_server.method.features.views import PosedView
+from mapless_server.method.optim.bounds import check_bounds
+from mapless_server.method.options import StageContext
+from mapless_server.method.pairs.pair import in_order
 from mapless_server.store import Store
 from mapless_server.store.compaction import compact_features
 from mapless_server.store.pairs import CLAIM_S, Claim, Pair, PairStore, Progress, delete_unused, record_use

@@ -11,15 +11,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapless_server.errors import DataLoss
-from mapless_server.method.agreement import MAX_ERROR_PX
-from mapless_server.method.correspond import Matcher
-from mapless_server.method.epipolar import SAME_PLACE
-from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.nearest import mutual_matches
+from mapless_server.method.features.extractors import FeatureExtractor
+from mapless_server.method.features.nearest import mutual_matches
+from mapless_server.method.features.views import Matches, PosedView
 from mapless_server.method.options import StageContext
-from mapless_server.method.readings import MatchedPair, align_sessions, consistent, explain, median_depth, same_poses
-from mapless_server.method.stationary import stationary_matches
-from mapless_server.method.views import Matches, PosedView
+from mapless_server.method.pairs.agreement import MAX_ERROR_PX
+from mapless_server.method.pairs.correspond import Matcher
+from mapless_server.method.pairs.epipolar import SAME_PLACE
+from mapless_server.method.pairs.readings import (
+    MatchedPair,
+    align_sessions,
+    consistent,
+    explain,
+    median_depth,
+    same_poses,
+)
+from mapless_server.method.pairs.stationary import stationary_matches
 from mapless_server.security import SceneKey
 from mapless_server.store.pairs import Pair
 

@@ -6,11 +6,11 @@ import logging
 import threading
 from collections.abc import Sequence
 
+from mapless_server.cache import LruCache
 from mapless_server.errors import DataLoss, NotFound, RequestError
-from mapless_server.method.cache import LruCache
-from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.features.extractors import FeatureExtractor
+from mapless_server.method.features.views import PosedView
 from mapless_server.method.options import StageContext
-from mapless_server.method.views import PosedView
 from mapless_server.security import SceneKey
 from mapless_server.store import Store
 

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from mapless.names import reference_name
 from mapless_server.errors import AlreadyExists, DataLoss, InvalidArgument, RequestError
 from mapless_server.images import ImageLimits, decode_image, decode_mask
-from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.features.extractors import FeatureExtractor
+from mapless_server.method.features.views import Ignored, Photograph, PosedView, View
 from mapless_server.method.options import StageContext
-from mapless_server.method.views import Ignored, Photograph, PosedView, View
 from mapless_server.security import SceneKey
 from mapless_server.store import DescribedReference, ReferenceRecord, SceneAttributes, Store
 

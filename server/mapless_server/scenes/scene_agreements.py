@@ -1,6 +1,6 @@
 """Whether the scenes of a store contradict themselves: their references compared with their poses, pair by pair.
 
-The errors of pairs (`method.agreement`) are those that matching in the background has stored. Where they are too few,
+The errors of pairs (`method.pairs.agreement`) are those that background matching has stored. Where they are too few,
 because it is off, has not come so far or was done by an earlier version, some pairs of a few references are matched
 here, unless queries have matched them already. What is known of a scene is kept in memory, and derived again after a
 start when it is first asked for.
@@ -18,12 +18,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mapless_server.errors import NotFound
-from mapless_server.method.agreement import MAX_ERROR_PX
-from mapless_server.method.correspond import Matcher
-from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.features.extractors import FeatureExtractor
+from mapless_server.method.features.views import PosedView
 from mapless_server.method.options import StageContext
-from mapless_server.method.pairs import in_order
-from mapless_server.method.views import PosedView
+from mapless_server.method.pairs.agreement import MAX_ERROR_PX
+from mapless_server.method.pairs.correspond import Matcher
+from mapless_server.method.pairs.pair import in_order
 from mapless_server.security import SceneKey
 from mapless_server.store import Store
 from mapless_server.store.pairs import Pair, PairStore

@@ -5,11 +5,11 @@ import threading
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
-from mapless_server.method.cache import LruCache
-from mapless_server.method.correspond import Matcher
-from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.matching import StoredPair
-from mapless_server.method.views import KeypointDepths, Matches, PosedView
+from mapless_server.cache import LruCache
+from mapless_server.method.features.extractors import FeatureExtractor
+from mapless_server.method.features.matching import StoredPair
+from mapless_server.method.features.views import KeypointDepths, Matches, PosedView
+from mapless_server.method.pairs.correspond import Matcher
 from mapless_server.store.database import Database
 from mapless_server.store.depths import load_depths
 from mapless_server.store.pairs import Pair, PairStore
@@ -69,7 +69,7 @@ def matching_name(extractor: str, rule: str) -> str:
 
 
 class PairFinder:
-    """Implements `method.matching.StoredPairs` for the matcher of one extractor's features."""
+    """Implements `method.features.matching.StoredPairs` for the matcher of one extractor's features."""
 
     def __init__(self, pairs: PairStore, extractor: str, observer: BackgroundObserver) -> None:
         """`extractor` is the name of the features that are matched."""

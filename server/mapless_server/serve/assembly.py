@@ -17,8 +17,8 @@ from mapless_server.images import ImageLimits
 from mapless_server.method.choices import AUTO, BEST_VARIANTS, OFF, STORED
 from mapless_server.method.coarse import Reconstructor
 from mapless_server.method.coarse.make import make_reconstructor
-from mapless_server.method.correspond import Matcher, make_matcher
-from mapless_server.method.features import FeatureExtractor, make_extractor
+from mapless_server.method.features.extractors import FeatureExtractor, make_extractor
+from mapless_server.method.pairs.correspond import Matcher, make_matcher
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.networks.weights import CATALOGUE, WeightsError, WeightsMissing, find_weights, named
 from mapless_server.networks.weights.folder import Status, look_up

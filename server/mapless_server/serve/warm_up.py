@@ -20,10 +20,10 @@ from mapless.geometry import Camera, RigidTransform
 from mapless_server.engine.photos import Photo
 from mapless_server.engine.query import Caller, Query, Tier
 from mapless_server.engine.queue_engine import QueueEngine
-from mapless_server.method.answer import Localization
-from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.features.extractors import FeatureExtractor
+from mapless_server.method.features.views import Photograph, PosedView
+from mapless_server.method.judge.answer import Localization
 from mapless_server.method.options import LocalizeOptions, StageContext
-from mapless_server.method.views import Photograph, PosedView
 from mapless_server.scenes import Choice, Narrowing
 from mapless_server.scheduling import Flow
 from mapless_server.security import SceneKey

@@ -15,9 +15,9 @@ from mapless.v1 import localization_service_pb2_grpc as rpcs
 from mapless_server.engine.groups import MAX_FRAMES, MAX_RIG_IMAGES, MIN_FRAMES, GroupResult, PhotoGroup
 from mapless_server.engine.query import TRACK, Query, Result
 from mapless_server.errors import RequestError
-from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.rejection import Rejection
-from mapless_server.method.results import MetricScale
+from mapless_server.method.structure.model import MetricScale
 from mapless_server.observability.metrics import LOCALIZED, Metrics
 from mapless_server.rpc import Call
 from mapless_server.store import SceneAttributes, Store

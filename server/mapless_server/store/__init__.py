@@ -6,7 +6,7 @@ become values in `rows` and `codec`, which check every byte. `sqlite` and `postg
 `verify` are what the `store` commands do.
 """
 
-from mapless_server.method.cache import LruCache
+from mapless_server.cache import LruCache
 
 from .database import StoreError
 from .records import (

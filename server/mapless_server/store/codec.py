@@ -44,7 +44,7 @@ from mapless.geodesy import Datum
 from mapless.geometry import Camera, Quaternion, RigidTransform
 from mapless.lenses import LENS_MODELS, Distortion, lens_model_of
 from mapless.scenes import Calibration
-from mapless_server.method.views import Features, KeptDepth, Matches, View
+from mapless_server.method.features.views import Features, KeptDepth, Matches, View
 
 from .records import SceneAttributes, SelfCalibration
 

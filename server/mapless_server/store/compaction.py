@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Select, delete, select, tuple_
 
 from mapless_server.errors import NotFound
-from mapless_server.method.views import Features, rounded_descriptors
+from mapless_server.method.features.views import Features, rounded_descriptors
 
 from . import codec, queries, rows
 from .database import Database, unless_damaged

@@ -11,7 +11,7 @@ from typing import Any
 
 from sqlalchemy import Select, delete, select, update
 
-from mapless_server.method.views import KeptDepth
+from mapless_server.method.features.views import KeptDepth
 
 from . import codec, queries, rows
 from .database import Database

@@ -17,7 +17,7 @@ from typing import Any
 from sqlalchemy import Connection, Row, Select, delete, func, literal, or_, select, update
 
 from mapless_server.errors import NotFound
-from mapless_server.method.matching import StoredPair
+from mapless_server.method.features.matching import StoredPair
 from mapless_server.security import SceneKey
 
 from . import codec, queries, rows
@@ -89,7 +89,7 @@ class PairStore:
         return {_pair(row): _decoded(matching, row) for row in found if _pair(row) in wanted}
 
     def list_errors(self, matching: str, scene_key: SceneKey, at_most: int) -> dict[Pair, float]:
-        """The known errors of a scene's pairs, see `method.agreement`, pixels; of a large scene some of its pairs."""
+        """The known errors of a scene's pairs, see `pairs.agreement`, pixels; some of a large scene's."""
         column = reference_pair.c
         known: Select[Any] = (
             select(column.first_key, column.second_key, column.error_px)

@@ -10,8 +10,8 @@ from typing import Any, Concatenate, NamedTuple, NoReturn, ParamSpec, Protocol, 
 from sqlalchemy import Connection, Row, Select, bindparam, select
 
 from mapless.geometry import Camera, RigidTransform
+from mapless_server.cache import LruCache
 from mapless_server.errors import AlreadyExists, NotFound, RequestError
-from mapless_server.method.cache import LruCache
 from mapless_server.security import SceneKey
 
 from . import codec, queries, rows, tables

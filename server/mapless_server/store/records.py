@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mapless.geodesy import Datum
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless.scenes import MAX_FACTOR, MIN_FACTOR, Calibration, Vector
-from mapless_server.method.views import View
+from mapless_server.method.features.views import View
 from mapless_server.security import SceneKey, scene_id_of
 
 MAX_DOWN_DISAGREEMENT_DEG = 10.0
@@ -41,7 +41,7 @@ class SelfCalibration:
         position_factor, rotation_factor: factors of radii at the usual gap (see `viewpoint_gap`), 0.01 to 1000.
         reference_noise_m, reference_noise_deg: errors of the references' own poses, not exceeded in 68 % of cases,
             which every answer contains.
-        trust_quantiles: quantiles of the generic trust of right answers, at the levels of `method.trust.judge`; empty
+        trust_quantiles: quantiles of the generic trust of right answers, at the levels of `method.judge.judge`; empty
             if unknown.
         lens: sentence about an error of the intrinsics that the references share; empty if they show none.
     """

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Row
 
 from mapless_server.errors import DataLoss
-from mapless_server.method.views import View
+from mapless_server.method.features.views import View
 from mapless_server.security import SceneKey, scene_id_of
 
 from . import codec

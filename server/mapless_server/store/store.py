@@ -16,9 +16,9 @@ from sqlalchemy import Connection, insert, select, update
 from mapless.geodesy import Datum
 from mapless.names import scene_name
 from mapless.scenes import UNCHANGED, Calibration, UnchangedType, Vector
+from mapless_server.cache import LruCache
 from mapless_server.errors import AlreadyExists, DataLoss, NotFound, Overloaded
-from mapless_server.method.cache import LruCache
-from mapless_server.method.views import View
+from mapless_server.method.features.views import View
 from mapless_server.security import SceneKey, scene_id_of
 
 from . import deletion, queries, rows, tables

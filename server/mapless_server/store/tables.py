@@ -134,7 +134,7 @@ reference_pair = Table(
     Column("matching", _Matching, primary_key=True),
     Column("data", LargeBinary, nullable=False),  # see codec.py
     Column("sha256", _Sha256, nullable=False),
-    Column("error_px", Double),  # see method/agreement.py; null if it is not known
+    Column("error_px", Double),  # see method/pairs/agreement.py; null if it is not known
     Index("reference_pair_by_second", "second_key"),
 )
 

@@ -14,8 +14,8 @@ from mapless.geometry import Array, Camera, RigidTransform
 from mapless_server.method.coarse import Outcome, Request
 from mapless_server.method.coarse.grids import GridOptions, common_grid, lay_out
 from mapless_server.method.coarse.network import NetworkReconstructor
+from mapless_server.method.features.views import PosedView, ReconstructedView, Reconstruction, View
 from mapless_server.method.rejection import Rejection
-from mapless_server.method.views import PosedView, ReconstructedView, Reconstruction, View
 
 UNITS_PER_METRE = 0.3
 """Of the planted reconstruction, so that there is a scale to find."""

@@ -17,13 +17,13 @@ import torch
 
 from mapless_server.engine.query import Tier
 from mapless_server.images import ImageLimits, decode_image
-from mapless_server.method.answer import Answer, Localization
 from mapless_server.method.coarse.network import NetworkReconstructor
-from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.features.extractors import FeatureExtractor
+from mapless_server.method.features.views import Photograph, PosedView
+from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.views import Photograph, PosedView
 from mapless_server.networks.runner import NetworkRunner
 from mapless_server.networks.weights import WeightsError
 from mapless_server.serve.assembly import make_tiers

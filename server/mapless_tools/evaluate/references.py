@@ -9,10 +9,10 @@ from typing import TypeVar
 from mapless.text_files import numbered_lines
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, decode_image, image_size
-from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.matching import OPTIONS, CorrespondOptions
-from mapless_server.method.nearest import mutual_matches
-from mapless_server.method.views import PosedView, View
+from mapless_server.method.features.extractors import FeatureExtractor
+from mapless_server.method.features.matching import OPTIONS, CorrespondOptions
+from mapless_server.method.features.nearest import mutual_matches
+from mapless_server.method.features.views import PosedView, View
 from mapless_server.networks.weights import WeightsError
 from mapless_server.scenes.retrieval.ranking import spread_choice
 from mapless_server.serve.assembly import image_limits, make_first_features

@@ -6,7 +6,7 @@ from typing import Any
 
 from rich.console import Console
 
-from mapless_server.method.readings import Alignment, Verdict, is_start, similarity_text
+from mapless_server.method.pairs.readings import Alignment, Verdict, is_start, similarity_text
 from mapless_tools.dataset import Dataset, Frame, Refusal
 from mapless_tools.output_files import finite
 

@@ -20,10 +20,10 @@ from mapless.geometry import Camera
 from mapless_server.engine.query import Tier
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.stages import Method
-from mapless_server.method.answer import Answer
+from mapless_server.method.features.views import Features, Ignored, View
+from mapless_server.method.judge.answer import Answer
 from mapless_server.method.pipeline import Coarse, Pipeline, Prepared
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.views import Features, Ignored, View
 from mapless_server.observability.logs import configure_logging
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security import RateLimiter

@@ -39,11 +39,11 @@ from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.stages import Method, QueryStages
 from mapless_server.errors import DataLoss
 from mapless_server.images import decode_image, decode_mask
-from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.features.extractors import FeatureExtractor
+from mapless_server.method.features.views import Ignored, Photograph, PosedView, View
 from mapless_server.method.localize import refine
 from mapless_server.method.options import StageContext
 from mapless_server.method.pipeline import coarse_answer
-from mapless_server.method.views import Ignored, Photograph, PosedView, View
 from mapless_server.observability.metrics import Metrics
 from mapless_server.rpc import Call
 from mapless_server.scenes import Choice, Selection

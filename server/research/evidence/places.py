@@ -12,17 +12,17 @@ import numpy as np
 
 from mapless.geometry import RigidTransform
 from mapless_server.images import ImageLimits, decode_image
-from mapless_server.method.answer import Answer, Localization
+from mapless_server.method.bundle.estimate import Support
+from mapless_server.method.bundle.priors import NO_PRIORS, Priors
 from mapless_server.method.coarse.make import make_reconstructor
-from mapless_server.method.correspond import make_matcher
-from mapless_server.method.features import make_extractor
+from mapless_server.method.features.extractors import make_extractor
+from mapless_server.method.features.matching import OPTIONS
+from mapless_server.method.features.views import PosedView, View
+from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.localize import localize
-from mapless_server.method.matching import OPTIONS
 from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.pairs.correspond import make_matcher
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.priors.known import NO_PRIORS, Priors
-from mapless_server.method.results import Support
-from mapless_server.method.views import PosedView, View
 from mapless_tools.evaluate.metrics import pose_error
 from mapless_tools.evaluate.plan import evenly_spread
 from mapless_tools.evaluate.references import choose_references

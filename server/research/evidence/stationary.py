@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.images import ImageLimits, decode_image
-from mapless_server.method.answer import Localization
 from mapless_server.method.coarse.make import make_reconstructor
-from mapless_server.method.correspond import make_matcher
-from mapless_server.method.features import FeatureExtractor, SiftExtractor, SiftOptions, make_extractor
+from mapless_server.method.features.extractors import FeatureExtractor, SiftExtractor, SiftOptions, make_extractor
+from mapless_server.method.features.nearest import mutual_matches
+from mapless_server.method.features.views import Features, Matches, PosedView, View
+from mapless_server.method.judge.answer import Localization
 from mapless_server.method.localize import localize
-from mapless_server.method.nearest import mutual_matches
 from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.pairs.correspond import make_matcher
+from mapless_server.method.pairs.stationary import StationaryOptions, displacements_px, fixed_in, share_of_parts
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.stationary import StationaryOptions, displacements_px, fixed_in, share_of_parts
-from mapless_server.method.views import Features, Matches, PosedView, View
 from mapless_tools.dataset import Dataset
 from mapless_tools.evaluate.metrics import pose_error
 from mapless_tools.evaluate.plan import evenly_spread
@@ -270,8 +270,8 @@ def _extractors() -> dict[str, FeatureExtractor]:
     found: dict[str, FeatureExtractor] = {"sift": SiftExtractor(SiftOptions(max_keypoints=MAX_KEYPOINTS))}
     weights = Path(os.environ.get("MAPLESS_WEIGHTS_DIR", "")) / "edgepoint2-l64.safetensors"
     if weights.is_file():
-        from mapless_server.method.features.edgepoint2 import EdgePoint2Extractor
-        from mapless_server.method.features.network import LearnedOptions
+        from mapless_server.method.features.extractors.edgepoint2 import EdgePoint2Extractor
+        from mapless_server.method.features.extractors.network import LearnedOptions
 
         options = LearnedOptions(max_keypoints=MAX_KEYPOINTS, min_score=0.0067)
         found["edgepoint2-l64"] = EdgePoint2Extractor("l64", weights, options=options)

@@ -18,7 +18,7 @@ OTHERS, RIGHT = 4, 3
 """Photographs of other places, and of the place itself, for each scene and overlay."""
 QUESTION = Question(
     "stationary-overlays-auto",
-    "mapless_server.method.stationary:StationaryOptions.unmoved_px",
+    "mapless_server.method.pairs.stationary:StationaryOptions.unmoved_px",
     "How many photographs of other places does a server with `auto` localize because they carry the same picture as "
     "the references, and how many of the place itself?",
     f"The scenes and overlays of [stationary-overlays](stationary-overlays.md), {OTHERS} photographs of other places "

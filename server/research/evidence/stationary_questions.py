@@ -15,7 +15,7 @@ _DRIVE = (
     "The drive of KITTI as it is, 26 photographs ahead, SIFT: the share of keypoints that are ignored in ten "
     "references that follow one another, by all matches of their descriptors."
 )
-_CODE = "mapless_server.method.stationary:StationaryOptions"
+_CODE = "mapless_server.method.pairs.stationary:StationaryOptions"
 _FAR = (
     "SIFT on the drive with a display and with a watermark, as in [stationary-overlays](stationary-overlays.md): 12 "
     "photographs of other places, 8 of the place itself."

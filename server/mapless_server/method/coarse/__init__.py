@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from mapless.geometry import RigidTransform
 
-from ..correspond import Correspondences
-from ..priors.known import NO_PRIORS, Priors
+from ..bundle.priors import NO_PRIORS, Priors
+from ..features.views import PosedView, Reconstruction, View
+from ..pairs.correspond import Correspondences
 from ..rejection import Rejection
-from ..results import Structure
-from ..views import PosedView, Reconstruction, View
+from ..structure.model import Structure
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,19 +13,19 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, Similarity
 
-from ..correspond import Correspondences
-from ..kept_depth import with_kept_depths
-from ..match import vote
-from ..perturbation import reprojection_errors_px
-from ..pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, format_false_alarms, log10_false_alarms, ransac
-from ..priors.informed import informed_pose
-from ..priors.known import NO_PRIORS, Priors
+from ..bundle.priors import NO_PRIORS, Priors
+from ..features.views import PosedView, ReconstructedView, Reconstruction, View
+from ..optim.perturbation import reprojection_errors_px
+from ..pairs.correspond import Correspondences
+from ..pose.pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, format_false_alarms, log10_false_alarms, ransac
+from ..pose.with_priors import informed_pose
 from ..rejection import Rejection, RejectionReason
-from ..results import PointMatches, Structure
-from ..scale import unit_frame
-from ..structure import StructureOptions, triangulated_structure
-from ..views import PosedView, ReconstructedView, Reconstruction, View
+from ..structure.kept_depth import with_kept_depths
+from ..structure.match import vote
+from ..structure.model import PointMatches, Structure
+from ..structure.structure import StructureOptions, triangulated_structure
 from . import Outcome, Request, Triangulation
+from .scale import unit_frame
 
 CELL_PX = 2
 """Side of a cell of the point maps, pixels of the view; so small that two keypoints seldom share a cell."""

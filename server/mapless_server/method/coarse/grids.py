@@ -18,8 +18,8 @@ from PIL import Image
 from mapless.geometry import Array, Camera
 from mapless_server.networks.encoder import PATCH_PX
 
-from ..options import check_bounds
-from ..views import Ignored, undistort_pixels
+from ..features.views import Ignored, undistort_pixels
+from ..optim.bounds import check_bounds
 
 PIXEL_LIMIT = 37 * 28 * PATCH_PX**2
 """Of 518x392."""

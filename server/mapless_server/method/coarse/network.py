@@ -24,8 +24,8 @@ from mapless.geometry import Array, RigidTransform
 from mapless_server.networks.network import NetworkOutput
 from mapless_server.networks.runner import NetworkRunner
 
+from ..features.views import Photograph, PosedView, ReconstructedView, Reconstruction, View
 from ..rejection import Rejection, RejectionReason
-from ..views import Photograph, PosedView, ReconstructedView, Reconstruction, View
 from . import Outcome, Request
 from .grids import Grid, GridOptions, Layout, common_grid, lay_out
 from .token_cache import TokenCache, TokenCacheOptions, TokenKey

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array
 
-from ..views import Ignored
+from .views import Ignored
 
 MARGIN_PX = 4.0
 """Keypoints are at least so far from an ignored pixel, in the image that features are found in."""

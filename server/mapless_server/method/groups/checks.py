@@ -13,12 +13,12 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform
 
-from ..answer import Answer, Localization
-from ..hints import FEW_MATCHES, MANY_MATCHES
-from ..priors.known import conflict_threshold
-from ..readings import CONVENTIONS, MOST_NAMED, Convention
+from ..bundle.priors import conflict_threshold
+from ..features.views import PosedView
+from ..judge.answer import Answer, Localization
+from ..judge.hints import FEW_MATCHES, MANY_MATCHES
+from ..pairs.readings import CONVENTIONS, MOST_NAMED, Convention
 from ..rejection import Advice, Hint, Rejection, RejectionReason
-from ..views import PosedView
 from .jumps import ALL_JUMPS, find_jumps
 from .rig import RigEstimate
 from .sequence import SequenceEstimate

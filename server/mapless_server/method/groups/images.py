@@ -13,20 +13,21 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
-from ..agreement import ReferenceErrors
-from ..answer import Answer, Localization
-from ..match import MatchOptions, search, vote
+from ..bundle.estimate import Support
+from ..bundle.priors import NO_PRIORS, Priors
+from ..features.views import Matches, PosedView, View
+from ..judge.answer import Answer, Localization
+from ..judge.evidence import findable_count, hull_share
+from ..judge.fixed import moved_matches, without
+from ..pairs.agreement import ReferenceErrors
+from ..pairs.stationary import StationaryOptions
 from ..pipeline import Prepared
-from ..pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, false_alarms, format_false_alarms
-from ..priors.known import NO_PRIORS, Priors
+from ..pose.generalized import CameraMatches
+from ..pose.pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, false_alarms, format_false_alarms
 from ..rejection import Rejection, RejectionReason
-from ..results import PointMatches, ScaleSource, Structure, Support
-from ..stationary import StationaryOptions
-from ..structure import StructureOptions, triangulated_structure
-from ..trust.evidence import findable_count, hull_share
-from ..trust.fixed import moved_matches, without
-from ..views import Matches, PosedView, View
-from .generalized import CameraMatches
+from ..structure.match import MatchOptions, search, vote
+from ..structure.model import PointMatches, ScaleSource, Structure
+from ..structure.structure import StructureOptions, triangulated_structure
 
 INLIER_PX = PnpOptions().inlier_px
 """Largest reprojection error of an inlier, as for one photograph."""

@@ -18,10 +18,10 @@ import numpy as np
 
 from mapless.geometry import Array
 
-from ..optimize import MinimizeOptions, minimize
-from ..perturbation import covariance_in_world, reprojection_errors_px
-from ..priors.known import PriorCheck, Priors
-from ..results import PointMatches
+from ..bundle.priors import PriorCheck, Priors
+from ..optim.optimize import MinimizeOptions, minimize
+from ..optim.perturbation import covariance_in_world, reprojection_errors_px
+from ..structure.model import PointMatches
 from .images import MatchedImage, PosedImage
 from .problem import ADJUST, GroupProblem, GroupState, S
 

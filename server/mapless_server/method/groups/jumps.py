@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, cross_matrix
 
-from ..perturbation import rotation_vector
-from ..priors.known import conflict_threshold
+from ..bundle.priors import conflict_threshold
+from ..optim.perturbation import rotation_vector
 from .drift import step_sigma
 
 

@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
-from ..bundle import BundleProblem, bundle_of
-from ..normal_equations import NormalEquations
-from ..observations import Tracks
-from ..optimize import solve_step
-from ..perturbation import reprojection_errors_px, world_jacobian
-from ..pose_problem import LEAST_DAMPING, AdjustOptions, most_probable, pose_errors
-from ..priors.known import Priors
-from ..results import PointMatches
-from ..structure import tracks_with_query
-from ..unknowns import Bundle, Poses
-from ..views import PosedView
+from ..bundle.bundle import BundleProblem, bundle_of
+from ..bundle.normal_equations import NormalEquations
+from ..bundle.pose_problem import LEAST_DAMPING, AdjustOptions, most_probable, pose_errors
+from ..bundle.priors import Priors
+from ..bundle.unknowns import Bundle, Poses
+from ..features.tracks import Tracks
+from ..features.views import PosedView
+from ..optim.optimize import solve_step
+from ..optim.perturbation import reprojection_errors_px, world_jacobian
+from ..structure.model import PointMatches
+from ..structure.structure import tracks_with_query
 from .images import MatchedImage
 
 S = TypeVar("S", bound="GroupState")

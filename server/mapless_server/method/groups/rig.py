@@ -11,11 +11,11 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform, cross_matrix
 
-from ..perturbation import covariance_in_world, perturbed
-from ..pnp import PnpOptions
-from ..priors.known import PriorCheck
+from ..bundle.priors import PriorCheck
+from ..optim.perturbation import covariance_in_world, perturbed
+from ..pose.generalized import inlier_count, rig_ransac
+from ..pose.pnp import PnpOptions
 from ..rejection import Rejection, RejectionReason
-from .generalized import inlier_count, rig_ransac
 from .images import (
     GroupImage,
     MatchedImage,

@@ -19,10 +19,10 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform, Similarity
 
-from ..perturbation import covariance_in_world
-from ..priors.known import PriorCheck, Priors
+from ..bundle.priors import PriorCheck, Priors
+from ..judge.evidence import findable_count
+from ..optim.perturbation import covariance_in_world
 from ..rejection import Rejection, RejectionReason
-from ..trust.evidence import findable_count
 from .drift import SequenceState, world_from_session_at
 from .images import (
     GroupImage,

@@ -11,11 +11,11 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform, Similarity
 
-from ..pnp import PnpOptions
-from ..priors.known import Priors
+from ..bundle.priors import Priors
+from ..pose.generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
+from ..pose.pnp import PnpOptions
 from ..rejection import Advice, Hint, Rejection, RejectionReason
 from .drift import world_from_session_at
-from .generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
 from .images import MatchedImage
 from .jumps import Chain, Jump, find_jumps
 

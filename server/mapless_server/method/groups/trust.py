@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
-from ..rejection import Rejection
-from ..trust.evidence import (
+from ..judge.evidence import (
     NO_AGREEMENT,
     PNP,
     SPLITS,
@@ -28,9 +27,10 @@ from ..trust.evidence import (
     hull_share,
     votes_on,
 )
-from ..trust.judge import JudgeOptions, low_trust, trust_of
-from ..trust.references import Supporters, disagreeing_references
-from .generalized import CameraMatches, rig_ransac
+from ..judge.judge import JudgeOptions, low_trust, trust_of
+from ..judge.references import Supporters, disagreeing_references
+from ..pose.generalized import CameraMatches, rig_ransac
+from ..rejection import Rejection
 from .images import PosedImage
 
 

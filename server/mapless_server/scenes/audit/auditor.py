@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapless_server.method.views import PosedView
+from mapless_server.method.features.views import PosedView
 from mapless_server.store import LruCache
 
 from .change import SAME_VIEWPOINT, SEEN_ALIKE, Change, find_change

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy.special import bdtr
 
 from mapless.geometry import Array
-from mapless_server.method.match import MatchOptions, search
-from mapless_server.method.results import PointMatches
-from mapless_server.method.views import PosedView
+from mapless_server.method.features.views import PosedView
+from mapless_server.method.structure.match import MatchOptions, search
+from mapless_server.method.structure.model import PointMatches
 
 from .comparison import Comparison
 from .neighbourhood import Neighbourhood, Visibility, Visible, visible_points

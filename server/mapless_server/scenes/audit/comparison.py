@@ -11,12 +11,13 @@ from functools import cached_property
 import numpy as np
 
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
+from mapless_server.method.bundle.estimate import PoseEstimate, PoseStage, Support
+from mapless_server.method.features.views import Matches, PosedView
+from mapless_server.method.judge.judge import JudgeOptions, judge
+from mapless_server.method.optim.perturbation import world_covariance
 from mapless_server.method.options import LocalizeOptions
-from mapless_server.method.perturbation import world_covariance
-from mapless_server.method.pnp import PnpOptions, false_alarms, ransac
-from mapless_server.method.results import PointMatches, PoseEstimate, PoseStage, Support
-from mapless_server.method.trust.judge import JudgeOptions, judge
-from mapless_server.method.views import Matches, PosedView
+from mapless_server.method.pose.pnp import PnpOptions, false_alarms, ransac
+from mapless_server.method.structure.model import PointMatches
 
 from .neighbourhood import Neighbourhood, PairMatches, build_neighbourhood, match_points, observed_points
 from .resection import CameraFit, Free, ObservedPoints, fit_camera

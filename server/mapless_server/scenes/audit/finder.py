@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from mapless.geometry import Array, RigidTransform
 from mapless.names import parse_reference_name, reference_name
-from mapless_server.method.views import PosedView
+from mapless_server.method.features.views import PosedView
 from mapless_server.store import LruCache
 
 from ..retrieval.index import Entries, Rows

@@ -17,15 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform
-from mapless_server.method.correspond import Correspondences
-from mapless_server.method.epipolar import epipolar_distance_px
-from mapless_server.method.match import vote
-from mapless_server.method.nearest import mutual_matches
-from mapless_server.method.observations import Tracks, build_tracks, triangulate
-from mapless_server.method.results import PointMatches, Structure
-from mapless_server.method.stationary import IgnoredKeypoints, fixed_in, without_ignored
-from mapless_server.method.structure import StructureOptions, observe, refine_points
-from mapless_server.method.views import Matches, PosedView
+from mapless_server.method.features.nearest import mutual_matches
+from mapless_server.method.features.tracks import Tracks, build_tracks
+from mapless_server.method.features.views import Matches, PosedView
+from mapless_server.method.pairs.correspond import Correspondences
+from mapless_server.method.pairs.epipolar import epipolar_distance_px
+from mapless_server.method.pairs.stationary import IgnoredKeypoints, fixed_in, without_ignored
+from mapless_server.method.structure.match import vote
+from mapless_server.method.structure.model import PointMatches, Structure
+from mapless_server.method.structure.observations import triangulate
+from mapless_server.method.structure.structure import StructureOptions, observe, refine_points
 from mapless_server.store import LruCache
 
 from .resection import ObservedPoints
@@ -34,7 +35,7 @@ from .resection import ObservedPoints
 class PairMatches:
     """Matches of pairs of photographs by descriptors alone, cached; thread-safe.
 
-    `method.correspond.Matcher` caches matches that agree with the given poses, which are what is audited here.
+    `method.pairs.correspond.Matcher` caches matches that agree with the given poses, which are what is audited here.
     """
 
     def __init__(self, ratio: float = 0.9, cached_pairs: int = 20_000) -> None:

@@ -1,7 +1,7 @@
 """Camera pose and focal length from known points in a photograph: four fits to compare.
 
 Points known from other references are matched in this one. They are fitted with the given pose and focal length, with
-another pose, with another focal length, and with both changed. Each is a robust fit (see `method.resection`). The
+another pose, with another focal length, and with both changed. Each is a robust fit (see `camera_fit`). The
 sigma of a match has two parts: the keypoint's own, and the projection of the point's covariance into this image, since
 a point that few references triangulate is uncertain along their rays.
 """
@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian
-from mapless_server.method.optimize import MinimizeOptions, minimize
-from mapless_server.method.resection import Resection
+from mapless_server.method.optim.optimize import MinimizeOptions, minimize
+from mapless_server.scenes.audit.camera_fit import Resection
 
 _BEHIND_SIGMA = 1e3
 """Residual of a point behind the camera."""

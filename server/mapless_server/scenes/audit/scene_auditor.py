@@ -9,9 +9,9 @@ import numpy as np
 
 from mapless.names import parse_reference_name, reference_name
 from mapless_server.errors import DataLoss, NotFound, Unavailable
-from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.features.extractors import FeatureExtractor
+from mapless_server.method.features.views import PosedView
 from mapless_server.method.options import StageContext
-from mapless_server.method.views import PosedView
 from mapless_server.security import SceneKey, scene_id_of
 
 from ..indexes import SceneIndexes

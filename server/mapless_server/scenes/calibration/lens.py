@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array
-from mapless_server.method.intrinsics import corrected_view, keypoint_motion
-from mapless_server.method.optimize import MinimizeOptions, cauchy_cost, cauchy_weight, damped_step, minimize
+from mapless_server.method.bundle.intrinsics import corrected_view, keypoint_motion
+from mapless_server.method.features.views import Features, Matches, PosedView, View
+from mapless_server.method.optim.optimize import MinimizeOptions, cauchy_cost, cauchy_weight, damped_step, minimize
 from mapless_server.method.options import IntrinsicsSigma
-from mapless_server.method.two_view.matches import TwoViewMatches
-from mapless_server.method.views import Features, Matches, PosedView, View
+from mapless_server.method.pose.two_view_matches import TwoViewMatches
 
 SHARED = [0, 3]
-"""Of the four errors (see `method.intrinsics`): ln of the focal length, and k1."""
+"""Of the four errors (see `method.bundle.intrinsics`): ln of the focal length, and k1."""
 
 MIN_MATCHES, MIN_SHARE, AGREEING_PX = 100, 0.3, 2.0
 """Fewer matches, or a smaller share that agrees within so many pixels, say nothing: poses are wrong, or photographs too
@@ -56,7 +56,7 @@ class SharedErrors:
 
     @property
     def of_all(self) -> Array:
-        """The four errors of `method.intrinsics`."""
+        """The four errors of `method.bundle.intrinsics`."""
         result = np.zeros(4)
         result[SHARED] = self.value
         return result

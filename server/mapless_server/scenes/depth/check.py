@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
-from mapless_server.method.correspond import Correspondences
-from mapless_server.method.results import MetricScale, Structure
-from mapless_server.method.structure import StructureOptions, triangulated_structure
-from mapless_server.method.views import KeptDepth, PosedView, ReconstructedView, Reconstruction, map_cells
+from mapless_server.method.features.views import KeptDepth, PosedView, ReconstructedView, Reconstruction, map_cells
+from mapless_server.method.pairs.correspond import Correspondences
+from mapless_server.method.structure.model import MetricScale, Structure
+from mapless_server.method.structure.structure import StructureOptions, triangulated_structure
 
 MAX_OFF, MAX_OFF_DEG = 0.1, 5.0
 """Largest error of the predicted pose that was not given: of its position as a share of the median depth, and of its

@@ -8,12 +8,12 @@ from dataclasses import replace
 
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.method.coarse import Reconstructor, Request, Triangulation
-from mapless_server.method.correspond import Matcher
-from mapless_server.method.features import FeatureExtractor
+from mapless_server.method.coarse.scale import estimate_scale
+from mapless_server.method.features.extractors import FeatureExtractor
+from mapless_server.method.features.views import KeptDepth, PosedView
 from mapless_server.method.options import StageContext
+from mapless_server.method.pairs.correspond import Matcher
 from mapless_server.method.rejection import Rejection
-from mapless_server.method.scale import estimate_scale
-from mapless_server.method.views import KeptDepth, PosedView
 from mapless_server.security import SceneKey
 from mapless_server.store import Store
 from mapless_server.store.depths import depth_kind, discard_depths, keep_depths, list_kinds, list_without

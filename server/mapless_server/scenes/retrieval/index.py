@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
-from mapless_server.method.views import View
+from mapless_server.method.features.views import View
 from mapless_server.store import IndexedReference, SceneChanges
 
 Vector = NDArray[np.float32]

@@ -18,7 +18,7 @@ import torch.nn.functional as F  # noqa: N812  its usual name
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mapless_server.method.views import View
+from mapless_server.method.features.views import View
 from mapless_server.networks.blocks import Attention
 from mapless_server.networks.checkpoint import load_strictly
 from mapless_server.networks.megaloc import MegaLoc, MegaLocSizes

@@ -23,8 +23,8 @@ from importlib.resources import files
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.views import View
+from mapless_server.method.features.extractors import FeatureExtractor
+from mapless_server.method.features.views import View
 
 from .index import Vector
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, normalize
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_server.method.results import Support
-from mapless_server.method.views import View
+from mapless_server.method.bundle.estimate import Support
+from mapless_server.method.features.views import View
 
 MAX_MATCHES = 2000
 """About 100 KB of message, and more than can be seen in a picture."""

@@ -15,9 +15,9 @@ from mapless.geometry import Array, RigidTransform, Similarity
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server.engine.query import Query
+from mapless_server.method.bundle.radii import accuracy_from_covariance
 from mapless_server.method.options import LocalizeOptions, Variant
 from mapless_server.method.rejection import Rejection
-from mapless_server.method.uncertainty.radii import accuracy_from_covariance
 from mapless_server.security import key_of
 from mapless_server.store import SceneAttributes
 

@@ -24,8 +24,7 @@ from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.photos import Photo
 from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Query
 from mapless_server.images import ImageLimits, check_mask, image_size
-from mapless_server.method.options import IntrinsicsSigma, LocalizeOptions
-from mapless_server.method.priors.known import (
+from mapless_server.method.bundle.priors import (
     NO_PRIORS,
     GravityPrior,
     HeadingPrior,
@@ -34,7 +33,8 @@ from mapless_server.method.priors.known import (
     Priors,
     check_covariance,
 )
-from mapless_server.method.views import seen_share
+from mapless_server.method.features.views import seen_share
+from mapless_server.method.options import IntrinsicsSigma, LocalizeOptions
 from mapless_server.scenes import ANYWHERE, Cone, Narrowing, Sphere
 from mapless_server.security import SceneKey, key_of
 from mapless_server.store import SceneAttributes

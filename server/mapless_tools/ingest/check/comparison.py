@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, decode_image
-from mapless_server.method.features import FeatureExtractor
-from mapless_server.method.readings import MatchedPair, Pair, Verdict, consistent, distinct_matches, judge
-from mapless_server.method.stationary import fixed_in, without_ignored
-from mapless_server.method.views import Matches, PosedView
+from mapless_server.method.features.extractors import FeatureExtractor
+from mapless_server.method.features.views import Matches, PosedView
+from mapless_server.method.pairs.readings import MatchedPair, Pair, Verdict, consistent, distinct_matches, judge
+from mapless_server.method.pairs.stationary import fixed_in, without_ignored
 from mapless_server.settings import available_cores
 from mapless_tools.dataset import Frame
 from mapless_tools.progress import Progress

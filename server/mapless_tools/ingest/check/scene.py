@@ -13,8 +13,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from mapless import Client, DataLoss, InvalidArgument, NotFound, Reference
-from mapless_server.method.features import FeatureExtractor, SiftExtractor
-from mapless_server.method.readings import Alignment, Pair, PairError, align, errors_of
+from mapless_server.method.features.extractors import FeatureExtractor, SiftExtractor
+from mapless_server.method.pairs.readings import Alignment, Pair, PairError, align, errors_of
 from mapless_tools.dataset import Frame
 from mapless_tools.progress import Progress
 

@@ -1,0 +1,247 @@
+"""Adjustment: a last refinement, not in the paper: bundle adjustment of the query, its points and the references.
+
+The paper fixes the points before it solves for the query, and never moves the references. But the query observes the
+points too, and reference poses are never exact: they have noise, and errors of the lens model add to it. So here all
+are adjusted together (see `pose_problem`).
+
+Where references are few and far apart, most keypoints that the query shares with one of them are in no other: no point
+can be triangulated without the query. With the query's pose one can, and after its elimination it is an equation of
+the pose, the epipolar one of both keypoints (see `two_view`). Where these are many they are adjusted with the others.
+They are no inliers: whether the pose is accepted depends on them only by its radius, which they make smaller.
+
+The query's intrinsics stay as given: where they are right, poses are twice as accurate without these four unknowns.
+What the photograph says of their errors follows from the same normal equations, and the pose's covariance contains them
+(see `intrinsics`). A parameter that the photograph contradicts is estimated with the pose (see `recalibrate`).
+Priors on the query's pose add their terms, unless the photograph alone contradicts them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from mapless.geometry import Array
+
+from ..features.tracks import Tracks
+from ..features.views import Matches, PosedView, View
+from ..options import IntrinsicsSigma
+from ..structure.model import MetricScale, PointMatches, Structure
+from ..structure.structure import query_tracks, with_query_points
+from .dispersion import scale_covariance
+from .estimate import PoseEstimate, PoseStage, Support
+from .pose_problem import (
+    AdjustInput,
+    AdjustOptions,
+    adjusted_estimate,
+    errors_of_pose,
+    optimum,
+    pose_problem,
+    shares_camera,
+)
+from .priors import NO_PRIORS, Priors
+from .recalibrate import Solved, is_suspicious, recalibrated
+
+SHARED_CAMERA = 0.03
+"""Share of the intrinsics' usual errors that differ between photographs of one camera. What they share is in the
+references' points too, and moves the pose but little: focus and stabilization remain. With 0.1 the covariance of these
+errors exceeds all others in scenes of one camera, where radii hold too often."""
+
+
+Optimum = tuple[AdjustInput, Solved]
+"""What was adjusted, with points of the query's own, and what was solved."""
+
+
+def adjust_pose(
+    query: View,
+    references: Sequence[PosedView],
+    structure: Structure,
+    matches: PointMatches,
+    estimate: PoseEstimate,
+    options: AdjustOptions,
+    priors: Priors = NO_PRIORS,
+    intrinsics: IntrinsicsSigma | None = None,
+    query_matches: Sequence[Matches] = (),
+) -> PoseEstimate:
+    """Refines an estimate together with its points and, within their noise, the references.
+
+    Args:
+        query: the query.
+        references: the references, in the order of the structure's tracks.
+        structure: metric points.
+        matches: 2D-3D matches of the query with these points.
+        estimate: the initial pose; its errors select the matches.
+        options: of the adjustment.
+        priors: on the query's pose. Each is checked against the pose from the photograph alone; only consistent ones
+            are used.
+        intrinsics: standard deviations of the query's intrinsics; None for the defaults.
+        query_matches: matches of the query with each reference; where many belong to no point, they are used too.
+
+    Returns:
+        The estimate with a refined pose and its covariance; unchanged if the adjustment fails.
+    """
+    given = AdjustInput(query, references, structure, matches, options)
+
+    def adjusted(start: PoseEstimate, active: Priors) -> tuple[PoseEstimate, Optimum | None] | None:
+        return _adjusted(given, start, active, intrinsics, query_matches)
+
+    # If no prior is used, the answer is bit-identical to the one without priors.
+    without_priors = estimate.without_priors or estimate
+    alone, where = adjusted(without_priors, NO_PRIORS) or (None, None)
+    if not priors:
+        return alone or without_priors
+    checks = priors.check(alone.world_from_camera, alone.covariance) if alone else estimate.prior_checks
+    used = priors.consistent(checks)
+    answer = alone or without_priors
+    if used:
+        informed = _with_priors(alone, where, used) if alone and where else None
+        answer = informed or (adjusted(estimate, used) or (estimate, None))[0]
+    return replace(answer, prior_checks=checks)
+
+
+def _with_priors(alone: PoseEstimate, where: Optimum, priors: Priors) -> PoseEstimate | None:
+    """The estimate with priors that are consistent with the one without, from whose optimum it starts.
+
+    What the photograph says of the pose's errors is computed there.
+    """
+    given, (problem, start, used) = where
+    with_priors = problem.replaced(priors=priors, prior_weight=given.options.error_inflation**2)
+    bundle = optimum(with_priors, start, given.options)
+    found = adjusted_estimate(given, used, alone, bundle, (alone.covariance, alone.intrinsics))
+    return found and _sharpened(_of_matches(found, len(alone.inliers)), priors)
+
+
+def _sharpened(found: PoseEstimate, priors: Priors) -> PoseEstimate:
+    return replace(found, covariance=priors.sharpened(found.covariance, found.world_from_camera))
+
+
+def _of_matches(found: PoseEstimate, count: int) -> PoseEstimate:
+    """The estimate without the matches that were added to the first ones."""
+    return replace(found, inliers=found.inliers[:count], errors_px=found.errors_px[:count])
+
+
+def _adjusted(
+    given: AdjustInput,
+    estimate: PoseEstimate,
+    priors: Priors,
+    intrinsics: IntrinsicsSigma | None,
+    query_matches: Sequence[Matches],
+) -> tuple[PoseEstimate, Optimum | None] | None:
+    """Returns the estimate at the optimum with priors, and where that is; None if it diverges or has too few matches.
+
+    Points of the query's own are chosen at its pose, with whatever error the intrinsics give it, so they hide a part
+    of this error: intrinsics that seem wrong with them are judged, and estimated, without them.
+    """
+    terms = intrinsics_terms(given.query, given.references, intrinsics)
+    own = _own_tracks(given, estimate, query_matches)
+    is_agreeing = estimate.inliers.mean() >= given.options.agreeing_share
+    first = _at_optimum(given, estimate, priors, terms, own) if own and is_agreeing else None
+    if first and not is_suspicious(first[0], given.options):
+        return _sharpened(first[0], priors), first[1]
+    plain = _at_optimum(given, estimate, priors, terms)
+    if plain is None:
+        return None
+    found, where = plain
+    better = recalibrated(given, found, priors, terms[2], where[1])
+    if better is found and own:
+        more, where = first or _at_optimum(given, found, priors, terms, own) or plain
+        better = replace(more, intrinsics=found.intrinsics)
+    return _sharpened(better, priors), where if better.view is None else None
+
+
+def _own_tracks(given: AdjustInput, estimate: PoseEstimate, query_matches: Sequence[Matches]) -> Tracks | None:
+    """Tracks of the query's keypoints that match references but no point; None if these are few."""
+    free = np.ones(len(given.query.features), bool)
+    free[given.matches.keypoint] = False
+    tracks = query_tracks(given.references, given.structure, query_matches, free)
+    is_many = tracks.point_count > 0 and tracks.point_count >= given.options.min_added_share * estimate.inliers.sum()
+    return tracks if is_many else None
+
+
+def _at_optimum(
+    given: AdjustInput,
+    estimate: PoseEstimate,
+    priors: Priors,
+    terms: tuple[View, Array, Array, Array],
+    own: Tracks | None = None,
+) -> tuple[PoseEstimate, Optimum] | None:
+    """The estimate at the optimum, with points of the query's own tracks, and where it was found."""
+    count, pose, options = len(given.matches), estimate.world_from_camera, given.options
+    if own:
+        points = given.query, given.references, given.structure, given.matches, own, pose, options.query_points
+        structure, matches = with_query_points(*points)
+        given = replace(given, structure=structure, matches=matches)
+    errors_px = np.concatenate([estimate.errors_px, given.errors_px(pose, slice(count, None))])
+    start_inliers = np.concatenate([estimate.inliers, np.ones(len(given.matches) - count, bool)])
+    used = np.flatnonzero(errors_px < options.max_error_px)
+    if len(used) < 3:  # two equations each, for six unknowns
+        return None
+    problem, start = pose_problem(given, used, pose)
+    with_priors = problem.replaced(priors=priors, prior_weight=options.error_inflation**2)
+    bundle = optimum(with_priors, start, options)
+    before = replace(estimate, inliers=start_inliers, errors_px=errors_px)
+    errors = errors_of_pose(given.query, problem, bundle, options, terms)
+    found = adjusted_estimate(given, used, before, bundle, errors)
+    if found is None:
+        return None
+    return _of_matches(found, count), (given, (problem, bundle, used))
+
+
+def intrinsics_terms(
+    query: View, references: Sequence[PosedView], intrinsics: IntrinsicsSigma | None
+) -> tuple[View, Array, Array, Array]:
+    """A photograph with its intrinsics as given, for `errors_of_pose`."""
+    usual = (intrinsics or IntrinsicsSigma()).of(query.camera)
+    is_shared = intrinsics is None and shares_camera(query, references)
+    return query, np.zeros(4), usual, SHARED_CAMERA * usual if is_shared else usual
+
+
+def with_covariance(
+    support: Support,
+    scale: MetricScale,
+    options: AdjustOptions,
+    priors: Priors = NO_PRIORS,
+    points_are_predicted: bool = False,
+    intrinsics: IntrinsicsSigma | None = None,
+) -> PoseEstimate:
+    """The estimate with the covariance of its pose, and the evidence of errors of its intrinsics.
+
+    Args:
+        support: the pose's support, with an estimate of any stage.
+        scale: its metric scale, whose deviation is used as its relative standard deviation.
+        options: of the adjustment.
+        priors: on the pose; those that were used reduce the covariance.
+        points_are_predicted: whether the structure's points are predicted by the reconstruction, rather than
+            triangulated from the references' poses.
+        intrinsics: standard deviations of the query's intrinsics; None for the defaults.
+
+    Raises:
+        ValueError: there is no estimate.
+    """
+    estimate, references = support.estimate, support.references
+    if estimate is None:
+        raise ValueError("support.estimate must not be None")
+    if estimate.is_adjusted:
+        return estimate
+    used = np.flatnonzero(estimate.errors_px < options.max_error_px)
+    if len(used) < 3:
+        return estimate
+    pose, is_initial = estimate.world_from_camera, estimate.stage is PoseStage.INITIAL
+    given = AdjustInput(support.query, references, support.structure, support.matches, options)
+    problem, bundle = pose_problem(given, used, pose)
+    terms = intrinsics_terms(support.query, references, intrinsics)
+    errors = errors_of_pose(support.query, problem, bundle, options, terms, is_initial)
+    if errors is None:
+        return estimate
+    covariance, evidence = errors
+    if is_initial or points_are_predicted:
+        centroid = np.mean([it.world_from_camera.translation for it in references], axis=0)
+        covariance = covariance + scale_covariance(pose, centroid, scale.deviation)
+    covariance = priors.consistent(estimate.prior_checks).sharpened(covariance, pose)
+    found = replace(estimate, covariance=covariance, intrinsics=evidence)
+    if evidence is None:
+        return found
+    # The pose stays as it is; but an error is not seen in full before it is estimated.
+    estimated = recalibrated(given, found, NO_PRIORS, terms[2], (problem, bundle, used)).intrinsics
+    if estimated is not None and estimated.contradicted(options.contradiction, terms[2]).any():
+        found = replace(found, intrinsics=estimated)
+    return found

@@ -1,0 +1,157 @@
+"""Bundle adjustment of cameras and points.
+
+    min  sum_obs rho(|r_o|^2 / sigma_o^2) + xi^T C^-1 xi      (Cauchy's loss)
+
+over the poses of all cameras and the points; xi are the motions of the references away from their given poses. The last
+camera is the query, whose pose may have priors. Its intrinsics may be unknowns too: four errors with a prior of mean 0
+(see `intrinsics`). They move its keypoints, which is linear, so that derivatives by poses and points do not depend on
+them. The points are eliminated (Schur complement), which leaves a dense system of 6 unknowns per camera and those 4.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array
+
+from ..features.tracks import Tracks
+from ..features.views import PosedView
+from ..optim.optimize import cauchy_cost, solve_step
+from ..optim.perturbation import world_jacobian
+from ..structure.model import DepthPlanes, Structure
+from ..structure.observations import Observations
+from ..structure.structure import observe
+from .normal_equations import NormalEquations, ViewColumns
+from .priors import NO_PRIORS, Priors
+from .unknowns import Bundle, Poses
+
+
+@dataclass(frozen=True, eq=False)
+class BundleProblem:
+    """The cost and its derivatives; see `optimize.Problem`.
+
+    Attributes:
+        observations: observations of the points in all views; the views' poses are not used.
+        view: (O,) index of the view of each observation.
+        given: poses of the references.
+        information: C^-1, (6 (V - 1), 6 (V - 1)), of the prior on the references' poses; 0 leaves them free.
+        loss_scale_sigma: scale of the Cauchy loss, in standard deviations.
+        priors: priors on the query's pose.
+        prior_weight: factor on their cost, relative to that of the observations.
+        keypoint_motion: (O_q, 2, I) of the query's observations, in their order, by errors of its intrinsics, in
+            standard deviations; I = 0 if they are no unknowns.
+        intrinsics_information: (I,) inverse variances of the prior on these errors.
+        intrinsics_offset: (I,) errors of the intrinsics that are removed already; the prior's mean is minus these.
+        planes: planes near which the points lie by stored depths, at the references' given poses: motions of these by
+            millimetres do not matter for depths known to centimetres.
+        least_curvature: least curvature of the loss along a residual, as a share of its weight. Along a residual
+            Cauchy's loss curves less than its weight says, so below 1 steps are longer and fewer (Triggs et al.,
+            Bundle adjustment: a modern synthesis, 2000); the minimum is the same.
+    """
+
+    observations: Observations
+    view: NDArray[np.intp]
+    given: Poses
+    information: Array
+    loss_scale_sigma: float
+    priors: Priors = NO_PRIORS
+    prior_weight: float = 1.0
+    keypoint_motion: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))
+    intrinsics_information: Array = field(default_factory=lambda: np.zeros(0))
+    intrinsics_offset: Array = field(default_factory=lambda: np.zeros(0))
+    planes: DepthPlanes | None = None
+    least_curvature: float = 1.0
+
+    @cached_property
+    def by_view(self) -> ViewColumns:
+        """The observations sorted by view, in columns."""
+        sorted_by_view = ViewColumns.of(self.observations, self.view, len(self.given.rotation) + 1, self.planes)
+        return sorted_by_view.with_keypoint_motion(self.keypoint_motion)
+
+    def replaced(self, **changes: Any) -> BundleProblem:
+        """Returns the problem with other priors or `keypoint_motion`; the same observations are not sorted again."""
+        other, by_view = replace(self, **changes), self.by_view
+        if "keypoint_motion" in changes:
+            by_view = by_view.with_keypoint_motion(other.keypoint_motion)
+        vars(other)["by_view"] = by_view
+        return other
+
+    @property
+    def query_rows(self) -> slice:
+        """The rows of the query's pose in the normal equations; those of its intrinsics follow."""
+        count = 6 * len(self.given.rotation)
+        return slice(count, count + 6)
+
+    def reference_motion(self, bundle: Bundle) -> Array:
+        """Motion (V - 1, 6) of each reference from its given pose."""
+        return bundle.poses[:-1].motion_from(self.given)
+
+    def cost(self, bundle: Bundle) -> float:
+        """Cost of the values; NaN if a point is behind a camera."""
+        squared = (self.by_view.linearized(bundle)[0] ** 2).sum(axis=0)
+        motion = self.reference_motion(bundle).ravel()
+        prior = float(motion @ self.information @ motion)
+        if bundle.intrinsics.size:
+            prior += float(self.intrinsics_information @ (bundle.intrinsics + self.intrinsics_offset) ** 2)
+        if self.priors:
+            prior += self.prior_weight * self.priors.cost(bundle.world_from_query)
+        if self.by_view.planes is not None:
+            prior += self.by_view.planes.cost(bundle.points)
+        return cauchy_cost(squared, self.loss_scale_sigma) + prior
+
+    def linearize(self, bundle: Bundle) -> NormalEquations:
+        """See `optimize.Problem`."""
+        equations = self.by_view.equations(bundle, self.loss_scale_sigma, self.least_curvature)
+        query = self.query_rows
+        references, intrinsics = slice(query.start), slice(query.stop, None)
+        equations.pose_block[references, references] += self.information
+        equations.pose_gradient[references] += self.information @ self.reference_motion(bundle).ravel()
+        if bundle.intrinsics.size:
+            errors = bundle.intrinsics + self.intrinsics_offset
+            equations.pose_block[intrinsics, intrinsics] += np.diag(self.intrinsics_information)
+            equations.pose_gradient[intrinsics] += self.intrinsics_information * errors
+        if self.priors:
+            pose = bundle.world_from_query
+            gradient, information = self.priors.gradient_and_information(pose)
+            to_world = world_jacobian(pose)
+            equations.pose_gradient[query] += self.prior_weight * to_world.T @ gradient
+            equations.pose_block[query, query] += self.prior_weight * to_world.T @ information @ to_world
+        return equations
+
+    def step(self, bundle: Bundle, equations: NormalEquations, damping: float) -> Bundle | None:
+        """See `optimize.Problem`."""
+        matrix, gradient, points = equations.reduced(damping)
+        motion = solve_step(matrix, gradient)
+        if motion is None:
+            return None
+        cameras = self.query_rows.stop
+        return bundle.moved(motion[:cameras].reshape(-1, 6), points.steps(motion), motion[cameras:])
+
+    def query_motion_sigma(self, before: Bundle, after: Bundle, equations: NormalEquations) -> float:
+        """Length of the query's motion, intrinsics included, in standard deviations by the residuals.
+
+        These are as if points and references were known, so the motion is no longer than this.
+        """
+        motion = after.poses[-1:].motion_from(before.poses[-1:]).ravel()
+        step = np.concatenate([motion, after.intrinsics - before.intrinsics])
+        unknowns = slice(self.query_rows.start, None)
+        return math.sqrt(step @ equations.pose_block[unknowns, unknowns] @ step)
+
+
+def bundle_of(
+    tracks: Tracks, views: Sequence[PosedView], structure: Structure, chosen: NDArray[np.bool_] | NDArray[np.intp]
+) -> tuple[Observations, Bundle, float]:
+    """Sets up an adjustment: observations, initial bundle and median depth of the chosen points of a structure, metres.
+
+    The tracks of these points are over the views: the references, then the query.
+    """
+    observations = observe(tracks, views, structure.noise)
+    bundle = Bundle(Poses.of(view.world_from_camera for view in views), structure.x_in_world[chosen])
+    return observations, bundle, float(np.median(observations.in_camera(bundle.points)[2]))

@@ -1,0 +1,258 @@
+"""Normal equations of a bundle adjustment, from observations sorted by view, and the elimination of the points."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_array
+
+from mapless.geometry import Array
+
+from ..features.tracks import summed
+from ..optim.optimize import apply_columns, cauchy_weight, columns, symmetric_products, take
+from ..optim.perturbation import pose_columns
+from ..structure.model import DepthPlanes
+from ..structure.observations import Observations
+from .unknowns import Bundle
+
+
+@dataclass(frozen=True, eq=False)
+class ViewColumns:
+    """Observations sorted by view, one row for each component; column o is one observation (see `optimize`).
+
+    Attributes:
+        point, view: (O,) indices of each observation's point and view.
+        view_count: number of views.
+        focal, offset: (2, O) as in `Observations`.
+        by_intrinsics: (2, I, O_q) derivative of the last view's residuals by errors of its intrinsics.
+        planes: planes of the points, if any have stored depths.
+    """
+
+    point: NDArray[np.intp]
+    view: NDArray[np.intp]
+    view_count: int
+    focal: Array
+    offset: Array
+    by_intrinsics: Array = field(default_factory=lambda: np.zeros((2, 0, 0)))
+    planes: DepthPlanes | None = None
+
+    @staticmethod
+    def of(
+        observations: Observations, view: NDArray[np.intp], view_count: int, planes: DepthPlanes | None = None
+    ) -> ViewColumns:
+        """Makes the columns from rows and the view (O,) of each; `planes` as in BundleProblem."""
+        order = np.argsort(view, kind="stable")
+        focal, offset = take(observations.focal, order), take(observations.offset, order)
+        return ViewColumns(observations.point[order], view[order], view_count, focal, offset, planes=planes)
+
+    def with_keypoint_motion(self, keypoint_motion: Array) -> ViewColumns:
+        """Returns the columns with the `keypoint_motion` (O_q, 2, I) of a BundleProblem."""
+        return replace(self, by_intrinsics=np.ascontiguousarray(np.moveaxis(keypoint_motion, 0, 2)))
+
+    @cached_property
+    def parts(self) -> tuple[slice, ...]:
+        """Range of the columns of each view."""
+        ends = np.searchsorted(self.view, np.arange(self.view_count + 1)).tolist()
+        return tuple(slice(*part) for part in itertools.pairwise(ends))
+
+    @cached_property
+    def sums(self) -> Any:
+        """(P, O) sparse: a product with it sums over the observations of each point."""
+        count = len(self.point)
+        shape = int(self.point.max(initial=-1)) + 1, count
+        return csc_array((np.ones(count), self.point, np.arange(count + 1)), shape=shape)
+
+    def of_points(self, chosen: NDArray[np.bool_]) -> ViewColumns:
+        """Returns the observations of some of the points (P,), with the points numbered anew."""
+        kept = np.flatnonzero(chosen[self.point])
+        point, view = (np.cumsum(chosen) - 1)[self.point[kept]], self.view[kept]
+        by_intrinsics = self.by_intrinsics
+        if by_intrinsics.size:
+            begin = self.parts[-1].start
+            by_intrinsics = take(by_intrinsics, kept[np.searchsorted(kept, begin) :] - begin)
+        columns = take(self.focal, kept), take(self.offset, kept), by_intrinsics
+        return ViewColumns(point, view, self.view_count, *columns, self.planes and self.planes[chosen])
+
+    def linearized(self, bundle: Bundle) -> tuple[Array, Array, Array]:
+        """Residuals (2, O), NaN behind the camera, and derivatives by the point (2, 3, O) and the pose (2, 6, O).
+
+        They are kept with the bundle: its cost needs the residuals, and few bundles are not linearized too.
+        """
+        known: tuple[ViewColumns, tuple[Array, Array, Array]] | None = vars(bundle).get("_linearized")
+        if known is None or known[0] is not self:
+            vars(bundle)["_linearized"] = known = self, self._linearized(bundle)
+        return known[1]
+
+    def _linearized(self, bundle: Bundle) -> tuple[Array, Array, Array]:
+        rotation = take(columns(bundle.poses.rotation), self.view)
+        x_in_world = take(np.ascontiguousarray(bundle.points.T), self.point)
+        x, y, z = apply_columns(rotation, x_in_world) + take(bundle.poses.translation.T, self.view)
+        inverse_depth = 1 / np.where(z > 0, z, np.nan)
+        ideal, slope = np.stack([x, y]) * inverse_depth, self.focal * inverse_depth
+        by_point = slope[:, None] * (rotation[:2] - ideal[:, None] * rotation[2])
+        by_pose = pose_columns(ideal, self.focal, inverse_depth)
+        residual = ideal * self.focal + self.offset
+        if bundle.intrinsics.size:
+            residual[:, self.parts[-1]] += np.einsum("aio,i->ao", self.by_intrinsics, bundle.intrinsics)
+        return residual, by_point, by_pose
+
+    def equations(
+        self,
+        bundle: Bundle,
+        loss_scale_sigma: float,
+        least_curvature: float = 1.0,
+        linearized: tuple[Array, Array, Array] | None = None,
+        weight: Array | None = None,
+    ) -> NormalEquations:
+        """The normal equations of the observations alone, for a Cauchy loss of this scale.
+
+        `linearized` is the result of the method of that name, if it is known, and `weight` (O,) replaces the loss's.
+
+        With `least_curvature` below 1 derivatives J become (I - (1 - c) r r^T / |r|^2) J and residuals r become r / c,
+        which leaves the gradient as it is. For a weight w the loss curves by w (2 w - 1) along r. But c^2 is least at
+        w = 1/2 and 1 far away, where the curvature is negative.
+        """
+        residual, by_point, by_pose = linearized or self.linearized(bundle)
+        squared, last, by_intrinsics = (residual**2).sum(axis=0), self.parts[-1], self.by_intrinsics
+        weight = cauchy_weight(squared, loss_scale_sigma) if weight is None else weight
+        if least_curvature < 1:
+            shrink = np.sqrt(1 - 4 * (1 - least_curvature) * weight * (1 - weight))
+            along = residual * ((1 - shrink) / np.maximum(squared, 1e-12))
+            by_point = by_point - residual[:, None] * (along[:, None] * by_point).sum(axis=0)
+            by_pose = by_pose - residual[:, None] * (along[:, None] * by_pose).sum(axis=0)
+            if by_intrinsics.size:
+                its_part = (along[:, None, last] * by_intrinsics).sum(axis=0)
+                by_intrinsics = by_intrinsics - residual[:, None, last] * its_part
+            residual = residual / shrink
+        weighted_point, weighted_pose = by_point * weight, by_pose * weight
+        weighted_intrinsics = by_intrinsics * weight[last] if by_intrinsics.size else by_intrinsics
+        blocks, gradients = [], []
+        for part in self.parts:
+            (x, y), (weighted_x, weighted_y) = by_pose[:, :, part], weighted_pose[:, :, part]
+            if part is last and by_intrinsics.size:
+                x, y = np.concatenate([by_pose[:, :, part], by_intrinsics], axis=1)
+                weighted_x, weighted_y = np.concatenate([weighted_pose[:, :, part], weighted_intrinsics], axis=1)
+            blocks.append(weighted_x @ x.T + weighted_y @ y.T)
+            gradients.append(weighted_x @ residual[0, part] + weighted_y @ residual[1, part])
+        terms = symmetric_products(weighted_point, by_point), (weighted_point * residual[:, None]).sum(axis=0)
+        point_block, point_gradient = np.split(summed(self.sums, np.concatenate(terms)), [6])
+        if self.planes is not None:
+            normal = self.planes.normal.T
+            weighted = normal * self.planes.information
+            point_block += symmetric_products(weighted[None], normal[None])
+            point_gradient += weighted * self.planes.distance(bundle.points)
+        pose_block, pose_gradient = _block_diagonal(blocks), np.concatenate(gradients)
+        by_camera = weighted_pose, weighted_intrinsics
+        return NormalEquations(self, pose_block, pose_gradient, point_block, point_gradient, by_point, *by_camera)
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations:
+    """Normal equations [B E; E^T C] [d_pose; d_point] = -[g; h]: C is block-diagonal, poses include the intrinsics.
+
+    Attributes:
+        columns: the observations.
+        pose_block: B, (6 V + I, 6 V + I).
+        pose_gradient: g, (6 V + I,).
+        point_block: C, (6, P) as in `optimize.SYMMETRIC`.
+        point_gradient: h, (3, P).
+        by_point: A, (2, 3, O), derivatives of the residuals by the points.
+        weighted_pose: w J, (2, 6, O), weighted derivatives by the poses. J^T w A is the block of E of an observation.
+        weighted_intrinsics: (2, I, O_q), the same by the query's intrinsics.
+    """
+
+    columns: ViewColumns
+    pose_block: Array
+    pose_gradient: Array
+    point_block: Array
+    point_gradient: Array
+    by_point: Array
+    weighted_pose: Array
+    weighted_intrinsics: Array
+
+    def reduced(self, damping: float) -> tuple[Array, Array, EliminatedPoints]:
+        """Eliminates the points: B - E C^-1 E^T (U, U), g - E C^-1 h (U,), U = 6 V + I; `damping` enlarges diagonals.
+
+        With Cholesky's C = L L^T the products are those of F = E L^-T with itself and with L^-1 h.
+        """
+        damped = self.point_block.copy()
+        damped[:3] *= 1 + damping
+        factor = _cholesky(damped)
+        gradient = np.stack(_forward(factor, self.point_gradient))
+        seen = self.columns
+        by_point = np.stack(_forward(take(factor, seen.point), np.swapaxes(self.by_point, 0, 1)), axis=1)
+        by_observation = np.einsum("kao,kbo->abo", self.weighted_pose, by_point).reshape(18, -1)
+        by_view = np.zeros((len(seen.parts), 18, self.point_gradient.shape[1]))
+        for cross, part in zip(by_view, seen.parts, strict=True):
+            cross[:, seen.point[part]] = by_observation[:, part]  # one observation per point and view
+        wide = by_view.reshape(6 * len(by_view), -1)
+        if self.weighted_intrinsics.size:
+            last = seen.parts[-1]
+            of_query = np.einsum("kao,kbo->abo", self.weighted_intrinsics, by_point[:, :, last])
+            its_rows = np.zeros((*of_query.shape[:2], self.point_gradient.shape[1]))
+            its_rows[:, :, seen.point[last]] = of_query
+            wide = np.concatenate([wide, its_rows.reshape(len(of_query), -1)])
+        matrix = self.pose_block + damping * np.diag(np.diag(self.pose_block)) - wide @ wide.T
+        return matrix, self.pose_gradient - wide @ gradient.ravel(), EliminatedPoints(factor, gradient, wide, by_point)
+
+
+@dataclass(frozen=True, eq=False)
+class EliminatedPoints:
+    """What is needed to compute the points once the cameras are known.
+
+    Attributes:
+        factor: L (6, P), as in `optimize.SYMMETRIC`.
+        gradient: L^-1 h, (3, P).
+        cross: E L^-T, (U, 3 P).
+        by_point: A L^-T, (2, 3, O), each with the factor of its point.
+    """
+
+    factor: Array
+    gradient: Array
+    cross: Array
+    by_point: Array
+
+    def steps(self, motion: Array) -> Array:
+        """Steps (P, 3) of the points that follow from a motion (U,) of the cameras."""
+        xx, yy, zz, xy, xz, yz = self.factor
+        x, y, z = -(self.gradient + (motion @ self.cross).reshape(3, -1))
+        z = z / zz
+        y = (y - yz * z) / yy
+        return np.stack([(x - xy * y - xz * z) / xx, y, z], axis=1)
+
+
+def _block_diagonal(blocks: Sequence[Array]) -> Array:
+    """Makes a block-diagonal matrix; SciPy's function takes six times as long for a dozen small blocks."""
+    ends = list(itertools.accumulate(map(len, blocks), initial=0))
+    matrix = np.zeros((ends[-1], ends[-1]))
+    for block, begin, end in zip(blocks, ends[:-1], ends[1:], strict=True):
+        matrix[begin:end, begin:end] = block
+    return matrix
+
+
+def _cholesky(matrices: Array) -> Array:
+    """Cholesky factors L (6, P) of positive matrices (6, P), both as in `optimize.SYMMETRIC`; NaN where singular."""
+    xx, yy, zz, xy, xz, yz = matrices
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first = np.sqrt(xx)
+        xy, xz = xy / first, xz / first
+        second = yy - xy * xy
+        yz = (yz - xz * xy) / np.sqrt(second)
+        third = zz - xz * xz - yz * yz
+    solvable = xx * second * third > 1e-14 * np.maximum(np.maximum(xx, yy), zz) ** 3
+    diagonal = np.sqrt(np.where(solvable, np.stack([xx, second, third]), np.nan))
+    return np.concatenate([diagonal, [xy, xz, yz]])
+
+
+def _forward(factor: Array, vectors: Array) -> list[Array]:
+    """Solves L y = b for vectors b (3, ..., P); returns the components of y."""
+    xx, yy, zz, xy, xz, yz = factor
+    x = vectors[0] / xx
+    y = (vectors[1] - xy * x) / yy
+    return [x, y, (vectors[2] - xz * x - yz * y) / zz]

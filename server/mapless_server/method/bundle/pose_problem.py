@@ -1,0 +1,338 @@
+"""The problem that adjusts one query's pose, and the estimate at its optimum.
+
+    min  sum_obs rho(|r_o|^2 / sigma_o^2) + xi^T C^-1 xi,
+
+over the query's pose, its points and small motions xi of the references, which a prior holds to their given poses. Its
+covariance C, by which neighbours move together and far references are held less, is found for each query from the
+references' observations (below). The points are eliminated (see `bundle`).
+
+A given pose has an error of its own (a marker, a surveyor's reading) and one that it shares with its neighbours and
+that drifts with the distance (odometry, the lens model, the scale of a reconstruction). A query's pose is known
+relative to the references around it, so what counts are the references' errors relative to the place of the query, x_q.
+The drift is modelled as a random walk over space, whose variance grows in proportion to the distance; then errors i and
+j have the covariance
+
+    C_ij = a^2 delta_ij + b^2 (|x_i - x_q| + |x_j - x_q| - |x_i - x_j|) / 2 d,
+
+in units of the structure's noise in the image (a shift by depth / focal length, or a rotation by 1 / focal length, for
+each pixel), where d is the median distance between two references that observe the points. So references near the query
+hold it, far ones hold little, and several far ones that are neighbours no more than one of them.
+
+The sizes a and b are the most probable ones under the observations of the references. At the given poses, with points
+and query eliminated from the normal equations of the adjustment, the gradient g of the references' motions has the
+covariance S + S C S, where S is the matrix. Where references share little, the prior of a and b decides.
+
+The random walk is the linear variogram of geostatistics (Matheron, Principles of geostatistics, 1963).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, RigidTransform
+
+from ..features.views import PosedView, View
+from ..optim.bounds import check_bounds
+from ..optim.optimize import MinimizeOptions, minimize
+from ..optim.perturbation import reprojection_errors_px, world_jacobian
+from ..structure.model import PointMatches, Structure
+from ..structure.structure import StructureOptions, tracks_with_query
+from .bundle import BundleProblem, bundle_of
+from .dispersion import UncertaintyOptions, disperse, dispersed_covariance
+from .estimate import PoseEstimate, PoseStage
+from .intrinsics import ContradictionOptions, IntrinsicsEvidence, intrinsics_evidence, keypoint_motion
+from .normal_equations import NormalEquations
+from .unknowns import Bundle
+
+LEAST_DAMPING = 1e-9
+"""Keeps the points determined where they are eliminated at the given poses."""
+
+LEAST_EIGENVALUE = 1e-6
+"""Directions with a smaller share of the largest eigenvalue are not observed: motions of the references as a whole."""
+LEAST_SPACING = 0.05
+"""Smallest d, as a share of the depth of the points: references at one place have no distance to measure drift by."""
+
+OWN = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
+"""Values of a that are tried, in units of the structure's noise. The smallest is that of a reconstruction from these
+very photographs."""
+DRIFT = (0.1, 0.2, 0.4, 1.0, 2.0, 4.0)
+"""Values of b that are tried."""
+USUAL_OWN, USUAL_DRIFT, PRIOR_LOG = 0.1, 0.4, 1.5
+"""Medians of the priors of a and b, log-normal and wide, and the standard deviation of their logarithms: ten references
+determine both, three do not. Reconstructions are smooth, so without evidence the poses drift."""
+OWN_INFLATION, DRIFT_INFLATION = 1.5, 2.0
+"""Factors on the a and b that are found from residuals. Keypoints move with the viewpoint, by the same for far
+references, so the drift is larger than residuals say. With 1 the median is 0.167 instead of 0.150 cm in a kitchen, 0.55
+instead of 0.53 on a drive. Where the errors are all the poses' own, more of the drift makes the answer worse."""
+
+
+@dataclass(frozen=True)
+class AdjustOptions:
+    """Options of the adjustment.
+
+    Attributes:
+        loss_scale_sigma: scale of the Cauchy loss, with which the influence of outliers vanishes.
+        error_inflation: factor by which standard deviations from the sum over residuals are typically too small; it
+            sets the weight of priors. The answer's covariance does not use it (see `uncertainty`).
+        inlier_px: as in the pose solver; the inliers of the answer are those of its own pose.
+        min_kept_share: an adjustment that keeps a smaller share of the inliers has diverged and is not used.
+        max_error_px: matches with a larger error under the initial pose are not used.
+        iterations: largest number of Levenberg-Marquardt steps.
+        min_decrease: stop when a step lowers the cost by a smaller share.
+        min_motion_sigma: stop when a step moves the pose by less, in standard deviations by the residuals; errors are
+            several of these. In a kitchen three steps are made, and poses differ from those of forty by 0.07 standard
+            deviations.
+        least_curvature: see `BundleProblem`. With 1 it takes one or two steps more; less than 0.5 saves none.
+        suspicion: when an error of the intrinsics counts in full in the covariance.
+        trial: when it is tried to estimate the intrinsics with the pose. A large error makes residuals large, where the
+            loss hardly curves: with the intrinsics as given it seems undetermined, and is not where it is estimated.
+        agreeing_share: or when fewer of the matches are inliers. In a kitchen with five references, where k1 was off by
+            0.3, one pose of six aroused suspicion; of the others this finds four.
+        contradiction: when this estimate is used.
+        rounds: how often, at most, the query's keypoints are corrected by an estimated parameter.
+        min_added_share: keypoints that the query shares with references, and no point has, are adjusted too where there
+            are so many for each inlier. Errors of 613 photographs of ten places are 0.86 times as large with them;
+            where there were fewer, those of 152 are 1.06 times as large.
+        query_points: options of triangulating these.
+        uncertainty: options of the answer's covariance.
+    """
+
+    loss_scale_sigma: float = 1.4
+    error_inflation: float = 2.0
+    inlier_px: float = 4.0
+    min_kept_share: float = 0.8
+    max_error_px: float = 8.0
+    iterations: int = 8
+    min_decrease: float = 1e-5
+    min_motion_sigma: float = 0.25
+    least_curvature: float = 0.5
+    suspicion: ContradictionOptions = field(default_factory=lambda: ContradictionOptions(2.0, 0.06, 0.06, 0.15))
+    trial: ContradictionOptions = field(default_factory=lambda: ContradictionOptions(2.0, *[math.inf] * 3))
+    contradiction: ContradictionOptions = field(default_factory=ContradictionOptions)
+    agreeing_share: float = 0.6
+    rounds: int = 4
+    min_added_share: float = 0.4
+    query_points: StructureOptions = field(default_factory=StructureOptions)
+    uncertainty: UncertaintyOptions = field(default_factory=UncertaintyOptions)
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "inlier_px min_kept_share loss_scale_sigma max_error_px agreeing_share", above=0)
+        check_bounds(self, "iterations min_decrease", above=0)
+        check_bounds(self, "min_motion_sigma min_added_share", at_least=0)
+        check_bounds(self, "least_curvature", above=0, at_most=1)
+        check_bounds(self, "rounds", at_least=2)  # the last one only reads the photograph again
+
+
+@dataclass(frozen=True, eq=False)
+class AdjustInput:
+    """What a pose is adjusted to.
+
+    Attributes:
+        query: the query.
+        references: the references, in the order of the structure's tracks.
+        structure: metric points.
+        matches: 2D-3D matches of the query with these points.
+        options: of the adjustment.
+    """
+
+    query: View
+    references: Sequence[PosedView]
+    structure: Structure
+    matches: PointMatches
+    options: AdjustOptions
+
+    def errors_px(self, world_from_query: RigidTransform, rows: slice = slice(None)) -> Array:
+        """Reprojection errors (M,) of matches at a pose, pixels; infinite behind the camera."""
+        pixels = self.query.features.keypoints[self.matches.keypoint[rows]].astype(np.float64)
+        x_in_world = self.structure.x_in_world[self.matches.point[rows]]
+        return reprojection_errors_px(self.query.camera, world_from_query, x_in_world, pixels)
+
+    def with_points(self, used: NDArray[np.intp], points: Array) -> "AdjustInput":
+        """Moves the points of the `used` matches to `points` (P, 3), in the order of the structure."""
+        x_in_world = self.structure.x_in_world.copy()
+        x_in_world[np.unique(self.matches.point[used])] = points
+        return replace(self, structure=replace(self.structure, x_in_world=x_in_world))
+
+
+def pose_problem(
+    given: AdjustInput, used: NDArray[np.intp], world_from_query: RigidTransform, information: Array | None = None
+) -> tuple[BundleProblem, Bundle]:
+    """Sets up the problem of one query without priors, and its start; `used` are the indices of the matches to use.
+
+    `information` is that of the prior on the references' poses, which is estimated if None.
+    """
+    query, references, structure, matches = given.query, given.references, given.structure, given.matches
+    views = [*references, PosedView("", "", query, world_from_query)]
+    tracks, chosen = tracks_with_query(structure, matches.point[used], matches.keypoint[used], len(references))
+    observations, start, depth_m = bundle_of(tracks, views, structure, chosen)
+    poses = start.poses[:-1]
+    free = np.zeros((6 * len(references),) * 2)
+    planes = structure.planes[chosen] if structure.planes is not None else None
+    problem = BundleProblem(observations, tracks.view, poses, free, given.options.loss_scale_sigma, planes=planes)
+    if information is not None:
+        return problem.replaced(information=information), start
+    centres = np.array([it.world_from_camera.translation for it in references])
+    observing = np.unique(tracks.view)[:-1]  # the last is the query
+    focal_px = float(np.median([references[i].view.camera.focal_x_px for i in observing]))
+    level_px = structure.noise.level_px
+    errors = pose_errors(centres, poses.rotation, world_from_query.translation, level_px, focal_px, depth_m, observing)
+    matrix, gradient, _ = problem.linearize(start).reduced(LEAST_DAMPING)
+    own, drift = most_probable(errors, matrix, gradient)
+    covariance = errors.covariance(own, drift)
+    return problem.replaced(information=np.asarray(np.linalg.inv(covariance), np.float64)), start
+
+
+def optimum(problem: BundleProblem, start: Bundle, options: AdjustOptions) -> Bundle:
+    """The values at the minimum of a problem, as near to it as matters for the query's pose."""
+    curved = problem.replaced(least_curvature=options.least_curvature)
+
+    def is_near(before: Bundle, after: Bundle, equations: NormalEquations) -> bool:
+        return curved.query_motion_sigma(before, after, equations) < options.min_motion_sigma
+
+    return minimize(curved, start, MinimizeOptions(options.iterations, options.min_decrease), is_near)
+
+
+def with_intrinsics(problem: BundleProblem, bundle: Bundle, query: View) -> tuple[BundleProblem, Bundle]:
+    """Adds errors of the query's intrinsics to the unknowns of a problem, without a prior on them."""
+    is_query = problem.view == len(problem.given.rotation)
+    observations = problem.observations
+    motion = keypoint_motion(query.camera, query.distortion, observations.pixel[:, is_query].T)
+    motion = motion / observations.sigma_px[is_query, None, None]
+    wider = problem.replaced(keypoint_motion=motion, intrinsics_information=np.zeros(4), intrinsics_offset=np.zeros(4))
+    return wider, replace(bundle, intrinsics=np.zeros(4))
+
+
+def shares_camera(query: View, references: Sequence[PosedView]) -> bool:
+    """Whether most references are of the query's camera."""
+    return 2 * sum(query.has_camera_of(it.view) for it in references) > len(references)
+
+
+def adjusted_estimate(
+    given: AdjustInput,
+    used: NDArray[np.intp],
+    estimate: PoseEstimate,
+    bundle: Bundle,
+    errors: tuple[Array, IntrinsicsEvidence | None] | None,
+) -> PoseEstimate | None:
+    """Returns the estimate at the optimum; None if it has diverged. `errors` are what `errors_of_pose` returns."""
+    pose, options = bundle.world_from_query, given.options
+    errors_px = given.with_points(used, bundle.points).errors_px(pose)
+    inliers = errors_px < options.inlier_px
+    if errors is None or inliers.sum() < max(1, options.min_kept_share * estimate.inliers.sum()):
+        return None
+    return PoseEstimate(pose, PoseStage.REFINED, inliers, errors_px, errors[0], is_adjusted=True, intrinsics=errors[1])
+
+
+def errors_of_pose(
+    query: View,
+    problem: BundleProblem,
+    bundle: Bundle,
+    options: AdjustOptions,
+    intrinsics: tuple[View, Array, Array, Array],
+    is_offset: bool = False,
+) -> tuple[Array, IntrinsicsEvidence | None] | None:
+    """A pose's covariance without scale and priors, and the evidence of errors of its intrinsics; None for neither.
+
+    `intrinsics`: the query with its intrinsics as given, the errors that are removed from them, and the standard
+    deviations `prior_sigma` and `held_sigma` of `intrinsics_evidence`. `is_offset` as for `dispersed_covariance`.
+    """
+    pose = bundle.world_from_query
+    dispersion = disperse(*with_intrinsics(problem, bundle, query), options.uncertainty.max_matches)
+    if dispersion is None:
+        return None
+    assert dispersion.intrinsics is not None
+    covariance = dispersed_covariance(dispersion, pose, options.uncertainty, is_offset)
+    factors = options.error_inflation, options.uncertainty.region_factor, options.suspicion
+    evidence = intrinsics_evidence(dispersion.intrinsics, *intrinsics, *factors, world_jacobian(pose))
+    return (covariance if evidence is None else covariance + evidence.pose_covariance), evidence
+
+
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """The two parts of the covariance of K references' errors, each (6 K, 6 K), with a = b = 1.
+
+    The errors are left perturbations (v, w) of camera_from_world, metres and radians.
+    """
+
+    own: Array
+    drift: Array
+
+    def covariance(self, own: float, drift: float) -> Array:
+        """The covariance C (6 K, 6 K) for sizes a = `own` and b = `drift`."""
+        return own**2 * self.own + drift**2 * self.drift
+
+
+def pose_errors(
+    centres: Array,
+    rotations: Array,
+    query_centre: Array,
+    level_px: float,
+    focal_px: float,
+    depth_m: float,
+    observing: NDArray[np.intp] | None = None,
+) -> PoseErrors:
+    """Computes the two parts of the covariance of the errors of K references.
+
+    Centres (K, 3) and (3,) of the query are in metres, rotations (K, 3, 3) are camera_from_world. `level_px` is the
+    noise of the structure, `depth_m` the median depth of the points. References that are not `observing` points (None
+    for all) may be in another part of the scene, and do not count for d.
+    """
+    unit = level_px / focal_px * np.array([depth_m, 1.0])
+    between = np.linalg.norm(centres[:, None] - centres, axis=2)
+    to_query = np.linalg.norm(centres - query_centre, axis=1)
+    distances = [between[i, j] for i, j in combinations(range(len(centres)) if observing is None else observing, 2)]
+    spacing = max(float(np.median(distances)) if distances else 0.0, LEAST_SPACING * depth_m)
+    drift = (to_query[:, None] + to_query - between) / (2 * spacing)
+    return PoseErrors(_of_motions(np.eye(len(centres)), rotations, unit), _of_motions(drift, rotations, unit))
+
+
+def _of_motions(covariance: Array, rotations: Array, unit: Array) -> Array:
+    """Covariance (6 K, 6 K) of left perturbations, from that (K, K) of shifts and rotations along each world axis."""
+    count = len(rotations)
+    turned = np.einsum("ij,iab,jcb->iajc", covariance, rotations, rotations)
+    result = np.zeros((count, 2, 3, count, 2, 3))
+    for kind in range(2):
+        result[:, kind, :, :, kind] = unit[kind] ** 2 * turned
+    return result.reshape(6 * count, 6 * count)
+
+
+def most_probable(errors: PoseErrors, matrix: Array, gradient: Array) -> tuple[float, float]:
+    """Most probable a and b, from normal equations of 6 K unknowns and, last, the query's, at the given poses."""
+    finite = bool(np.isfinite(matrix).all() and np.isfinite(gradient).all())
+    if not finite:
+        return OWN_INFLATION * USUAL_OWN, DRIFT_INFLATION * USUAL_DRIFT
+    project, data = _whitened(*_without_query(matrix, gradient, len(errors.own)), np.sqrt(np.diag(errors.own)))
+    own, drift = project @ errors.own @ project.T, project @ errors.drift @ project.T
+    sizes = np.array([(a, b) for a in OWN for b in DRIFT])
+    squares = sizes[:, :, None, None] ** 2
+    # The last row of a Cholesky factor [L 0; (L^-1 d)^T .] of the matrix bordered by d.
+    bordered = np.empty((len(sizes), len(data) + 1, len(data) + 1))
+    bordered[:, :-1, :-1] = np.eye(len(data)) + squares[:, 0] * own + squares[:, 1] * drift
+    bordered[:, -1, :-1] = bordered[:, :-1, -1] = data
+    bordered[:, -1, -1] = 1 + data @ data
+    factor = np.linalg.cholesky(bordered)
+    error = factor[:, -1, :-1]
+    log_determinant = np.log(np.diagonal(factor, axis1=1, axis2=2)[:, :-1]).sum(axis=1)
+    usual = np.array([USUAL_OWN, USUAL_DRIFT])
+    unusual = (np.log(sizes / usual) / PRIOR_LOG) ** 2
+    best = np.argmax(-0.5 * (error**2).sum(axis=1) - log_determinant - 0.5 * unusual.sum(axis=1))
+    return OWN_INFLATION * float(sizes[best, 0]), DRIFT_INFLATION * float(sizes[best, 1])
+
+
+def _without_query(matrix: Array, gradient: Array, n: int) -> tuple[Array, Array]:
+    """Normal equations (n, n), (n,) of the references, with the query's unknowns eliminated."""
+    coupling = matrix[:n, n:]
+    solved = np.linalg.lstsq(matrix[n:, n:], np.column_stack([coupling.T, gradient[n:]]), rcond=None)[0]
+    return matrix[:n, :n] - coupling @ solved[:, :-1], gradient[:n] - coupling @ solved[:, -1]
+
+
+def _whitened(matrix: Array, gradient: Array, unit: Array) -> tuple[Array, Array]:
+    """Linear observations of the errors e: P (M, 6 K) and d (M,), with d = P e + noise of standard deviation 1."""
+    values, vectors = np.linalg.eigh(matrix * unit[:, None] * unit)
+    seen = values > LEAST_EIGENVALUE * max(values[-1], 1.0)
+    root, vectors = np.sqrt(values[seen]), vectors[:, seen]
+    return root[:, None] * vectors.T / unit, vectors.T @ (gradient * unit) / root

@@ -1,0 +1,370 @@
+"""Scale: makes a reconstruction metric with the references' known poses, which gives the query's initial pose.
+
+The paper's scale estimation and pose initialization. Stage 1 compares depths triangulated from the known poses with the
+predicted depths; if the predicted trajectory, scaled by the result, is as large as the known one, this scale is
+adopted. Otherwise stage 2 aligns the predicted trajectory with the known one, and the stage whose scale fits the
+trajectory's size better is used.
+
+=====================  ======================================================
+in the paper           here
+=====================  ======================================================
+S                      `metres_per_unit`
+[R^GT | t^GT]          world_from_camera of the references
+[R^local | t^local]    local_from_camera of the reconstruction's views
+C^GT, C^local          translations of these
+r; d                   `trajectory_radius`; `trajectory_deviation`
+S_tri                  the median of `triangulated_ratios`
+S_traj                 `trajectory_scale`
+R_align; P_q^init      in `estimate_scale`
+=====================  ======================================================
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, RigidTransform, Similarity
+
+from ..features.tracks import keypoint_offsets
+from ..features.views import PosedView, Reconstruction
+from ..optim.bounds import check_bounds
+from ..options import ScaleStrategy
+from ..pairs.correspond import Correspondences
+from ..rejection import Rejection, RejectionReason
+from ..structure.model import MetricScale, ScaleStage, Structure
+from ..structure.observations import keypoint_depths, keypoint_rays
+
+
+@dataclass(frozen=True)
+class ScaleOptions:
+    """Options of the scale; "of the paper" marks the paper's values.
+
+    Attributes:
+        strategy: two stages, as in the paper; or one of them alone, for comparison.
+        min_baseline_m, max_baseline_m: baselines of pairs of references to triangulate (of the paper). Shorter ones do
+            not determine depth, longer ones share few points.
+        min_parallax_deg: least angle between the two rays of a triangulated match. The paper bounds the baseline alone,
+            but 0.3 m does not determine a depth of 100 m: one pixel at a focal length of 800 px is 0.07 deg, so an
+            angle of 1 deg gives a depth to 7 %, about the 5 % of `max_deviation`. 0 keeps every match.
+        min_ratios: fewest depth ratios, two per match, for stage 1. The median of 12 matches errs by 1.25 / sqrt(12) of
+            their spread: 3.6 % for a spread of 10 %, within `max_deviation`. With fewer, stage 2 gives the scale.
+        max_matches: largest number of matches to triangulate, evenly thinned: 32 references can have 400 000, but the
+            median of 20 000 errs by less than a hundredth of their spread.
+        max_deviation: deviation below which the scale of stage 1 is adopted at once (of the paper).
+        inlier_distance_m: largest distance between the aligned and the known centre of a camera that is an inlier of a
+            scale of stage 2 (of the paper).
+        max_pair_cameras: stage 2 tries every pair of at most this many cameras, evenly thinned. All 496 pairs of 32
+            replace the paper's 500 random ones, so that an answer is reproducible.
+        min_radius_m: smallest trajectory radius of the references that determines a scale: poses are accurate to about
+            1 cm.
+        min_radius_per_depth: the same for the predicted trajectory, as a share of the scene's depth. At 0.002 the
+            references' images differ by a parallax of 1.6 px at a focal length of 800 px: the noise of a keypoint.
+        max_metre_sigmas: where the reconstruction's unit is approximately the metre (`Reconstruction.metre_sigma`), a
+            stage whose scale differs from 1 by more standard deviations is not used if the other stage's does not. If
+            both differ, both may be used. With 20 %, three are a factor of 1.8.
+    """
+
+    strategy: ScaleStrategy = ScaleStrategy.TWO_STAGE
+    min_baseline_m: float = 0.3
+    max_baseline_m: float = 10.0
+    min_parallax_deg: float = 1.0
+    min_ratios: int = 24
+    max_matches: int = 20_000
+    max_deviation: float = 0.05
+    inlier_distance_m: float = 0.10
+    max_pair_cameras: int = 32
+    min_radius_m: float = 0.01
+    min_radius_per_depth: float = 0.002
+    max_metre_sigmas: float = 3.0
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "min_baseline_m", above=0, at_most=self.max_baseline_m)
+        check_bounds(self, "min_parallax_deg", at_least=0, below=90)
+        check_bounds(self, "min_ratios max_matches", at_least=1)
+        check_bounds(self, "max_deviation min_radius_per_depth", at_least=0)
+        check_bounds(self, "inlier_distance_m min_radius_m", above=0)
+        check_bounds(self, "max_pair_cameras", at_least=2)
+        check_bounds(self, "max_metre_sigmas", above=0)
+
+    @property
+    def by_triangulation(self) -> bool:
+        """Whether stage 1 may give the scale."""
+        return self.strategy is not ScaleStrategy.TRAJECTORY
+
+    @property
+    def by_trajectory(self) -> bool:
+        """Whether stage 2 may give the scale."""
+        return self.strategy is not ScaleStrategy.TRIANGULATION
+
+
+def estimate_scale(
+    reconstruction: Reconstruction,
+    references: Sequence[PosedView],
+    correspondences: Correspondences,
+    options: ScaleOptions | None = None,
+) -> MetricScale | Rejection:
+    """Estimates the metric scale of a reconstruction, and with it the query's initial pose; by default as the paper.
+
+    The reconstruction's references are in the order of `references`; of the correspondences, those with the query are
+    not used. Returns the scale, with finite values only, or a rejection: NO_USABLE_REFERENCES for fewer than two
+    references, DEGENERATE_REFERENCES for references too close to one another, SCALE_UNRELIABLE if the reconstruction is
+    not finite or the strategy finds no scale. ValueError if it has another number of references.
+    """
+    options, count = options or ScaleOptions(), len(references)
+    depth = keypoint_depths(reconstruction, references)
+    rejection = _check_references(references, options) or _check_finite(reconstruction, depth)
+    if rejection:
+        return rejection
+    known, local = (
+        [it.world_from_camera for it in references],
+        [it.local_from_camera for it in reconstruction.references],
+    )
+    centres_world, centres = (np.stack([it.translation for it in poses]) for poses in (known, local))
+    rejection = _check_depth(trajectory_radius(centres) / float(np.nanmedian(depth)), count, options)
+    if rejection:
+        return rejection
+    confidences = [np.nansum(view.confidence, dtype=np.float64) for view in reconstruction.references]
+    anchor = int(np.argmax(confidences))  # the first of equals
+    rotation = known[anchor].rotation @ local[anchor].rotation.T  # R_align, which needs no scale
+
+    ratios, first, second = np.empty(0), math.nan, math.nan
+    if options.by_triangulation:
+        ratios = triangulated_ratios(references, correspondences, depth, options)
+        first = float(np.median(ratios)) if len(ratios) >= options.min_ratios else math.nan
+    if options.by_trajectory:
+        pairs = pairs_of(count, options.max_pair_cameras)
+        second = trajectory_scale(centres @ rotation.T, centres_world, pairs, options.inlier_distance_m)
+    of_first, of_second = (trajectory_deviation(scale, centres, centres_world) for scale in (first, second))
+    by_triangulation = _is_first_better(first, second, of_first, of_second, reconstruction.metre_sigma, options)
+    deviation = of_first if by_triangulation else of_second
+    scale = first if by_triangulation else second
+    if not math.isfinite(scale):
+        return _no_scale(count, len(ratios), options)
+    # x_in_world = t_anc^GT + S R_align (x_in_local - t_anc^local), also of the query: P_q^init.
+    shift = known[anchor].translation - scale * (rotation @ local[anchor].translation)
+    world_from_local = Similarity(scale, rotation, shift)
+    world_from_query = world_from_local.transform_pose(reconstruction.query.local_from_camera)
+    stage = ScaleStage.TRIANGULATION if by_triangulation else ScaleStage.TRAJECTORY
+    return MetricScale(scale, stage, deviation, anchor, world_from_local, world_from_query)
+
+
+def _is_first_better(
+    first: float, second: float, of_first: float, of_second: float, metre_sigma: float | None, options: ScaleOptions
+) -> bool:
+    """Whether stage 1 gives the scale, from the scales of both stages and their deviations; NaN without a scale."""
+    if metre_sigma is not None:
+        limit = options.max_metre_sigmas * metre_sigma
+        first_agrees, second_agrees = (abs(math.log(scale)) <= limit for scale in (first, second))
+        if first_agrees != second_agrees:
+            return first_agrees
+    # Stage 1 if d_tri is below the bound; otherwise the stage with the smaller d, stage 1 of equals.
+    return of_first < options.max_deviation or of_first <= of_second or math.isnan(of_second)
+
+
+def network_scale(reconstruction: Reconstruction, reference: PosedView) -> MetricScale | Rejection:
+    """Returns the scale of a reconstruction from a single reference whose unit is approximately the metre.
+
+    It is one metre per unit, with the query's pose that follows; SCALE_UNRELIABLE if the reconstruction is not finite.
+    ValueError if the reconstruction's unit is arbitrary, or it has several references.
+    """
+    (view,) = reconstruction.references
+    if reconstruction.metre_sigma is None:
+        raise ValueError("the reconstruction's unit is arbitrary")
+    local, of_query = view.local_from_camera, reconstruction.query.local_from_camera
+    if not np.isfinite(np.stack([local.matrix(), of_query.matrix()])).all():
+        return Rejection(RejectionReason.SCALE_UNRELIABLE, "predicted poses are not finite")
+    if not (np.isfinite(view.point_map).all(axis=-1) & (view.confidence > 0)).any():
+        return Rejection(RejectionReason.SCALE_UNRELIABLE, "no depth of the reference is known")
+    world_from_local = reference.world_from_camera.compose(local.inverse())
+    return MetricScale(
+        1.0,
+        ScaleStage.NETWORK,
+        0.0,
+        0,
+        Similarity(1.0, world_from_local.rotation, world_from_local.translation),
+        world_from_local.compose(of_query),
+        reconstruction.metre_sigma,
+    )
+
+
+def known_scale(
+    structure: Structure,
+    world_from_query: RigidTransform,
+    references: Sequence[PosedView],
+    options: ScaleOptions | None = None,
+) -> MetricScale | Rejection:
+    """The scale of a reconstruction that was triangulated from the known poses, so that it is metric already.
+
+    The structure has at least one point, and its tracks the references' order; any strategy finds this scale, of the
+    frame `unit_frame`. The references' places must be within the options' bounds: NO_USABLE_REFERENCES for fewer than
+    two, DEGENERATE_REFERENCES for references too close to one another.
+    """
+    options = options or ScaleOptions()
+    rejection = _check_references(references, options)
+    if rejection:
+        return rejection
+    poses, tracks = [reference.world_from_camera for reference in references], structure.tracks
+    centres, axes = np.stack([it.translation for it in poses]), np.stack([it.rotation[:, 2] for it in poses])
+    depth_m = ((structure.x_in_world[tracks.point] - centres[tracks.view]) * axes[tracks.view]).sum(axis=1)
+    rejection = _check_depth(trajectory_radius(centres) / float(np.median(depth_m)), len(references), options)
+    if rejection:
+        return rejection
+    frame = unit_frame(poses[0], structure.x_in_world)
+    stage = ScaleStage.TRIANGULATION if options.by_triangulation else ScaleStage.TRAJECTORY
+    anchor = int(np.bincount(tracks.view).argmax())
+    return MetricScale(frame.scale, stage, 0.0, anchor, frame, world_from_query)
+
+
+def unit_frame(world_from_camera: RigidTransform, x_in_world: Array) -> Similarity:
+    """The frame of a camera, scaled so that the median of the points (P, 3) is one unit away: world_from_local."""
+    distance_m = float(np.median(np.linalg.norm(x_in_world - world_from_camera.translation, axis=1)))
+    return Similarity(distance_m, world_from_camera.rotation, world_from_camera.translation)
+
+
+def _check_references(references: Sequence[PosedView], options: ScaleOptions) -> Rejection | None:
+    """Rejects references at one place: their trajectory radius is 0, so the scale is not determined."""
+    count = len(references)
+    if count < 2:
+        message = f"the scale needs two references at different places, got {count}"
+        return Rejection(RejectionReason.NO_USABLE_REFERENCES, message)
+    radius_m = trajectory_radius(np.stack([reference.world_from_camera.translation for reference in references]))
+    if not radius_m >= options.min_radius_m:
+        message = (
+            f"{count} references within {radius_m:.2g} of their centroid, in the unit of their poses, "
+            f"{options.min_radius_m:g} needed"
+        )
+        return Rejection(RejectionReason.DEGENERATE_REFERENCES, message)
+    return None
+
+
+def _check_finite(reconstruction: Reconstruction, depth: Array) -> Rejection | None:
+    """Rejects a reconstruction with a pose that is not finite, or without any depth (N,) at a reference's keypoint."""
+    views = (*reconstruction.references, reconstruction.query)
+    broken = sum(not np.isfinite(view.local_from_camera.matrix()).all() for view in views)
+    if broken:
+        message = f"{broken} of {len(views)} predicted poses are not finite"
+        return Rejection(RejectionReason.SCALE_UNRELIABLE, message)
+    if np.isnan(depth).all():
+        message = f"no depth is known at any keypoint of {len(views) - 1} references"
+        return Rejection(RejectionReason.SCALE_UNRELIABLE, message)
+    return None
+
+
+def _check_depth(radius_per_depth: float, count: int, options: ScaleOptions) -> Rejection | None:
+    """Rejects references that are predicted too close to one another for the depth of what they see."""
+    if radius_per_depth >= options.min_radius_per_depth:
+        return None
+    message = (
+        f"{count} references predicted within {radius_per_depth:.2g} of the scene's depth of their centroid, "
+        f"{options.min_radius_per_depth:g} needed"
+    )
+    return Rejection(RejectionReason.DEGENERATE_REFERENCES, message)
+
+
+def _no_scale(count: int, ratio_count: int, options: ScaleOptions) -> Rejection:
+    message = (
+        f"{ratio_count} depths triangulated between {count} references with baselines of {options.min_baseline_m:g} to "
+        f"{options.max_baseline_m:g} m, {options.min_ratios} needed"
+    )
+    if not options.by_triangulation:
+        message = f"no pair of {count} references has two known and two predicted places"
+    return Rejection(RejectionReason.SCALE_UNRELIABLE, message)
+
+
+def triangulated_ratios(
+    references: Sequence[PosedView], correspondences: Correspondences, depth: Array, options: ScaleOptions
+) -> Array:
+    """Ratios (R,) Z^GT / Z^local of triangulated to predicted depths (N,), of matches whose baseline is in range.
+
+    A match gives one in either image, so that the order of the references does not matter.
+    """
+    offsets = keypoint_offsets(references)
+    chosen = [np.empty((0, 2), np.intp)]
+    for (i, j), matches in correspondences.reference_pairs.items():
+        between = references[j].world_from_camera.translation - references[i].world_from_camera.translation
+        if options.min_baseline_m <= np.linalg.norm(between) <= options.max_baseline_m:
+            chosen.append(matches + offsets[[i, j]])
+    in_range = np.concatenate(chosen)
+    in_range = in_range[:: 1 + len(in_range) // options.max_matches]
+    centre, ray = keypoint_rays(references)
+    depth_m, parallax_deg = triangulate_depths(centre[in_range], ray[in_range])
+    # A match behind either camera is wrong. False for NaN.
+    usable = (depth_m > 0).all(axis=1) & (parallax_deg >= options.min_parallax_deg)
+    ratios = (depth_m[usable] / depth[in_range[usable]]).ravel()
+    return np.asarray(ratios[np.isfinite(ratios)])
+
+
+def pairs_of(count: int, max_cameras: int) -> NDArray[np.intp]:
+    """The pairs (P, 2) of at most `max_cameras` evenly chosen cameras of `count`."""
+    cameras = np.linspace(0, count - 1, min(count, max_cameras)).round().astype(np.intp)
+    return cameras[np.stack(np.triu_indices(len(cameras), 1), axis=1)]
+
+
+def triangulate_depths(centre: Array, ray: Array) -> tuple[Array, Array]:
+    """Depths at which the two rays of each match are nearest to one another.
+
+    They solve z_i r_i - z_j r_j = C_j - C_i in the least squares sense:
+
+        z_i = (C_j - C_i) x r_j . n / |n|^2,   z_j = (C_j - C_i) x r_i . n / |n|^2,   n = r_i x r_j.
+
+    Args:
+        centre: (M, 2, 3) camera centres C_i and C_j in the world, metres.
+        ray: (M, 2, 3) viewing rays r_i and r_j in world axes, of depth 1 in their camera.
+
+    Returns:
+        depth_m: (M, 2) in either camera; negative behind it, NaN for parallel rays.
+        parallax_deg: (M,) angle between the rays, 0 to 180.
+    """
+    baseline = centre[:, 1] - centre[:, 0]
+    normal = np.cross(ray[:, 0], ray[:, 1])
+    squared = (normal**2).sum(axis=1)
+    # (b x r) n = r (n x b) for either camera, with the other camera's ray r.
+    turned = np.cross(normal, baseline)
+    depth_m = np.einsum("mvi,mi->mv", ray[:, ::-1], turned) / np.where(squared > 0, squared, np.nan)[:, None]
+    parallax = np.arctan2(np.sqrt(squared), (ray[:, 0] * ray[:, 1]).sum(axis=1))
+    return depth_m, np.degrees(parallax)
+
+
+def trajectory_radius(centres: Array) -> float:
+    """RMS distance of camera centres (K, 3) from their centroid, in their unit: r = sqrt(1/K sum |C_i - mean C|^2)."""
+    return float(((centres - centres.mean(0)) ** 2).sum(1).mean() ** 0.5)
+
+
+def trajectory_deviation(metres_per_unit: float, centres: Array, centres_world: Array) -> float:
+    """The paper's d = |S r^local / r^GT - 1| of a scale S, from the predicted and the known centres (K, 3)."""
+    return abs(metres_per_unit * trajectory_radius(centres) / trajectory_radius(centres_world) - 1)
+
+
+def trajectory_scale(aligned: Array, centres_world: Array, pairs: NDArray[np.intp], inlier_distance_m: float) -> float:
+    """S_traj: the scale with the most inliers, of equals that with the smallest RMS distance.
+
+    Every pair of cameras proposes the ratio of their known to their predicted distance. The predicted trajectory is
+    scaled by it and shifted so that its centroid is that of the known one; cameras near their known centre are inliers.
+
+    Args:
+        aligned: (K, 3) predicted centres in world axes, R_align C^local.
+        centres_world: (K, 3) known centres, metres.
+        pairs: (P, 2) pairs of cameras, at least one.
+        inlier_distance_m: largest distance of an inlier.
+
+    Returns:
+        Metres per unit; NaN when no pair has a distance in both trajectories.
+    """
+    predicted, known = (
+        np.linalg.norm(centres[pairs[:, 0]] - centres[pairs[:, 1]], axis=1) for centres in (aligned, centres_world)
+    )
+    # Distances at the level of rounding propose no scale.
+    apart = (predicted > 1e-6 * trajectory_radius(aligned)) & (known > 1e-6 * trajectory_radius(centres_world))
+    if not apart.any():
+        return math.nan
+    proposals = known[apart] / predicted[apart]
+    moved = proposals[:, None, None] * (aligned - aligned.mean(0))  # (P, K, 3)
+    squared = ((moved - (centres_world - centres_world.mean(0))) ** 2).sum(2)  # (P, K) square metres
+    inliers = squared <= inlier_distance_m**2
+    count = inliers.sum(1)
+    counted = inliers | (count == 0)[:, None]  # all cameras, where none is an inlier
+    mean_squared = (squared * counted).sum(1) / counted.sum(1)
+    return float(proposals[np.where(count == count.max(), mean_squared, np.inf).argmin()])

@@ -1,0 +1,216 @@
+"""How two photographs are matched: options of each kind of features, nearest neighbours, and what a network offers."""
+
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from mapless_server.scheduling import count_helper
+
+from ..choices import EDGEPOINT2
+from ..optim.bounds import check_bounds
+from .nearest import mutual_matches
+from .views import Matches, PosedView, View
+
+ItemT = TypeVar("ItemT")
+ResultT = TypeVar("ResultT")
+
+
+@dataclass(frozen=True)
+class CorrespondOptions:
+    """Options of matching that depend on the descriptor; `OPTIONS` has a set for each extractor.
+
+    Attributes:
+        reference_ratio: Lowe's ratio, the largest distance of the nearest descriptor over that of the second-nearest,
+            between references, from either of them; loose, because the epipolar constraint filters too.
+        query_ratio: the same ratio for matches with the query, which have no other filter.
+        epipolar_px: largest distance from the epipolar line, in both images; keypoints are accurate to about a pixel.
+        distinct_ratio: the ratio of matches between references that show, without the poses, whether these agree.
+        wide_ratio: the ratio among the keypoints along the line; stricter, because they are few.
+        wide_similarity: smallest cosine of descriptors of a match along the line, for the same reason.
+        guided_similarity: smallest cosine of descriptors of a match that is searched near a point's projection.
+        sampled_share: one in so many of the query's keypoints is matched with all references among which those of a
+            query are chosen. With a sixth the chosen have 0.97 to 1.00 of the matches that those chosen by all
+            keypoints have, with an eighth 0.97 to 0.99 (kitchen, drive, office, lockers).
+        enough_sampled: if the chosen have fewer matches of sampled keypoints each, on average, they are chosen again by
+            all: in `office-lockers`, where SIFT has 23, the order of the references is partly noise.
+        rematched_references: so many references of a query, those with the most matches, are matched again by a
+            `PairMatching`, if there is one.
+        enough_matches: pairs of references for which nearest neighbours find so many are not matched by it: from about
+            250 on LightGlue finds fewer, of fewer keypoints. In the kitchen with 3 references (433, 267 and 179
+            matches) 300 instead of 500 costs one of 40 photographs; in meeting-room with 5 (141 at most) 50 costs none.
+        remembered_pairs: number of cached pairs of references, about 8 KiB each.
+        structure_bytes: memory of the cached structures of sets of references, about 0.25 MB for ten at 640x480.
+    """
+
+    reference_ratio: float = 0.9
+    query_ratio: float = 0.85
+    distinct_ratio: float = 0.8
+    epipolar_px: float = 2.0
+    wide_ratio: float = 0.8
+    wide_similarity: float = 0.85
+    guided_similarity: float = 0.89
+    sampled_share: int = 6
+    enough_sampled: float = 30.0
+    rematched_references: int = 5
+    enough_matches: int = 500
+    remembered_pairs: int = 20_000
+    structure_bytes: int = 32 * 2**20
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "reference_ratio query_ratio distinct_ratio wide_ratio", above=0, at_most=1)
+        check_bounds(self, "wide_similarity guided_similarity", at_least=-1)
+        check_bounds(self, "epipolar_px", above=0)
+        check_bounds(self, "sampled_share", at_least=1)
+        check_bounds(self, "enough_sampled", at_least=0)
+        check_bounds(self, "rematched_references enough_matches remembered_pairs structure_bytes", at_least=0)
+
+
+_ALIKED = CorrespondOptions(
+    reference_ratio=1.0,
+    query_ratio=0.95,
+    distinct_ratio=0.9,
+    wide_ratio=0.9,
+    wide_similarity=0.6,
+    guided_similarity=0.65,
+)
+
+_EDGEPOINT2 = replace(_ALIKED, wide_similarity=0.84, guided_similarity=0.86)
+
+OPTIONS: Mapping[str, CorrespondOptions] = {
+    "sift": CorrespondOptions(),
+    **dict.fromkeys(EDGEPOINT2, _EDGEPOINT2),
+    "aliked": _ALIKED,
+    "xfeat": replace(_ALIKED, wide_similarity=0.84, guided_similarity=0.86),
+    # Not measured, for lack of the weights. The cosine is that of a distance of 0.7, which is usual.
+    "superpoint": replace(_ALIKED, query_ratio=0.9, wide_similarity=0.755, guided_similarity=0.755),
+}
+"""For each extractor that a setting can name.
+
+Distances of learned descriptors differ less: at ALIKED's ratio of 0.95 a pair of kitchen photographs has 243 true
+matches and 36 false ones, at 0.85 only 119 and 2, where SIFT has 125 and 56. Between references the ratio test would
+cost a third of the true matches without benefit, because the epipolar constraint removes nearly all false ones.
+
+EdgePoint2's were measured with L64. A ratio of 0.9 for the query, or a similarity of 0.8, helps in the kitchen (0.34 cm
+instead of 0.41 from 5 references) and costs as much on the drive; both let a wrong pose pass in `office-lockers`.
+"""
+
+
+class QueryMatching(Protocol):
+    """Matches a query with its references; implemented by nearest neighbours and by LightGlue."""
+
+    def match(self, query: View, references: Sequence[PosedView], check: Callable[[], None]) -> Sequence[Matches]:
+        """Matches (query keypoint, reference keypoint) with each reference; each keypoint occurs at most once in them.
+
+        Calls `check` between its steps and does not catch what it raises.
+        """
+        ...
+
+
+class PairMatching(Protocol):
+    """Matches two photographs better than nearest neighbours do, at many times the cost.
+
+    Attributes:
+        name: names everything that determines the matches, except for the photographs.
+    """
+
+    name: str
+
+    def match_one(self, first: View, second: View, pause: Callable[[], None] = lambda: None) -> Matches:
+        """Matches (keypoint of the first, keypoint of the second); each keypoint occurs at most once in them.
+
+        Calls `pause`, which may wait, between its steps.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class StoredPair:
+    """A pair of references as it is stored.
+
+    Attributes:
+        matches: (M, 2), within the distance from the epipolar lines that the matching allows.
+        error_px: see `agreement.pair_error_px`; None if it is not known.
+    """
+
+    matches: Matches
+    error_px: float | None = None
+
+
+class StoredPairs(Protocol):
+    """Matches of pairs of references that were made before."""
+
+    def find(self, matching: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> Sequence[StoredPair | None]:
+        """Returns what is stored of each pair, given `in_order`; None for a pair that is not stored.
+
+        `matching` is what `Matcher.matching` returns. Does not raise.
+        """
+        ...
+
+
+class SharedThreads:
+    """Helps queries to match: each computes in its own thread, and threads that are free take over a part.
+
+    So a query alone uses all cores, and as many queries as there are cores use a thread each.
+    """
+
+    def __init__(self, threads: int) -> None:
+        """Uses so many threads for one query, its own among them."""
+        self.threads = threads
+        self._pool = ThreadPoolExecutor(max(1, threads - 1), "match")
+
+    def map(self, compute: Callable[[ItemT], ResultT], items: Sequence[ItemT]) -> list[ResultT]:
+        """The results for all items, in order; raises what a computation raises, when no other one is running."""
+        results: dict[int, ResultT] = {}
+        rest = iter(list(enumerate(items)))  # the next item is taken under the interpreter's lock
+
+        def work() -> None:
+            try:
+                for i, item in rest:
+                    results[i] = compute(item)
+            except BaseException:
+                deque(rest, 0)
+                raise
+
+        def help_out() -> float:
+            begin_s = time.thread_time()
+            work()
+            return time.thread_time() - begin_s
+
+        helpers = [self._pool.submit(help_out) for _ in range(min(self.threads, len(items)) - 1)]
+        try:
+            work()
+        finally:
+            running = [it for it in helpers if not it.cancel()]
+            wait(running)
+        for helper in running:
+            count_helper(helper.result())
+        return [results[i] for i in range(len(items))]
+
+    def close(self) -> None:
+        """Ends the threads."""
+        self._pool.shutdown()
+
+
+class NearestNeighbours:
+    """Matches mutual nearest neighbours that pass the ratio test, for any descriptor."""
+
+    def __init__(self, ratio: float, threads: SharedThreads) -> None:
+        self.ratio = ratio
+        self._threads = threads
+
+    def match(self, query: View, references: Sequence[PosedView], check: Callable[[], None]) -> Sequence[Matches]:
+        """See QueryMatching.match."""
+        ours = query.features
+        if ours.descriptors.dtype == np.uint8:  # once for all references
+            ours = replace(ours, descriptors=ours.unit_descriptors())
+
+        def with_one(reference: PosedView) -> Matches:
+            check()
+            return mutual_matches(ours, reference.view.features, self.ratio)
+
+        return tuple(self._threads.map(with_one, references))

@@ -1,0 +1,252 @@
+"""Comparison of a photograph's camera with others, by the score of all its matches.
+
+Intrinsics of another image, half or double the focal length, or a wide lens whose distortion is left out, are too far
+off for the linear check (`intrinsics`): a pose then fits a part of the matches, at similar depths or near the centre,
+and these alone do not contradict it. But with a camera that is nearer to the true one far more of all matches agree
+with one pose. So poses are computed with other focal lengths, with other values of k1 and without the lens, and, where
+these are unusual, with the principal point in the centre and with square pixels; the score of `two_view.pose` compares
+them, by points and by matches without points together. That costs a query nothing of which the linear check is certain.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, Camera, RigidTransform
+from mapless.lenses import Fisheye
+
+from ..bundle.estimate import Support
+from ..bundle.intrinsics import IntrinsicsEvidence, corrected, read_as
+from ..features.views import View
+from ..options import IntrinsicsSigma
+from ..pose.pnp import PnpOptions, ransac
+from ..pose.relative import Evidence, RelativePoseOptions, find_pose, score
+from ..pose.two_view_matches import TwoViewMatches
+from ..rejection import Advice, Hint, IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason
+from .intrinsics import advice_for
+
+DOUBTED_SIGMAS = 3.0
+"""Other cameras are tried if the linear check finds a parameter off by more standard deviations,"""
+
+UNDETERMINED_FOCAL, UNDETERMINED_K1 = 0.02, 0.05
+"""or leaves the focal length (as a share) or k1 more uncertain: with K of an image of twice the size all poses are
+doubted, and so are those of a wide lens given without its distortion with which few of the matches agree."""
+
+MIN_GAIN, MANY_MATCHES, LARGE_SHARE, MIN_GAIN_ELSE = 1.1, 100, 0.45, 1.2
+"""The camera is wrong if a pose of another one scores this many times as high, where there are many matches with points
+and no large share of them agrees with the pose; else if it scores 1.2 times as high. Of 274 right answers of 24 places
+38 are compared: one has 1.15, with 42 matches, the others up to 1.03. A pose that a large share agrees with is as right
+as its radii say, though its camera be a little wrong: eight photographs of the statue, which is given one focal length
+for all, have 1.1 to 1.2, seven with errors of 1 to 3 % of the distance."""
+
+CLEAR_GAIN = 2.0
+"""From here on that of a pose with too little evidence is evidence against its camera, too. Wrong poses of right
+cameras have up to 1.6; with intrinsics of an image of twice the size 28 of 34 have more than this."""
+
+MIN_MATCHES, MAX_LINES = 20, 1500
+"""Fewer matches with points say nothing. Where there are more matches with references, every other keypoint, or fewer,
+is compared: so many suffice."""
+
+UNUSUAL_PRINCIPAL_SHARE, UNUSUAL_ASPECT = 0.1, 0.03
+"""Distance of the principal point from the centre, as a share of the width, from which the centre is tried too; share
+by which both focal lengths differ, from which square pixels are tried too."""
+
+PNP = PnpOptions(min_iterations=30, max_iterations=300, max_matches=300)
+"""Of the poses by points. Few matches suffice to compare cameras."""
+
+LINES = RelativePoseOptions(min_iterations=50, max_iterations=150, pair_iterations=200, strongest=1)
+"""Of the poses where the given one rests on matches without points; brief, 20 to 40 ms a camera."""
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """Which other cameras are tried.
+
+    Attributes:
+        focal: how many focal lengths below the given one, and above.
+        per_octave: how many from one to its double.
+        lens: how many values of k1 below the given one, and above.
+        bend: by how much one of them moves the image's corner, as a share of its distance from the principal point.
+    """
+
+    focal: int
+    per_octave: int
+    lens: int
+    bend: float
+
+
+BY_POINTS, BY_LINES = _Steps(5, 4, 3, 0.08), _Steps(2, 2, 1, 0.16)
+
+
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """The matches that cameras are compared by: those of the whole image with points, and those with references.
+
+    They are of every `step`-th keypoint, and so are the views: reading these with other lenses takes long.
+    """
+
+    support: Support
+    step: int
+    lines: TwoViewMatches
+    x_in_world: Array
+    keypoint: NDArray[np.intp]
+
+    @staticmethod
+    def of(support: Support) -> "_Compared":
+        matches, lines = support.matches, TwoViewMatches.of(support.query, support.references, support.query_matches)
+        step = 1 + len(lines) // MAX_LINES
+        used = np.flatnonzero(~matches.guided & (matches.keypoint % step == 0))
+        points = support.structure.x_in_world[matches.point[used]]
+        lines = lines[lines.keypoint % step == 0]
+        lines = replace(lines, keypoint=lines.keypoint // step)
+        return _Compared(support, step, lines, points, matches.keypoint[used] // step)
+
+    def thinned(self, view: View) -> View:
+        """A view of the photograph with every `step`-th keypoint."""
+        return replace(view, features=view.features.every(self.step))
+
+    def score_of(self, view: View, pose: RigidTransform | None = None) -> float:
+        """The score of a pose, by default of the best one that is found, of the photograph read as a thinned view."""
+        is_seen = np.asarray(np.isfinite(view.features.keypoints).all(axis=1))
+        points, keypoint, lines = self.x_in_world, self.keypoint, self.lines.read_as(view)
+        if not is_seen.all():
+            points, keypoint, lines = (
+                points[is_seen[keypoint]],
+                keypoint[is_seen[keypoint]],
+                lines[is_seen[lines.keypoint]],
+            )
+        all_matches = Evidence(view, self.support.references, lines, points, keypoint)
+        if pose is None and self.support.two_view is not None:
+            pose = find_pose(all_matches, LINES)
+        elif pose is None:
+            pose = ransac(view.camera, points, all_matches.pixels, None, PNP)
+        return 0.0 if pose is None else score(all_matches, pose, LINES)
+
+    def scored(self, camera: Camera) -> tuple[float, Camera]:
+        """A camera with its score, comparable with that of the given camera's pose."""
+        query = self.support.query
+        value = self.score_of(read_as(self.thinned(query), camera))
+        # Without points a right camera has up to 0.98 of its score with another lens, 0.92 with another focal length.
+        is_bent = self.support.two_view is not None and camera.distortion != query.distortion
+        return value / MIN_GAIN if is_bent else value, camera
+
+
+def wrong_camera(support: Support, best_reference: str, is_doubted: bool = False) -> Rejection | None:
+    """A rejection that names what is wrong and the better value, if a pose of another camera scores clearly higher.
+
+    A pose that rests on matches without points is compared whatever the linear check says, with few cameras by a brief
+    search: these score 0.67 to 0.90 of the pose where the given camera is right, and 1.07 to 1.44 where its intrinsics
+    are those of an image of half or twice the size. What speaks against the camera of a pose that is doubted for lack
+    of evidence is named, but without the checks that keep stronger features from being tried, unless it is very clear.
+    """
+    assert support.estimate is not None
+    query, evidence, by_lines = support.query, support.estimate.intrinsics, support.two_view is not None
+    count = int((~support.matches.guided).sum())
+    if not by_lines and (count < MIN_MATCHES or evidence is None or not _is_doubtful(evidence)):
+        return None
+    steps = BY_LINES if by_lines else BY_POINTS
+    prior_sigma = (support.intrinsics_sigma or IntrinsicsSigma()).of(query.camera)
+    given = replace(query.camera, distortion=query.distortion)
+    others = list(_other_cameras(given, prior_sigma, steps))
+    if not others:
+        return None
+    compared = _Compared.of(support)
+    best = max(map(compared.scored, others), key=lambda it: it[0])
+    # The estimate's own intrinsics are those that were estimated with it, within what the caller allows.
+    given_view = compared.thinned(support.estimate.view or query)
+    own, least = compared.score_of(given_view, support.estimate.world_from_camera), 1.0
+    if not by_lines:
+        is_clear = count >= MANY_MATCHES and support.estimate.inliers.mean() < LARGE_SHARE
+        own, least = max(own, compared.score_of(compared.thinned(query))), MIN_GAIN if is_clear else MIN_GAIN_ELSE
+        best = max([best, *map(compared.scored, _between(given, best[1], steps))], key=lambda it: it[0])
+    if best[0] < least * own:
+        return None
+    sent = query.photograph.camera if query.photograph else given
+    checks = tuple(_checks(sent, prior_sigma, given, best[1], steps))
+    named = ", ".join(map(_difference, checks))
+    inliers = support.estimate.inliers
+    message = f"{inliers.sum()} of {len(inliers)} matches agree with the pose; all together fit one of {named} better"
+    if by_lines:  # the matches with points may be none
+        message = f"its matches agree as well with a pose of {named}"
+    hint = Hint("judge", Advice.CHECK_CALIBRATION, advice_for(sent.distortion, checks), best_reference)
+    is_evidence = not is_doubted or best[0] >= CLEAR_GAIN * own
+    return Rejection(RejectionReason.GATE, message, hint, intrinsics_checks=checks if is_evidence else ())
+
+
+def _difference(check: IntrinsicsCheck) -> str:
+    digits = 2 if check.parameter is IntrinsicsParameter.K1 else 0
+    return f"{check.parameter.field} {check.estimated:.{digits}f} instead of {check.given:.{digits}f}"
+
+
+def _is_doubtful(evidence: IntrinsicsEvidence) -> bool:
+    """Whether the linear check speaks against the camera, or cannot speak for it."""
+    off = np.abs(evidence.value) > DOUBTED_SIGMAS * np.hypot(evidence.sigma, evidence.prior_sigma)
+    return bool(off.any() or evidence.sigma[0] > UNDETERMINED_FOCAL or evidence.sigma[3] > UNDETERMINED_K1)
+
+
+def _other_cameras(given: Camera, prior_sigma: Array, steps: _Steps) -> Iterator[Camera]:
+    """Cameras that the given one may be mistaken for, none of them within three standard deviations (4,) of it."""
+    x, y = (given.width_px - 1) / 2, (given.height_px - 1) / 2
+    bases = [given]
+    if np.hypot(given.principal_x_px - x, given.principal_y_px - y) > UNUSUAL_PRINCIPAL_SHARE * given.width_px:
+        bases.append(replace(given, principal_x_px=x, principal_y_px=y))
+    if abs(np.log(given.focal_x_px / given.focal_y_px)) > UNUSUAL_ASPECT:
+        bases += [replace(base, focal_x_px=base.focal_y_px) for base in bases]
+    for base in bases:
+        for step in range(-steps.focal, steps.focal + 1):
+            log_factor = np.log(2) * step / steps.per_octave
+            if abs(log_factor) > 3 * prior_sigma[0] or (step == 0 and base is not given):
+                yield _scaled(base, float(np.exp(log_factor)))
+    lenses = [given.pinhole() if given.distortion else replace(given, distortion=Fisheye())]
+    lenses += [_bent(given, step * _k1_step(given, steps)) for step in range(-steps.lens, steps.lens + 1)]
+    yield from (it for it in lenses if abs(_bend(it) - _bend(given)) > 3 * prior_sigma[3])
+
+
+def _between(given: Camera, best: Camera, steps: _Steps) -> tuple[Camera, Camera]:
+    """Half a step to both sides of the best camera."""
+    if best.distortion != given.distortion:
+        k1 = _k1_step(given, steps) / 2
+        return _bent(best, -k1), _bent(best, k1)
+    factor = 2 ** (0.5 / steps.per_octave)
+    return _scaled(best, 1 / factor), _scaled(best, factor)
+
+
+def _scaled(camera: Camera, factor: float) -> Camera:
+    return replace(camera, focal_x_px=factor * camera.focal_x_px, focal_y_px=factor * camera.focal_y_px)
+
+
+def _bent(camera: Camera, k1: float) -> Camera:
+    return corrected(camera, (0.0, 0.0, 0.0, k1))
+
+
+def _k1_step(camera: Camera, steps: _Steps) -> float:
+    """The difference of k1 of one step: the narrower the lens, the larger."""
+    x, y = camera.principal_x_px, camera.principal_y_px
+    corner_px = np.hypot(max(x, camera.width_px - 1 - x), max(y, camera.height_px - 1 - y))
+    return float(steps.bend * (camera.focal_x_px / corner_px) ** 2)
+
+
+def _bend(camera: Camera) -> float:
+    """What r^3 is multiplied by in the distance at which the lens shows a ray of slope r."""
+    return 0.0 if camera.distortion is None else camera.distortion.cubic
+
+
+def _checks(sent: Camera, prior_sigma: Array, given: Camera, found: Camera, steps: _Steps) -> Iterator[IntrinsicsCheck]:
+    """What differs, in pixels of the photograph as it was sent; standard deviations are those of the steps tried."""
+    scale, uniform = sent.width_px / found.width_px, 1 / np.sqrt(12)
+    k1, focal_px, centre_sigma_px = sent.distortion.k1 if sent.distortion else 0.0, sent.focal_x_px, sent.width_px / 20
+    of_sent = np.array([focal_px, sent.principal_x_px, sent.principal_y_px, k1])
+    before, after = (
+        np.array([it.focal_x_px, it.principal_x_px, it.principal_y_px, _bend(it)]) for it in (given, found)
+    )
+    focal_sigma_px = scale * found.focal_x_px * np.log(2) / steps.per_octave * uniform
+    sigma = np.array([focal_sigma_px, centre_sigma_px, centre_sigma_px, _k1_step(given, steps) * uniform])
+    estimated = of_sent + np.array([scale, scale, scale, 1.0]) * (after - before)
+    given_sigma = np.array([focal_px, scale, scale, 1.0]) * prior_sigma
+    differs = after != before
+    for i, parameter in enumerate(IntrinsicsParameter):
+        if differs[i]:
+            values = float(of_sent[i]), float(estimated[i]), float(sigma[i]), float(given_sigma[i])
+            yield IntrinsicsCheck(parameter, *values, conflict=True, used=False)

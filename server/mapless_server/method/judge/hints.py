@@ -1,0 +1,180 @@
+"""Hints: what would help after a rejection.
+
+A hint follows from the numbers of the answer: features of the photograph, matches with each reference, inliers.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..features.views import PosedView, View
+from ..rejection import Advice, Hint, Rejection, RejectionReason
+from .answer import Answer
+
+_STAGES = {
+    RejectionReason.NO_USABLE_REFERENCES: "coarse",
+    RejectionReason.DEGENERATE_REFERENCES: "coarse",
+    RejectionReason.LOW_TEXTURE: "",
+    RejectionReason.LOW_OVERLAP: "coarse",
+    RejectionReason.SCALE_UNRELIABLE: "scale",
+    RejectionReason.TOO_FEW_MATCHES: "match",
+    RejectionReason.PNP_FAILED: "pnp",
+    RejectionReason.GATE: "judge",
+    RejectionReason.AMBIGUOUS: "judge",
+    RejectionReason.PRIOR_CONFLICT: "judge",
+}
+
+
+FEW_FEATURES = 200
+"""A photograph with fewer is dark, blurred or shows nothing; sharp ones have 500 to 2048."""
+
+FEW_MATCHES = 30
+"""References of another place have fewer matches with a photograph by chance."""
+
+MANY_MATCHES = 100
+"""So many with one reference are not chance; if they have no common pose, intrinsics or poses are wrong."""
+
+
+MUCH_IGNORED = 0.5
+"""Share of a photograph that masks seldom ignore: vehicles, grippers and people take less, inverted ones more."""
+
+
+@dataclass(frozen=True)
+class _Case:
+    """The numbers that a hint follows from.
+
+    Attributes:
+        rejection: the query's rejection.
+        features: number of features of the photograph.
+        matches: number of matches with the best reference.
+        second: number of matches with the second best reference.
+        inliers: number of inliers among all 2D-3D matches.
+        tried: number of 2D-3D matches; None if there are none yet.
+        best: name of the reference with most matches; None if none has any.
+        reference_count: number of references used.
+        has_prior: whether the request has a prior.
+    """
+
+    rejection: Rejection
+    features: int
+    matches: int
+    second: int
+    inliers: int
+    tried: int | None
+    best: str | None
+    reference_count: int
+    has_prior: bool
+
+
+def hinted(answer: Answer, query: View, references: Sequence[PosedView], has_prior: bool = False) -> Answer:
+    """Adds a hint to a rejection without one; the references are in the order of the answer's counts.
+
+    `has_prior` is whether the request has a prior on position or heading.
+    """
+    rejection = answer.outcome
+    if not isinstance(rejection, Rejection) or rejection.hint is not None:
+        return answer
+    estimate = answer.support.estimate if answer.support else None
+    matches = answer.reference_match_counts
+    best = int(np.argmax(matches)) if any(matches) else None
+    most, second = sorted((*matches, 0, 0), reverse=True)[:2]
+    case = _Case(
+        rejection,
+        len(query.features),
+        most,
+        second,
+        0 if estimate is None else int(estimate.inliers.sum()),
+        rejection.tried if answer.support is None else len(answer.support.matches),
+        None if best is None else references[best].name,
+        len(references),
+        has_prior,
+    )
+    advice, message = _advice(case)
+    share = query.photograph.ignored_share if query.photograph else 0.0
+    if share >= MUCH_IGNORED or (share > 0 and case.features < FEW_FEATURES):
+        message += f" The mask ignores {_percent(share)} of the image: 0 means ignore, every other value use."
+    hint = Hint(_STAGES[rejection.reason] if references else "", advice, message, case.best)
+    return replace(answer, outcome=replace(rejection, hint=hint))
+
+
+def _advice(case: _Case) -> tuple[Advice, str]:
+    reason = case.rejection.reason
+    if reason is RejectionReason.PRIOR_CONFLICT:
+        return Advice.CHECK_PRIOR, "Check the prior: the matches place the camera elsewhere."
+    if reason is RejectionReason.AMBIGUOUS:
+        return (
+            Advice.TELL_PLACES_APART,
+            "Give a prior on the pose, or take a photograph that shows where the two places differ; if there is one "
+            "place only, check the references' poses.",
+        )
+    if reason is RejectionReason.LOW_TEXTURE:
+        return Advice.RETAKE_PHOTOGRAPH, _retake(case)
+    if reason is RejectionReason.DEGENERATE_REFERENCES:
+        return (
+            Advice.SPREAD_REFERENCES,
+            f"The {case.reference_count} references were taken from one place: use some from different places.",
+        )
+    if case.reference_count == 0 and case.has_prior:
+        return Advice.CHECK_PRIOR, "Check the prior: it leaves no reference."
+    if case.reference_count < 2:
+        return (
+            Advice.ADD_REFERENCES,
+            f"There {'is one reference' if case.reference_count else 'are no references'}: two at least are needed, "
+            "taken from different places.",
+        )
+    return _of_overlap(case)
+
+
+def _of_overlap(case: _Case) -> tuple[Advice, str]:
+    """The hint if photograph and references are usable, but have too little in common."""
+    shared = f"the best reference shares {case.matches} of the photograph's {case.features} features"
+    if case.features < FEW_FEATURES:
+        return Advice.RETAKE_PHOTOGRAPH, _retake(case)
+    if case.rejection.reason in (RejectionReason.NO_USABLE_REFERENCES, RejectionReason.SCALE_UNRELIABLE):
+        return (
+            Advice.SPREAD_REFERENCES,
+            f"The {case.reference_count} references do not give depth together: use some that show the same things "
+            "from different places, and check their poses.",
+        )
+    if case.matches < FEW_MATCHES:
+        return (
+            Advice.CHOOSE_OTHER_REFERENCES,
+            f"Use references that show what the photograph shows: {shared}, no more than chance gives.",
+        )
+    if case.matches >= MANY_MATCHES and case.tried is not None and case.tried < case.matches / 4:
+        # Even if what two references show were independent, they would have so many of the features in common.
+        if case.tried < case.matches * case.second / case.features / 4 and case.second >= MANY_MATCHES:
+            return (
+                Advice.CHECK_CALIBRATION,
+                f"Check the references' poses, for which `mapless-server audit` helps: world_from_camera (not its "
+                f"inverse), with OpenCV's axes. The two best references share {case.matches} and {case.second} of the "
+                f"photograph's {case.features} features, but only {case.tried} have a point that fits their poses. If "
+                "the two show different things, add references from a step aside.",
+            )
+        return (
+            Advice.ADD_REFERENCES,
+            f"Add references that show the same as {case.best} from a step aside: {shared}, but of the photograph's "
+            f"matches only {case.tried} have a point that a second reference shows as well, as depth requires.",
+        )
+    if case.matches >= MANY_MATCHES and case.inliers < case.matches / 4:
+        agreeing = f"{case.inliers} of {case.tried} matches with points agree on a pose" if case.tried else "few agree"
+        return (
+            Advice.CHECK_CALIBRATION,
+            f"Check the photograph's intrinsics and the references' poses: {shared}, but {agreeing}.",
+        )
+    return (
+        Advice.LOOK_AT_REFERENCE,
+        f"Point the camera at what the best reference shows, or add references from nearer: {shared}.",
+    )
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if share >= 0.01 else "less than 1 %"
+
+
+def _retake(case: _Case) -> str:
+    return (
+        f"Take the photograph again, with more light, without motion blur and of something with texture: it has "
+        f"{case.features} local features."
+    )

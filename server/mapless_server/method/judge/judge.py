@@ -1,0 +1,319 @@
+"""Judge: accepts or rejects a pose, at a given share of right answers to accept.
+
+The evidence for a pose gives a score, the larger the better. The *trust* of an answer is the share of right answers to
+photographs of difficult places, with known poses, whose score is at most as high. So accepting poses with a trust of at
+least 1 - c accepts the share c of right answers, independent of the scale of the score: trust is the p-value of "this
+is a right answer", as in conformal prediction (Vovk, Gammerman and Shafer 2005). It is not the probability of being
+right, which depends on how many of a caller's photographs show the place at all.
+
+Wrong intrinsics are checked separately (`intrinsics`), because the evidence of their answers is as good as that of
+right ones.
+
+The quantiles were measured once (server/research): answers to photographs with many and few references, of the third of
+twelve places where right answers have the least evidence, so that the coverage holds in a place like these; elsewhere
+more are accepted. A right answer is off by at most 5 % of the distance to what the photograph shows, 5 degrees and, in
+scenes in metres, 25 cm.
+
+A second pose, at another place, that other references support about as well, makes a pose ambiguous. With repeated
+corridors and floors, identical furniture, or some references with wrong poses, the matches of the references form two
+clusters, and the pose with a few more inliers is found. So a second pose is searched among the matches that are
+outliers of the first. It is a rival if
+
+    its inliers are not chance (the a-contrario test of `gate`, over these matches),
+    it explains at least a given share of the number of keypoints that the first pose explains,
+    it is further from the first pose than the 95 % radii of both, and
+    most of its inliers come from references that support it more than the first pose.
+
+Keypoints are counted over the matches with each reference, before the majority vote for a keypoint's point, which
+removes the matches of the weaker place.
+"""
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Camera, RigidTransform, rotation_angle_deg
+
+from ..bundle.estimate import Support
+from ..bundle.intrinsics import ContradictionOptions
+from ..bundle.radii import Accuracy, accuracy_from_covariance
+from ..features.views import Matches
+from ..optim.bounds import check_bounds
+from ..optim.perturbation import pose_hessian, world_covariance
+from ..pose.pnp import PnpOptions, false_alarms, ransac
+from ..rejection import Advice, Hint, Hypothesis, Rejection, RejectionReason
+from .cameras import wrong_camera
+from .evidence import Evidence, Votes, evidence_of, votes_of
+from .intrinsics import wrong_intrinsics
+from .references import disagreeing_references, supporters_of
+
+RIVAL_MIN_SHARE, RIVAL_MIN_KEYPOINTS = 0.5, 10
+"""Least number of keypoints of a rival, as a share of those of the first pose, and in all. A place with less than half
+the keypoints of another is distinguished from it."""
+
+RIVAL_MAX_LOG10_FALSE_ALARMS = -6.0
+"""As in `gate`, but stricter, because a rival is searched for every answer."""
+
+RIVAL_MIN_OWN_SHARE = 0.5
+"""Least share of a rival's inliers from references that support it more than the first pose. A few references that show
+both places support both."""
+
+MIN_APART_M, MIN_APART_DEG = 0.1, 5.0
+"""Poses nearer than this are one place, independent of their radii."""
+
+AGREEING_PX = 12.0
+"""Matches within this distance belong to the first pose; larger than the inlier bound, since a point with an error is
+not a second place."""
+
+RIVAL_PNP = PnpOptions(min_iterations=50, max_iterations=200, max_matches=300)
+"""Of the rival's pose. The few iterations find a pose with a third of the matches as inliers."""
+
+_RARE = (0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075)
+LEVELS = (*_RARE, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+"""Shares of the right answers at which `JudgeOptions.scores` are the quantiles."""
+
+
+@dataclass(frozen=True)
+class JudgeOptions:
+    """Options of the judge.
+
+    Attributes:
+        scores: quantiles of the scores of right answers at `LEVELS`.
+        agreement_weight: weight of ln(1 / chance) if gravity or heading agrees with a pose. It would be 1 if poses were
+            wrong only by chance; but poses from repeated structure and wrong references agree too, and so do slightly
+            wrong ones.
+        intrinsics: options of the check of the photograph's intrinsics.
+        max_radius_share: largest 68 % radius of the position, as a share of the distance to what the photograph shows:
+            of the poses with a larger one too many are wrong. Of 2,416 right answers 7 have it, of 116 wrong ones 18.
+            Each of twelve places left out, the others choose this limit.
+    """
+
+    scores: tuple[float, ...] = (
+        -12.224, -11.752, -11.254, -10.17, -8.789, -7.801, -6.527, -4.942, -3.329, -1.931,
+        -0.623, 0.323, 1.854, 2.719, 3.518, 4.185, 4.882, 5.504, 6.015, 6.717,
+    )  # fmt: skip
+    agreement_weight: float = 0.3
+    intrinsics: ContradictionOptions = field(default_factory=ContradictionOptions)
+    max_radius_share: float = 0.08
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "agreement_weight", at_least=0)
+        check_bounds(self, "max_radius_share", above=0)
+        if len(self.scores) != len(LEVELS):
+            raise ValueError(f"JudgeOptions.scores must be {len(LEVELS)} numbers, is {self.scores}")
+        if not all(a <= b for a, b in itertools.pairwise(self.scores)):
+            raise ValueError(f"JudgeOptions.scores must be rising, is {self.scores}")
+
+    def with_trust(self, quantiles: tuple[float, ...]) -> "JudgeOptions":
+        """Options of a scene whose right answers have these quantiles (at `LEVELS`) of the trust by these options."""
+        return replace(self, scores=tuple(np.interp(quantiles, LEVELS, self.scores).tolist()))
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The result of the judge.
+
+    Attributes:
+        trust: 0 to 1; share of right answers whose score is at most as high.
+        evidence: from which it is computed.
+        rejection: why the pose is not accepted; None if it is.
+    """
+
+    trust: float
+    evidence: Evidence
+    rejection: Rejection | None
+
+
+def judge(
+    support: Support,
+    query_matches: Sequence[Matches],
+    coverage: float,
+    options: JudgeOptions,
+    log10_chance: float = 0.0,
+    unit: str = "m",
+) -> Judgement:
+    """Judges the estimate of a support.
+
+    Args:
+        support: the support, whose estimate has passed the gate.
+        query_matches: matches of the query with each reference.
+        coverage: share of right answers to accept, above 0 and at most 1.
+        options: options of the judge.
+        log10_chance: see `Priors.log10_chance`.
+        unit: the scene's unit of length, in messages.
+
+    Returns:
+        The judgement. Its rejection, in the support's world, is GATE, with a hint, if the photograph contradicts its
+        intrinsics; AMBIGUOUS with both hypotheses if a second pose is supported about as well; GATE, with a hint, if
+        the position's radius is too large; and GATE if the trust is
+        less than 1 - coverage.
+    """
+    votes = votes_of(support, query_matches)
+    evidence = evidence_of(support, votes, query_matches)
+    trust = trust_of(evidence, options, log10_chance)
+    doubt = low_trust(evidence, trust, coverage)
+    contradicted = contradiction(support, votes, options, is_doubted=doubt is not None, unit=unit)
+    return Judgement(trust, evidence, contradicted or doubt)
+
+
+def contradiction(
+    support: Support,
+    votes: Votes,
+    options: JudgeOptions,
+    is_doubted: bool = False,
+    unit: str = "m",
+) -> Rejection | None:
+    """Rejects a pose whose references, intrinsics or other matches contradict it, or whose radius is too large.
+
+    For one that is doubted for lack of evidence see `wrong_camera`.
+    """
+    assert support.estimate is not None
+    if disagreeing := disagreeing_references([supporters_of(support)]):
+        return disagreeing
+    evidence = support.estimate.intrinsics
+    best = support.references[int(np.argmax(support.inliers_by_reference()))].name
+    wrong = wrong_intrinsics(evidence, best, options.intrinsics) if evidence else None
+    if wrong:
+        return wrong
+    if wrong := wrong_camera(support, best, is_doubted):
+        return wrong
+    hypotheses = find_rival(support, votes)
+    return _ambiguous(hypotheses, unit) if hypotheses else _too_uncertain(support, options)
+
+
+def trust_of(evidence: Evidence, options: JudgeOptions, log10_chance: float = 0.0) -> float:
+    """Trust: the share of right answers with at most this score; agreement with priors raises the score."""
+    agreement = -options.agreement_weight * math.log(10) * log10_chance
+    return float(np.interp(evidence.score + agreement, options.scores, LEVELS))
+
+
+def trust_in_scene(trust: float, quantiles: tuple[float, ...]) -> float:
+    """Trust in a scene whose right answers have these quantiles of trust; unchanged without quantiles."""
+    return float(np.interp(trust, quantiles, LEVELS)) if quantiles else trust
+
+
+def low_trust(evidence: Evidence, trust: float, coverage: float) -> Rejection | None:
+    """Rejects a pose if its trust is less than 1 - coverage."""
+    if trust >= 1 - coverage:
+        return None
+    shown = math.floor(1000 * trust) / 1000  # rounded down, so that it never equals the bound
+    message = (
+        f"its trust of {shown:g} is below the {round(1 - coverage, 6):g} that a coverage of {coverage:g} requires: "
+        f"{format_evidence(evidence)}"
+    )
+    return Rejection(RejectionReason.GATE, message)
+
+
+def format_evidence(evidence: Evidence) -> str:
+    """Formats the evidence as text."""
+    return (
+        f"{evidence.inlier_count} of {evidence.match_count} matches agree, {100 * evidence.found_share:.0f} % of the "
+        f"points that should be found, of which references find {100 * evidence.expected_share:.0f} %, over "
+        f"{100 * evidence.hull_share:.0f} % of the image; {100 * math.sqrt(evidence.epipolar_share):.0f} % of the "
+        "matches with the two best references lie on their epipolar lines; halves of the data give positions apart by "
+        f"{100 * evidence.disagreement:.1f} % of the distance"
+    )
+
+
+def _too_uncertain(support: Support, options: JudgeOptions) -> Rejection | None:
+    """Rejects a pose whose own radius says that it may well be wrong."""
+    assert support.estimate is not None
+    share = accuracy_from_covariance(support.estimate.covariance).position_68_m / support.distance_m()
+    if share <= options.max_radius_share:
+        return None
+    message = (
+        f"its position is known to {100 * share:.1f} % of the distance to what the photograph shows (68 % radius), "
+        f"{100 * options.max_radius_share:g} % is needed"
+    )
+    strongest = np.argsort(-np.array(support.inliers_by_reference()), kind="stable")[:2]
+    names = [support.references[i].name for i in strongest]
+    advice = f"Add references that show the same from other places: {' and '.join(names)} alone do not suffice."
+    return Rejection(RejectionReason.GATE, message, Hint("judge", Advice.ADD_REFERENCES, advice, names[0]))
+
+
+def _ambiguous(hypotheses: tuple[Hypothesis, Hypothesis], unit: str) -> Rejection:
+    first, second = sorted(hypotheses, key=lambda it: -it.inlier_count)
+    apart = math.dist(first.world_from_camera.translation, second.world_from_camera.translation)
+    message = (
+        f"two poses {apart:.2f} {unit} apart explain the photograph: {first.inlier_count} keypoints agree with one by "
+        f"{len(first.references)} references, {second.inlier_count} with the other by {len(second.references)}"
+    )
+    return Rejection(RejectionReason.AMBIGUOUS, message, hypotheses=(first, second))
+
+
+def find_rival(support: Support, votes: Votes) -> tuple[Hypothesis, Hypothesis] | None:
+    """Finds the first pose and its rival, as hypotheses in the support's world; None without a rival.
+
+    Projects all matches, and searches only if enough of them are outliers.
+
+    Args:
+        support: the first pose's support, with its estimate.
+        votes: the query's matches with each reference.
+    """
+    estimate, camera = support.estimate, support.query.camera
+    if estimate is None:
+        return None
+    errors_px = votes.errors_px(camera, estimate.world_from_camera)
+    own = errors_px < RIVAL_PNP.inlier_px
+    wanted = max(RIVAL_MIN_KEYPOINTS, int(np.ceil(RIVAL_MIN_SHARE * votes.keypoint_count(own))))
+    candidates = _outliers(votes, own, ~(errors_px < AGREEING_PX), len(support.references))
+    if votes.keypoint_count(candidates) < wanted:
+        return None
+    rival = _second_pose(camera, votes[candidates], wanted)
+    if rival is None:
+        return None
+    pose, radii = rival
+    own_radii = accuracy_from_covariance(estimate.covariance)
+    if not _are_apart(estimate.world_from_camera, own_radii, pose, radii):
+        return None
+    theirs = votes.errors_px(camera, pose) < RIVAL_PNP.inlier_px
+    counts = [np.bincount(votes.reference[rows], minlength=len(support.references)) for rows in (own, theirs)]
+    if counts[1][counts[1] > counts[0]].sum() < RIVAL_MIN_OWN_SHARE * counts[1].sum():
+        return None
+    names = [reference.name for reference in support.references]
+    return (
+        Hypothesis(estimate.world_from_camera, votes.keypoint_count(own), _supporters(names, counts[0], counts[1])),
+        Hypothesis(pose, votes.keypoint_count(theirs), _supporters(names, counts[1], counts[0])),
+    )
+
+
+def _second_pose(camera: Camera, votes: Votes, wanted: int) -> tuple[RigidTransform, Accuracy] | None:
+    """Finds a pose with enough inliers that are not chance, and its radii."""
+    pose = ransac(camera, votes.x_in_world, votes.pixels, None, RIVAL_PNP)
+    if pose is None:
+        return None
+    inliers = votes.errors_px(camera, pose) < RIVAL_PNP.inlier_px
+    keypoint_count, count = len(np.unique(votes.keypoint)), votes.keypoint_count(inliers)
+    # The chance of an inlier is proportional to the number of matches of a keypoint.
+    disc_share = np.pi * RIVAL_PNP.inlier_px**2 / (camera.width_px * camera.height_px)
+    chance = float(disc_share * len(votes.keypoint) / keypoint_count)
+    if count < wanted or false_alarms(keypoint_count, count, chance) > RIVAL_MAX_LOG10_FALSE_ALARMS:
+        return None
+    # With a keypoint noise of one pixel.
+    covariance = world_covariance(pose_hessian(camera, pose, votes.x_in_world[inliers]), pose)
+    return pose, accuracy_from_covariance(covariance)
+
+
+def _supporters(names: Sequence[str], own: NDArray[np.intp], other: NDArray[np.intp]) -> tuple[str, ...]:
+    """Names of the references with more inliers of one pose than of the other, those with the most first."""
+    return tuple(names[i] for i in np.argsort(-own, kind="stable") if own[i] > other[i])
+
+
+def _outliers(
+    votes: Votes, own: NDArray[np.bool_], apart: NDArray[np.bool_], reference_count: int
+) -> NDArray[np.bool_]:
+    """Mask (V,) of the matches far from the first pose, of references with more such matches than inliers."""
+    against, favour = (np.bincount(votes.reference[rows], minlength=reference_count) for rows in (apart, own))
+    return np.asarray(apart & (against > favour)[votes.reference])
+
+
+def _are_apart(first: RigidTransform, radii: Accuracy, second: RigidTransform, other: Accuracy) -> bool:
+    apart_m = float(np.linalg.norm(second.translation - first.translation))
+    apart_deg = rotation_angle_deg(first.rotation.T @ second.rotation)
+    reach_m = max(MIN_APART_M, radii.position_95_m + other.position_95_m)
+    reach_deg = max(MIN_APART_DEG, radii.rotation_95_deg + other.rotation_95_deg)
+    return apart_m > reach_m or apart_deg > reach_deg

@@ -1,0 +1,238 @@
+"""Levenberg-Marquardt and robust losses: `minimize` for one problem, `minimize_each` for many small ones at once.
+
+A step solves the linearized problem with its diagonal enlarged by a relative damping. A step that lowers the cost is
+accepted and the damping is reduced; any other, also one that cannot be computed, is repeated with more damping. So the
+cost never rises, and a start whose cost is NaN is returned as it is.
+
+Each problem solves its own normal equations: dense ones (`damped_step`), or with the points eliminated (see `bundle`).
+
+Robust losses rho(s) of a squared residual s, with a scale c; both in standard deviations.
+
+    loss       rho(s)                           weight rho'(s)
+    Cauchy     c^2 log(1 + s / c^2)             1 / (1 + s / c^2)
+    soft L1    2 c^2 (sqrt(1 + s / c^2) - 1)    1 / sqrt(1 + s / c^2)
+    switched   s / (1 + s / c^2)                1 / (1 + s / c^2)^2
+
+All are s for small s. For large s, soft L1 grows like the residual, and Cauchy's loss like its logarithm, so that the
+influence of outliers vanishes. The switched loss (Geman and McClure's) is that of a switch variable 0 <= t <= 1 for
+each residual, min_t t^2 s + (1 - t)^2 c^2 (Suenderhauf and Protzel 2012): an outlier costs c^2, however large it is.
+The weights are those of iteratively reweighted least squares: the gradient of a sum of losses is 2 sum rho'(s) J^T r.
+(As in `scipy.optimize.least_squares`, with f_scale = c.)
+
+An array "in columns" has its long axis last, (..., N) instead of (N, ...): many small matrices as few long rows. NumPy
+computes with these several times as fast.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array
+
+from .bounds import check_bounds
+
+X = TypeVar("X")
+E = TypeVar("E")
+
+LOWERED = 0.1
+"""Factor on the damping after an accepted step."""
+
+LEAST_DIAGONAL = 1e-12
+"""Added to the diagonal before it is damped: an unknown that is not determined stays where it is."""
+
+
+class Problem(Protocol[X, E]):
+    """A cost over points of any type X; E is the type of its linearization."""
+
+    def cost(self, x: X) -> float:
+        """The cost; NaN where it is not defined, for example behind a camera."""
+        ...
+
+    def linearize(self, x: X) -> E:
+        """The linearization at a point, which does not depend on the damping."""
+        ...
+
+    def step(self, x: X, equations: E, damping: float) -> X | None:
+        """The point after a step; None where the step is not determined."""
+        ...
+
+
+@dataclass(frozen=True)
+class MinimizeOptions:
+    """Options of `minimize`.
+
+    Attributes:
+        iterations: largest number of steps that are tried.
+        min_decrease: stop after a step that lowers the cost by a smaller share.
+        damping: initial value; small, since the Gauss-Newton step is nearly right within an inlier threshold of the
+            minimum.
+        raised_by: factor on the damping after a rejected step.
+        max_damping: stop beyond it; the steps are then too short to matter.
+    """
+
+    iterations: int
+    min_decrease: float
+    damping: float = 1e-4
+    raised_by: float = 10.0
+    max_damping: float = 1e6
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "iterations", at_least=0)
+        check_bounds(self, "min_decrease damping max_damping", above=0)
+        check_bounds(self, "raised_by", above=1)
+
+
+def minimize(
+    problem: Problem[X, E],
+    start: X,
+    options: MinimizeOptions,
+    is_near: Callable[[X, X, E], bool] = lambda before, after, equations: False,
+) -> X:
+    """Finds the minimum near a start; returns the last point if the iterations do not suffice.
+
+    `is_near` is whether an accepted step, by the equations at its start, is so short that it may be the last one.
+    """
+    x, cost, damping = start, problem.cost(start), options.damping
+    if math.isnan(cost):
+        return start
+    equations: E | None = None
+    for _ in range(options.iterations):
+        if equations is None:
+            equations = problem.linearize(x)
+        candidate = problem.step(x, equations, damping)
+        candidate_cost = math.nan if candidate is None else problem.cost(candidate)
+        if candidate is None or not candidate_cost < cost:
+            damping *= options.raised_by
+            if damping > options.max_damping:
+                break
+            continue
+        converged = cost - candidate_cost < options.min_decrease * cost or is_near(x, candidate, equations)
+        x, cost, damping, equations = candidate, candidate_cost, damping * LOWERED, None
+        if converged:
+            break
+    return x
+
+
+def minimize_each(
+    cost: Callable[[Array], Array],
+    linearize: Callable[[Array], tuple[Array, Array]],
+    start: Array,
+    iterations: int,
+) -> Array:
+    """Finds minima of many independent problems of three unknowns, each with its own damping, from points (3, P).
+
+    All problems take the same number of steps. `cost` returns the costs (P,) at points (3, P); `linearize` the hessians
+    (6, P), as in `optimize.SYMMETRIC`, and gradients (3, P) of half the cost.
+    """
+    x, damped, least = start, np.full_like(start[0], 1e-3), cost(start)
+    for _ in range(iterations):
+        hessian, gradient = linearize(x)
+        hessian[:3] *= 1 + damped  # the diagonals
+        candidate = x - solve_columns(hessian, gradient)
+        candidate_cost = cost(candidate)
+        better = candidate_cost <= least  # False for NaN: behind a camera, or a singular system
+        x = np.where(better, candidate, x)
+        least = np.where(better, candidate_cost, least)
+        damped = np.where(better, damped * LOWERED, damped * 10)
+    return x
+
+
+def damped_step(hessian: Array, gradient: Array, damping: float) -> Array | None:
+    """Step (N,) of dense normal equations (N, N), (N,); None where it is not determined."""
+    return solve_step(hessian + damping * np.diag(np.diag(hessian) + LEAST_DIAGONAL), gradient)
+
+
+def solve_step(matrix: Array, gradient: Array, *, least_norm: bool = False) -> Array | None:
+    """Returns -matrix^-1 gradient; None if not finite. With `least_norm`, the shortest solution if singular."""
+    try:
+        step = -np.linalg.lstsq(matrix, gradient, rcond=None)[0] if least_norm else -np.linalg.solve(matrix, gradient)
+    except np.linalg.LinAlgError:
+        return None
+    return np.asarray(step, np.float64) if np.isfinite(step).all() else None
+
+
+def cauchy_cost(squared: Array, scale: float) -> float:
+    """Sum of rho over squared residuals (N,); NaN if one is NaN."""
+    return float(scale**2 * np.log1p(squared / scale**2).sum())
+
+
+def cauchy_weight(squared: Array, scale: float) -> Array:
+    """Weights rho' (N,)."""
+    return np.asarray(1 / (1 + squared / scale**2))
+
+
+def switched_cost(squared: Array, scale: float) -> float:
+    """Sum of rho over squared residuals (N,), with a switch for each."""
+    return float((squared / (1 + squared / scale**2)).sum())
+
+
+def switched_weight(squared: Array, scale: float) -> Array:
+    """Weights rho' (N,): the squares of the switches."""
+    return np.asarray((1 + squared / scale**2) ** -2.0)
+
+
+def soft_l1(squared: Array, scale: float) -> Array:
+    """Losses rho (N,)."""
+    return np.asarray(2 * scale**2 * ((1 + squared / scale**2) ** 0.5 - 1))
+
+
+def soft_l1_weight(squared: Array, scale: float) -> Array:
+    """Weights rho' (N,)."""
+    return np.asarray(1 / (1 + squared / scale**2) ** 0.5)
+
+
+def length(vectors: Array) -> Array:
+    """Euclidean length (...) of vectors (..., D)."""
+    return np.asarray((vectors**2).sum(-1) ** 0.5)
+
+
+def columns(values: Array) -> Array:
+    """Values (N, ...) in columns, (..., N)."""
+    return np.ascontiguousarray(np.moveaxis(values, 0, -1))
+
+
+def rows(values: Array) -> Array:
+    """Inverse of `columns`."""
+    return np.ascontiguousarray(np.moveaxis(values, -1, 0))
+
+
+def take(values: Array, index: NDArray[np.intp] | NDArray[np.bool_]) -> Array:
+    """Columns (..., M) of values (..., N) at indices (M,) or where a mask (N,) is true.
+
+    Indexing takes five times as long.
+    """
+    return np.take(values, np.flatnonzero(index) if index.dtype == bool else index, axis=-1)
+
+
+def apply_columns(matrices: Array, vectors: Array) -> Array:
+    """Multiplies matrices (I, J, N) with one vector (J, N) each: (I, N)."""
+    return np.asarray(np.einsum("ijn,jn->in", matrices, vectors))
+
+
+SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+"""The elements (6, N) of many symmetric 3x3 matrices, in columns."""
+
+
+def symmetric_products(first: Array, second: Array) -> Array:
+    """Products A^T B of matrices (I, 3, N), if symmetric: elements (6, N) in the order of `SYMMETRIC`."""
+    across = [(first[:, i, None] * second[:, i + 1 :]).sum(0) for i in range(2)]
+    return np.concatenate([(first * second).sum(0), *across])
+
+
+def solve_columns(matrices: Array, vectors: Array) -> Array:
+    """Solves symmetric 3x3 systems, (6, P) in the order of `SYMMETRIC`, of vectors (3, ..., P); NaN where singular.
+
+    By the adjugate: much faster than a LAPACK call per matrix, and exact enough for steps that are checked afterwards.
+    """
+    xx, yy, zz, xy, xz, yz = matrices
+    x, y, z = vectors
+    ixx, ixy, ixz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    iyy, iyz, izz = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    determinant = xx * ixx + xy * ixy + xz * ixz
+    solvable = abs(determinant) > 1e-14 * abs(matrices).max(axis=0) ** 3
+    solution = np.stack([ixx * x + ixy * y + ixz * z, ixy * x + iyy * y + iyz * z, ixz * x + iyz * y + izz * z])
+    return np.asarray(solution / np.where(solvable, determinant, np.nan))

@@ -1,0 +1,82 @@
+"""Whether two references agree with their poses, by matches that the poses took no part in.
+
+References are matched along the epipolar lines of their poses, so what remains of the matches says nothing of these: a
+pair with wrong poses has few matches, like one that shows nothing in common. The evidence is taken before: matches that
+are distinct by their descriptors, and that one fundamental matrix, estimated from them alone, explains. If there are
+enough, the poses must satisfy them: their distance from the epipolar lines of the poses is the error of the pair. A
+repeated pattern gives such matches, too, but then a good part of the others satisfies poses that are right. Where the
+poses place most points behind the cameras, no distance is small enough: the epipolar lines of a camera that moves
+ahead, and of the same one moving back, are the same.
+
+The error does not depend on the unit of length, nor on the choice of the world's axes.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..features.views import Matches, PosedView
+from .epipolar import BEHIND_SHARE, MIN_MATCHES, QUICK_ITERATIONS, PosedMatches, fundamental_inliers
+
+MAX_ERROR_PX = 3.0
+"""Largest median error of a pair that agrees, pixels of an image whose longer side is 1024. Good poses give 0.1
+(surveyed) to 0.8 px (motion capture, a rolling shutter); a phone's tracking up to two. Wrong conventions give tens."""
+
+STATIONARY_PX = 35.0
+"""The same for two references at one place, where only the rotation is compared: a camera turned by hand or on a tripod
+does not turn about its centre, and what is near moves by some per cent of the image."""
+
+MAJORITY = 0.5
+"""Share of distinct matches that satisfy the poses; then no matrix is estimated: it would be that of the poses."""
+
+AMBIGUOUS_SHARE = 0.25
+"""Matches that satisfy the poses, as a share of those that contradict them, from which the pair says nothing."""
+
+_MOST_MATCHES = 150
+LARGEST_ERROR_PX = _SIDE_PX = 1024.0
+
+
+ReferenceErrors = Callable[[int, int], float | None]
+"""Returns the error of a pair of a query's references, by their indices; None if it is not known."""
+
+
+def thinned(matches: Matches) -> Matches:
+    """As many of the matches, evenly, as the error of a pair is computed from."""
+    return matches[:: -(-len(matches) // _MOST_MATCHES) or 1]
+
+
+def pair_error_px(first: PosedView, second: PosedView, matches: Matches) -> float | None:
+    """Error of a pair: median distance of consistent matches from satisfying the poses; None if they do not show it.
+
+    Args:
+        first: a reference.
+        second: another one.
+        matches: (M, 2) distinct matches of both, that have not been filtered by the poses.
+
+    Returns:
+        The median distance (see `epipolar`), pixels of an image whose longer side is 1024; the largest possible if most
+        points are behind the cameras. For references at one place, relative to `STATIONARY_PX`.
+    """
+    if len(matches) < MIN_MATCHES:
+        return None
+    matches = thinned(matches)
+    per_px = _SIDE_PX / max(max(it.view.camera.width_px, it.view.camera.height_px) for it in (first, second))
+    posed = PosedMatches.of_pair(first, second, matches)
+    (is_one_place,) = posed.are_at_one_place
+    scale = per_px * MAX_ERROR_PX / STATIONARY_PX if is_one_place else per_px
+    errors_px = scale * np.nan_to_num(np.abs(posed.distances_px()[0]), nan=np.inf)
+    agreeing: NDArray[np.bool_] = errors_px <= MAX_ERROR_PX
+    consistent = agreeing
+    if agreeing.sum() < max(MIN_MATCHES, MAJORITY * len(matches)):
+        consistent = fundamental_inliers(first.view, second.view, matches, QUICK_ITERATIONS)
+        if not consistent.any():
+            return None
+        is_satisfied = float(np.median(errors_px[consistent])) <= MAX_ERROR_PX
+        if not is_satisfied and agreeing.sum() > AMBIGUOUS_SHARE * consistent.sum():
+            return None
+    error_px = float(np.median(errors_px[consistent]))
+    if error_px > MAX_ERROR_PX or is_one_place:
+        return min(error_px, LARGEST_ERROR_PX)
+    (behind_share,) = PosedMatches.of_pair(first, second, matches[consistent & agreeing]).behind_shares()
+    return LARGEST_ERROR_PX if behind_share > BEHIND_SHARE else error_px

@@ -1,0 +1,204 @@
+"""The mistake that explains why poses do not fit: the correction that makes them fit.
+
+A mistake explains if its correction leaves less than `GAIN` of the error, and most pairs good. Of several that fit
+equally well, the more common ones are named; of two, both; of more, none, since the photographs do not say which.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...features.views import PosedView
+from .alignment import align_sessions
+from .conventions import CONVENTIONS, RARE, STRANGE, USUAL, ViewCorrection, on_view
+from .errors import MatchedPair, PairError, PairSample, Views, summary
+from .intrinsics import FIELDS_DEG, camera_mistakes, focal_scaled, is_unset, of_field, scaled, with_camera
+from .rounding import rounding_text
+from .sessions import sessions_of
+
+FOCAL_SCALES = np.geomspace(0.2, 5.0, 33)
+"""Wrong image sizes are usually wrong by a factor of up to four."""
+FOCAL_TOLERANCE = 0.03
+"""A focal length that would have to change by less is not the reason."""
+GAIN = 0.4
+"""Share of the error that an explanation may leave."""
+BAD_SHARE = 0.5
+"""Share of the pairs that may stay bad."""
+MIXED_BAD_SHARE = 0.2
+"""The same where each pair is given the choice of which of its two to correct."""
+EQUAL_SHARE, EQUAL_PX = 1.25, 0.1
+"""Errors that differ by less than this factor, and this distance, are equal: noise of medians."""
+COVERED_SHARE = 0.8
+"""Share of the photographs that two sessions must explain."""
+MOST_NAMED = 2
+"""Explanations that are named beside one another."""
+_REFINEMENTS = 3
+_ENOUGH_MATCHES = 64  # for a median that distinguishes mistakes
+_BEHIND_PX = 1000.0  # stands for the error of a pair whose points lie behind its cameras
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A likely mistake, and the photographs that it concerns, if not all; without text there is none.
+
+    `error_px` is the median error of the pairs after its correction; NaN where the right poses are unknown.
+    """
+
+    text: str = ""
+    error_px: float = math.nan
+    photographs: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    text: str
+    error_px: float
+    bad_share: float
+    rarity: int
+
+
+def explain(views: Views, matched: Sequence[MatchedPair], given_px: float | None = None) -> Explanation:
+    """Finds the mistake whose correction makes the poses fit; `given_px` is the median error, measured if None."""
+    sample = PairSample(views, [item for item in matched if len(item.matches)], _ENOUGH_MATCHES)
+    if not sample.pairs:
+        return Explanation()
+    given = _score(sample.measure())[0]
+    corrections = list(_corrections(sample.views))
+    candidates = [
+        _Candidate(text, *_score_with(sample, correct), rarity) for text, correct, rarity in corrections
+    ] + list(_scalings(sample))
+    fitting = [it for it in candidates if it.bad_share < BAD_SHARE and it.error_px < GAIN * given]
+    if fitting:
+        return _named(fitting)
+    text = rounding_text(sample, summary(sample.measure())[0] if given_px is None else given_px)
+    if text:
+        return Explanation(text)
+    if apart := _sessions(views, matched, sample.measure()):
+        return apart
+    mixed = [
+        (_mixed(sample, text, correct), rarity) for text, correct, rarity in corrections if rarity < STRANGE
+    ]  # perhaps it was made with some photographs only
+    found = [it for it in mixed if it[0].text]
+    least = min((rarity for _, rarity in found), default=USUAL)
+    return min((it for it, rarity in found if rarity == least), key=lambda it: it.error_px, default=Explanation())
+
+
+def _sessions(views: Views, matched: Sequence[MatchedPair], errors: Sequence[PairError]) -> Explanation | None:
+    """Explains pairs by two sessions, with the similarity that aligns the smaller one, if the pairs determine it."""
+    groups = sessions_of({it.pair: not it.is_bad for it in errors})
+    if groups is None or sum(map(len, groups)) < COVERED_SHARE * len({i for it in errors for i in it.pair}):
+        return None
+    first, second = groups
+    text = (
+        f"two sessions, {len(first)} and {len(second)} photographs that agree among themselves but not with each "
+        "other, each in a world of its own"
+    )
+    found = align_sessions(views, matched, first, second)
+    if found is None:
+        return Explanation(text, photographs=second)
+    return Explanation(f"{text}: the smaller one fits with {found.text}", found.median_px, second)
+
+
+def _named(fitting: Sequence[_Candidate]) -> Explanation:
+    """The best candidates, the most common ones of those that are equal."""
+    best = min(it.error_px for it in fitting)
+    equal = [it for it in fitting if it.error_px <= max(EQUAL_SHARE * best, best + EQUAL_PX)]
+    rarity = min(it.rarity for it in equal)
+    named = sorted((it for it in equal if it.rarity == rarity), key=lambda it: it.error_px)
+    if len(named) > MOST_NAMED:
+        return Explanation()
+    return Explanation("; or ".join(it.text for it in named), named[0].error_px)
+
+
+def _corrections(views: Mapping[int, PosedView]) -> Iterator[tuple[str, ViewCorrection, int]]:
+    for convention in CONVENTIONS:
+        yield convention.text, on_view(convention.correct), convention.rarity
+    for mistake in camera_mistakes(list(views.values())):
+        yield mistake.text, mistake.correct, mistake.rarity
+
+
+def _score(errors: Sequence[PairError]) -> tuple[float, float]:
+    """Median error, that of pairs behind their cameras being large, and share of bad pairs."""
+    costs = [_BEHIND_PX if it.is_behind or math.isnan(it.error_px) else it.error_px for it in errors]
+    return float(np.median(costs)), float(np.mean([it.is_bad for it in errors]))
+
+
+def _score_with(sample: PairSample, change: ViewCorrection) -> tuple[float, float]:
+    return _score(sample.measure({i: change(view) for i, view in sample.views.items()}))
+
+
+def _scalings(sample: PairSample) -> Iterator[_Candidate]:
+    """Explanations by focal lengths that fit: of another image size, or of no camera at all."""
+    cameras = [view.view.camera for view in sample.views.values()]
+    if any(map(is_unset, cameras)):
+        yield from _unset(sample)
+        return
+    for what, change in (("focal lengths are", focal_scaled), ("focal lengths and principal points are", scaled)):
+        scale, error_px, bad_share = best_scale(sample, change)
+        if abs(scale - 1) > FOCAL_TOLERANCE and FOCAL_SCALES[0] < scale < FOCAL_SCALES[-1]:
+            text = (
+                f"the {what} {scale:.2f} times what is given (intrinsics of another image size, or of a video "
+                "mode that crops?)"
+            )
+            yield _Candidate(text, error_px, bad_share, RARE)
+
+
+def _unset(sample: PairSample) -> Iterator[_Candidate]:
+    """A focal length of no camera: the one that fits, with the principal point in the image's centre."""
+    starts = [
+        (_score_with(sample, lambda view, it=field: with_camera(view, of_field(view.view.camera, it))), field)  # type: ignore[misc]
+        for field in FIELDS_DEG
+    ]
+    (_, _), field = min(starts, key=lambda it: it[0][0])
+
+    def scaled_field(view: PosedView, scale: float) -> PosedView:
+        return focal_scaled(with_camera(view, of_field(view.view.camera, field)), scale)
+
+    scale, error_px, bad_share = best_scale(sample, scaled_field)
+    cameras = [it.view.camera for it in sample.views.values()]
+    given = np.median([it.focal_x_px for it in cameras])
+    found = np.median([scale * of_field(it, field).focal_x_px for it in cameras])
+    text = (
+        f"K was not set (a camera that is not calibrated), or is not in pixels: focal lengths of {given:.3g} px are "
+        f"those of no camera; about {found:.0f} px fit"
+    )
+    yield _Candidate(text, error_px, bad_share, USUAL)
+
+
+def best_scale(sample: PairSample, change: Callable[[PosedView, float], PosedView]) -> tuple[float, float, float]:
+    """The factor by which to `change` all views with the least median error; that error, and the share of bad pairs."""
+
+    def score_at(scale: float) -> tuple[float, float]:
+        return _score_with(sample, lambda view: change(view, scale))
+
+    scales = FOCAL_SCALES
+    for _ in range(_REFINEMENTS):
+        best = int(np.argmin([score_at(scale)[0] for scale in scales]))
+        low, high = scales[max(best - 1, 0)], scales[min(best + 1, len(scales) - 1)]
+        scale = float(scales[best])
+        scales = np.geomspace(low, high, 9)
+    return scale, *score_at(scale)
+
+
+def _mixed(sample: PairSample, text: str, correction: ViewCorrection) -> Explanation:
+    """Explains pairs by correcting either, both or none of their photographs; empty if that does not fit."""
+    turned = {i: correction(view) for i, view in sample.views.items()}
+    count = len(sample.pairs)
+    measured = [sample.measure(), sample.measure(turned, sample.views)]
+    measured += [sample.measure(sample.views, turned), sample.measure(turned)]
+    best: list[PairError] = []
+    votes: Counter[int] = Counter()
+    for row in range(count):
+        options = [_score([errors[row]])[0] for errors in measured]
+        chosen = int(np.argmin(options))
+        best.append(measured[chosen][row])
+        for side, i in enumerate(sample.pairs[row]):
+            votes[i] += 1 if chosen in ((1, 3), (2, 3))[side] else -1
+    error_px, bad_share = _score(best)
+    concerned = tuple(sorted(i for i, votes_for in votes.items() if votes_for > 0))
+    if bad_share >= MIXED_BAD_SHARE or not concerned:
+        return Explanation()
+    return Explanation(f"with some photographs, not all, {text}", error_px, concerned)

@@ -1,0 +1,142 @@
+"""Intrinsics that are read otherwise than they were meant, each with its correction.
+
+Some leave a mark: a principal point at the first pixel is that of a K given by columns, a focal length of a pixel that
+of a K that was never set. What was meant is then unknown, and the image's centre and a focal length that fits stand in.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mapless.geometry import Camera
+
+from ...features.views import PosedView, undistort_pixels
+from .conventions import RARE, USUAL, ViewCorrection, turned_camera
+
+LEAST_FOCAL_SHARE = 0.1
+"""Share of the image's longer side; a shorter focal length would be a pinhole with more than 157 degrees of view."""
+SAME_SHARE = 0.01
+"""Share of the image's longer side; coordinates that differ by less cannot be distinguished."""
+FIELDS_DEG = (30.0, 45.0, 60.0, 75.0, 90.0, 110.0, 130.0)
+"""Horizontal fields of view from which a focal length that is unknown is searched."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraMistake:
+    """A mistake in intrinsics: how it is named, its correction, and how common it is."""
+
+    text: str
+    correct: ViewCorrection
+    rarity: int
+
+
+def with_camera(posed: PosedView, camera: Camera) -> PosedView:
+    """A view with another pinhole; keypoints are undistorted anew where the lens is known."""
+    view = posed.view
+    if view.distortion is None:
+        return replace(posed, view=replace(view, camera=camera))
+    seen = replace(view.camera, distortion=view.distortion).project(view.camera.rays(view.features.keypoints))
+    ideal = undistort_pixels(seen, replace(camera, distortion=view.distortion))
+    features = replace(view.features, keypoints=ideal.astype(np.float32))
+    return replace(posed, view=replace(view, camera=camera, features=features))
+
+
+def centred(camera: Camera) -> Camera:
+    """The camera with its principal point in the image's centre."""
+    return replace(camera, principal_x_px=(camera.width_px - 1) / 2, principal_y_px=(camera.height_px - 1) / 2)
+
+
+def of_field(camera: Camera, field_deg: float) -> Camera:
+    """A camera with square pixels, a centred principal point, and this field of view along the longer side."""
+    longer = max(camera.width_px, camera.height_px)
+    focal_px = longer / 2 / math.tan(math.radians(field_deg) / 2)
+    return replace(centred(camera), focal_x_px=focal_px, focal_y_px=focal_px)
+
+
+def is_at_first_pixel(camera: Camera) -> bool:
+    """Whether the principal point is that of a K that was given by columns, or not set."""
+    bound_px = SAME_SHARE * max(camera.width_px, camera.height_px)
+    return max(abs(camera.principal_x_px), abs(camera.principal_y_px)) <= bound_px
+
+
+def is_unset(camera: Camera) -> bool:
+    """Whether the focal length is none of a camera: of a K that was not set, or not in pixels."""
+    return min(camera.focal_x_px, camera.focal_y_px) < LEAST_FOCAL_SHARE * max(camera.width_px, camera.height_px)
+
+
+def _swapped_focal(camera: Camera) -> Camera:
+    return replace(camera, focal_x_px=camera.focal_y_px, focal_y_px=camera.focal_x_px)
+
+
+def _swapped_principal(camera: Camera) -> Camera:
+    # Exchanged in the photograph as it was given, where (0, 0) is the first pixel's centre as here.
+    return replace(camera, principal_x_px=camera.principal_y_px, principal_y_px=camera.principal_x_px)
+
+
+def camera_mistakes(views: Sequence[PosedView]) -> Iterator[CameraMistake]:
+    """The mistakes that these views may have; none whose correction would change next to nothing."""
+    cameras = [view.view.camera for view in views]
+    if not cameras:
+        return
+    sides = np.array([max(it.width_px, it.height_px) for it in cameras])
+    if all(map(is_at_first_pixel, cameras)):
+        if not any(map(is_unset, cameras)):
+            yield CameraMistake(
+                "K is given by columns, or its last column is missing: the principal point (cx, cy) is 0 0, and one in "
+                "the image's centre fits",
+                lambda view: with_camera(view, centred(view.view.camera)),
+                USUAL,
+            )
+    elif _differ([it.principal_x_px - it.principal_y_px for it in cameras], sides):
+        yield CameraMistake(
+            "cx and cy are exchanged", lambda view: with_camera(view, _swapped_principal(view.view.camera)), USUAL
+        )
+    if _differ([it.focal_x_px - it.focal_y_px for it in cameras], sides):
+        yield CameraMistake(
+            "fx and fy are exchanged", lambda view: with_camera(view, _swapped_focal(view.view.camera)), USUAL
+        )
+    for quarters in (1, 2, 3):
+        yield CameraMistake(
+            f"poses and intrinsics are of images turned by {90 * quarters} degrees (EXIF orientation)",
+            turned(quarters),
+            RARE,
+        )
+
+
+def _differ(differences_px: Sequence[float], sides: "np.ndarray[tuple[int], np.dtype[np.int64]]") -> bool:
+    return bool(np.median(np.abs(differences_px) / sides) > SAME_SHARE)
+
+
+_QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def turned(quarters: int) -> ViewCorrection:
+    """Correction of a photograph that was turned so often to the left, without its pose and its intrinsics."""
+
+    def correct(view: PosedView) -> PosedView:
+        camera = view.view.camera
+        fx, fy, x, y = camera.focal_x_px, camera.focal_y_px, camera.principal_x_px, camera.principal_y_px
+        sides_px = [camera.width_px, camera.height_px]
+        for remaining in range(quarters, 0, -1):
+            fx, fy, x, y = fy, fx, y, sides_px[remaining % 2] - 1 - x
+        camera = replace(camera, focal_x_px=fx, focal_y_px=fy, principal_x_px=x, principal_y_px=y)
+        pose = turned_camera(np.linalg.matrix_power(_QUARTER, quarters))(view.world_from_camera)
+        return replace(view, view=replace(view.view, camera=camera), world_from_camera=pose)
+
+    return correct
+
+
+def focal_scaled(view: PosedView, scale: float) -> PosedView:
+    """A view with its focal lengths multiplied."""
+    camera = view.view.camera
+    camera = replace(camera, focal_x_px=scale * camera.focal_x_px, focal_y_px=scale * camera.focal_y_px)
+    return replace(view, view=replace(view.view, camera=camera))
+
+
+def scaled(view: PosedView, scale: float) -> PosedView:
+    """A view with its focal lengths and its principal point multiplied."""
+    camera = focal_scaled(view, scale).view.camera
+    camera = replace(camera, principal_x_px=scale * camera.principal_x_px, principal_y_px=scale * camera.principal_y_px)
+    return replace(view, view=replace(view.view, camera=camera))

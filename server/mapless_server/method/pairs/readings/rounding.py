@@ -1,0 +1,118 @@
+"""Poses that were written with few digits: the steps of their numbers, and the errors that these steps make.
+
+Rounded numbers are multiples of a step. That alone is no mistake: poses of a simulator are so, too. It explains pairs
+that do not fit if errors as large as theirs come of moving every pose within its steps.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mapless.geometry import Array, RigidTransform, rotation_from_vector
+
+from ...features.views import PosedView
+from .errors import PairSample, summary
+
+LEAST_COUNT = 4
+"""Poses whose numbers say something."""
+DIGITS = (1, 2, 3, 4)
+"""Digits after the point that are tried for rotations."""
+POSITION_DIGITS = range(-4, 7)
+"""The same of positions; negative before it."""
+_ROUNDED_SHARE = 0.3  # of rotations that come of a rounded matrix, which is not one before it is made one
+_EXACT = 1e-8
+_FACTOR = 3.0  # between the errors that are found and those that the steps make
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """Steps of the numbers of poses; 0 where none was found.
+
+    Attributes:
+        position: (3,) of x, y and z, in the poses' unit.
+        rotation: of the numbers of rotation matrices, or of quaternions.
+    """
+
+    position: Array
+    rotation: float
+
+
+def steps_of(poses: Sequence[RigidTransform]) -> Steps:
+    """Finds the steps of the numbers of poses; a pose that is given several times counts once."""
+    poses = list({pose.matrix().round(8).tobytes(): pose for pose in poses}.values())
+    if len(poses) < LEAST_COUNT:
+        return Steps(np.zeros(3), 0.0)
+    positions = np.array([pose.translation for pose in poses])
+    return Steps(np.array([_step(positions[:, axis]) for axis in range(3)]), _rotation_step(poses))
+
+
+def _step(values: Array) -> float:
+    """The largest decimal or single-precision step of which all values are multiples; 0 if they are constant."""
+    if np.ptp(values) == 0:
+        return 0.0
+    for digits in POSITION_DIGITS:
+        step = 10.0**-digits
+        multiples = values / step
+        if (np.abs(multiples - np.round(multiples)) <= np.maximum(1e-6, 1e-15 * np.abs(multiples) * 4)).all():
+            return step if digits < max(POSITION_DIGITS) else 0.0
+    if np.array_equal(values.astype(np.float32).astype(float), values):
+        return float(np.spacing(np.float32(np.abs(values).max())))
+    return 0.0
+
+
+def _rotation_step(poses: Sequence[RigidTransform]) -> float:
+    for digits in DIGITS:
+        rounded = [_is_of_rounded_matrix(pose, digits) or _is_of_rounded_quaternion(pose, digits) for pose in poses]
+        if np.mean(rounded) >= _ROUNDED_SHARE:
+            return 10.0**-digits
+    return 0.0
+
+
+def _is_of_rounded_matrix(pose: RigidTransform, digits: int) -> bool:
+    rounded = np.round(pose.rotation, digits)
+    u, _, vt = np.linalg.svd(rounded)
+    return bool(np.abs(u @ vt - pose.rotation).max() < _EXACT)
+
+
+def _is_of_rounded_quaternion(pose: RigidTransform, digits: int) -> bool:
+    q = pose.quaternion()
+    numbers = np.array([q.x, q.y, q.z, q.w])
+    rounded = np.round(numbers, digits)
+    length = float(np.linalg.norm(rounded))
+    return length > 0 and bool(np.abs(rounded / length - numbers).max() < _EXACT)
+
+
+def rounding_text(sample: PairSample, given_px: float) -> str:
+    """Names the rounded numbers if rounding gives errors like the given median of the sample's pairs; else empty."""
+    steps = steps_of([view.world_from_camera for view in sample.views.values()])
+    parts = []
+    if steps.position.any() and _explains(sample, replace(steps, rotation=0.0), given_px):
+        names = [f"{name} to {step:.2g}" for name, step in zip("xyz", steps.position, strict=True) if step]
+        parts.append(f"the positions are rounded ({', '.join(names)})")
+    if steps.rotation and _explains(sample, replace(steps, position=np.zeros(3)), given_px):
+        parts.append(f"the rotations are rounded to {round(-math.log10(steps.rotation))} digits")
+    if not parts and steps.rotation and steps.position.any() and _explains(sample, steps, given_px):
+        parts.append("positions and rotations are rounded")
+    if not parts:
+        return ""
+    return f"{' and '.join(parts)}: write all digits, or subtract a common origin from large coordinates first"
+
+
+def _explains(sample: PairSample, steps: Steps, given_px: float) -> bool:
+    made_px, _ = summary(sample.measure(_moved(sample.views, steps)))
+    return given_px <= _FACTOR * made_px
+
+
+def _moved(views: Mapping[int, PosedView], steps: Steps) -> dict[int, PosedView]:
+    """Views whose poses are moved by random parts of the steps, as rounding did; the same for the same views."""
+    random = np.random.default_rng(len(views))
+    moved = {}
+    for i, view in views.items():
+        pose = view.world_from_camera
+        shift = random.uniform(-0.5, 0.5, 3) * steps.position
+        turn = random.uniform(-0.5, 0.5, 3) * steps.rotation
+        turned = RigidTransform(rotation_from_vector(turn) @ pose.rotation, pose.translation + shift)
+        moved[i] = replace(view, world_from_camera=turned)
+    return moved

@@ -1,0 +1,172 @@
+"""Poses of several cameras as one: generalized PnP by PoseLib.
+
+A generalized camera is a set of rays without a common centre: those of all cameras, in the frame that they are fixed
+to. Three 2D-3D matches of any of the cameras determine its pose (gp3p), four also the unit of that frame (gp4ps):
+
+    lambda_i d_i + s p_i = rig_from_world x_i
+
+for a match's ray from p_i in the direction d_i, in the frame's unit, and its point x_i in metres; s is metres per unit.
+"""
+
+import ctypes
+import math
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import poselib
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, Camera, RigidTransform, Similarity
+
+from ..optim.perturbation import reprojection_errors_px
+from .pnp import PnpOptions, poselib_camera, poselib_pose
+
+_libc = ctypes.CDLL(None)
+_rand_lock = threading.Lock()
+
+
+@dataclass(frozen=True, eq=False)
+class CameraMatches:
+    """One camera of a group, with its matches.
+
+    Attributes:
+        camera: the pinhole camera.
+        rig_from_camera: its pose in the rig; metres, or units of the rig's frame.
+        pixels: (M, 2) of the matches.
+        x_in_world: (M, 3) metres.
+    """
+
+    camera: Camera
+    rig_from_camera: RigidTransform
+    pixels: Array
+    x_in_world: Array
+
+    def inliers(self, world_from_rig: RigidTransform | Similarity, inlier_px: float) -> NDArray[np.bool_]:
+        """Which of the matches (M,) are inliers of a pose."""
+        pose = camera_in_world(world_from_rig, self.rig_from_camera)
+        return reprojection_errors_px(self.camera, pose, self.x_in_world, self.pixels) < inlier_px
+
+    def thinned(self, step: int) -> "CameraMatches":
+        """Returns the camera with every `step`-th match."""
+        return CameraMatches(self.camera, self.rig_from_camera, self.pixels[::step], self.x_in_world[::step])
+
+
+def camera_in_world(world_from_rig: RigidTransform | Similarity, rig_from_camera: RigidTransform) -> RigidTransform:
+    """Metric `world_from_camera` of a camera of the rig."""
+    if isinstance(world_from_rig, Similarity):
+        return world_from_rig.transform_pose(rig_from_camera)
+    return world_from_rig.compose(rig_from_camera)
+
+
+def inlier_count(
+    cameras: Sequence[CameraMatches], world_from_rig: RigidTransform | Similarity, inlier_px: float
+) -> int:
+    """Number of inliers of a pose, over all cameras."""
+    return sum(int(camera.inliers(world_from_rig, inlier_px).sum()) for camera in cameras)
+
+
+def rig_ransac(cameras: Sequence[CameraMatches], options: PnpOptions) -> RigidTransform | None:
+    """Estimates `world_from_rig` by gp3p in RANSAC with a final Cauchy refinement; None without a finite pose.
+
+    The same matches give the same pose.
+    """
+    cameras = _bounded(cameras, options.max_matches)
+    if sum(len(camera.pixels) for camera in cameras) < 3:
+        return None
+    with _repeatable():
+        pose, _ = poselib.estimate_generalized_absolute_pose(
+            [camera.pixels for camera in cameras],
+            [camera.x_in_world for camera in cameras],
+            [poselib_pose(camera.rig_from_camera.inverse()) for camera in cameras],
+            [poselib_camera(camera.camera) for camera in cameras],
+            {
+                "max_reproj_error": options.inlier_px,
+                "min_iterations": options.min_iterations,
+                "max_iterations": options.max_iterations,
+                "seed": 0,
+            },
+            {"loss_type": "CAUCHY", "loss_scale": options.loss_scale_px},
+        )
+    return _world_from_rig(pose)
+
+
+def scaled_ransac(
+    cameras: Sequence[CameraMatches], options: PnpOptions, max_iterations: int, max_matches: int
+) -> Similarity | None:
+    """Estimates the similarity `world_from_rig` by gp4ps in our own RANSAC; PoseLib has the solver, but no estimator.
+
+    `rig_from_camera` of the cameras is in any common unit. Poses are scored on at most `max_matches`, thinned evenly;
+    fewer than `max_iterations` samples are taken if a pose has many inliers. Returns the pose with the most inliers;
+    None if there is none. A scale that is not above zero, or not determined because all cameras are at one place, is no
+    pose.
+    """
+    cameras = _bounded(cameras, max_matches)
+    rays = np.concatenate([_rays(camera) for camera in cameras])
+    starts = np.concatenate(
+        [np.broadcast_to(camera.rig_from_camera.translation, (len(camera.pixels), 3)) for camera in cameras]
+    )
+    points = np.concatenate([camera.x_in_world for camera in cameras])
+    owner = np.repeat(np.arange(len(cameras)), [len(camera.pixels) for camera in cameras])
+    if len(points) < 4 or len(np.unique(owner)) < 2:
+        return None
+    random, best, best_count, needed = np.random.default_rng(0), None, 3, max_iterations
+    for iteration in range(max_iterations):
+        if iteration >= needed:
+            break
+        sample = random.choice(len(points), 4, replace=False)
+        if len(np.unique(owner[sample])) < 2:
+            continue
+        with _repeatable():
+            solutions = poselib.gp4ps(starts[sample], rays[sample], points[sample], True)
+        for pose, scale in zip(*solutions, strict=True):
+            world_from_rig = _similarity(pose, scale)
+            count = inlier_count(cameras, world_from_rig, options.inlier_px) if world_from_rig else 0
+            if count > best_count:
+                best, best_count = world_from_rig, count
+                needed = _iterations_needed(count / len(points))
+    return best
+
+
+@contextmanager
+def _repeatable() -> Iterator[None]:
+    """Makes PoseLib's generalized solvers repeatable: they rotate the problem by random numbers of the C library.
+
+    PoseLib's seed does not apply to these numbers: the same matches would give poses that differ in the last digits.
+    """
+    with _rand_lock:
+        _libc.srand(0)
+        yield
+
+
+def _iterations_needed(inlier_share: float) -> int:
+    """Number of samples of which one has four inliers with 99.9 %, if half of all are of a single camera."""
+    good = inlier_share**4 / 2
+    return 2 if good >= 1 else math.ceil(math.log(1e-3) / math.log1p(-good))
+
+
+def _bounded(cameras: Sequence[CameraMatches], max_matches: int) -> list[CameraMatches]:
+    step = -(-sum(len(camera.pixels) for camera in cameras) // max_matches)
+    return [camera.thinned(max(1, step)) for camera in cameras]
+
+
+def _rays(camera: CameraMatches) -> Array:
+    """Unit directions (M, 3) of the matches' rays in the rig's axes."""
+    rays = camera.camera.rays(camera.pixels) @ camera.rig_from_camera.rotation.T
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def _similarity(pose: poselib.CameraPose, scale: float) -> Similarity | None:
+    world_from_rig = _world_from_rig(pose)
+    if world_from_rig is None or not (math.isfinite(scale) and scale > 0):
+        return None
+    return Similarity(scale, world_from_rig.rotation, world_from_rig.translation)
+
+
+def _world_from_rig(pose: poselib.CameraPose) -> RigidTransform | None:
+    rotation, translation = np.asarray(pose.R), np.asarray(pose.t)
+    if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
+        return None
+    return RigidTransform(rotation, translation).inverse()

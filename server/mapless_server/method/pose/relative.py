@@ -1,0 +1,243 @@
+"""Initial pose of a query from two-view matches and 2D-3D matches together.
+
+Candidates, of which the one with the highest score is taken:
+
+    - poses that the caller knows;
+    - PnP on the 2D-3D matches, if there are any;
+    - the generalized relative pose: five matches with one reference and one with another (PoseLib);
+    - for each of the references with the most matches, the relative pose up to its unknown distance (five points), and
+      the distance from every single match with another reference and with a point. PoseLib chooses the distance
+      among random samples of all matches, most of which are of the strongest reference and do not depend on it.
+
+The score is sum (1 - r^2 / r_max^2) log10(1 / p) over the inliers, with residual r and the chance p that a wrong match
+is an inlier: an epipolar line excludes less of the image than a point, so such a match counts less.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import poselib
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, Camera, RigidTransform
+
+from ..features.views import PosedView, View
+from ..optim.bounds import check_bounds
+from ..optim.perturbation import reprojection_errors_px
+from .pnp import PnpOptions, poselib_camera, poselib_pose, ransac
+from .two_view_matches import TwoViewMatches
+
+
+@dataclass(frozen=True)
+class RelativePoseOptions:
+    """Options of the search.
+
+    Attributes:
+        epipolar_px: largest Sampson distance of an inlier; keypoints are accurate to about a pixel.
+        pnp: options of poses from 2D-3D matches; its `inlier_px` bounds their inliers.
+        min_iterations, max_iterations: bounds of iterations for the generalized relative pose; 20,000 take 0.1 s.
+        pair_iterations: largest number of iterations for one reference, reached with 15 % inliers.
+        strongest: number of references whose relative pose is computed.
+        min_matches: least number of matches with a reference, for its relative pose.
+        max_distances: largest number of distances that are scored for each reference, evenly thinned.
+    """
+
+    epipolar_px: float = 2.0
+    pnp: PnpOptions = field(default_factory=PnpOptions)
+    min_iterations: int = 1000
+    max_iterations: int = 20_000
+    pair_iterations: int = 5000
+    strongest: int = 2
+    min_matches: int = 8
+    max_distances: int = 200
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "epipolar_px", above=0)
+        check_bounds(self, "min_iterations", above=0, at_most=self.max_iterations)
+        check_bounds(self, "pair_iterations strongest max_distances", above=0)
+        check_bounds(self, "min_matches", at_least=5)
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """All matches of a query.
+
+    Attributes:
+        query: the photograph.
+        references: the posed references.
+        two_view: matches with the references.
+        x_in_world: (N, 3) points of the 2D-3D matches.
+        keypoint: (N,) their keypoints in the query.
+    """
+
+    query: View
+    references: Sequence[PosedView]
+    two_view: TwoViewMatches
+    x_in_world: Array
+    keypoint: NDArray[np.intp]
+
+    @property
+    def pixels(self) -> Array:
+        """Pixels (N, 2) of the 2D-3D matches."""
+        return self.query.features.keypoints[self.keypoint].astype(np.float64)
+
+
+def disc_chance(camera: Camera, inlier_px: float) -> float:
+    """Chance that a wrong match lies within `inlier_px` of a point's projection: a disc's share of the image."""
+    return float(min(1.0, np.pi * inlier_px**2 / (camera.width_px * camera.height_px)))
+
+
+def band_chance(camera: Camera, epipolar_px: float) -> float:
+    """Chance that a wrong match is within this Sampson distance of its epipolar line: a band's share of the image.
+
+    Both keypoints share the distance, so the band is sqrt(2) times as wide; it is at most as long as the diagonal.
+    """
+    length_px = np.hypot(camera.width_px, camera.height_px)
+    return float(min(1.0, 2 * np.sqrt(2) * epipolar_px * length_px / (camera.width_px * camera.height_px)))
+
+
+def find_pose(
+    evidence: Evidence, options: RelativePoseOptions, known: Iterable[RigidTransform] = ()
+) -> RigidTransform | None:
+    """Returns the world_from_query with the highest score, not refined; None without a candidate."""
+    candidates = [*known, *_from_points(evidence, options), *_generalized(evidence, options)]
+    for reference in _strongest(evidence.two_view, options):
+        candidates += _by_distance(evidence, reference, options)
+    if not candidates:
+        return None
+    return candidates[int(np.argmax([score(evidence, pose, options) for pose in candidates]))]
+
+
+def score(evidence: Evidence, world_from_query: RigidTransform, options: RelativePoseOptions) -> float:
+    """The score of a pose; the docstring of this module defines it."""
+    rotation, centre = world_from_query.rotation, world_from_query.translation
+    return float(_scores_along(evidence, rotation, centre, np.zeros(3), np.zeros(1), options)[0])
+
+
+def _scores_along(
+    evidence: Evidence,
+    rotation: Array,
+    centre: Array,
+    direction: Array,
+    distance: Array,
+    options: RelativePoseOptions,
+) -> Array:
+    """Scores (S,) at centre + distance * direction, for S distances."""
+    camera, inlier_px = evidence.query.camera, options.pnp.inlier_px
+    lines = evidence.two_view.sampson_along_px(rotation, centre, direction, distance) / options.epipolar_px
+    total = -np.log10(band_chance(camera, options.epipolar_px)) * _truncated(lines)
+    if len(evidence.x_in_world):
+        weight, pixels = -np.log10(disc_chance(camera, inlier_px)), evidence.pixels
+        poses = [RigidTransform(rotation, centre + it * direction) for it in distance]
+        errors = [reprojection_errors_px(camera, pose, evidence.x_in_world, pixels) for pose in poses]
+        total = total + weight * _truncated(np.array(errors) / inlier_px)
+    return np.asarray(total)
+
+
+def _truncated(residuals: Array) -> Array:
+    """Sums (S,) of 1 - r^2 over residuals r (S, N) below one."""
+    return np.asarray(np.clip(1 - np.nan_to_num(residuals, nan=np.inf) ** 2, 0, None).sum(axis=1))
+
+
+def _from_points(evidence: Evidence, options: RelativePoseOptions) -> list[RigidTransform]:
+    if len(evidence.x_in_world) < options.pnp.min_matches:
+        return []
+    pose = ransac(evidence.query.camera, evidence.x_in_world, evidence.pixels, None, options.pnp)
+    return [pose] if pose else []
+
+
+def _generalized(evidence: Evidence, options: RelativePoseOptions) -> list[RigidTransform]:
+    two_view, references = evidence.two_view, evidence.references
+    counts = np.bincount(two_view.reference, minlength=len(references))
+    used = np.flatnonzero(counts)
+    if len(used) < 2 or counts.max() < 5:  # PoseLib's sampling would not end
+        return []
+    pairs = []
+    for reference in used:
+        rows, pair = two_view.reference == reference, poselib.PairwiseMatches()
+        pair.cam_id1, pair.cam_id2 = int(reference), 0
+        pair.x1, pair.x2 = _pixels(evidence, rows, int(reference))
+        pairs.append(pair)
+    pose, _ = poselib.estimate_generalized_relative_pose(
+        pairs,
+        [poselib_pose(it.world_from_camera.inverse()) for it in references],
+        [poselib_camera(it.view.camera) for it in references],
+        [poselib_pose(RigidTransform(np.eye(3), np.zeros(3)))],
+        [poselib_camera(evidence.query.camera)],
+        {
+            "max_epipolar_error": options.epipolar_px,
+            "min_iterations": options.min_iterations,
+            "max_iterations": options.max_iterations,
+            "seed": 0,
+        },
+        {"loss_type": "CAUCHY", "loss_scale": options.pnp.loss_scale_px},
+    )
+    return _finite(pose)
+
+
+def _strongest(two_view: TwoViewMatches, options: RelativePoseOptions) -> list[int]:
+    """Indices of the references with the most matches."""
+    counts = np.bincount(two_view.reference)
+    order = np.argsort(-counts, kind="stable")[: options.strongest]
+    return [int(it) for it in order if counts[it] >= options.min_matches]
+
+
+def _by_distance(evidence: Evidence, reference: int, options: RelativePoseOptions) -> list[RigidTransform]:
+    """Poses relative to a reference, each at the distance that the other matches support most."""
+    view, two_view = evidence.references[reference], evidence.two_view
+    theirs, ours = _pixels(evidence, two_view.reference == reference, reference)
+    relative, _ = poselib.estimate_relative_pose(
+        theirs,
+        ours,
+        poselib_camera(view.view.camera),
+        poselib_camera(evidence.query.camera),
+        {
+            "max_epipolar_error": options.epipolar_px,
+            "min_iterations": options.pnp.min_iterations,
+            "max_iterations": options.pair_iterations,
+            "seed": 0,
+        },
+        {"loss_type": "CAUCHY", "loss_scale": options.pnp.loss_scale_px},
+    )
+    turned = _finite(relative)  # reference_from_query, at a distance of one
+    if not turned:
+        return []
+    rotation = view.world_from_camera.rotation @ turned[0].rotation
+    direction = view.world_from_camera.rotation @ turned[0].translation
+    centre = view.world_from_camera.translation
+    distances = _distances(evidence, reference, rotation, centre, direction)
+    distances = distances[np.isfinite(distances) & (distances > 0)]
+    if not len(distances):
+        return []
+    distances = np.sort(distances)[:: -(-len(distances) // options.max_distances)]
+    scores = _scores_along(evidence, rotation, centre, direction, distances, options)
+    return [RigidTransform(rotation, centre + float(distances[np.argmax(scores)]) * direction)]
+
+
+def _distances(evidence: Evidence, reference: int, rotation: Array, centre: Array, direction: Array) -> Array:
+    """Distances from the reference that each match with another reference, and each 2D-3D match, gives."""
+    others = evidence.two_view[evidence.two_view.reference != reference]
+    normal = np.cross(others.ray @ rotation.T, others.reference_ray)
+    rays = evidence.query.camera.rays(evidence.pixels) @ rotation.T
+    across, offset = np.cross(direction, rays), np.cross(evidence.x_in_world - centre, rays)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        by_lines = (normal * (others.reference_centre - centre)).sum(axis=1) / (normal @ direction)
+        by_points = (across * offset).sum(axis=1) / (across**2).sum(axis=1)
+    return np.concatenate([by_lines, by_points])
+
+
+def _pixels(evidence: Evidence, rows: NDArray[np.bool_], reference: int) -> tuple[Array, Array]:
+    """Pixels (M, 2) of the given matches in their reference, and in the query."""
+    two_view, view = evidence.two_view, evidence.references[reference].view
+    theirs = view.features.keypoints[two_view.reference_keypoint[rows]]
+    ours = evidence.query.features.keypoints[two_view.keypoint[rows]]
+    return theirs.astype(np.float64), ours.astype(np.float64)
+
+
+def _finite(pose: poselib.CameraPose) -> list[RigidTransform]:
+    """Inverts a pose of PoseLib; an empty list if it is not finite."""
+    rotation, translation = np.asarray(pose.R), np.asarray(pose.t)
+    if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
+        return []
+    return [RigidTransform(rotation, translation).inverse()]

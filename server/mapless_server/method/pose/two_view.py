@@ -1,0 +1,147 @@
+"""The pose from two-view matches and 2D-3D matches, adjusted over both.
+
+A two-view match becomes a point that its reference and the query observe. Eliminating the point from the adjustment
+(see `bundle`) leaves its epipolar residual, exactly rather than to first order, with the noise of both keypoints and of
+the reference's pose; so both kinds of match are adjusted by one problem (`adjust`), and its covariance covers both: a
+point without its only reference has no information.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, RigidTransform
+
+from ..bundle.adjust import adjust_pose
+from ..bundle.estimate import PoseEstimate, PoseStage, Support, TwoViewSupport
+from ..bundle.pose_problem import AdjustOptions
+from ..features.tracks import Tracks
+from ..features.views import PosedView, View
+from ..optim.perturbation import reprojection_errors_px
+from ..options import IntrinsicsSigma
+from ..pairs.correspond import Correspondences
+from ..structure.match import MatchOptions, match_points, vote
+from ..structure.model import PointMatches, Structure
+from ..structure.structure import StructureOptions, triangulated_structure
+from .relative import Evidence, RelativePoseOptions, find_pose, score
+from .two_view_matches import TwoViewMatches
+
+POSE = RelativePoseOptions()
+"""Of the search for the initial pose, and of its inliers."""
+
+MIN_PARALLAX_DEG = 0.5
+"""Matches with a smaller parallax are not adjusted: their points have no depth."""
+
+ROUNDS = 3
+"""Of choosing inliers and adjusting."""
+
+MIN_INLIERS = 8
+"""Fewer matches do not determine a pose with any redundancy."""
+
+
+def solve_two_view(
+    query: View,
+    references: Sequence[PosedView],
+    correspondences: Correspondences,
+    known: Sequence[RigidTransform],
+    origin: Array,
+    structure_options: StructureOptions,
+    match_options: MatchOptions,
+    adjust_options: AdjustOptions,
+    intrinsics: IntrinsicsSigma | None = None,
+) -> Support | None:
+    """Finds the pose that most matches of both kinds support, with these matches; None if there is none.
+
+    There are two or more references, and matches between all photographs. The poses world_from_query of other stages,
+    `known`, are candidates too; for `origin` (3,) of their world see `Support`. `intrinsics` are standard deviations
+    of those of the query; None for the defaults.
+    """
+    structure = triangulated_structure(references, correspondences, structure_options)
+    matches = vote(structure, [len(it.view.features) for it in references], correspondences)
+    two_view = TwoViewMatches.of(query, references, correspondences.query_matches)
+    evidence = Evidence(query, references, two_view, structure.x_in_world[matches.point], matches.keypoint)
+    pose = find_pose(evidence, POSE, known)
+    if pose is None:
+        return None
+    searched = match_points(query, references, structure, correspondences, pose, match_options)
+    problem = _Problem(evidence, structure, searched, adjust_options, intrinsics)
+    best = problem.at(pose)
+    for _ in range(ROUNDS):
+        adjusted = problem.adjusted(best)
+        if adjusted is None or (best.estimate is not None and adjusted.score <= best.score):
+            break
+        best = adjusted
+    if best.estimate is None or best.inlier_count < MIN_INLIERS:
+        return None
+    matched = best.support, tuple(correspondences.query_matches), intrinsics, correspondences.reference_error_px
+    return Support(query, tuple(references), structure, searched, best.estimate, origin, *matched)
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    """A pose with the inliers of both kinds.
+
+    Attributes:
+        world_from_query: the pose.
+        score: see `pose`.
+        errors_px, inliers: (M,) reprojection errors of the 2D-3D matches, and which are inliers.
+        support: the two-view matches that are no inliers through a point.
+        parallax_deg: (T,) their parallaxes.
+        estimate: the estimate after an adjustment; None before.
+    """
+
+    world_from_query: RigidTransform
+    score: float
+    errors_px: Array
+    inliers: NDArray[np.bool_]
+    support: TwoViewSupport
+    parallax_deg: Array
+    estimate: PoseEstimate | None = None
+
+    @property
+    def inlier_count(self) -> int:
+        return int(self.inliers.sum() + self.support.inliers.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    evidence: Evidence
+    structure: Structure
+    matches: PointMatches
+    adjust: AdjustOptions
+    intrinsics: IntrinsicsSigma | None
+
+    def at(self, pose: RigidTransform, estimate: PoseEstimate | None = None) -> _Solution:
+        """Finds the inliers of a pose."""
+        evidence, matches = self.evidence, self.matches
+        query, pixels = evidence.query, evidence.query.features.keypoints[matches.keypoint].astype(np.float64)
+        errors_px = reprojection_errors_px(query.camera, pose, self.structure.x_in_world[matches.point], pixels)
+        inliers = errors_px < self.adjust.inlier_px
+        # A keypoint with a point gives its equations there.
+        rest = evidence.two_view[~np.isin(evidence.two_view.keypoint, matches.keypoint[inliers])]
+        points, parallax_deg = rest.triangulated(query, evidence.references, pose, self.structure.noise)
+        sampson_px = rest.sampson_px(pose)
+        agreeing = (sampson_px < POSE.epipolar_px) & np.isfinite(points).all(axis=1)
+        support = TwoViewSupport(rest.reference, rest.keypoint, rest.reference_keypoint, points, sampson_px, agreeing)
+        value = score(evidence, pose, POSE)
+        return _Solution(pose, value, errors_px, inliers, support, parallax_deg, estimate)
+
+    def adjusted(self, start: _Solution) -> _Solution | None:
+        """Adjusts over the inliers of both kinds; None if that fails."""
+        used = start.support.inliers & (start.parallax_deg >= MIN_PARALLAX_DEG)
+        support, rows = start.support, np.arange(used.sum(), dtype=np.intp)
+        single = Tracks(rows, support.reference[used], support.reference_keypoint[used])
+        structure = self.structure.and_last(support.x_in_world[used], single)
+        matches = self.matches.and_last(rows + len(self.structure.x_in_world), support.keypoint[used])
+        errors_px = np.concatenate([start.errors_px, start.support.errors_px[used]])
+        inliers = np.concatenate([start.inliers, np.ones(len(rows), bool)])
+        before = PoseEstimate(start.world_from_query, PoseStage.REFINED, inliers, errors_px, np.eye(6))
+        given = self.evidence.query, self.evidence.references, structure, matches, before, self.adjust
+        estimate = adjust_pose(*given, intrinsics=self.intrinsics)
+        if not estimate.is_adjusted:
+            return None
+        found = self.at(estimate.world_from_camera)
+        kept = replace(estimate, inliers=found.inliers, errors_px=found.errors_px)
+        return replace(found, estimate=kept)

@@ -1,0 +1,310 @@
+"""Pose estimation with priors: candidates from priors, the best candidate, and its refinement with the priors.
+
+A candidate from priors must explain more matches than the pose from the photograph; a prior's cost counts at most as
+much as one match. The best pose is refined without priors, compared with each prior, and refined with the consistent
+ones. So a wrong prior does no harm: it is not used, and the answer equals the one without it bit for bit.
+
+The refinement has fixed points, and the pose alone as unknowns (PoseLib's has no priors):
+
+    min  sum_i rho(|u_i - pi(P, X_i)|^2 / sigma^2) + w sum_k r_k^T C_k^-1 r_k,    rho(s) = c^2 log(1 + s / c^2)
+
+With few inliers, a pose from two matches and gravity needs fewer samples in RANSAC than one from three matches. Gravity
+is known to about a degree, which is many pixels, so such a pose is only a hypothesis: it is scored with a tolerance as
+large as gravity's error in the image, and the best are refined with gravity as one measurement among others.
+
+A pinhole camera sees the points (N, 3) of the world at the pixels (N, 2).
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import poselib
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, Camera, RigidTransform
+
+from ..bundle.priors import NO_PRIORS, GravityPrior, PriorCheck, Priors
+from ..optim.optimize import MinimizeOptions, cauchy_cost, cauchy_weight, damped_step, minimize
+from ..optim.perturbation import moved, pose_jacobian, reprojection_errors_px, world_jacobian
+
+SIGMA_PX = 1.0
+"""Standard deviation of a right match."""
+
+LOSS_SCALE_SIGMA = 1.4
+"""Scale c of the Cauchy loss, in standard deviations."""
+
+PRIOR_WEIGHT = 4.0
+"""w, factor by which the matches have less information than if their errors were independent: the square of
+`AdjustOptions.error_inflation`."""
+
+STEPS = MinimizeOptions(iterations=10, min_decrease=1e-4)
+
+MIN_INLIERS = 4
+"""Fewer give no pose."""
+
+ENOUGH_INLIERS = 50
+"""With so many no candidates from priors are tried, since none could be better. Repeated structure has supported wrong
+poses with at most 23 matches."""
+
+MIN_KEPT_SHARE = 0.8
+"""A refinement without priors that keeps a smaller share of the inliers has diverged; priors are then compared with the
+pose before it."""
+
+WEAK_INFORMATION = np.diag([1e-6] * 3 + [1e-2] * 3)
+"""Information of an unknown pose: within kilometres, of any orientation."""
+
+MAX_MATCHES = 300
+"""Of RANSAC with gravity, evenly thinned; more do not improve the choice, and scoring is linear in them."""
+
+BATCH, MAX_SAMPLES, CONFIDENCE = 64, 512, 0.999
+"""Samples that are scored together, and at most; and the probability that two right matches have been drawn with which
+it stops. If 10 % of the matches are right, that is 99.4 % after all samples."""
+
+REFINED = 3
+"""Number of the best hypotheses that are refined."""
+
+
+@dataclass(frozen=True, eq=False)
+class InformedPose:
+    """A pose refined with the priors that are consistent with it.
+
+    Attributes:
+        world_from_camera: metric.
+        without_priors: the pose before priors were used.
+        checks: comparison with each prior.
+        used: the priors that were used.
+    """
+
+    world_from_camera: RigidTransform
+    without_priors: RigidTransform
+    checks: tuple[PriorCheck, ...]
+    used: Priors
+
+
+def informed_pose(
+    camera: Camera, x_in_world: Array, pixels: Array, found: RigidTransform | None, priors: Priors, inlier_px: float
+) -> InformedPose | None:
+    """Chooses between the pose from the photograph and those from priors; None if there is none.
+
+    `found` is world_from_camera from the photograph alone, None if there is none; `inlier_px` the largest reprojection
+    error of a right match.
+    """
+    seen = camera, x_in_world, pixels
+
+    def cost(pose: RigidTransform) -> float:
+        """Truncated sum of squared errors, in standard deviations of a keypoint, plus `Priors.penalty`."""
+        errors_px = reprojection_errors_px(camera, pose, x_in_world, pixels)
+        squared = (np.where(errors_px < inlier_px, errors_px, inlier_px) / SIGMA_PX) ** 2
+        return float(squared.sum()) + priors.penalty(pose)
+
+    best, others = found, []
+    if found is None or _inlier_count(*seen, found, inlier_px) < ENOUGH_INLIERS:
+        others = _from_priors(*seen, priors, inlier_px)
+    if others:
+        costs = [cost(pose) for pose in others]
+        # Better by one match at least; otherwise it is the same pose found in another way.
+        least = math.inf if found is None else cost(found)
+        if min(costs) < least - (inlier_px / SIGMA_PX) ** 2:
+            best = others[int(np.argmin(costs))]
+    return None if best is None else _with_priors(*seen, best, priors, inlier_px)
+
+
+def _from_priors(
+    camera: Camera, x_in_world: Array, pixels: Array, priors: Priors, inlier_px: float
+) -> list[RigidTransform]:
+    """Candidates from priors: the pose prior, and poses by RANSAC with gravity."""
+    poses = []
+    if priors.pose:
+        poses.append(refine_pose(camera, x_in_world, pixels, priors.pose.world_from_camera, priors))
+    if priors.gravity:
+        poses += ransac_with_gravity(camera, x_in_world, pixels, priors, inlier_px)
+    return poses
+
+
+def _with_priors(
+    camera: Camera, x_in_world: Array, pixels: Array, pose: RigidTransform, priors: Priors, inlier_px: float
+) -> InformedPose:
+    """Checks the priors and refines a pose, which has `MIN_INLIERS` inliers or more, with the consistent ones."""
+    seen = camera, x_in_world, pixels
+    alone = refine_pose(*seen, pose, NO_PRIORS)
+    before, after = (_inlier_count(*seen, it, inlier_px) for it in (pose, alone))
+    if after < max(MIN_INLIERS, MIN_KEPT_SHARE * before):
+        alone = pose
+    # The inverse covariance of the pose error if the matches' errors were independent.
+    information = _Problem(*seen, alone, NO_PRIORS).linearize(alone)[1]
+    covariance = np.linalg.inv(information / PRIOR_WEIGHT + WEAK_INFORMATION)
+    checks = priors.check(alone, np.asarray(covariance, np.float64))
+    used = priors.consistent(checks)
+    return InformedPose(refine_pose(*seen, pose, used) if used else pose, pose, checks, used)
+
+
+def _inlier_count(camera: Camera, x_in_world: Array, pixels: Array, pose: RigidTransform, inlier_px: float) -> int:
+    return int((reprojection_errors_px(camera, pose, x_in_world, pixels) < inlier_px).sum())
+
+
+def refine_pose(
+    camera: Camera,
+    x_in_world: Array,
+    pixels: Array,
+    world_from_camera: RigidTransform,
+    priors: Priors,
+    loss_scale_sigma: float = LOSS_SCALE_SIGMA,
+    steps: MinimizeOptions = STEPS,
+) -> RigidTransform:
+    """Minimizes the cost, starting from a pose; all priors are used, and no points behind the camera at the start."""
+    problem = _Problem(camera, x_in_world, pixels, world_from_camera, priors, loss_scale_sigma)
+    return minimize(problem, world_from_camera, steps)
+
+
+class _Problem:
+    """The cost and its derivatives by the pose error; see `optimize.Problem`."""
+
+    def __init__(
+        self,
+        camera: Camera,
+        x_in_world: Array,
+        pixels: Array,
+        start: RigidTransform,
+        priors: Priors,
+        loss_scale_sigma: float = LOSS_SCALE_SIGMA,
+    ) -> None:
+        in_front = start.inverse().apply(x_in_world)[:, 2] > 0
+        self.camera, self.x_in_world, self.pixels = camera, x_in_world[in_front], pixels[in_front]
+        self.priors, self.loss_scale_sigma = priors, loss_scale_sigma
+
+    def residuals(self, pose: RigidTransform) -> tuple[Array, Array]:
+        """Points in the camera frame (N, 3), and reprojection errors (N, 2) in standard deviations."""
+        x_in_camera = (self.x_in_world - pose.translation) @ pose.rotation
+        return x_in_camera, (self.camera.project(x_in_camera) - self.pixels) / SIGMA_PX
+
+    def cost(self, pose: RigidTransform) -> float:
+        """Cost at a pose; NaN if a point is behind the camera, so that the step is rejected."""
+        _, residual = self.residuals(pose)
+        matched = cauchy_cost((residual**2).sum(axis=1), self.loss_scale_sigma)
+        return matched + PRIOR_WEIGHT * self.priors.cost(pose)
+
+    def linearize(self, pose: RigidTransform) -> tuple[Array, Array]:
+        """Half the cost's gradient (6,) and its information (6, 6), in ROS's order."""
+        x_in_camera, residual = self.residuals(pose)
+        weight = cauchy_weight((residual**2).sum(axis=1), self.loss_scale_sigma)
+        jacobian = pose_jacobian(self.camera, x_in_camera) / SIGMA_PX
+        weighted, to_camera = weight * jacobian, np.linalg.inv(world_jacobian(pose))
+        by_pose = weighted[0] @ residual[:, 0] + weighted[1] @ residual[:, 1]
+        hessian = weighted[0] @ jacobian[0].T + weighted[1] @ jacobian[1].T
+        gradient, information = self.priors.gradient_and_information(pose)
+        return (
+            to_camera.T @ by_pose + PRIOR_WEIGHT * gradient,
+            to_camera.T @ hessian @ to_camera + PRIOR_WEIGHT * information,
+        )
+
+    def step(self, pose: RigidTransform, equations: tuple[Array, Array], damping: float) -> RigidTransform | None:
+        """See `optimize.Problem`."""
+        gradient, hessian = equations
+        error = damped_step(hessian, gradient, damping)
+        return None if error is None else moved(pose, error)
+
+
+def ransac_with_gravity(
+    camera: Camera, x_in_world: Array, pixels: Array, priors: Priors, inlier_px: float
+) -> list[RigidTransform]:
+    """Finds the best hypotheses and refines them with all priors; none if no two matches give a pose.
+
+    `inlier_px` is the largest reprojection error of a right match.
+    """
+    gravity = priors.gravity
+    if gravity is None:
+        raise ValueError("there is no gravity prior")
+    if len(pixels) < 2:
+        return []
+    step = -(-len(pixels) // MAX_MATCHES)
+    x_in_world, pixels = x_in_world[::step], pixels[::step]
+    # An angle error in pixels; a shift of the camera compensates half of it.
+    wide_px = math.hypot(inlier_px, 0.5 * camera.focal_x_px * min(gravity.sigma, 0.1))
+    hypotheses = _Hypotheses(camera, x_in_world, pixels, wide_px)
+    rng = np.random.default_rng(0)
+    rays = camera.rays(pixels)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    drawn, wanted = 0, float(MAX_SAMPLES)
+    while drawn < min(wanted, MAX_SAMPLES):
+        hypotheses.add(*solve_pairs(gravity, rays, x_in_world, _pairs(rng, len(pixels), BATCH)))
+        drawn += BATCH
+        wanted = _samples_needed(hypotheses.inlier_share)
+    # Refined first with a loss as wide as gravity's error, then with a narrow one.
+    scales = max(wide_px / 2 / SIGMA_PX, LOSS_SCALE_SIGMA), LOSS_SCALE_SIGMA
+    poses = hypotheses.best()
+    for scale in scales:
+        poses = [refine_pose(camera, x_in_world, pixels, pose, priors, scale) for pose in poses]
+    return poses
+
+
+def solve_pairs(gravity: GravityPrior, rays: Array, x_in_world: Array, pairs: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Poses that see two points along two rays, with the direction of gravity, down, given in both frames.
+
+    PoseLib's solver (Kukelova et al., "Closed-form solutions to minimal absolute pose problems with known vertical
+    direction", ACCV 2010) takes both frames with their y axes along the vertical, both up or both down. Points (N, 3),
+    viewing rays (N, 3) of unit length in the camera, pairs (S, 2) of their indices. Returns rotations (H, 3, 3) and
+    translations (H, 3) of camera_from_world, none to two for each pair.
+    """
+    from_camera, from_world = _to_y(gravity.in_camera), _to_y(gravity.in_world)
+    turned_rays, turned_points = rays @ from_camera.T, x_in_world @ from_world.T
+    poses = [pose for pair in pairs for pose in poselib.up2p(turned_rays[pair], turned_points[pair])]
+    if not poses:
+        return np.zeros((0, 3, 3)), np.zeros((0, 3))
+    rotation = from_camera.T @ np.stack([pose.R for pose in poses]) @ from_world
+    translation = np.stack([pose.t for pose in poses]) @ from_camera
+    finite = np.isfinite(rotation).all(axis=(1, 2)) & np.isfinite(translation).all(axis=1)
+    return rotation[finite], translation[finite]
+
+
+def _to_y(direction: Array) -> Array:
+    """A rotation (3, 3) that maps a direction of unit length to the y axis."""
+    # The other two axes are arbitrary; the cross product with the least parallel axis is the most accurate.
+    other = np.eye(3)[int(np.argmin(np.abs(direction)))]
+    x = np.cross(direction, other)
+    x /= np.linalg.norm(x)
+    return np.stack([x, direction, np.cross(x, direction)])
+
+
+def _pairs(rng: np.random.Generator, count: int, size: int) -> NDArray[np.int64]:
+    """Draws pairs (size, 2) of two different indices below `count`."""
+    first = rng.integers(count, size=size)
+    return np.stack([first, (first + rng.integers(1, count, size=size)) % count], axis=1)
+
+
+def _samples_needed(inlier_share: float) -> float:
+    """Number of samples after which two inliers have been drawn with probability `CONFIDENCE`."""
+    missed = 1 - inlier_share**2
+    return math.log(1 - CONFIDENCE) / math.log(missed) if 0 < missed < 1 else (math.inf if missed >= 1 else 1.0)
+
+
+class _Hypotheses:
+    """The best poses camera_from_world, by the truncated sum of their squared errors."""
+
+    def __init__(self, camera: Camera, x_in_world: Array, pixels: Array, tolerance_px: float) -> None:
+        self._focal = np.array([camera.focal_x_px, camera.focal_y_px])
+        self._ideal = camera.rays(pixels)[:, :2]
+        self._x_in_world, self._tolerance_px = x_in_world, tolerance_px
+        self._costs, self._poses = np.zeros(0), np.zeros((0, 3, 4))
+        self.inlier_share = 0.0
+
+    def add(self, rotation: Array, translation: Array) -> None:
+        """Scores poses with rotations (H, 3, 3) and translations (H, 3), and keeps the best."""
+        if not len(rotation):
+            return
+        x, y, z = np.moveaxis(rotation @ self._x_in_world.T + translation[:, :, None], 1, 0)  # (H, N) each
+        depth = np.where(z > 0, z, np.nan)
+        squared = ((x / depth - self._ideal[:, 0]) * self._focal[0]) ** 2
+        squared += ((y / depth - self._ideal[:, 1]) * self._focal[1]) ** 2
+        limit = self._tolerance_px**2
+        inlier = squared < limit
+        costs = np.where(inlier, squared, limit).sum(axis=1)
+        self.inlier_share = max(self.inlier_share, float(inlier.mean(axis=1).max()))
+        poses = np.concatenate([rotation, translation[:, :, None]], axis=2)
+        self._costs, self._poses = np.append(self._costs, costs), np.concatenate([self._poses, poses])
+        order = np.argsort(self._costs, kind="stable")[:REFINED]
+        self._costs, self._poses = self._costs[order], self._poses[order]
+
+    def best(self) -> list[RigidTransform]:
+        """Returns world_from_camera of the best hypotheses, the best first."""
+        return [RigidTransform(pose[:, :3], pose[:, 3]).inverse() for pose in self._poses]

@@ -1,1 +1,0 @@
-"""Priors on a pose (`known`), and pose estimation with them (`informed`)."""

@@ -1,0 +1,145 @@
+"""Depths stored with the references: points where nothing can be triangulated.
+
+A network has predicted the depth of each reference once, when it was added (see `scenes.depth`). A keypoint with depth
+d and relative standard deviation s, of a camera at C with the viewing direction z, then has its point near the plane
+
+    z . (x - C) = d,    with the standard deviation    s d.
+
+A reference's keypoint that only the query matches becomes a point at its depth, which one reference observes. Its error
+is along the ray, so it moves the photograph's keypoint along the epipolar line; the final adjustment knows that, since
+it keeps the planes (see `bundle`). Where the photograph matches mostly triangulated points, these alone are used.
+
+A network's errors are shared by all depths of a photograph, so that they do not average out. What they share is seen at
+the keypoints of triangulated points: the most probable common factor is removed, by the variances of depths and points,
+with Cauchy's loss and a prior of standard deviation s. Points that are triangulated stay where they are.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array
+
+from ..features.tracks import Tracks, keypoint_offsets
+from ..features.views import PosedView
+from ..optim.optimize import cauchy_weight
+from ..pairs.correspond import Correspondences
+from .match import vote
+from .model import DepthPlanes, Structure
+from .observations import keypoint_rays
+from .structure import observe
+
+MIN_ADDED_SHARE = 0.4
+"""Points at stored depths are added where there are so many for each match with a triangulated point; as
+`AdjustOptions.min_added_share`. In `euroc-v101-drone` with five references and over a thousand matches, they would make
+errors a fifth larger."""
+
+LOSS_SCALE_SIGMA = 2.0
+"""Of the Cauchy loss for common factors: depths are wrong at edges, and of what is reflected."""
+
+ITERATIONS = 6
+"""Steps to a common factor, by reweighted least squares."""
+
+
+def with_kept_depths(
+    structure: Structure,
+    references: Sequence[PosedView],
+    correspondences: Correspondences,
+    min_added_share: float = MIN_ADDED_SHARE,
+) -> Structure:
+    """Adds the points that stored depths give to a structure, after the triangulated ones, with its `planes`.
+
+    Each is of a reference's keypoint that the query matches and that observes no triangulated point. The references
+    are in the order of the structure's tracks; the correspondences are those of the query with each. The structure,
+    possibly without points, is unchanged if depths are not needed. A reference at least has some.
+    """
+    known = _KnownDepths.of(references)
+    rows = _single_rows(structure, correspondences, known)
+    counts = [len(reference.view.features) for reference in references]
+    if not len(rows) or len(rows) < min_added_share * len(vote(structure, counts, correspondences)):
+        return structure
+    return _with_single(structure, _without_common_factors(structure, references, known), rows)
+
+
+@dataclass(frozen=True, eq=False)
+class _KnownDepths:
+    """Known depths of the N keypoints of all references.
+
+    Attributes:
+        offsets: (K + 1,) of each reference's keypoints.
+        centre, ray, axis: (N, 3) camera centre, viewing ray of depth 1 and viewing direction, world.
+        depth, sigma: (N,) depth and standard deviation in the unit of the poses; NaN where unknown.
+    """
+
+    offsets: NDArray[np.intp]
+    centre: Array
+    ray: Array
+    axis: Array
+    depth: Array
+    sigma: Array
+
+    @staticmethod
+    def of(references: Sequence[PosedView]) -> "_KnownDepths":
+        offsets = keypoint_offsets(references)
+        counts = np.diff(offsets)
+        depth, sigma = np.full(offsets[-1], np.nan), np.full(offsets[-1], np.nan)
+        for reference, start, end in zip(references, offsets[:-1], offsets[1:], strict=True):
+            if reference.depths is not None:
+                depth[start:end] = reference.depths.depth
+                sigma[start:end] = reference.depths.depth * reference.depths.relative_sigma
+        axis = np.repeat([it.world_from_camera.rotation[:, 2] for it in references], counts, axis=0)
+        return _KnownDepths(offsets, *keypoint_rays(references), axis, depth, sigma)
+
+    def planes(self, rows: NDArray[np.intp]) -> DepthPlanes:
+        """Planes of the points that these keypoints show; all must have a depth."""
+        normal = self.axis[rows]
+        offset = (normal * self.centre[rows]).sum(axis=1) + self.depth[rows]
+        return DepthPlanes(normal, offset, self.sigma[rows] ** -2.0)
+
+
+def _without_common_factors(structure: Structure, references: Sequence[PosedView], known: _KnownDepths) -> _KnownDepths:
+    """Divides the depths of each reference by the factor that triangulated points say they share."""
+    tracks, depth, sigma = structure.tracks, known.depth.copy(), known.sigma.copy()
+    row = known.offsets[tracks.view] + tracks.keypoint
+    has_depth = np.isfinite(known.depth[row])
+    if not has_depth.any():
+        return known
+    observations = observe(tracks, references, structure.noise)
+    covariance = observations.point_covariances(structure.x_in_world)[tracks.point]
+    axis = known.axis[row]
+    triangulated = (axis * (structure.x_in_world[tracks.point] - known.centre[row])).sum(axis=1)
+    log_factor = np.log(known.depth[row] / triangulated)
+    relative_variance = np.einsum("oi,oij,oj->o", axis, covariance, axis) / triangulated**2
+    for view, reference in enumerate(references):
+        seen = has_depth & (tracks.view == view)
+        if reference.depths is None or not seen.any():
+            continue
+        own_variance = reference.depths.relative_sigma**2
+        values, variance, common = log_factor[seen], own_variance + relative_variance[seen], 0.0
+        for _ in range(ITERATIONS):
+            weight = cauchy_weight((values - common) ** 2 / variance, LOSS_SCALE_SIGMA) / variance
+            common = float(weight @ values) / (float(weight.sum()) + 1 / own_variance)
+        its_rows = slice(known.offsets[view], known.offsets[view + 1])
+        depth[its_rows] /= np.exp(common)
+        sigma[its_rows] /= np.exp(common)
+    return replace(known, depth=depth, sigma=sigma)
+
+
+def _single_rows(structure: Structure, correspondences: Correspondences, known: _KnownDepths) -> NDArray[np.intp]:
+    """Rows of the references' keypoints that the query matches, and that have a depth and observe no point."""
+    tracks = structure.tracks
+    matched = zip(correspondences.query_matches, known.offsets[:-1], strict=True)
+    rows = np.unique(np.concatenate([pairs[:, 1] + start for pairs, start in matched]))
+    return np.setdiff1d(rows[np.isfinite(known.depth[rows])], known.offsets[tracks.view] + tracks.keypoint)
+
+
+def _with_single(structure: Structure, known: _KnownDepths, rows: NDArray[np.intp]) -> Structure:
+    """Adds a point at its depth for each of these keypoints."""
+    view = np.searchsorted(known.offsets, rows, side="right") - 1
+    points = known.centre[rows] + known.ray[rows] * known.depth[rows, None]
+    single = Tracks(np.arange(len(rows)), view, rows - known.offsets[view])
+    count = len(structure.x_in_world)
+    none = DepthPlanes(np.zeros((count, 3)), np.zeros(count), np.zeros(count))
+    return replace(structure, planes=none).and_last(points, single, known.planes(rows))

@@ -1,0 +1,191 @@
+"""Results that stages pass on: scale, structure, matches, pose. Data only; computed by the stage of the same name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, RigidTransform, Similarity
+
+from ..features.tracks import Tracks
+from .observations import KeypointNoise
+
+if TYPE_CHECKING:  # services do not load what computes
+    pass
+
+
+class ScaleStage(str, Enum):
+    """The stage that gave the scale."""
+
+    TRIANGULATION = "triangulation"
+    TRAJECTORY = "trajectory"
+    NETWORK = "network"
+    """The network's own metres, with a single reference."""
+
+
+class ScaleSource(str, Enum):
+    """What the lengths of an answer rest on."""
+
+    REFERENCES = "references"
+    """The references' given poses."""
+    NETWORK = "network"
+    """The metres that a network predicts, with a single reference."""
+
+
+@dataclass(frozen=True, eq=False)
+class MetricScale:
+    """A reconstruction made metric.
+
+    Attributes:
+        metres_per_unit: S, above 0; metres per unit of the reconstruction.
+        stage: the stage that gave it.
+        deviation: the trajectory deviation d of this scale, 0 or more.
+        anchor: index of the reference whose pose ties the local frame to the world.
+        world_from_local: the reconstruction's frame in the world, metres.
+        world_from_query: the query camera's initial pose P_q^init, metres.
+        relative_sigma: standard deviation of the network's metre, if that gives the scale; otherwise 0.
+    """
+
+    metres_per_unit: float
+    stage: ScaleStage
+    deviation: float
+    anchor: int
+    world_from_local: Similarity
+    world_from_query: RigidTransform
+    relative_sigma: float = 0.0
+
+    @property
+    def source(self) -> ScaleSource:
+        """What the scale rests on."""
+        return ScaleSource.NETWORK if self.stage is ScaleStage.NETWORK else ScaleSource.REFERENCES
+
+
+@dataclass(frozen=True, eq=False)
+class DepthPlanes:
+    """Planes from stored depths: each of P points is near a plane, normal . x = offset.
+
+    Attributes:
+        normal: (P, 3) unit vectors, world.
+        offset: (P,) metres.
+        information: (P,) inverse variance of the distance from the plane; 0 if unknown.
+    """
+
+    normal: Array
+    offset: Array
+    information: Array
+
+    def __getitem__(self, points: NDArray[np.bool_] | NDArray[np.intp]) -> DepthPlanes:
+        return DepthPlanes(self.normal[points], self.offset[points], self.information[points])
+
+    def and_last(self, others: DepthPlanes) -> DepthPlanes:
+        """Appends the planes of further points."""
+        pairs = ((getattr(self, name), getattr(others, name)) for name in ("normal", "offset", "information"))
+        return DepthPlanes(*map(np.concatenate, pairs))
+
+    def cost(self, x_in_world: Array) -> float:
+        """Sum over the points (P, 3) of their squared distances, in standard deviations."""
+        return float(self.information @ self.distance(x_in_world) ** 2)
+
+    def distance(self, x_in_world: Array) -> Array:
+        """Signed distances (P,) of points (P, 3) from their planes."""
+        return np.asarray((self.normal * x_in_world).sum(axis=1) - self.offset)
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """Points and their tracks.
+
+    Attributes:
+        x_in_world: (P, 3) metres.
+        tracks: observations of these points by the references, in the order of the points.
+        noise: noise of the keypoints, estimated from the residuals.
+        planes: planes of the points, if references have stored depths; points that a single reference observes are
+            last.
+    """
+
+    x_in_world: Array
+    tracks: Tracks
+    noise: KeypointNoise
+    planes: DepthPlanes | None = None
+
+    @property
+    def triangulated(self) -> NDArray[np.bool_]:
+        """Which points (P,) several references observe."""
+        if self.planes is None:
+            return np.ones(len(self.x_in_world), bool)
+        return np.bincount(self.tracks.point, minlength=len(self.x_in_world)) > 1
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory of points and tracks, bytes."""
+        tracks = self.tracks
+        return self.x_in_world.nbytes + tracks.point.nbytes + tracks.view.nbytes + tracks.keypoint.nbytes
+
+    def moved(self, order: Sequence[int], offset: Array) -> Structure:
+        """The triangulated structure with view v renumbered order[v], and an offset (3,) added to the points.
+
+        Points are in the order of their first keypoints, as in `build_tracks`.
+        """
+        if not len(self.x_in_world):
+            return self
+        tracks, view = self.tracks, np.asarray(order, np.intp)[self.tracks.view]
+        keypoint = view * (tracks.keypoint.max() + 1) + tracks.keypoint  # counted through all references
+        points = np.argsort(np.minimum.reduceat(keypoint, tracks.starts))
+        point = np.argsort(points)[tracks.point]
+        rows = np.argsort(point * len(order) + view)
+        moved = Tracks(point[rows], view[rows], tracks.keypoint[rows])
+        return Structure(self.x_in_world[points] + offset, moved, self.noise)
+
+    def and_last(self, x_in_world: Array, tracks: Tracks, planes: DepthPlanes | None = None) -> Structure:
+        """Appends points (Q, 3) with their tracks; without `planes`, none of these is near a plane."""
+        count, added = len(self.x_in_world), len(x_in_world)
+        both = Tracks(
+            np.concatenate([self.tracks.point, count + tracks.point]),
+            np.concatenate([self.tracks.view, tracks.view]),
+            np.concatenate([self.tracks.keypoint, tracks.keypoint]),
+        )
+        if self.planes is not None:
+            none = DepthPlanes(np.zeros((added, 3)), np.zeros(added), np.zeros(added))
+            planes = self.planes.and_last(planes or none)
+        return Structure(np.concatenate([self.x_in_world, x_in_world]), both, self.noise, planes)
+
+
+@dataclass(frozen=True, eq=False)
+class PointMatches:
+    """2D-3D matches; each point and each keypoint occurs at most once.
+
+    Attributes:
+        point: (M,) index into the structure.
+        keypoint: (M,) index into the query's keypoints.
+        guided: (M,) whether the match was searched near the point's projection, rather than in the whole image.
+        radius_px: radius of that search.
+    """
+
+    point: NDArray[np.intp]
+    keypoint: NDArray[np.intp]
+    guided: NDArray[np.bool_]
+    radius_px: float
+
+    def __len__(self) -> int:
+        return len(self.point)
+
+    def select(self, rows: NDArray[np.bool_]) -> PointMatches:
+        """Some of the matches; `rows` is (M,)."""
+        return PointMatches(self.point[rows], self.keypoint[rows], self.guided[rows], self.radius_px)
+
+    def and_last(
+        self, point: NDArray[np.intp], keypoint: NDArray[np.intp], guided: NDArray[np.bool_] | None = None
+    ) -> PointMatches:
+        """Appends matches, by default of the whole image."""
+        guided = np.zeros(len(point), bool) if guided is None else guided
+        return PointMatches(
+            np.concatenate([self.point, point]),
+            np.concatenate([self.keypoint, keypoint]),
+            np.concatenate([self.guided, guided]),
+            self.radius_px,
+        )

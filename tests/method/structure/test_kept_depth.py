@@ -1,0 +1,186 @@
+"""Depths kept with references: where they put points, what triangulation says of them, what they gain."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.scenes import SceneOptions, make_scene, random_for
+
+from mapless.geometry import Array
+from mapless_server.method.bundle.bundle import BundleProblem, bundle_of
+from mapless_server.method.features.tracks import Tracks
+from mapless_server.method.features.views import Features, KeptDepth, KeypointDepths, PosedView
+from mapless_server.method.judge.answer import Localization
+from mapless_server.method.localize import localize
+from mapless_server.method.options import LocalizeOptions, Variant
+from mapless_server.method.pairs.correspond import Correspondences, Matcher
+from mapless_server.method.pipeline import Pipeline
+from mapless_server.method.structure.kept_depth import with_kept_depths
+from mapless_server.method.structure.model import Structure
+from mapless_server.method.structure.structure import StructureOptions, triangulated_structure
+
+SCENE = make_scene(random_for("kept depth"), SceneOptions(point_count=500, reference_count=3, baseline_m=0.8))
+SIGMA = 0.02
+ALWAYS = 0.0
+"""Share of points at depths to add: also where many triangulated points are matched."""
+
+
+def true_depth(index: int) -> Array:
+    """(N,) at the keypoints of a reference; NaN where they show no point."""
+    points, pose = SCENE.reference_points[index], SCENE.references[index].world_from_camera
+    depth = pose.inverse().apply(SCENE.x_in_world[points])[:, 2]
+    return np.where(points >= 0, depth, np.nan)
+
+
+def with_depths(index: int, noise: float = SIGMA, seed: int = 0, factor: float = 1.0) -> PosedView:
+    """A reference with its true depths, each with an error."""
+    depth = true_depth(index)
+    error = np.random.default_rng(seed).normal(0.0, noise, len(depth)) if noise else 0.0
+    depths = KeypointDepths((factor * depth * np.exp(error)).astype(np.float32), max(noise, 1e-3))
+    return replace(SCENE.references[index], depths=depths)
+
+
+def matched(references: tuple[PosedView, ...]) -> tuple[Structure, Correspondences]:
+    correspondences = Matcher().correspond(SCENE.query, references)
+    return triangulated_structure(references, correspondences, StructureOptions()), correspondences
+
+
+def point_numbers(structure: Structure, references: tuple[PosedView, ...]) -> Array:
+    """The scene's point that each point of a structure is, by its first observation; -1 for none."""
+    tracks, index = structure.tracks, [SCENE.references.index(replace_depths(it)) for it in references]
+    first = tracks.starts
+    views, keypoints = tracks.view[first], tracks.keypoint[first]
+    return np.array([SCENE.reference_points[index[v]][k] for v, k in zip(views, keypoints, strict=True)])
+
+
+def replace_depths(reference: PosedView) -> PosedView:
+    return next(it for it in SCENE.references if it.key == reference.key)
+
+
+def test_a_keypoint_that_only_the_query_matches_gets_a_point() -> None:
+    references = (with_depths(0, noise=0.0),)
+    nothing = np.empty(0, np.intp)
+    structure = Structure(np.empty((0, 3)), Tracks(nothing, nothing, nothing), StructureOptions().first_noise)
+    correspondences = Matcher().correspond(SCENE.query, references)
+    found = with_kept_depths(structure, references, correspondences, ALWAYS)
+    assert len(found.x_in_world) > 200
+    assert not found.triangulated.any()
+    numbers = point_numbers(found, references)
+    off = np.linalg.norm(found.x_in_world - SCENE.x_in_world[numbers], axis=1)
+    assert np.quantile(off, 0.99) < 0.02, "half a pixel at four metres is a few millimetres"
+
+
+def test_triangulated_points_come_before_single_ones() -> None:
+    references = tuple(with_depths(i) for i in range(3))
+    structure, correspondences = matched(references)
+    found = with_kept_depths(structure, references, correspondences, ALWAYS)
+    count = len(structure.x_in_world)
+    assert found.triangulated[:count].all()
+    assert not found.triangulated[count:].any()
+    single = found.tracks.select(~found.triangulated)
+    of_query = [set(it[:, 1].tolist()) for it in correspondences.query_matches]
+    assert all(k in of_query[v] for v, k in zip(single.view, single.keypoint, strict=True))
+    pairs = list(zip(found.tracks.view.tolist(), found.tracks.keypoint.tolist(), strict=True))
+    assert len(set(pairs)) == len(pairs), "no keypoint observes two points"
+
+
+@pytest.mark.parametrize("factor", [0.95, 1.0, 1.05])
+def test_a_factor_common_to_all_depths_is_removed(factor: float) -> None:
+    """Triangulated points say what it is, though a tenth of the depths is wrong; they stay where they are."""
+    reference = with_depths(0, noise=0.005, factor=factor)
+    assert reference.depths is not None
+    depth = reference.depths.depth.copy()
+    depth[::10] *= 1.5
+    references = (replace(reference, depths=KeypointDepths(depth, SIGMA)), *SCENE.references[1:])
+    structure, correspondences = matched(references)
+    kept = structure.tracks.select(np.arange(len(structure.x_in_world)) % 2 == 0)
+    half = replace(structure, x_in_world=structure.x_in_world[::2], tracks=kept)
+    found = with_kept_depths(half, references, correspondences, ALWAYS)
+    count = len(half.x_in_world)
+    np.testing.assert_array_equal(found.x_in_world[:count], half.x_in_world)
+    assert found.planes is not None
+    assert not found.planes.information[:count].any()
+    pose, numbers = references[0].world_from_camera.inverse(), point_numbers(found, references)[count:]
+    known = numbers >= 0
+    ratio = pose.apply(found.x_in_world[count:][known])[:, 2] / pose.apply(SCENE.x_in_world[numbers[known]])[:, 2]
+    assert known.sum() > 50
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.005)
+
+
+def test_where_triangulated_points_suffice_depths_change_nothing() -> None:
+    references = tuple(with_depths(i) for i in range(3))
+    structure, correspondences = matched(references)
+    assert with_kept_depths(structure, references, correspondences) is structure
+    poses = [localize(SCENE.query, it, Pipeline(), LocalizeOptions()).outcome for it in (references, SCENE.references)]
+    assert all(isinstance(it, Localization) for it in poses)
+    first, second = (it.world_from_camera.matrix() for it in poses if isinstance(it, Localization))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_planes_are_in_the_normal_equations_as_in_the_cost() -> None:
+    references = tuple(with_depths(i) for i in range(3))
+    structure, correspondences = matched(references)
+    found = with_kept_depths(structure, references, correspondences, ALWAYS)
+    chosen = np.arange(len(found.x_in_world))
+    observations, start, _ = bundle_of(found.tracks, references, found, chosen)
+    assert found.planes is not None
+    given = start.poses[:-1]
+    problem = BundleProblem(observations, found.tracks.view, given, np.zeros((12, 12)), 1e6, planes=found.planes)
+    start = start.moved(np.zeros((3, 6)), np.random.default_rng(0).normal(0, 0.05, start.points.shape))
+    equations, step = problem.linearize(start), 1e-6
+    for point in (0, len(chosen) - 1):
+        for axis in range(3):
+            change = np.zeros((len(chosen), 3))
+            change[point, axis] = step
+            ahead, behind = (problem.cost(start.moved(np.zeros((3, 6)), sign * change)) for sign in (1, -1))
+            assert 2 * equations.point_gradient[axis, point] == pytest.approx((ahead - behind) / (2 * step), rel=1e-3)
+
+
+def test_references_that_share_nothing_give_points_by_depth() -> None:
+    """Without depths the pose is from matches with the references themselves, or there is none."""
+    parts = []
+    for index, reference in enumerate(SCENE.references):
+        kept = np.flatnonzero(SCENE.reference_points[index] % 3 == index)
+        view, depths = reference.view, with_depths(index).depths
+        assert depths is not None
+        arrays = view.features.keypoints[kept], view.features.descriptors[kept], view.features.sizes_px[kept]
+        view = replace(view, features=Features(*arrays))
+        parts.append(replace(reference, view=view, depths=replace(depths, depth=depths.depth[kept])))
+    answers = {
+        has_depths: localize(
+            SCENE.query, [it if has_depths else replace(it, depths=None) for it in parts], Pipeline(), LocalizeOptions()
+        )
+        for has_depths in (False, True)
+    }
+    alone = answers[False]
+    assert not isinstance(alone.outcome, Localization) or (alone.support and alone.support.two_view is not None)
+    outcome, support = answers[True].outcome, answers[True].support
+    assert isinstance(outcome, Localization)
+    assert support is not None
+    assert support.two_view is None
+    assert np.linalg.norm(outcome.world_from_camera.translation - SCENE.world_from_query.translation) < 0.02
+
+
+@pytest.mark.parametrize("variant", [Variant.COARSE, Variant.NO_STRUCTURE, Variant.FULL])
+def test_the_papers_variants_use_no_depths_in_their_points(variant: Variant) -> None:
+    references = tuple(with_depths(i) for i in range(3))
+    answer = localize(SCENE.query, references, Pipeline(), LocalizeOptions(variant=variant))
+    assert answer.support is None or answer.support.structure.planes is None
+
+
+def test_depths_are_read_at_the_keypoints_nearest_pixel() -> None:
+    camera = SCENE.query.camera
+    depth = np.full((camera.height_px // 2, camera.width_px // 2), np.nan, np.float32)
+    column, row = np.rint((SCENE.query.features.keypoints[0] - 0.5) / 2).astype(int)
+    depth[row, column] = 3.0
+    kept = KeptDepth(camera.resized(camera.width_px // 2, camera.height_px // 2), depth, 0.02)
+    found = kept.at_keypoints(SCENE.query)
+    assert found.depth[0] == 3.0
+    assert np.isnan(found.depth).sum() >= len(found.depth) - 5
+
+
+def test_a_map_of_another_size_than_its_camera_is_an_error() -> None:
+    with pytest.raises(ValueError, match="does not fit"):
+        KeptDepth(SCENE.query.camera, np.ones((2, 2), np.float32), 0.02)
+    with pytest.raises(ValueError, match="relative_sigma"):
+        KeptDepth(SCENE.query.camera.resized(2, 2), np.ones((2, 2), np.float32), 0.0)
