@@ -29,7 +29,7 @@ LADDER = (
     "scheduling",
 )
 """The rooms of mapless_server, the highest first; each may import those after it."""
-LOOSE = ("__init__", "__main__", "errors", "extras", "settings")
+LOOSE = ("__init__", "__main__", "cache", "errors", "extras", "settings")
 """Modules of mapless_server outside its rooms, which import no room; but `__main__`, which starts the process."""
 NAMES = "mapless_server.method.choices"
 """Of what a setting can name: the settings read it, so it imports nothing."""

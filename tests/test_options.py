@@ -23,7 +23,7 @@ OUTSIDE: dict[str, list[tuple[str, Any]]] = {
     ],
     "method.features.lightglue.LightGlueOptions": [("min_score", 1.0), ("max_keypoints", 0), ("pairs_at_once", 0)],
     "method.structure.match.MatchOptions": [("radius_px", -1.0), ("min_similarity", 2.0), ("radius_px", NAN)],
-    "method.pose.one_reference.OneReferenceOptions": [("scores", (1.0, 0.0)), ("first_depth_sigma", 0.5)],
+    "method.pose.one_reference.OneReferenceOptions": [("first_depth_sigma", 0.5)],
     "method.options.IntrinsicsSigma": [("focal_share", 0.0), ("principal_share", -1.0), ("k1", NAN), ("k1", 2.0)],
     "method.pose.pnp.PnpOptions": [("inlier_px", 0.0), ("loss_scale_px", NAN), ("min_matches", 3)]
     + [("min_iterations", 10**6)],

@@ -14,13 +14,12 @@ from mapless_server.errors import NotFound, Unavailable
 from mapless_server.method import localize as method
 from mapless_server.method import pipeline
 from mapless_server.method.bundle.estimate import Support
-from mapless_server.method.groups.images import tracked_support
 from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.judge.hints import hinted
 from mapless_server.method.judge.judge import trust_in_scene
 from mapless_server.method.judge.references import supporters_of, with_contradiction, without_agreement
 from mapless_server.method.options import StageContext
-from mapless_server.method.pipeline import Coarse, Pipeline, Prepared
+from mapless_server.method.pipeline import Coarse, Pipeline, Prepared, tracked_support
 from mapless_server.method.rejection import Hint, Hypothesis, Rejection, RejectionReason
 from mapless_server.scenes import ANYWHERE, Selection
 from mapless_server.scenes.library import FeaturesMissing

@@ -50,7 +50,7 @@ OTHERS = 2
 
 RIVAL_SHARE = 0.5
 """A reference elsewhere contradicts a pose by so many matches off their epipolar lines, as a share of the matches with
-the best reference; as in `trust.judge`."""
+the best reference; as in `judge.judge`."""
 
 _GEOMETRIC = GeometricReconstructor()
 

@@ -7,6 +7,7 @@ from .features.views import Reconstruction
 from .judge.answer import Answer, Localization
 from .judge.evidence import votes_of
 from .judge.judge import contradiction
+from .judge.one_reference import one_reference_failure, trust_of_score
 from .judge.two_view import (
     lacks_distance,
     one_reference_rejection,
@@ -16,7 +17,7 @@ from .judge.two_view import (
     without_unmoved,
 )
 from .pipeline import Coarse
-from .pose.one_reference import one_reference_failure, solve_one_reference, trust_of_score
+from .pose.one_reference import solve_one_reference
 from .pose.two_view import solve_two_view
 from .rejection import Rejection, RejectionReason
 from .structure.model import MetricScale
@@ -37,7 +38,7 @@ def from_one_reference(coarse: Coarse, scale: MetricScale) -> Answer:
     checks = prepared.priors.check(estimate.world_from_camera, estimate.covariance)
     estimate = replace(estimate, prior_checks=tuple(replace(it, used=False) for it in checks))
     support = replace(found.support, estimate=estimate)
-    trust = trust_of_score(found.score, options.one_reference)
+    trust = trust_of_score(found.score)
     failure = one_reference_failure(found, trust, prepared.options.coverage)
     if failure:
         return coarse.answer(Rejection(RejectionReason.GATE, failure), support)

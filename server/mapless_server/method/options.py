@@ -69,7 +69,7 @@ class LocalizeOptions:
         variant: variant of the method.
         scale_strategy: how the metric scale is estimated.
         coverage: share of right answers to accept, in a difficult place; a larger share accepts more wrong answers too
-            (see `trust.judge`).
+            (see `judge.judge`).
         intrinsics: standard deviations of the photograph's intrinsics; None for the defaults, which are smaller where
             the references have the same camera.
     """

@@ -25,9 +25,9 @@ from .pose.one_reference import OneReferenceOptions
 from .pose.pnp import PnpOptions
 from .rejection import Rejection, RejectionReason
 from .structure.kept_depth import with_kept_depths
-from .structure.match import PAPER_MATCH, MatchOptions, match_points
+from .structure.match import PAPER_MATCH, MatchOptions, match_points, vote
 from .structure.model import MetricScale, PointMatches, Structure
-from .structure.structure import PAPER_STRUCTURE, StructureOptions, build_structure
+from .structure.structure import PAPER_STRUCTURE, StructureOptions, build_structure, triangulated_structure
 
 T = TypeVar("T")
 
@@ -317,3 +317,25 @@ def structure_and_matches(coarse: Coarse, scale: MetricScale) -> tuple[Structure
         prior_pose = prepared.priors.pose.world_from_camera if prepared.priors.pose else None
         matches = match_points(prepared.query, references, structure, correspondences, initial, options, prior_pose)
     return structure, matches
+
+
+def tracked_support(prepared: Prepared) -> Support | None:
+    """Support of a photograph that could not be posed alone, from wide correspondences; None without matches.
+
+    Without a reconstruction, the references' tracks and poses are enough to triangulate points, and the photograph's
+    matches with the references lead to them through the tracks.
+    """
+    query, references, check = prepared.query, prepared.references, prepared.context.check
+    if len(references) < 2:
+        return None
+    known = prepared.correspondences.query_matches
+    in_world = prepared.references_in_world
+    correspondences = prepared.pipeline.matcher.correspond(query, in_world, True, check, known)
+    check()
+    structure = triangulated_structure(references, correspondences, StructureOptions())
+    matches = vote(structure, [len(r.view.features) for r in references], correspondences)
+    query_matches = tuple(correspondences.query_matches)
+    sigma = prepared.options.intrinsics
+    support = Support(query, references, structure, matches, None, prepared.origin, None, query_matches, sigma)
+    support = replace(support, reference_error_px=correspondences.reference_error_px)
+    return support if len(matches) else None

@@ -13,16 +13,11 @@ from support.fake_network import FakeNetwork, FakeNetworkOptions
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import RigidTransform, Similarity, rotation_angle_deg, rotation_from_vector
-from mapless_server.method.coarse.scale import (
-    ScaleOptions,
-    estimate_scale,
-    pairs_of,
-    trajectory_scale,
-    triangulate_depths,
-)
+from mapless_server.method.coarse.scale import ScaleOptions, estimate_scale, pairs_of, trajectory_scale
 from mapless_server.method.features.views import ReconstructedView, Reconstruction
 from mapless_server.method.options import ScaleStrategy
 from mapless_server.method.pairs.correspond import Correspondences
+from mapless_server.method.pairs.epipolar import triangulate_depths
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.structure.model import MetricScale, ScaleStage
 

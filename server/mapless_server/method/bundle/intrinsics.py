@@ -67,7 +67,7 @@ class ContradictionOptions:
 
 @dataclass(frozen=True, eq=False)
 class IntrinsicsEquations:
-    """Normal equations of the I errors of the intrinsics, all other unknowns eliminated; see `uncertainty.dispersion`.
+    """Normal equations of the I errors of the intrinsics, all other unknowns eliminated; see `dispersion`.
 
     Attributes:
         matrices, gradients: (1 + K, I, I) and (1 + K, I): of all data, and without each of K references.

@@ -77,7 +77,7 @@ class AdjustOptions:
     Attributes:
         loss_scale_sigma: scale of the Cauchy loss, with which the influence of outliers vanishes.
         error_inflation: factor by which standard deviations from the sum over residuals are typically too small; it
-            sets the weight of priors. The answer's covariance does not use it (see `uncertainty`).
+            sets the weight of priors. The answer's covariance does not use it (see `dispersion`).
         inlier_px: as in the pose solver; the inliers of the answer are those of its own pose.
         min_kept_share: an adjustment that keeps a smaller share of the inliers has diverged and is not used.
         max_error_px: matches with a larger error under the initial pose are not used.

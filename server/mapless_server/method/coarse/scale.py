@@ -33,6 +33,7 @@ from ..features.views import PosedView, Reconstruction
 from ..optim.bounds import check_bounds
 from ..options import ScaleStrategy
 from ..pairs.correspond import Correspondences
+from ..pairs.epipolar import triangulate_depths
 from ..rejection import Rejection, RejectionReason
 from ..structure.model import MetricScale, ScaleStage, Structure
 from ..structure.observations import keypoint_depths, keypoint_rays
@@ -301,31 +302,6 @@ def pairs_of(count: int, max_cameras: int) -> NDArray[np.intp]:
     """The pairs (P, 2) of at most `max_cameras` evenly chosen cameras of `count`."""
     cameras = np.linspace(0, count - 1, min(count, max_cameras)).round().astype(np.intp)
     return cameras[np.stack(np.triu_indices(len(cameras), 1), axis=1)]
-
-
-def triangulate_depths(centre: Array, ray: Array) -> tuple[Array, Array]:
-    """Depths at which the two rays of each match are nearest to one another.
-
-    They solve z_i r_i - z_j r_j = C_j - C_i in the least squares sense:
-
-        z_i = (C_j - C_i) x r_j . n / |n|^2,   z_j = (C_j - C_i) x r_i . n / |n|^2,   n = r_i x r_j.
-
-    Args:
-        centre: (M, 2, 3) camera centres C_i and C_j in the world, metres.
-        ray: (M, 2, 3) viewing rays r_i and r_j in world axes, of depth 1 in their camera.
-
-    Returns:
-        depth_m: (M, 2) in either camera; negative behind it, NaN for parallel rays.
-        parallax_deg: (M,) angle between the rays, 0 to 180.
-    """
-    baseline = centre[:, 1] - centre[:, 0]
-    normal = np.cross(ray[:, 0], ray[:, 1])
-    squared = (normal**2).sum(axis=1)
-    # (b x r) n = r (n x b) for either camera, with the other camera's ray r.
-    turned = np.cross(normal, baseline)
-    depth_m = np.einsum("mvi,mi->mv", ray[:, ::-1], turned) / np.where(squared > 0, squared, np.nan)[:, None]
-    parallax = np.arctan2(np.sqrt(squared), (ray[:, 0] * ray[:, 1]).sum(axis=1))
-    return depth_m, np.degrees(parallax)
 
 
 def trajectory_radius(centres: Array) -> float:

@@ -21,13 +21,11 @@ from ..judge.evidence import findable_count, hull_share
 from ..judge.fixed import moved_matches, without
 from ..pairs.agreement import ReferenceErrors
 from ..pairs.stationary import StationaryOptions
-from ..pipeline import Prepared
 from ..pose.generalized import CameraMatches
 from ..pose.pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, false_alarms, format_false_alarms
 from ..rejection import Rejection, RejectionReason
-from ..structure.match import MatchOptions, search, vote
+from ..structure.match import MatchOptions, search
 from ..structure.model import PointMatches, ScaleSource, Structure
-from ..structure.structure import StructureOptions, triangulated_structure
 
 INLIER_PX = PnpOptions().inlier_px
 """Largest reprojection error of an inlier, as for one photograph."""
@@ -127,7 +125,7 @@ class PosedImage:
         return tuple(np.bincount(seen, minlength=count).tolist())
 
     def moved(self) -> PosedImage:
-        """Without matches at the same pixels as in the references, see `trust.fixed`."""
+        """Without matches at the same pixels as in the references, see `judge.fixed`."""
         it = self.source
         given = it.query, it.references, it.structure, self.matches, it.query_matches
         kept = moved_matches(*given, StationaryOptions())
@@ -236,28 +234,6 @@ def _searched_area(matched: PosedImage, guided: bool) -> float:
         return matched.matches.radius_px**2
     camera = matched.source.query.camera
     return camera.width_px * camera.height_px / np.pi
-
-
-def tracked_support(prepared: Prepared) -> Support | None:
-    """Support of a photograph that could not be posed alone, from wide correspondences; None without matches.
-
-    Without a reconstruction, the references' tracks and poses are enough to triangulate points, and the photograph's
-    matches with the references lead to them through the tracks.
-    """
-    query, references, check = prepared.query, prepared.references, prepared.context.check
-    if len(references) < 2:
-        return None
-    known = prepared.correspondences.query_matches
-    in_world = prepared.references_in_world
-    correspondences = prepared.pipeline.matcher.correspond(query, in_world, True, check, known)
-    check()
-    structure = triangulated_structure(references, correspondences, StructureOptions())
-    matches = vote(structure, [len(r.view.features) for r in references], correspondences)
-    query_matches = tuple(correspondences.query_matches)
-    sigma = prepared.options.intrinsics
-    support = Support(query, references, structure, matches, None, prepared.origin, None, query_matches, sigma)
-    support = replace(support, reference_error_px=correspondences.reference_error_px)
-    return support if len(matches) else None
 
 
 def _is_of_network(answer: Answer) -> bool:

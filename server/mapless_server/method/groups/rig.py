@@ -41,7 +41,7 @@ class RigEstimate:
         covariance: (6, 6) of the pose, order x y z rx ry rz, fixed world axes, metres and radians.
         matched: the images that have matches, in order.
         origin: (3,) origin of the world of `matched`, metres; the pose is in the caller's world.
-        trust: 0 to 1, see `trust`.
+        trust: 0 to 1, see `judge`.
         prior_checks: comparisons with the photographs' priors, by the photographs' index.
     """
 

@@ -64,7 +64,7 @@ class SequenceEstimate:
         matched: the frames that have matches, in order.
         origin: (3,) origin of the world of `matched`, metres; the poses are in the caller's world.
         jumps: jumps of the tracking, in order.
-        trust: 0 to 1, see `trust`; of the frames since the last jump.
+        trust: 0 to 1, see `judge`; of the frames since the last jump.
         prior_checks: comparisons with the frames' priors, by the frames' index.
     """
 

@@ -15,7 +15,12 @@ from numpy.typing import NDArray
 from ..bundle.estimate import Support
 from ..features.tracks import keypoint_offsets
 from ..features.views import Matches, PosedView, View
-from ..pairs.stationary import StationaryOptions, displacements_px, have_same_shape, in_columns, show_same_view
+from ..pairs.stationary import (
+    StationaryOptions,
+    have_same_shape,
+    in_columns,
+    shows_view_of,
+)
 from ..pose.pnp import gate_failure
 from ..structure.model import PointMatches, Structure
 
@@ -81,7 +86,7 @@ def moved_matches(
     is_moved = _are_moved(query, references, view, keypoint[rows], theirs, options)
     if knows_same_view:
         for i in np.unique(view[~is_moved]):
-            is_moved[view == i] |= _shows_view_of(query, references[i], query_matches[i], options)
+            is_moved[view == i] |= shows_view_of(query, references[i], query_matches[i], options)
     moved = np.zeros(len(structure.x_in_world), bool)
     moved[point[is_moved]] = True
     return np.asarray(moved[matches.point])
@@ -102,21 +107,3 @@ def _are_moved(
     apart = np.abs(in_columns(query.camera, query.features.keypoints[keypoint]) - pixels).max(axis=1)
     alike = np.array([have_same_shape(query.camera, it.view.camera) for it in references])
     return np.asarray((apart >= options.unmoved_px) | ~alike[view])
-
-
-def are_moved(
-    query: View, reference: PosedView, pairs: Matches, query_matches: Matches | None, options: StationaryOptions
-) -> NDArray[np.bool_]:
-    """Returns whether each match (M, 2) of a photograph with a reference is at other pixels.
-
-    All, if both show the same view, as all their matches, `query_matches`, say; None is not asked.
-    """
-    moved = displacements_px(query, reference.view, pairs) >= options.unmoved_px
-    if query_matches is None or moved.all():
-        return moved
-    return moved | _shows_view_of(query, reference, query_matches, options)
-
-
-def _shows_view_of(query: View, reference: PosedView, query_matches: Matches, options: StationaryOptions) -> bool:
-    unmoved = query_matches[displacements_px(query, reference.view, query_matches) <= options.unmoved_px]
-    return show_same_view(query, reference.view, unmoved, options)

@@ -21,13 +21,13 @@ import numpy as np
 
 from ..bundle.estimate import Support, TwoViewSupport
 from ..features.views import Matches
-from ..pairs.stationary import StationaryOptions
+from ..pairs.stationary import StationaryOptions, are_moved
 from ..pose.pnp import false_alarms, format_false_alarms, log10_tail
 from ..pose.relative import band_chance, disc_chance
 from ..pose.two_view_matches import TwoViewMatches
 from ..rejection import Advice, Hint, Rejection, RejectionReason
 from .evidence import hull_px2
-from .fixed import are_moved, moved_matches
+from .fixed import moved_matches
 
 MAX_LOG10_POSE = -15.0
 """Largest log10 of the expected number of such poses among wrong matches. Of 220 photographs with references of other

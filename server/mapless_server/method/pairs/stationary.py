@@ -117,6 +117,25 @@ def share_of_parts(first: View, second: View, matches: Matches, columns: int) ->
     return float(matched.sum() / max(1, occupied.sum()))
 
 
+def are_moved(
+    query: View, reference: PosedView, pairs: Matches, query_matches: Matches | None, options: StationaryOptions
+) -> NDArray[np.bool_]:
+    """Returns whether each match (M, 2) of a photograph with a reference is at other pixels.
+
+    All, if both show the same view, as all their matches, `query_matches`, say; None is not asked.
+    """
+    moved = displacements_px(query, reference.view, pairs) >= options.unmoved_px
+    if query_matches is None or moved.all():
+        return moved
+    return moved | shows_view_of(query, reference, query_matches, options)
+
+
+def shows_view_of(query: View, reference: PosedView, query_matches: Matches, options: StationaryOptions) -> bool:
+    """Whether a photograph shows the same as a reference from the same place, by all their matches."""
+    unmoved = query_matches[displacements_px(query, reference.view, query_matches) <= options.unmoved_px]
+    return show_same_view(query, reference.view, unmoved, options)
+
+
 def distance_from_explained_px(first: PosedView, second: PosedView, pixels: Array, others: Array) -> Array:
     """Distances (N,) of pixels of the second view (N, 2) from where it sees the points at these of the first (N, 2).
 

@@ -12,7 +12,6 @@ depths share, of the network's metre, changes no residual: it moves the camera a
 pose contains it as s^2 d d^T, with d the step and s its relative standard deviation.
 """
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -25,15 +24,13 @@ from ..bundle.dispersion import scale_covariance
 from ..bundle.estimate import PoseEstimate, PoseStage, Support
 from ..features.tracks import Tracks
 from ..features.views import Matches, PosedView, Reconstruction, View
-from ..judge.fixed import are_moved
-from ..judge.judge import LEVELS
 from ..optim.bounds import check_bounds
 from ..optim.perturbation import motion_jacobian, perturbed, world_covariance
-from ..pairs.stationary import StationaryOptions
+from ..pairs.stationary import StationaryOptions, are_moved
 from ..rejection import Rejection, RejectionReason
 from ..structure.model import MetricScale, PointMatches, Structure
 from ..structure.observations import FIRST_GUESS
-from .pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, false_alarms, format_false_alarms, ransac
+from .pnp import PnpOptions, false_alarms, ransac
 
 MAD_TO_SIGMA = 1.4826
 """Of a normal distribution."""
@@ -56,9 +53,6 @@ class OneReferenceOptions:
             lens or of the depths of one surface.
         rotation_factor: factor on standard deviations of the rotation. Poses from several references needed it with a
             covariance of this form; with one reference it is not measured.
-        scores: quantiles, at `LEVELS`, of the scores of right answers (see `score_of`), of 138 pairs of photographs of
-            nine places, each of which counts alike, with depths triangulated from other photographs, an error of 3 %
-            common to all of them and of 5 % of each.
     """
 
     first_sigma_px: float = 1.5
@@ -71,10 +65,6 @@ class OneReferenceOptions:
     min_inliers: int = 12
     shared_matches: float = 20.0
     rotation_factor: float = 1.79
-    scores: tuple[float, ...] = (
-        39.6, 39.6, 39.6, 39.8, 40.9, 58.2, 66.6, 127.2, 165.8, 185.0,
-        272.3, 487.4, 628.0, 838.7, 945.9, 1291.4, 1647.3, 2464.5, 3837.8, 4685.0,
-    )  # fmt: skip
 
     def __post_init__(self) -> None:
         check_bounds(self, "min_sigma_px min_depth_sigma inlier_sigma iterations", above=0)
@@ -82,8 +72,6 @@ class OneReferenceOptions:
         check_bounds(self, "first_sigma_px", at_least=self.min_sigma_px)
         check_bounds(self, "first_depth_sigma", at_least=self.min_depth_sigma, at_most=self.max_depth_sigma)
         check_bounds(self, "min_inliers", at_least=6)
-        if len(self.scores) != len(LEVELS) or not all(a <= b for a, b in itertools.pairwise(self.scores)):
-            raise ValueError(f"OneReferenceOptions.scores must be {len(LEVELS)} rising numbers, is {self.scores}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +81,7 @@ class Found:
     Attributes:
         support: support with the estimate; its points have their predicted depths.
         score: the larger, the less likely are so many inliers among wrong matches.
-        moved_score: the same for those matches that are at other pixels than in the reference; see `trust.fixed`.
+        moved_score: the same for those matches that are at other pixels than in the reference; see `judge.fixed`.
     """
 
     support: Support
@@ -145,27 +133,6 @@ def solve_one_reference(
     support = Support(query, tuple(references), structure, found, estimate, origin)
     moved = are_moved(query, reference, matches, matches, stationary)
     return Found(support, score_of(problem, solved, options), score_of(*_of_rows(problem, solved, moved), options))
-
-
-def trust_of_score(score: float, options: OneReferenceOptions) -> float:
-    """Share of right answers from one reference whose score is at most as high."""
-    return float(np.interp(score, options.scores, LEVELS))
-
-
-def one_reference_failure(found: Found, trust: float, coverage: float) -> str | None:
-    """Says in one sentence why a pose is not accepted; None if it is."""
-    assert found.support.estimate is not None
-    inliers = found.support.estimate.inliers
-    count = f"{inliers.sum()} of {len(inliers)} matches agree on a pose"
-    if -found.score > MAX_LOG10_FALSE_ALARMS:
-        return f"{count}, which chance could do ({format_false_alarms(-found.score, MAX_LOG10_FALSE_ALARMS)})"
-    if -found.moved_score > MAX_LOG10_FALSE_ALARMS:
-        chance = format_false_alarms(-found.moved_score, MAX_LOG10_FALSE_ALARMS)
-        return f"{count}, at the same pixels as in the reference, as if fixed to the camera; without them {chance}"
-    if trust < 1 - coverage:
-        required = f"the {round(1 - coverage, 6):g} that a coverage of {coverage:g} requires"
-        return f"its trust of {np.floor(1000 * trust) / 1000:g} is below {required}: {count} with a single reference"
-    return None
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...coarse.scale import triangulate_depths
+from ..epipolar import triangulate_depths
 from .errors import MatchedPair, Views
 
 MIN_PARALLAX_DEG = 1.0
