@@ -208,10 +208,10 @@ class Connection:
             else:
                 started = self._start(server, method, request, timeout_s)
                 response = await started
-            await self._check_masks(server, request, started)
         except grpc.RpcError as error:
             raise self._failed(server, error) from error
         self._answered(server)
+        await self._check_masks(server, request, started)
         return response
 
     async def _responses(self, method: str, request: Message, timeout_s: float) -> AsyncGenerator[Any, None]:

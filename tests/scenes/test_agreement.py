@@ -7,9 +7,11 @@ from itertools import combinations
 from typing import Any, cast
 
 import pytest
+from support.waiting import wait_until
 
 from mapless_server.method.features.extractors import SiftExtractor
 from mapless_server.method.pairs.correspond import make_matcher
+from mapless_server.scenes import scene_agreements
 from mapless_server.scenes.agreement import Agreement, agreement_of
 from mapless_server.scenes.explaining import SamePose
 from mapless_server.scenes.scene_agreements import SceneAgreements
@@ -85,6 +87,10 @@ class Pairs:
         self.may_read = threading.Event()
         self.may_read.set()
         self.reads = 0
+        self.scenes = [SceneKey(f"scene-{i}") for i in range(5)]
+
+    def list_scenes_with_errors(self, *_: object) -> list[SceneKey]:
+        return self.scenes
 
     def list_errors(self, *_: object) -> dict[tuple[str, str], float]:
         self.reads += 1
@@ -93,13 +99,15 @@ class Pairs:
 
 
 class Explainer:
-    """The depth that a test plants."""
+    """The depth and the mistake that a test plants."""
 
     def __init__(self) -> None:
-        self.depth = 3.0
+        self.depth, self.fails = 3.0, False
 
     def explanation(self, *_: object) -> str:
-        return ""
+        if self.fails:
+            raise OSError
+        return "inverse"
 
     def same_poses(self, *_: object) -> list[SamePose]:
         return []
@@ -175,3 +183,36 @@ class TestScenes:
         pairs.errors_px = session("b", 8, GOOD)
         agreements.changed(HALL)
         assert agreements.current(HALL).warnings(arbitrary_unit=False) == []
+
+    def test_a_change_while_pairs_are_read_is_seen(self, agreements: SceneAgreements, pairs: Pairs) -> None:
+        pairs.may_read.clear()
+        assert agreements.touch(HALL) is not None
+        wait_until(lambda: pairs.reads == 1)
+        agreements.changed(HALL)
+        pairs.errors_px = session("a", 8, GOOD)
+        pairs.may_read.set()
+        assert not agreements.current(HALL).contradicts_itself
+        assert pairs.reads == 2
+
+    def test_a_scene_that_is_asked_for_does_not_wait_for_all(
+        self, agreements: SceneAgreements, pairs: Pairs, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(scene_agreements, "LONGEST_WAIT_S", 30.0)
+        pairs.may_read.clear()
+        agreements.derive_all()
+        asked = threading.Thread(target=agreements.current, args=[HALL])
+        asked.start()
+        wait_until(lambda: len(agreements._scenes) == 2)  # that of the list, which waits, and the one that is asked for
+        pairs.may_read.set()
+        asked.join(30)
+        wait_until(lambda: pairs.reads == len(pairs.scenes) + 1)
+        assert list(agreements._scenes).index(HALL) == 1
+
+    def test_what_fails_is_tried_again_after_a_rest(
+        self, agreements: SceneAgreements, explainer: Explainer, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(scene_agreements, "FAILED_S", 0.0)
+        explainer.fails = True
+        assert agreements.current(HALL).explanation == ""
+        explainer.fails = False
+        wait_until(lambda: agreements.current(HALL).explanation == "inverse")

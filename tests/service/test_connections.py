@@ -92,6 +92,15 @@ def test_connections_that_are_never_ready_end_and_disturb_nobody(
         assert server.value("mapless_max_connections") == descriptors.most_connections()
 
 
+async def test_many_connections_are_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    found = [0, 10**7, 10**7, 10**7, 0, 0]
+    caplog.set_level("INFO")
+    with pytest.raises(IndexError):
+        await descriptors.watch_connections(lambda: found.pop(0), 0.01)
+    said = [it.levelname for it in caplog.records if "connections are open" in it.message]
+    assert said == ["WARNING", "INFO"]
+
+
 def test_the_soft_limit_of_descriptors_becomes_the_hard_one() -> None:
     """And connections leave a part of it to all else."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)

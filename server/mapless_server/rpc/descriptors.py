@@ -63,9 +63,8 @@ def open_connections(port: int) -> int:
     ending, count = f":{port:04X}", 0
     for table in map(Path, _TABLES):
         with suppress(OSError):
-            for line in table.read_text().splitlines()[1:]:
-                _, local, _, state, *_ = line.split()
-                count += local.endswith(ending) and state in _OPEN_STATES
+            rows = [line.split() for line in table.read_text().splitlines()[1:]]
+            count += sum(row[1].endswith(ending) and row[3] in _OPEN_STATES for row in rows if len(row) > 3)
     return count
 
 
@@ -75,9 +74,9 @@ async def watch_connections(count: Callable[[], int], interval_s: float = CHECK_
     while True:
         found, most = await asyncio.to_thread(count), most_connections()
         are_many = found > FULL_SHARE * most
-        if are_many:
+        if are_many and not were_many:
             log.warning("%d of %d connections are open: further ones are refused when all are", found, most)
-        elif were_many:
+        elif were_many and not are_many:
             log.info("%d of %d connections are open", found, most)
         were_many = are_many
         await asyncio.sleep(interval_s)

@@ -10,7 +10,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -53,6 +53,8 @@ READ_PAIRS = 20_000
 STALE_S, REST_FACTOR = 2.0, 50.0
 """An agreement is derived again after so long, and after so many times what reading its pairs took: 20,000
 take a tenth of a second, which queries would have to share."""
+FAILED_S = 60.0
+"""Where that failed, it is tried again after so long."""
 LONGEST_WAIT_S = 3.0
 """For what must be computed, by who asks for the agreement as it is now."""
 _KNOWN_SCENES = 10_000
@@ -132,10 +134,13 @@ class SceneAgreements:
 
     def current(self, scene_key: SceneKey) -> Agreement:
         """The agreement as it is now; waits some seconds at most for what must be computed."""
-        update = self.touch(scene_key)
-        if update is not None:
-            with suppress(TimeoutError):
-                update.result(LONGEST_WAIT_S)
+        until_s = time.monotonic() + LONGEST_WAIT_S
+        # An update that runs may have read the pairs before the last change: then another one follows it.
+        for _ in range(2):
+            update = self.touch(scene_key)
+            if update is not None:
+                with suppress(TimeoutError):
+                    update.result(max(0.0, until_s - time.monotonic()))
         return self._agreement(scene_key)
 
     def touch(self, scene_key: SceneKey) -> "Future[None] | None":
@@ -143,9 +148,14 @@ class SceneAgreements:
         with self._guard:
             known = self._known(scene_key)
             is_running = known.update is not None and not known.update.done()
-            if not is_running and not self._closing.is_set() and time.monotonic() >= known.rests_until_s:
-                known.update = self._thread.submit(self._update, scene_key, known)
+            if not is_running and time.monotonic() >= known.rests_until_s:
+                self._submit(scene_key, known)
             return known.update
+
+    def _submit(self, scene_key: SceneKey, known: _Known) -> None:
+        """Has the scene brought up to date; with the guard."""
+        if not self._closing.is_set():
+            known.update = self._thread.submit(self._update, scene_key, known)
 
     def changed(self, scene_key: SceneKey) -> None:
         """Brings the agreement up to date in the background, however recent it is: references were added."""
@@ -172,8 +182,16 @@ class SceneAgreements:
 
     def derive_all(self) -> None:
         """Brings the scenes with stored pairs that do not agree up to date, for the metric and the log."""
-        for scene_key in self._pairs.list_scenes_with_errors(self._matching, MAX_ERROR_PX, _KNOWN_SCENES):
+        self._derive_next(iter(self._pairs.list_scenes_with_errors(self._matching, MAX_ERROR_PX, _KNOWN_SCENES)))
+
+    def _derive_next(self, scene_keys: Iterator[SceneKey]) -> None:
+        """One scene after the other, so that a scene that is asked for does not wait for all of them."""
+        scene_key = next(scene_keys, None)
+        if scene_key is not None:
             self.touch(scene_key)
+            with self._guard:
+                if not self._closing.is_set():
+                    self._thread.submit(self._derive_next, scene_keys)
 
     def _known(self, scene_key: SceneKey) -> _Known:
         """Returns a scene's state, to be changed by whoever holds the guard."""
@@ -185,15 +203,22 @@ class SceneAgreements:
         return (known and known.agreement) or Agreement()
 
     def _update(self, scene_key: SceneKey, known: _Known) -> None:
-        known.rests_until_s = time.monotonic() + STALE_S
+        with self._guard:
+            known.rests_until_s = time.monotonic() + STALE_S
         try:
             self._derive(scene_key, known)
         except NotFound:
             self.forget_scene(scene_key)
         except Closed:
             pass
-        except Exception as error:
-            log.warning("the pairs of scene %s could not be compared with its poses: %s", scene_key, error)
+        except Exception:
+            log.warning("the pairs of scene %s could not be compared with its poses", scene_key, exc_info=True)
+            with self._guard:
+                known.rests_until_s = time.monotonic() + FAILED_S
+            return
+        with self._guard:
+            if known.rests_until_s == -math.inf and self._scenes.get(scene_key) is known:  # changed meanwhile
+                self._submit(scene_key, known)
 
     def _derive(self, scene_key: SceneKey, known: _Known) -> None:
         begin_s = time.monotonic()
@@ -222,16 +247,16 @@ class SceneAgreements:
     def _explain(self, scene_key: SceneKey, known: _Known, found: Agreement, pairs: Sequence[Pair]) -> None:
         """Finds the likely mistake, if the pairs are others than when that was tried."""
         if known.explained.is_outdated(set(pairs), bool(self._agreement(scene_key).explanation)):
-            known.explained = _Basis.of(pairs)
             explanation = self._explainer.explanation(scene_key, found, pairs)
+            known.explained = _Basis.of(pairs)
             self._settle(scene_key, known, replace(found, explanation=explanation))
 
     def _measure(self, scene_key: SceneKey, known: _Known, found: Agreement, errors_px: Mapping[Pair, float]) -> None:
         """Finds how far away is what the references show, if the pairs are others than when that was tried."""
         agreeing = {pair for pair, error_px in errors_px.items() if error_px <= MAX_ERROR_PX}
         if known.measured.is_outdated(agreeing, self._agreement(scene_key).median_depth is not None):
-            known.measured = _Basis.of(agreeing)
             median_depth = self._explainer.median_depth(scene_key, list(agreeing))
+            known.measured = _Basis.of(agreeing)
             self._settle(scene_key, known, replace(found, median_depth=median_depth))
 
     def _with_kept(self, known: _Known, stored: Mapping[Pair, float]) -> dict[Pair, float]:
@@ -282,8 +307,8 @@ class SceneAgreements:
         if len(rows) < LEAST_REFERENCES or (not is_small and len(rows) < GROWTH * known.sampled_size):
             return
         known.sampled_size = len(rows)
-        spread = np.linspace(0, len(rows) - 1, min(len(rows), SAMPLED_REFERENCES)).round().astype(int)
-        for row in rows[np.unique(spread)]:
+        places = np.linspace(0, len(rows) - 1, min(len(rows), SAMPLED_REFERENCES)).round().astype(int)
+        for row in rows[np.unique(places)]:
             reference_id, key, _ = entries.reference(int(row))
             if key in known.sampled:
                 continue
