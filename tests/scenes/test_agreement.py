@@ -72,6 +72,13 @@ def test_large_scenes_that_disagree_are_grouped_in_linear_time() -> None:
     assert time.thread_time() - begin_s < 3.0
 
 
+def test_sessions_agree_within() -> None:
+    worlds = session("a", 9, GOOD) | session("b", 7, GOOD) | between("a", "b", 3, BAD)
+    some_bad = dict.fromkeys(list(session("b", 7, GOOD))[1::4], BAD)
+    assert agreement_of(worlds).groups
+    assert agreement_of(worlds | some_bad).groups == ()
+
+
 class Counts(dict[str, int]):
     """The observer's last figures by name."""
 

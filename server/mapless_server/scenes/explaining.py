@@ -115,14 +115,19 @@ class SceneExplainer:
         at_one_place = np.flatnonzero((np.abs(first - second) < SAME_PLACE).all(axis=1)).tolist()
         keys = sorted({key for i in at_one_place for key in bad[i]}, key=lambda key: row_of[key])
         known = {key: entries.reference(row_of[key]) for key in keys}
+        groups = same_poses({i: known[key][2] for i, key in enumerate(keys)})
+        group_of = {keys[i]: number for number, indices in enumerate(groups) for i in indices}
+        votes = [0] * len(groups)
+        for (one, other), error_px in errors_px.items():
+            number = group_of.get(one)
+            if number is not None and number == group_of.get(other):
+                votes[number] += 1 if error_px <= MAX_ERROR_PX else -1
         found = []
-        for indices in same_poses({i: known[key][2] for i, key in enumerate(keys)}):
-            group = {keys[i] for i in indices}
-            inside = [it <= MAX_ERROR_PX for pair, it in errors_px.items() if group.issuperset(pair)]
-            if 2 * sum(inside) < len(inside):
+        for indices, vote in zip(groups, votes, strict=True):
+            if vote < 0:
                 ids = [known[keys[i]][0] for i in indices]
                 text = same_pose_text("that show different things", ids, known[keys[indices[0]]][2])
-                found.append(SamePose(frozenset(group), text))
+                found.append(SamePose(frozenset(keys[i] for i in indices), text))
         return found
 
     def _entries(self, scene_key: SceneKey) -> Entries:

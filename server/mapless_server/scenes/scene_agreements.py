@@ -29,7 +29,7 @@ from mapless_server.store import Store
 from mapless_server.store.pairs import Pair, PairStore
 
 from .agreement import Agreement, agreement_of
-from .explaining import SceneExplainer, spread
+from .explaining import NAMED, SceneExplainer, spread
 from .indexes import SceneIndexes
 from .library import Closed, ReferenceLibrary
 from .observer import BackgroundObserver
@@ -236,11 +236,13 @@ class SceneAgreements:
             errors_px = self._with_kept(known, stored)
             found = agreement_of(errors_px)
         groups = self._explainer.same_poses(scene_key, errors_px) if found.agreeing_count < found.pair_count else []
-        found = replace(found, same_pose=tuple(it.text for it in groups))
+        found = replace(found, same_pose=tuple(_some([it.text for it in groups])))
         self._settle(scene_key, known, found)
         if found.contradicts_itself:
             excluded = {key for it in groups for key in it.keys}
-            self._explain(scene_key, known, found, [it for it in errors_px if excluded.isdisjoint(it)])
+            others = {pair: it for pair, it in errors_px.items() if excluded.isdisjoint(pair)}
+            if agreement_of(others).contradicts_itself:  # otherwise the repeated poses are the mistake
+                self._explain(scene_key, known, found, list(others))
         else:
             self._measure(scene_key, known, found, errors_px)
 
@@ -328,3 +330,9 @@ class SceneAgreements:
             if error_px is not None:
                 with self._guard:
                     known.errors_px[pair] = error_px
+
+
+def _some(texts: Sequence[str]) -> list[str]:
+    """The first sentences, and how many more there are."""
+    more = [f"the same holds for {len(texts) - NAMED} more poses"] if len(texts) > NAMED else []
+    return [*texts[:NAMED], *more]

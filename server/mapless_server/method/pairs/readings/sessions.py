@@ -11,8 +11,9 @@ from typing import TypeVar
 K = TypeVar("K", int, str)
 """A photograph: its index, or the key of its reference."""
 
-MIN_GROUP, MIN_BETWEEN, MAX_BETWEEN_SHARE = 3, 6, 0.25
-"""Photographs of a session; pairs between two; how many of these may agree: docs/evidence/scene-agreement.md."""
+MIN_GROUP, MIN_BETWEEN, MAX_BETWEEN_SHARE, MIN_INSIDE_SHARE = 3, 6, 0.25, 0.8
+"""Photographs of a session; pairs between two; how many of these may agree, and how many inside each must:
+docs/evidence/scene-agreement.md."""
 
 _ROUNDS = 3
 
@@ -34,10 +35,14 @@ def sessions_of(agrees: Mapping[tuple[K, K], bool]) -> tuple[tuple[K, ...], tupl
     if len(large) < 2:
         return None
     first_group, second_group = large[:2]
-    between = [
-        vote for key in members[first_group] for other, vote in links[key].items() if group[other] == second_group
-    ]
+
+    def votes(of: int, with_group: int) -> list[int]:
+        return [vote for key in members[of] for other, vote in links[key].items() if group[other] == with_group]
+
+    between = votes(first_group, second_group)
     if len(between) < MIN_BETWEEN or between.count(1) > MAX_BETWEEN_SHARE * len(between):
+        return None
+    if any(inside.count(1) < MIN_INSIDE_SHARE * len(inside) for inside in (votes(it, it) for it in large[:2])):
         return None
     return tuple(members[first_group]), tuple(members[second_group])
 
