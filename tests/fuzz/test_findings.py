@@ -142,7 +142,7 @@ KINDS = {
 
 @pytest.mark.parametrize("name", [name for name in KINDS if " bits" not in name])
 def test_the_chunks_that_are_left_out_change_no_pixel(name: str) -> None:
-    """Of 8 bits; what has 16 is stretched, see test_deep_pixels."""
+    """Photographs of 8 bits; those of 16 are stretched, see test_deep_pixels."""
     whole = cv2.imdecode(np.frombuffer(KINDS[name], np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
     assert whole is not None
     np.testing.assert_array_equal(decode_image(KINDS[name], LIMITS), whole)

@@ -30,7 +30,7 @@ READINGS: dict[str, Reading] = {
 }
 OTHER_ROTATION = np.array([0.1, 0.7, -0.2])
 OTHER_FROM_WORLD = Similarity(0.4, rotation_from_vector(OTHER_ROTATION), np.array([3.0, -2.0, 11.0]))
-"""Of a second session with half of the references."""
+"""World of a second session with half of the references."""
 
 
 def reference(frame: Frame, read: Reading) -> NewReference:

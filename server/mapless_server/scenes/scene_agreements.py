@@ -194,7 +194,7 @@ class SceneAgreements:
                     self._thread.submit(self._derive_next, scene_keys)
 
     def _known(self, scene_key: SceneKey) -> _Known:
-        """Returns a scene's state, to be changed by whoever holds the guard."""
+        """Returns a scene's state, to be changed while the guard is held."""
         return self._scenes.setdefault(scene_key, _Known())
 
     def _agreement(self, scene_key: SceneKey) -> Agreement:

@@ -1,4 +1,4 @@
-"""What may be fixed to the camera is no evidence for a pose; the same view from the same place is."""
+"""Matches that may be fixed to the camera are no evidence for a pose; the same view from the same place is."""
 
 from dataclasses import replace
 

@@ -21,7 +21,7 @@ from mapless_server.method.options import IntrinsicsSigma
 from mapless_server.method.pose.two_view_matches import TwoViewMatches
 
 SHARED = [0, 3]
-"""Of the four errors (see `method.bundle.intrinsics`): ln of the focal length, and k1."""
+"""Indices of ln of the focal length and of k1 among the four errors (see `method.bundle.intrinsics`)."""
 
 MIN_MATCHES, MIN_SHARE, AGREEING_PX = 100, 0.3, 2.0
 """Fewer matches, or a smaller share that agrees within so many pixels, say nothing: poses are wrong, or photographs too
