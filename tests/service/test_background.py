@@ -15,6 +15,7 @@ from mapless import Client, NewReference, wire
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.scenes.background import BackgroundMatching
+from mapless_server.scenes.scene_agreements import SceneAgreements
 from mapless_tools.demo import room
 
 REFERENCES, QUERIES = 5, 1
@@ -34,6 +35,12 @@ def _answer(stub: LocalizationServiceStub, index: int) -> bytes:
     request.options.include_debug = True
     request.options.ignore_calibration = True  # which is made at some time after the matches
     return essence(stub.Localize(request, timeout=60))
+
+
+@pytest.fixture(autouse=True)
+def _without_agreements(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing but queries looks for pairs: how well a scene's poses agree is computed from pairs, too."""
+    monkeypatch.setattr(SceneAgreements, "touch", lambda _, scene_key: None)
 
 
 @pytest.fixture(scope="module")

@@ -232,7 +232,7 @@ class SceneAgreements:
         # Known before it is explained, which takes a second or two.
         self._settle(scene_key, known, replace(found, same_pose=self._agreement(scene_key).same_pose))
         if len(stored) < ENOUGH_PAIRS:
-            self._sample(scene_key, known)
+            self._sample(scene_key, known, stored)
             errors_px = self._with_kept(known, stored)
             found = agreement_of(errors_px)
         groups = self._explainer.same_poses(scene_key, errors_px) if found.agreeing_count < found.pair_count else []
@@ -301,8 +301,8 @@ class SceneAgreements:
         if self._closing.is_set():
             raise Closed
 
-    def _sample(self, scene_key: SceneKey, known: _Known) -> None:
-        """Matches a few references with those that look most similar."""
+    def _sample(self, scene_key: SceneKey, known: _Known, stored: Collection[Pair]) -> None:
+        """Matches a few references with those that look most similar; not pairs that are stored."""
         entries = self._indexes.entries(scene_key, StageContext(self._check))
         rows = entries.rows()
         is_small = len(rows) <= SAMPLED_REFERENCES
@@ -320,7 +320,9 @@ class SceneAgreements:
             views = self._explainer.load(scene_key, [reference_id, *(it.reference_id for it in beside)])
             for other in views[1:]:
                 self._check()
-                self._compare(known, *in_order(views[0], other))
+                first, second = in_order(views[0], other)
+                if (first.key, second.key) not in stored:
+                    self._compare(known, first, second)
 
     def _compare(self, known: _Known, first: PosedView, second: PosedView) -> None:
         pair = first.key, second.key
