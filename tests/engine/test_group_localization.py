@@ -58,7 +58,7 @@ class Toy(QueueEngine):
         stages = {Stage(PREPARE, "host"): compute_items, Stage(JOIN, "host"): compute_items}
         self.queue = WorkQueue(stages, {"host": 2}, options, Observer())
 
-    def query_job(self, query: Query, caller: Caller, source: object = None, on_coarse: object = None) -> Job:
+    def query_job(self, query: Query, caller: Caller, source: object = None, on_better: object = None) -> Job:
         def compute(_: None, check: object) -> None:
             number = next(self._numbers)
             time.sleep(self.seconds)

@@ -94,8 +94,8 @@ class Refusing:
     def __init__(self) -> None:
         self.jobs: list[weakref.ref[Job]] = []
 
-    def query_job(self, query: Any, caller: Any, *, on_coarse: Any = None) -> Job:
-        job = Job(Flow("", ""), Step("prepare", "", "", on_coarse), math.inf, 0)
+    def query_job(self, query: Any, caller: Any, *, on_better: Any = None) -> Job:
+        job = Job(Flow("", ""), Step("prepare", "", "", on_better), math.inf, 0)
         self.jobs.append(weakref.ref(job))
         return job
 

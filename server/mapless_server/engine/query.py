@@ -153,6 +153,27 @@ class Query:
         return sigma <= math.radians(MAX_TRACKED_SIGMA_DEG)
 
 
+@dataclass(frozen=True)
+class Tried:
+    """One attempt at a pose.
+
+    Attributes:
+        rung: the attempt's place among the attempts, such as "wide".
+        features: the local features' name with their options.
+        outcome: "localized", the value of the rejection's reason, or how it ended without a verdict, such as "failed".
+        seconds: its computing time.
+        processor_s: its processor time.
+        is_chosen: whether the answer came from it.
+    """
+
+    rung: str
+    features: str
+    outcome: str
+    seconds: float
+    processor_s: float
+    is_chosen: bool = False
+
+
 @dataclass(frozen=True, eq=False)
 class Result:
     """The answer to a query, and the data that it was computed from.
@@ -168,6 +189,7 @@ class Result:
         stage_seconds: time of every stage that was computed, in order, of all searches. The name of a stage of a
             further search begins with its extractor's name and a slash. Such a search has only "unfinished" if it
             failed, was ended for lack of time, or its tier has not described the references yet.
+        attempts: the attempts that were made, in order.
     """
 
     answer: Answer
@@ -178,6 +200,7 @@ class Result:
     choice: Choice | None = None
     attributes: SceneAttributes = field(default_factory=SceneAttributes)
     stage_seconds: dict[str, float] = field(default_factory=dict)
+    attempts: tuple[Tried, ...] = ()
 
     def seconds_with(self, stage_seconds: Mapping[str, float]) -> dict[str, float]:
         """Time of its stages and of those of a further search with a tier; a tier may search several times."""
@@ -228,7 +251,7 @@ class QueryRun:
         source: source of the references.
         views: the photograph.
         deadline_s: time after which the answer is useless, by `time.monotonic`.
-        on_coarse: called with the first tier's coarse result as soon as there is one, in the computing thread.
+        on_better: called in the computing thread with each result that may be shown before the answer.
         tier: index of the tier that computes.
         best: best result so far; None in the first search of the first tier.
         start_s: when this tier began, by `time.monotonic`.
@@ -254,7 +277,7 @@ class QueryRun:
     source: ReferenceSource
     views: QueryViews
     deadline_s: float
-    on_coarse: Callable[[Result], object] | None = None
+    on_better: Callable[[Result], object] | None = None
     tier: int = 0
     best: Result | None = None
     start_s: float = field(default_factory=time.monotonic)

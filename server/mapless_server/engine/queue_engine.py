@@ -114,19 +114,19 @@ class QueueEngine:
         caller: Caller,
         source: ReferenceSource | None = None,
         *,
-        on_coarse: Callable[[Result], None] | None = None,
+        on_better: Callable[[Result], None] | None = None,
     ) -> Job:
         """Makes the job of localizing a photograph, for `run`; its `records` list the stages that it has been through.
 
-        `source` replaces the references, for the warm-up. `on_coarse` is called on the event loop, before the answer,
+        `source` replaces the references, for the warm-up. `on_better` is called on the event loop, before the answer,
         with the first tier's localization before its refinement, if there is one; nothing has checked it. It is called
         again if references are deleted while they are used. The answer does not depend on it.
         """
         views = QueryViews(query.photo, self.options.image_limits)
         run = QueryRun(query, source or self.references, views, caller.deadline_s)
-        if on_coarse is not None:
+        if on_better is not None:
             loop = asyncio.get_running_loop()
-            run = replace(run, on_coarse=lambda result: loop.call_soon_threadsafe(on_coarse, result))
+            run = replace(run, on_better=lambda result: loop.call_soon_threadsafe(on_better, result))
         size_bytes = 0 if query.is_part else query.photo.size_bytes  # which `hold` counts
         return Job(caller.flow, run.first_step, caller.deadline_s, size_bytes)
 

@@ -260,14 +260,14 @@ class QueryStages:
             return self._conclude(run, part)
         kind = run.kind
         step = Step(REFINE, kind, kind, run.but(part=part))
-        if run.earlier is not None or not (run.query.allow_coarse or run.on_coarse is not None):
+        if run.earlier is not None or not (run.query.allow_coarse or run.on_better is not None):
             return self._next(run, step)
         answer = self._method.coarse_answer(part)
         if answer is None or not answer.is_finite:
             return self._next(run, step)
         coarse = self._result(run, answer)
-        if run.on_coarse is not None and isinstance(coarse.answer.outcome, Localization):
-            run.on_coarse(coarse)
+        if run.on_better is not None and isinstance(coarse.answer.outcome, Localization):
+            run.on_better(coarse)
         if not run.query.allow_coarse:
             return self._next(run, step)
         done = Done(coarse, Ending.DEGRADED)
@@ -333,7 +333,7 @@ class QueryStages:
     def _further(self, run: QueryRun, query: Query, tier: int, best: Result) -> QueryRun:
         """Another search; if it finds nothing better in time, the best result so far is returned."""
         limits = time.monotonic(), self._give_up_s(run)
-        return QueryRun(query, run.source, run.views, run.deadline_s, run.on_coarse, tier, best, *limits)
+        return QueryRun(query, run.source, run.views, run.deadline_s, run.on_better, tier, best, *limits)
 
     def _search(self, run: QueryRun) -> StageResult:
         return self._unfinished(run) if self._gives_up(run) else self._next(run, run.first_step)

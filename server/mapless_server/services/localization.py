@@ -119,7 +119,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
                 self._metrics.answered_coarsely(seconds)
                 coarse.set_result(to_message(result))
 
-        job = engine.query_job(query, call.caller, on_coarse=None if coarse is None else give_coarse)
+        job = engine.query_job(query, call.caller, on_better=None if coarse is None else give_coarse)
         records = job.records  # what the functions above use, not the job: it holds the photograph, and them
         try:
             result = await engine.run(job)

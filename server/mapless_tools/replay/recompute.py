@@ -246,7 +246,7 @@ class _Recomputing:
         unrefined = Method(refine=lambda coarse: coarse_answer(coarse) or refine(coarse))
         self._method = unrefined if _is_cut_short(request, then) else Method()
 
-    def query_job(self, query: Query, caller: Caller, source: object = None, on_coarse: object = None) -> Job:
+    def query_job(self, query: Query, caller: Caller, source: object = None, on_better: object = None) -> Job:
         field = query.photo.field
         extractor, part = self._tiers[0].extractor, self._parts[field]
         recorded = RecordedSource(self._call, part, self._blobs, extractor, field in self._described)
