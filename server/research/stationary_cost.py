@@ -17,7 +17,7 @@ from mapless_server.method.judge.answer import Answer
 from mapless_server.method.judge.fixed import unmoved_failure
 from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions
-from mapless_server.method.pairs.pair import PairKey, PairMatches
+from mapless_server.method.pairs.pair import Matching, PairKey, PairMatches
 from mapless_server.method.pairs.stationary import StationaryOptions, stationary_matches
 from mapless_server.method.pairs.stationary_filter import references_without_fixed, without_fixed
 from mapless_server.method.pipeline import Pipeline
@@ -50,7 +50,7 @@ def measured(overlay: Overlay) -> Mapping[str, float]:
         (i, j): mutual_matches(references[i].view.features, references[j].view.features, 0.9, True) for i, j in every
     }
     pairs = {(i, j): PairMatches.of(references[i], references[j], it, OPTIONS) for (i, j), it in matches.items()}
-    keys = frozenset(PairKey(references[i].key, references[j].key, False, False) for i, j in every)
+    keys = frozenset(PairKey(references[i].key, references[j].key, Matching.STRICT) for i, j in every)
     of_query = [mutual_matches(query.features, it.view.features, ratio, True) for it in references]
     cache: LruCache[object] = LruCache(2**25)
 

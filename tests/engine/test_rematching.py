@@ -36,7 +36,7 @@ class TestRematching:
 
     def pair_matching(self, setting: Setting, seconds: float = 0.0) -> OneMatch:
         setting.replies = {"cheap": rejected(), "strong": localized(SURE_INLIERS)}
-        planted = setting.engine.tiers[1].pipeline.matcher.pair_matching = OneMatch(seconds)
+        planted = setting.engine.tiers[1].pipeline.matcher.pairs.pair_matching = OneMatch(seconds)
         return planted
 
     @pytest.mark.parametrize("chooses", [False, True])

@@ -31,6 +31,7 @@ from mapless_server.method.judge.evidence import evidence_of, votes_of
 from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions, ScaleStrategy, StageContext, Variant
 from mapless_server.method.pairs.correspond import Correspondences, Matcher
+from mapless_server.method.pairs.pair import Matching
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.structure.model import ScaleStage
 
@@ -183,26 +184,26 @@ def test_an_answer_is_finite_where_all_its_numbers_are(number: float) -> None:
 
 
 def test_a_weak_answer_is_recomputed_from_wide_correspondences(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[bool] = []
+    asked: list[Matching] = []
     correspond = Matcher.correspond
 
     def spy(
         self: Matcher,
         query: View,
         references: Sequence[PosedView],
-        wide: bool,
+        matching: Matching,
         check: Callable[[], None],
         query_matches: Sequence[Matches] | None,
     ) -> Correspondences:
-        asked.append(wide)
-        assert (query_matches is not None) == wide, "the query is matched once"
-        return correspond(self, query, references, wide, check, query_matches)
+        asked.append(matching)
+        assert (query_matches is not None) == matching.is_wide, "the query is matched once"
+        return correspond(self, query, references, matching, check, query_matches)
 
     monkeypatch.setattr(Matcher, "correspond", spy)
     strong = pose_of(answer_of(weak_below(10, pipeline_of("geometric"))))
-    assert asked == [False]
+    assert asked == [Matching.STRICT]
     again = answer_of(weak_below(10**6, pipeline_of("geometric")))
-    assert asked == [False, False, True]
+    assert asked == [Matching.STRICT, Matching.STRICT, Matching.WIDE]
     assert pose_of(again).inlier_count >= strong.inlier_count
     assert list(again.stage_seconds) == ["correspond", "coarse", "scale", *LATER_STAGES, "adjust", *JUDGED]
     assert_pose_close(pose_of(again).world_from_camera, SCENE.world_from_query, metres=0.01, degrees=0.1)
@@ -210,7 +211,7 @@ def test_a_weak_answer_is_recomputed_from_wide_correspondences(monkeypatch: pyte
     for variant in (Variant.COARSE, Variant.NO_STRUCTURE, Variant.FULL):  # the paper's forms stay the paper's
         asked.clear()
         answer_of(weak_below(10**6, pipeline_of("geometric")), LocalizeOptions(variant))
-        assert asked == [False]
+        assert asked == [Matching.STRICT]
 
 
 @pytest.mark.parametrize("steps", [0, 1, 10, 20])

@@ -24,15 +24,15 @@ from mapless_server.method.features import matching, nearest
 from mapless_server.method.features.matching import CorrespondOptions, PairMatching, StoredPair
 from mapless_server.method.features.views import Features, Matches, PosedView, View
 from mapless_server.method.options import StageContext
-from mapless_server.method.pairs import correspond
+from mapless_server.method.pairs import pair as reference_pairs
 from mapless_server.method.pairs.correspond import Matcher
-from mapless_server.method.pairs.pair import in_order
+from mapless_server.method.pairs.pair import Matching, in_order
 from mapless_server.scenes import background
 from mapless_server.scenes.background import BackgroundMatching, BackgroundOptions
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
-from mapless_server.scenes.stored import Matching, PairFinder
+from mapless_server.scenes.stored import PairFinder, TierMatching
 from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, Store, pairs
 from mapless_server.store.pairs import PairStore
@@ -40,6 +40,7 @@ from mapless_server.store.pairs import PairStore
 SCENE = SceneKey("s")
 EXTRACTOR, DESCRIPTOR = StandInExtractor(), StandInDescriptor()
 PLANTED = make_scene(random_for("background"), SceneOptions(reference_count=5, point_count=60, outlier_share=0.3))
+TWO = (Matching.STRICT, Matching.WIDE)
 
 
 @dataclass
@@ -80,35 +81,33 @@ class Server:
         store: Store,
         options: BackgroundOptions | None = None,
         is_idle: Callable[[], bool] = lambda: True,
-        widths: Sequence[bool] = (False, True),
-        strong: bool = False,
+        kinds: Sequence[Matching] = TWO,
         strong_matching: PairMatching | None = None,
         enough_matches: int = 500,
     ) -> None:
         self.store, self.counts = store, Counts()
         self.matcher = Matcher(
             CorrespondOptions(enough_matches=enough_matches),
-            pair_matching=strong_matching or AnyRatio() if strong else None,
+            pair_matching=strong_matching or AnyRatio() if any(it.is_strong for it in kinds) else None,
         )
         self.pairs = PairStore(store.database)
-        self.finder = self.matcher.stored = PairFinder(self.pairs, EXTRACTOR.name, self.counts)
+        self.finder = self.matcher.pairs.stored = PairFinder(self.pairs, EXTRACTOR.name, self.counts)
         self.library = ReferenceLibrary(store)
         indexes = SceneIndexes(store, self.library, DESCRIPTOR, EXTRACTOR, 2**30)
-        kinds = (False, True) if strong else (False,)
-        matchings = {Matching(EXTRACTOR, self.matcher, wide, kind): self.finder for kind in kinds for wide in widths}
+        matchings = {TierMatching(EXTRACTOR, self.matcher, kind): self.finder for kind in kinds}
         self.background = BackgroundMatching(store, indexes, matchings, is_idle, self.counts, options)
 
     def references(self) -> tuple[PosedView, ...]:
         ids = self.store.list_reference_ids(SCENE, 100)
         return self.library.load(SCENE, ids, EXTRACTOR, StageContext())[1]
 
-    def name(self, wide: bool = False) -> str:
-        return Matching(EXTRACTOR, self.matcher, wide).name
+    def name(self, matching: Matching = Matching.STRICT) -> str:
+        return TierMatching(EXTRACTOR, self.matcher, matching).name
 
-    def stored(self, wide: bool = False) -> dict[tuple[str, str], Matches | None]:
+    def stored(self, matching: Matching = Matching.STRICT) -> dict[tuple[str, str], Matches | None]:
         """By the references' names, of all pairs that are stored."""
         name_of = {it.key: it.name.rpartition("/")[2] for it in self.references()}
-        found = self.pairs.load(self.name(wide), [(a, b) for a in name_of for b in name_of])
+        found = self.pairs.load(self.name(matching), [(a, b) for a in name_of for b in name_of])
         return {(name_of[a], name_of[b]): None if it is None else it.matches for (a, b), it in found.items()}
 
 
@@ -138,19 +137,21 @@ def compared(monkeypatch: pytest.MonkeyPatch) -> Counter[int]:
 
         return compare
 
-    for module, name in (correspond, "mutual_matches_of_ratios"), (matching, "mutual_matches"):
+    for module, name in (reference_pairs, "mutual_matches_of_ratios"), (matching, "mutual_matches"):
         monkeypatch.setattr(module, name, counting(getattr(nearest, name)))
     return counts
 
 
 class TestResults:
-    @pytest.mark.parametrize("wide", [False, True])
-    def test_a_query_finds_all_pairs_and_gets_the_same(self, store: Store, wide: bool, compared: Counter[int]) -> None:
+    @pytest.mark.parametrize("matching", TWO)
+    def test_a_query_finds_all_pairs_and_gets_the_same(
+        self, store: Store, matching: Matching, compared: Counter[int]
+    ) -> None:
         server, query = Server(store), PLANTED.query
-        expected = Matcher().correspond(query, server.references(), wide)
+        expected = Matcher().correspond(query, server.references(), matching)
         server.background.match_waiting()
         compared.clear()
-        found = server.matcher.correspond(query, server.references(), wide)
+        found = server.matcher.correspond(query, server.references(), matching)
         assert compared.total() == 5  # with the query
         assert server.counts.found == {"stored": 10, "absent": 0, "damaged": 0}
         for pair, matches in expected.reference_pairs.items():
@@ -163,12 +164,12 @@ class TestResults:
             store.create_scene(SCENE)
             for i in (0, 4, 1, 3):
                 store.add_references(SCENE, [new(i)])
-            server = Server(store, BackgroundOptions(pairs=1), widths=[False])
+            server = Server(store, BackgroundOptions(pairs=1), kinds=[Matching.STRICT])
             server.background.match_waiting()
             assert set(server.stored()) == {("r0", "r1"), ("r3", "r4")}
 
     def test_one_that_is_added_later_is_matched_with_those_before(self, store: Store, compared: Counter[int]) -> None:
-        server = Server(store, widths=[False])
+        server = Server(store, kinds=[Matching.STRICT])
         server.background.match_waiting()
         compared.clear()
         store.delete_reference(SCENE, "r1")
@@ -178,7 +179,7 @@ class TestResults:
         assert len(server.stored()) == 10
         for (a, b), matches in server.stored().items():
             first, second = (next(it for it in server.references() if it.name.endswith(name)) for name in (a, b))
-            np.testing.assert_array_equal(matches, Matcher().match_pair(*in_order(first, second)))
+            np.testing.assert_array_equal(matches, Matcher().pairs.make(*in_order(first, second)))
 
 
 class NeverCalled(AnyRatio):
@@ -203,20 +204,20 @@ class Halfway(AnyRatio):
 
 class TestStrongPairs:
     def test_a_query_finds_them_and_their_wide_ones(self, store: Store) -> None:
-        server = Server(store, strong=True)
+        server = Server(store, kinds=list(Matching))
         server.background.match_waiting()
         assert server.counts.made == 40
-        for wide in (False, True):
-            found = server.matcher.correspond(PLANTED.query, server.references(), wide).reference_pairs
+        for kind, strong in ((Matching.STRICT, Matching.STRONG), (Matching.WIDE, Matching.STRONG_WIDE)):
+            found = server.matcher.correspond(PLANTED.query, server.references(), kind).reference_pairs
             twin = Matcher(pair_matching=AnyRatio())
             for (i, j), matches in found.items():
                 first, second = server.references()[i], server.references()[j]
                 pair = in_order(first, second)
-                expected = twin.match_pair(*pair, wide, True)
+                expected = twin.pairs.make(*pair, strong)
                 np.testing.assert_array_equal(matches if pair[0] is first else matches[:, ::-1], expected)
 
     def test_nearest_neighbours_that_find_enough_suffice(self, store: Store) -> None:
-        server = Server(store, strong=True, strong_matching=NeverCalled(), enough_matches=1)
+        server = Server(store, kinds=list(Matching), strong_matching=NeverCalled(), enough_matches=1)
         server.background.match_waiting()
         assert (server.counts.made, server.counts.waits, server.counts.failures) == (20, 0, 0)
         assert min(len(it) for it in server.stored().values() if it is not None) >= 1
@@ -224,13 +225,13 @@ class TestStrongPairs:
 
 class TestDamage:
     def test_a_damaged_pair_is_made_again(self, store: Store, place: Folder) -> None:
-        server = Server(store, widths=[False])
+        server = Server(store, kinds=[Matching.STRICT])
         server.background.match_waiting()
         usual = server.stored()
         place.execute(
             "UPDATE reference_pair SET data = zeroblob(8) WHERE first_key = (SELECT min(first_key) FROM reference_pair)"
         )
-        found = Server(store, widths=[False])
+        found = Server(store, kinds=[Matching.STRICT])
         correspondences = found.matcher.correspond(PLANTED.query, found.references())
         assert found.counts.found["damaged"] > 0
         for pair, matches in Matcher().correspond(PLANTED.query, found.references()).reference_pairs.items():
@@ -243,7 +244,7 @@ class TestDamage:
             np.testing.assert_array_equal(again[names], stored)
 
     def test_matches_of_keypoints_that_are_not_there_are_damage(self, store: Store) -> None:
-        server = Server(store, widths=[False])
+        server = Server(store, kinds=[Matching.STRICT])
         first, second = server.references()[:2]
         claim = server.pairs.claim(server.name(), pairs.Progress())
         assert claim is not None
@@ -251,7 +252,7 @@ class TestDamage:
             server.pairs.add(
                 server.name(), claim, {(first.key, second.key): StoredPair(np.array([wrong], np.int32))}, False
             )
-            assert server.finder.find(server.matcher.matching(), [(first, second)]) == [None]
+            assert server.finder.find(server.matcher.pairs.name(), [(first, second)]) == [None]
             server.pairs.discard(server.name(), server.finder.take_damaged(server.name()))
         assert server.counts.found == {"damaged": 3, "stored": 0, "absent": 0}
 
@@ -259,7 +260,7 @@ class TestDamage:
         self, store: Store, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         damage(store, SCENE, "r3", "features")
-        server = Server(store, widths=[False])
+        server = Server(store, kinds=[Matching.STRICT])
         with caplog.at_level(logging.WARNING):
             server.background.match_waiting()
         assert server.counts.failures == 1
@@ -298,37 +299,37 @@ class TestUnused:
     def test_servers_with_other_settings_keep_one_anothers_pairs(
         self, store: Store, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        servers = [Server(store, widths=[False]), Server(store, widths=[True])]
+        servers = [Server(store, kinds=[Matching.STRICT]), Server(store, kinds=[Matching.WIDE])]
         for _ in range(4):
             for server in servers:
                 server.background.match_waiting()
             let_pass(monkeypatch, 0.6 * pairs.KEPT_S)
-        assert [len(servers[0].stored(wide)) for wide in (False, True)] == [10, 10]
+        assert [len(servers[0].stored(it)) for it in TWO] == [10, 10]
         for _ in range(2):
             servers[0].background.match_waiting()
             let_pass(monkeypatch, 0.6 * pairs.KEPT_S)
-        assert [len(servers[0].stored(wide)) for wide in (False, True)] == [10, 0]
+        assert [len(servers[0].stored(it)) for it in TWO] == [10, 0]
 
     def test_a_server_that_makes_none_keeps_what_it_uses(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-        Server(store, widths=[False]).background.match_waiting()
+        Server(store, kinds=[Matching.STRICT]).background.match_waiting()
         let_pass(monkeypatch, 1.1 * pairs.KEPT_S)
-        reader, other = Server(store, widths=[False]), Server(store, widths=[True])
+        reader, other = Server(store, kinds=[Matching.STRICT]), Server(store, kinds=[Matching.WIDE])
         reader.background.maintain()
         other.background.match_waiting()
-        assert [len(reader.stored(wide)) for wide in (False, True)] == [10, 10]
+        assert [len(reader.stored(it)) for it in TWO] == [10, 10]
 
 
 class TestFailures:
     def test_a_failure_is_counted_and_tried_again_with_back_off(
         self, store: Store, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        server = Server(store, widths=[False])
+        server = Server(store, kinds=[Matching.STRICT])
 
         def fail(*_: object) -> Matches:
             raise ArithmeticError("planted")
 
         with monkeypatch.context() as patch:
-            patch.setattr(server.matcher, "match_pair", fail)
+            patch.setattr(server.matcher.pairs, "make", fail)
             server.background.match_waiting()
             # The first reference has none before it.
             assert (server.counts.failures, server.counts.made, server.counts.waits) == (4, 0, 4)
@@ -367,14 +368,14 @@ class TestSharing:
         with place.open() as first, place.open() if database == "postgresql" else first.uncached() as second:
             first.create_scene(SCENE)
             first.add_references(SCENE, [new(i) for i in range(5)])
-            servers = [Server(it, widths=[False]) for it in (first, second, first)]
+            servers = [Server(it, kinds=[Matching.STRICT]) for it in (first, second, first)]
             with ThreadPoolExecutor(3) as threads:
                 list(threads.map(lambda it: it.background.match_waiting(), servers))
             assert len(compared) == compared.total() == sum(it.counts.made for it in servers) == 10
             assert len(servers[0].stored()) == 10
 
     def test_what_a_killed_server_began_is_finished(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-        killed, server = Server(store, widths=[False]), Server(store, widths=[False])
+        killed, server = Server(store, kinds=[Matching.STRICT]), Server(store, kinds=[Matching.STRICT])
 
         class Killed(BaseException):
             pass
@@ -394,7 +395,7 @@ class TestSharing:
 
 
 class TestPriority:
-    @pytest.mark.parametrize(("owner", "step", "most"), [("matcher", "match_pair", 2), ("library", "load", 0)])
+    @pytest.mark.parametrize(("owner", "step", "most"), [("pairs", "make", 2), ("library", "load", 0)])
     def test_a_busy_server_matches_little(
         self, store: Store, monkeypatch: pytest.MonkeyPatch, owner: str, step: str, most: int
     ) -> None:
@@ -402,7 +403,7 @@ class TestPriority:
         is_busy = threading.Event()
         options = BackgroundOptions(poll_s=0.01, busy_share=1e-6, quiet_s=0.01)
         server = Server(store, options, lambda: not is_busy.is_set())
-        place: Any = ReferenceLibrary if owner == "library" else server.matcher
+        place: Any = ReferenceLibrary if owner == "library" else server.matcher.pairs
         usual = getattr(place, step)
 
         def then_busy(*arguments: Any) -> Any:
@@ -424,7 +425,7 @@ class TestPriority:
     def test_a_slow_pair_waits_in_its_middle(self, store: Store, ends: str) -> None:
         slow = Halfway()
         options = BackgroundOptions(poll_s=0.01, busy_share=1e-6, quiet_s=0.01)
-        server = Server(store, options, lambda: not slow.is_busy.is_set(), [False], True, slow)
+        server = Server(store, options, lambda: not slow.is_busy.is_set(), [Matching.STRICT, Matching.STRONG], slow)
         server.background.start()
         try:
             wait_until(slow.is_busy.is_set)
@@ -470,7 +471,7 @@ class TestPriority:
         self, store: Store, monkeypatch: pytest.MonkeyPatch, compared: Counter[int]
     ) -> None:
         monkeypatch.setattr("mapless_server.scenes.background.CLAIM_S", 0.0)
-        server = Server(store, widths=[False])
+        server = Server(store, kinds=[Matching.STRICT])
         usual = server.background._let_callers_first
         steps = iter(range(1000))
 

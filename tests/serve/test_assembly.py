@@ -8,6 +8,7 @@ from support.programs import printed
 
 from mapless_server.method.features.extractors import make_extractor
 from mapless_server.method.pairs.correspond import make_matcher
+from mapless_server.method.pairs.pair import Matching
 from mapless_server.networks.weights import WeightsMissing
 from mapless_server.observability.metrics import Metrics
 from mapless_server.serve import assembly
@@ -153,4 +154,4 @@ def test_a_stronger_tier_rematches_by_light_glue(tmp_path: Path) -> None:
     matcher = make_matcher("aliked", 1, assembly._find_light_glue("aliked", settings(tmp_path), missing := {}))
     assert not missing
     assert matcher.pair_matching is not None
-    assert matcher.matching(strong=True) not in {matcher.matching(), without.matching()}
+    assert matcher.pairs.name(Matching.STRONG) not in {matcher.pairs.name(), without.pairs.name()}

@@ -16,6 +16,7 @@ from .judge.two_view import (
     two_view_trust,
     without_unmoved,
 )
+from .pairs.pair import Matching
 from .pipeline import Coarse
 from .pose.one_reference import solve_one_reference
 from .pose.two_view import solve_two_view
@@ -79,7 +80,7 @@ def _two_view_support(coarse: Coarse, found: Support | None) -> Support | None:
     known = [found.estimate.world_from_camera] if found and found.estimate else []
     with context.stage("two_view"):
         in_world = prepared.references_in_world
-        wide = matcher.correspond(query, in_world, True, context.check, query_matches)
+        wide = matcher.correspond(query, in_world, Matching.WIDE, context.check, query_matches)
         stages = prepared.structure_options, prepared.match_options, options.adjust, prepared.options.intrinsics
         result = solve_two_view(query, references, wide, known, prepared.origin, *stages)
     if result is None or result.estimate is None:

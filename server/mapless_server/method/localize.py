@@ -20,6 +20,7 @@ from .judge.fixed import unmoved_failure
 from .judge.intrinsics import intrinsics_checks
 from .judge.judge import judge
 from .options import LocalizeOptions, StageContext, Variant
+from .pairs.pair import Matching
 from .pipeline import Coarse, Pipeline, Prepared, reconstruct, structure_and_matches, with_wide_correspondences
 from .pose.pnp import gate_failure, solve_pose
 from .rejection import Rejection, RejectionReason
@@ -75,7 +76,7 @@ def prepare(
     nearby = tuple(replace(r, world_from_camera=r.world_from_camera.shifted(-origin)) for r in references)
     bucket = pipeline.reconstructor.bucket(query, nearby)
     with context.stage("correspond"):
-        correspondences = pipeline.matcher.correspond(query, references, False, context.check, query_matches)
+        correspondences = pipeline.matcher.correspond(query, references, Matching.STRICT, context.check, query_matches)
     given = query, nearby, tuple(references), origin, pipeline, options
     return Prepared(*given, correspondences, bucket, context, priors.shifted(-origin), is_metric)
 

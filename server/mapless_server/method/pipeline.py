@@ -21,6 +21,7 @@ from .judge.answer import Answer, Localization, shifted
 from .judge.judge import JudgeOptions
 from .options import LocalizeOptions, StageContext, Variant
 from .pairs.correspond import Correspondences, Matcher
+from .pairs.pair import Matching
 from .pose.one_reference import OneReferenceOptions
 from .pose.pnp import PnpOptions
 from .rejection import Rejection, RejectionReason
@@ -245,7 +246,7 @@ def with_wide_correspondences(coarse: Coarse) -> Coarse:
     with context.stage("correspond"):
         known = prepared.correspondences.query_matches
         in_world = prepared.references_in_world
-        correspondences = pipeline.matcher.correspond(query, in_world, True, context.check, known)
+        correspondences = pipeline.matcher.correspond(query, in_world, Matching.WIDE, context.check, known)
         # What was left out is not among the known matches any more.
         correspondences = replace(correspondences, stationary_count=prepared.correspondences.stationary_count)
     with context.stage("coarse"):
@@ -330,7 +331,7 @@ def tracked_support(prepared: Prepared) -> Support | None:
         return None
     known = prepared.correspondences.query_matches
     in_world = prepared.references_in_world
-    correspondences = prepared.pipeline.matcher.correspond(query, in_world, True, check, known)
+    correspondences = prepared.pipeline.matcher.correspond(query, in_world, Matching.WIDE, check, known)
     check()
     structure = triangulated_structure(references, correspondences, StructureOptions())
     matches = vote(structure, [len(r.view.features) for r in references], correspondences)

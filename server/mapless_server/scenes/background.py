@@ -32,7 +32,7 @@ from .library import Closed, ReferenceLibrary
 from .observer import BackgroundObserver
 from .retrieval.ranking import rank_beside
 from .scene_agreements import SceneAgreements
-from .stored import Matching, PairFinder
+from .stored import PairFinder, TierMatching
 
 log = logging.getLogger(__name__)
 
@@ -84,7 +84,7 @@ class BackgroundMatching:
         self,
         store: Store,
         indexes: SceneIndexes,
-        matchings: Mapping[Matching, PairFinder],
+        matchings: Mapping[TierMatching, PairFinder],
         is_idle: Callable[[], bool],
         observer: BackgroundObserver,
         options: BackgroundOptions | None = None,
@@ -213,7 +213,7 @@ class BackgroundMatching:
                 self._observer.count("background_failures")
                 log.warning("matching references in the background failed, and is tried again: %s", error)
 
-    def _claim(self) -> tuple[Matching, Claim] | None:
+    def _claim(self) -> tuple[TierMatching, Claim] | None:
         self.maintain()
         for matching in self._matchings:
             claim = self._pairs.claim(matching.name, self._progress[matching.name])
@@ -226,7 +226,7 @@ class BackgroundMatching:
         self._observer.waiting("background_waiting", self._waiting_count)
         self._counted_s = time.monotonic()
 
-    def _match_claimed(self, library: ReferenceLibrary, matching: Matching, claim: Claim) -> None:
+    def _match_claimed(self, library: ReferenceLibrary, matching: TierMatching, claim: Claim) -> None:
         """Matches one reference, or postpones it if that fails."""
         until_s = time.monotonic() + CLAIM_S / 3
         begin_s = time.thread_time()
@@ -253,7 +253,7 @@ class BackgroundMatching:
         self._observer.count("background_cpu_seconds", time.thread_time() - begin_s)
 
     def _match(
-        self, library: ReferenceLibrary, matching: Matching, claim: Claim, until_s: float
+        self, library: ReferenceLibrary, matching: TierMatching, claim: Claim, until_s: float
     ) -> tuple[dict[Pair, StoredPair], bool]:
         """Matches a reference's pairs until a time or until closed; returns the pairs, and whether these are all."""
         made: dict[Pair, StoredPair] = {}
@@ -282,17 +282,17 @@ class BackgroundMatching:
                 return made, False
         return made, True
 
-    def _match_pair(self, matching: Matching, first: PosedView, second: PosedView) -> dict[Pair, StoredPair]:
+    def _match_pair(self, matching: TierMatching, first: PosedView, second: PosedView) -> dict[Pair, StoredPair]:
         """Matches a pair, unless it needs no matches of this kind."""
         base = matching.base
         begun = None if base is None else self._matchings[matching].find_one(base.name, first, second)
         matches = matching.match_pair(first, second, begun, self._pause)
         if matches is None:
             return {}
-        error_px = None if matching.wide else matching.matcher.error_px(first, second)
+        error_px = None if matching.kind.is_wide else matching.matcher.pairs.error_px(first, second)
         return {(first.key, second.key): StoredPair(matches, error_px)}
 
-    def _nearest(self, matching: Matching, claim: Claim) -> list[str]:
+    def _nearest(self, matching: TierMatching, claim: Claim) -> list[str]:
         """Ids of the references that a query from the claimed one's place would choose first, without stored pairs.
 
         In a scene whose references were added at once, half of them precede the claimed one on average.
@@ -302,7 +302,7 @@ class BackgroundMatching:
             if not self._indexes.is_damaged(claim.scene_key, claim.reference_id):
                 raise NotFound("the reference was deleted")
             raise DataLoss(f"reference {claim.reference_id!r} is damaged in the store; delete it and add it again")
-        count = self.options.strong_pairs if matching.strong else self.options.pairs
+        count = self.options.strong_pairs if matching.kind.is_strong else self.options.pairs
         id_of = {it.key: it.reference_id for it in rank_beside(entries, claim.reference_id, 2 * count)}
         missing = self._pairs.list_missing(matching.name, claim, list(id_of), count)
         return [id_of[key] for key in missing]

@@ -86,7 +86,7 @@ class SceneExplainer:
     def median_depth(self, scene_key: SceneKey, agreeing: Sequence[Pair]) -> float | None:
         """Median depth of what pairs that agree show, in the scene's unit; None if they show too few points."""
         pairs = spread(sorted(agreeing), MEASURED_PAIRS)
-        return median_depth(*self._matched(scene_key, pairs, self._matcher.match_references))
+        return median_depth(*self._matched(scene_key, pairs, self._matcher.pairs.match))
 
     def _sessions(self, scene_key: SceneKey, groups: Sequence[Sequence[str]], pairs: Sequence[Pair]) -> str:
         group_of = {key: number for number, keys in enumerate(groups) for key in keys}

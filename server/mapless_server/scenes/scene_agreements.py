@@ -34,7 +34,7 @@ from .indexes import SceneIndexes
 from .library import Closed, ReferenceLibrary
 from .observer import BackgroundObserver
 from .retrieval.ranking import rank_beside
-from .stored import Matching
+from .stored import TierMatching
 
 log = logging.getLogger(__name__)
 
@@ -114,7 +114,7 @@ class SceneAgreements:
         self._pairs = PairStore(store.database)
         self._indexes, self._matcher = indexes, matcher
         self._explainer = SceneExplainer(indexes, library, extractor, matcher, self._check)
-        self._matching = Matching(extractor, matcher).name
+        self._matching = TierMatching(extractor, matcher).name
         self._observer = observer
         self._scenes: dict[SceneKey, _Known] = {}
         self._guard = threading.Lock()
@@ -327,8 +327,8 @@ class SceneAgreements:
     def _compare(self, known: _Known, first: PosedView, second: PosedView) -> None:
         pair = first.key, second.key
         if pair not in known.errors_px:
-            self._matcher.match_references(first, second)
-            error_px = self._matcher.error_px(first, second)
+            self._matcher.pairs.match(first, second)
+            error_px = self._matcher.pairs.error_px(first, second)
             if error_px is not None:
                 with self._guard:
                     known.errors_px[pair] = error_px

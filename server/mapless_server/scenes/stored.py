@@ -10,6 +10,7 @@ from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.features.matching import StoredPair
 from mapless_server.method.features.views import KeypointDepths, Matches, PosedView
 from mapless_server.method.pairs.correspond import Matcher
+from mapless_server.method.pairs.pair import Matching
 from mapless_server.store.database import Database
 from mapless_server.store.depths import load_depths
 from mapless_server.store.pairs import Pair, PairStore
@@ -23,28 +24,22 @@ _CACHE_BYTES = 32 * 2**20
 
 
 @dataclass(frozen=True, eq=False)
-class Matching:
-    """A way in which references are matched, by the extractor's features and the matcher of the queries.
-
-    Matches are wide ones, or those of `Matcher.pair_matching` if they are `strong`.
-    """
+class TierMatching:
+    """A way in which references are matched, by the extractor's features and the matcher of the queries."""
 
     extractor: FeatureExtractor
     matcher: Matcher
-    wide: bool = False
-    strong: bool = False
+    kind: Matching = Matching.STRICT
 
     @property
     def name(self) -> str:
         """Name of the matching, as `PairStore` expects it."""
-        return matching_name(self.extractor.name, self.matcher.matching(self.wide, self.strong))
+        return matching_name(self.extractor.name, self.matcher.pairs.name(self.kind))
 
     @property
-    def base(self) -> "Matching | None":
+    def base(self) -> "TierMatching | None":
         """The matching whose matches of a pair this one begins with."""
-        if self.wide:
-            return replace(self, wide=False)
-        return replace(self, strong=False) if self.strong else None
+        return None if self.kind.base is None else replace(self, kind=self.kind.base)
 
     def match_pair(
         self, first: PosedView, second: PosedView, begun: Matches | None, pause: Callable[[], None]
@@ -53,18 +48,17 @@ class Matching:
 
         `begun` are matches by `base`, if they are stored; for `pause` see `PairMatching`.
         """
-        if self.strong and not self.wide:
-            nearest = self.matcher.match_pair(first, second) if begun is None else begun
-            if self.matcher.has_enough(nearest):
-                return None
-            return self.matcher.match_pair(first, second, strong=True, pause=pause)
-        if self.strong and begun is None:
+        pairs = self.matcher.pairs
+        if self.kind is Matching.STRONG:
+            nearest = pairs.make(first, second) if begun is None else begun
+            return None if pairs.has_enough(nearest) else pairs.make(first, second, self.kind, pause=pause)
+        if self.kind is Matching.STRONG_WIDE and begun is None:
             return None
-        return self.matcher.match_pair(first, second, self.wide, self.strong, begun)
+        return pairs.make(first, second, self.kind, begun)
 
 
 def matching_name(extractor: str, rule: str) -> str:
-    """Returns a name for the features and the rule by which they are matched, see `Matcher.matching`."""
+    """Returns a name for the features and the rule by which they are matched, see `ReferencePairs.name`."""
     return f"{extractor}/{rule}"
 
 

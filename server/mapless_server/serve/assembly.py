@@ -19,6 +19,7 @@ from mapless_server.method.coarse import Reconstructor
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.features.extractors import FeatureExtractor, make_extractor
 from mapless_server.method.pairs.correspond import Matcher, make_matcher
+from mapless_server.method.pairs.pair import Matching
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.networks.weights import CATALOGUE, WeightsError, WeightsMissing, find_weights, named
 from mapless_server.networks.weights.folder import Status, look_up
@@ -34,7 +35,7 @@ from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.scenes.retrieval.vlad import VladDescriptor
 from mapless_server.scenes.scene_agreements import SceneAgreements
-from mapless_server.scenes.stored import DepthFinder, Matching, PairFinder
+from mapless_server.scenes.stored import DepthFinder, PairFinder, TierMatching
 from mapless_server.scheduling import Observer, Quota, WorkQueueOptions
 from mapless_server.security import RateLimiter
 from mapless_server.settings import Settings, available_cores
@@ -173,20 +174,21 @@ def _background_matching(
     agreements: SceneAgreements,
 ) -> BackgroundMatching:
     """Makes the matching for the queries of each tier, in order; queries look for its results from then on."""
-    pairs, matchings, strong = PairStore(store.database), dict[Matching, PairFinder](), dict[Matching, PairFinder]()
+    pairs = PairStore(store.database)
+    finders, strong = dict[TierMatching, PairFinder](), dict[TierMatching, PairFinder]()
     for tier in engine.tiers:
         matcher = tier.pipeline.matcher
-        matcher.stored = finder = PairFinder(pairs, tier.extractor.name, observer)
-        matchings |= {Matching(tier.extractor, matcher, wide): finder for wide in (False, True)}
+        matcher.pairs.stored = finder = PairFinder(pairs, tier.extractor.name, observer)
+        finders |= {TierMatching(tier.extractor, matcher, it): finder for it in Matching if not it.is_strong}
         if matcher.pair_matching is not None:  # last, because it takes long
-            strong |= {Matching(tier.extractor, matcher, wide, True): finder for wide in (False, True)}
+            strong |= {TierMatching(tier.extractor, matcher, it): finder for it in Matching if it.is_strong}
     first = engine.tiers[0]
     # Answers of stronger tiers, some per cent, keep the generic radii: their references take too long to localize.
     calibrator = Calibrator(indexes, first.extractor, first.pipeline, first.kind)
     return BackgroundMatching(
         store,
         indexes,
-        matchings | strong,
+        finders | strong,
         lambda: engine.queue.job_count == 0,
         observer,
         calibrations=SceneCalibrations(store, calibrator, observer, depths if first.uses_depths else None, agreements),

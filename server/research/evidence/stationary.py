@@ -185,7 +185,7 @@ def on_mask(view: View, mask: Mask) -> NDArray[np.bool_]:
 def pipeline_of(features: str, options: StationaryOptions) -> Pipeline:
     """A pipeline with nothing cached."""
     pipeline = Pipeline(make_reconstructor("geometric", Path()), make_matcher(features, 1))
-    pipeline.matcher.stationary = options
+    pipeline.matcher.pairs.stationary = options
     return pipeline
 
 

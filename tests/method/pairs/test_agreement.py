@@ -24,8 +24,8 @@ OPENGL = np.diag([1.0, -1.0, -1.0])
 
 def error_px(first: PosedView, second: PosedView) -> float | None:
     matcher = Matcher()
-    matcher.match_references(first, second)
-    return matcher.error_px(first, second)
+    matcher.pairs.match(first, second)
+    return matcher.pairs.error_px(first, second)
 
 
 def moved(view: PosedView, pose: RigidTransform) -> PosedView:

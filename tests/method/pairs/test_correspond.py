@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import combinations, product
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -17,9 +17,12 @@ from mapless_server.method.features.extractors import FEATURES
 from mapless_server.method.features.matching import OPTIONS, CorrespondOptions, SharedThreads, StoredPair
 from mapless_server.method.features.nearest import best_of_both, mutual_matches
 from mapless_server.method.features.views import Features, Matches, PosedView, View
-from mapless_server.method.pairs import correspond
+from mapless_server.method.pairs import pair as reference_pairs
 from mapless_server.method.pairs.correspond import Matcher, make_matcher
 from mapless_server.method.pairs.epipolar import epipolar_distance_px, epipolar_distances_px
+from mapless_server.method.pairs.pair import Matching, in_order
+
+TWO = (Matching.STRICT, Matching.WIDE)
 
 
 def features(descriptors: Array, keypoints: Array | None = None) -> Features:
@@ -106,12 +109,12 @@ def test_photographs_with_few_or_no_features_have_no_matches(n: int, m: int) -> 
     assert mutual_matches(first, second, 0.9).shape == (0, 2)
 
 
-@pytest.mark.parametrize("wide", [False, True])
-def test_one_photograph_at_two_poses_does_not_match_itself(wide: bool) -> None:
+@pytest.mark.parametrize("matching", TWO)
+def test_one_photograph_at_two_poses_does_not_match_itself(matching: Matching) -> None:
     reference = make_scene(random_for("copied photograph")).references[0]
     pose = reference.world_from_camera.shifted(np.array([6.0, 0.0, 0.0]))
     copied = replace(reference, key="copy", world_from_camera=pose)
-    assert Matcher().match_references(reference, copied, wide).shape == (0, 2)
+    assert Matcher().pairs.match(reference, copied, matching).shape == (0, 2)
 
 
 # Epipolar lines
@@ -198,16 +201,16 @@ def test_wide_matches_contain_the_strict_ones() -> None:
     matcher = Matcher(options)
     for i, j in ((0, 1), (0, 2), (1, 2)):
         first, second = scene.references[i], scene.references[j]
-        strict = {tuple(m) for m in matcher.match_references(first, second).tolist()}
-        wide = matcher.match_references(first, second, wide=True)
+        strict = {tuple(m) for m in matcher.pairs.match(first, second).tolist()}
+        wide = matcher.pairs.match(first, second, Matching.WIDE)
         assert strict < {tuple(m) for m in wide.tolist()}
         assert epipolar_distance_px(first, second, wide).max() < options.epipolar_px + 1e-3
         for column in wide.T:
             assert len(np.unique(column)) == len(column)
         true = {tuple(m) for m in same_points(scene.reference_points[i], scene.reference_points[j]).tolist()}
         assert len({tuple(m) for m in wide.tolist()} & true) > 0.95 * len(wide)
-        np.testing.assert_array_equal(matcher.match_references(first, second, wide=True), wide)
-        assert {tuple(m) for m in matcher.match_references(first, second).tolist()} == strict
+        np.testing.assert_array_equal(matcher.pairs.match(first, second, Matching.WIDE), wide)
+        assert {tuple(m) for m in matcher.pairs.match(first, second).tolist()} == strict
 
 
 def test_without_features_there_are_no_matches() -> None:
@@ -217,8 +220,8 @@ def test_without_features_there_are_no_matches() -> None:
     correspondences = Matcher().correspond(blank, references)
     assert [len(m) for m in correspondences.query_matches] == [0, 0]
     assert correspondences.reference_pairs[0, 1].shape == (0, 2)
-    assert Matcher().match_references(*references, wide=True).shape == (0, 2)
-    assert Matcher().match_references(*references[::-1], wide=True).shape == (0, 2)
+    assert Matcher().pairs.match(*references, Matching.WIDE).shape == (0, 2)
+    assert Matcher().pairs.match(*references[::-1], Matching.WIDE).shape == (0, 2)
 
 
 @pytest.fixture
@@ -233,7 +236,7 @@ def matched_pairs(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Features, Featu
 
         return compare
 
-    for module, name in (correspond, "mutual_matches_of_ratios"), (matching, "mutual_matches"):
+    for module, name in (reference_pairs, "mutual_matches_of_ratios"), (matching, "mutual_matches"):
         monkeypatch.setattr(module, name, spy(getattr(nearest, name)))
     return calls
 
@@ -252,12 +255,12 @@ def test_pairs_of_references_are_matched_once(matched_pairs: list[tuple[Features
 def test_matches_depend_neither_on_the_order_nor_on_the_other_references() -> None:
     scene = make_scene(random_for("no order"), SceneOptions(outlier_share=0.3, reference_count=4))
     forth, back = scene.references, scene.references[::-1]
-    for wide in (False, True):
+    for kind in TWO:
         for some in combinations(forth, 2):
-            alone = Matcher().correspond(scene.query, some, wide).reference_pairs[0, 1]
+            alone = Matcher().correspond(scene.query, some, kind).reference_pairs[0, 1]
             pair = forth.index(some[0]), forth.index(some[1])
-            among = Matcher().correspond(scene.query, forth, wide).reference_pairs[pair]
-            turned = Matcher().correspond(scene.query, back, wide).reference_pairs[3 - pair[1], 3 - pair[0]]
+            among = Matcher().correspond(scene.query, forth, kind).reference_pairs[pair]
+            turned = Matcher().correspond(scene.query, back, kind).reference_pairs[3 - pair[1], 3 - pair[0]]
             np.testing.assert_array_equal(among, alone)
             np.testing.assert_array_equal(turned[:, ::-1], alone)
 
@@ -275,21 +278,23 @@ class Shelf:
         return [StoredPair(self.matches[key]) if key in self.matches else None for key in keys]
 
 
-@pytest.mark.parametrize("wide", [False, True])
-def test_stored_pairs_are_used_and_give_the_same(wide: bool, matched_pairs: list[tuple[Features, Features]]) -> None:
+@pytest.mark.parametrize("kind", TWO)
+def test_stored_pairs_are_used_and_give_the_same(
+    kind: Matching, matched_pairs: list[tuple[Features, Features]]
+) -> None:
     scene = make_scene(random_for("stored"), SceneOptions(outlier_share=0.3, reference_count=4))
-    expected = Matcher().correspond(scene.query, scene.references, wide)
-    made = {(a.key, b.key): Matcher().match_pair(a, b, wide) for a, b in list(combinations(scene.references, 2))[:4]}
+    expected = Matcher().correspond(scene.query, scene.references, kind)
+    made = {(a.key, b.key): Matcher().pairs.make(a, b, kind) for a, b in list(combinations(scene.references, 2))[:4]}
     matched_pairs.clear()
     matcher = Matcher()
-    matcher.stored = shelf = Shelf(made)
+    matcher.pairs.stored = shelf = Shelf(made)
     for _ in range(2):
         # In any order of the references, the pairs are looked for as they were stored, and once.
-        found = matcher.correspond(scene.query, scene.references[::-1], wide)
+        found = matcher.correspond(scene.query, scene.references[::-1], kind)
         for (i, j), matches in found.reference_pairs.items():
             np.testing.assert_array_equal(matches[:, ::-1], expected.reference_pairs[3 - j, 3 - i])
     ((matching, keys),) = shelf.asked
-    assert matching == matcher.matching(wide)
+    assert matching == matcher.pairs.name(kind)
     assert {tuple(sorted(key)) for key in keys} == set(keys)
     assert len(matched_pairs) == 2 + 2 * 4  # the two that are not stored, and the query's twice
 
@@ -298,9 +303,9 @@ class FullShelf(Shelf):
     """Pairs that were stored of several matchings."""
 
     def __init__(self, matcher: Matcher, pairs: Sequence[tuple[PosedView, PosedView]], wide: bool = True) -> None:
-        kinds = [(False, True), (True, True)] if wide else [(False, True)]
+        kinds = [Matching.STRONG, Matching.STRONG_WIDE] if wide else [Matching.STRONG]
         self.of = {
-            matcher.matching(*kind): {(a.key, b.key): matcher.match_pair(a, b, *kind) for a, b in pairs}
+            matcher.pairs.name(kind): {(a.key, b.key): matcher.pairs.make(a, b, kind) for a, b in pairs}
             for kind in kinds
         }
 
@@ -326,28 +331,29 @@ class TestPairMatching:
         assert len(pairs.seen) == 2
         assert matcher.pair_s is not None
 
-    @pytest.mark.parametrize("wide", [False, True])
-    def test_a_query_has_no_time_to_make_strong_pairs(self, wide: bool) -> None:
+    @pytest.mark.parametrize("matching", TWO)
+    def test_a_query_has_no_time_to_make_strong_pairs(self, matching: Matching) -> None:
         pairs = AnyRatio()
         matcher = Matcher(CorrespondOptions(rematched_references=0), pair_matching=pairs)
-        found, usual = (it.correspond(self.SCENE.query, self.SCENE.references, wide) for it in (matcher, Matcher()))
+        found, usual = (it.correspond(self.SCENE.query, self.SCENE.references, matching) for it in (matcher, Matcher()))
         assert not pairs.seen
         for pair, matches in usual.reference_pairs.items():
             np.testing.assert_array_equal(found.reference_pairs[pair], matches)
 
-    @pytest.mark.parametrize("wide", [False, True])
+    @pytest.mark.parametrize("matching", TWO)
     @pytest.mark.parametrize("wide_are_stored", [False, True])
-    def test_strong_pairs_are_used_as_soon_as_they_are_stored(self, wide: bool, wide_are_stored: bool) -> None:
+    def test_strong_pairs_are_used_as_soon_as_they_are_stored(self, matching: Matching, wide_are_stored: bool) -> None:
         """Wide ones are the same, whether they were stored or are made from the stored strict ones."""
         scene, matcher = self.SCENE, Matcher(pair_matching=AnyRatio())
-        usual = matcher.correspond(scene.query, scene.references, wide).reference_pairs
+        strong = Matching.STRONG_WIDE if matching.is_wide else Matching.STRONG
+        usual = matcher.correspond(scene.query, scene.references, matching).reference_pairs
         ordered = list(combinations(scene.references, 2))[:4]
-        matcher.stored = FullShelf(Matcher(pair_matching=AnyRatio()), ordered, wide_are_stored)
-        found = matcher.correspond(scene.query, scene.references, wide).reference_pairs
+        matcher.pairs.stored = FullShelf(Matcher(pair_matching=AnyRatio()), ordered, wide_are_stored)
+        found = matcher.correspond(scene.query, scene.references, matching).reference_pairs
         for pair in combinations(range(4), 2):
             first, second = (scene.references[i] for i in pair)
             is_stored = any(first is a and second is b for a, b in ordered)
-            expected = matcher.match_pair(first, second, wide, True) if is_stored else usual[pair]
+            expected = matcher.pairs.make(first, second, strong) if is_stored else usual[pair]
             np.testing.assert_array_equal(found[pair], expected)
         assert sum(map(len, found.values())) > sum(map(len, usual.values()))
 
@@ -355,10 +361,22 @@ class TestPairMatching:
         one, other = AnyRatio(), AnyRatio()
         other.name = "other weights"
         matchers = [Matcher(pair_matching=it) for it in (one, other)]
-        names = [
-            matcher.matching(wide, strong) for matcher in matchers for wide, strong in product((False, True), repeat=2)
-        ]
+        names = [matcher.pairs.name(kind) for matcher in matchers for kind in Matching]
         assert len(set(names)) == 2 + 4
+
+    @pytest.mark.parametrize("matching", TWO)
+    def test_the_key_says_which_matches_were_found(self, matching: Matching) -> None:
+        """Strong matches that have left the cache since they were looked up are not used, and not said to be."""
+        pairs = [in_order(*it) for it in combinations(self.SCENE.references, 2)]
+        matcher = Matcher(CorrespondOptions(remembered_pairs=1), pair_matching=AnyRatio())
+        matcher.pairs.stored = FullShelf(Matcher(pair_matching=AnyRatio()), pairs, wide=False)
+        matcher.pairs.look_up(pairs, matching)
+        keys = []
+        for first, second in reversed(pairs):
+            key, found = matcher.pairs.find(first, second, matching)
+            np.testing.assert_array_equal(found.all, matcher.pairs.make(first, second, key.matching))
+            keys.append(key.matching)
+        assert len(set(keys)) == 2
 
 
 def test_what_determines_matches_is_in_their_name() -> None:
@@ -367,9 +385,9 @@ def test_what_determines_matches_is_in_their_name() -> None:
         replace(usual, **{name: getattr(usual, name) * 0.99})
         for name in ("reference_ratio", "epipolar_px", "wide_ratio", "wide_similarity")
     ]
-    names = {Matcher(options).matching(wide) for options in (usual, *changed) for wide in (False, True)}
+    names = {Matcher(options).pairs.name(kind) for options in (usual, *changed) for kind in TWO}
     assert len(names) == 5 + 3  # strict matches do not depend on the options of wide ones
-    assert Matcher(replace(usual, query_ratio=0.5)).matching() == Matcher(usual).matching()
+    assert Matcher(replace(usual, query_ratio=0.5)).pairs.name() == Matcher(usual).pairs.name()
 
 
 def test_the_cache_is_bounded_and_drops_the_least_recently_used(matched_pairs: list[tuple[Features, Features]]) -> None:
@@ -377,12 +395,12 @@ def test_the_cache_is_bounded_and_drops_the_least_recently_used(matched_pairs: l
     a, b, c, d = scene.references
     matcher = Matcher(CorrespondOptions(remembered_pairs=2))
     for first, second in ((a, b), (a, c), (a, b), (a, d)):  # forgets (a, c), since (a, b) was used after it
-        matcher.match_references(first, second)
+        matcher.pairs.match(first, second)
     assert len(matched_pairs) == 3
-    matcher.match_references(a, b)
-    matcher.match_references(a, d)
+    matcher.pairs.match(a, b)
+    matcher.pairs.match(a, d)
     assert len(matched_pairs) == 3
-    matcher.match_references(a, c)
+    matcher.pairs.match(a, c)
     assert len(matched_pairs) == 4
 
 
@@ -391,13 +409,13 @@ def test_pairs_of_a_deleted_reference_leave_the_cache(matched_pairs: list[tuple[
     a, b, c = scene.references
     matcher = Matcher()
     for first, second in ((a, b), (b, c), (a, c)):
-        matcher.match_references(first, second)
+        matcher.pairs.match(first, second)
     matcher.forget({b.key, "another"})
     assert len(matched_pairs) == 3
-    matcher.match_references(a, c)
+    matcher.pairs.match(a, c)
     assert len(matched_pairs) == 3
-    matcher.match_references(a, b)
-    matcher.match_references(b, c)
+    matcher.pairs.match(a, b)
+    matcher.pairs.match(b, c)
     assert len(matched_pairs) == 5
 
 

@@ -150,10 +150,10 @@ def test_a_pair_is_separated_as_it_was_made() -> None:
     scene = make_scene(random)
     first, second = (replace(it, view=with_badge(it.view, random)) for it in (scene.references[0], scene.references[5]))
     matcher = Matcher()
-    stored = matcher.match_pair(first, second)
+    stored = matcher.pairs.make(first, second)
     parts = PairMatches.of(first, second, stored, matcher.stationary)
     np.testing.assert_array_equal(parts.all, stored)
-    np.testing.assert_array_equal(parts.agreeing, matcher.match_references(first, second))
+    np.testing.assert_array_equal(parts.agreeing, matcher.pairs.match(first, second))
     every = mutual_matches(first.view.features, second.view.features, matcher.options.reference_ratio, True)
     badge = (first.view.features.keypoints[every[:, 0]] <= BADGE_PX).all(axis=1)
     assert len(parts.stationary) > 0.8 * badge.sum() > 50
@@ -161,7 +161,7 @@ def test_a_pair_is_separated_as_it_was_made() -> None:
 
 def ask(query: View, references: list[PosedView], options: StationaryOptions) -> Localization | Rejection:
     pipeline = Pipeline()
-    pipeline.matcher.stationary = options
+    pipeline.matcher.pairs.stationary = options
     return localize(query, references, pipeline, LocalizeOptions()).outcome
 
 

@@ -32,6 +32,7 @@ from mapless_server.method.optim.perturbation import moved, rotation_vector
 from mapless_server.method.options import IntrinsicsSigma, LocalizeOptions
 from mapless_server.method.pairs.correspond import Correspondences, Matcher
 from mapless_server.method.pairs.epipolar import sampson_px
+from mapless_server.method.pairs.pair import Matching
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.pose.two_view import solve_two_view
 from mapless_server.method.pose.two_view_matches import TwoViewMatches
@@ -72,7 +73,7 @@ class Given(Matcher):
         self,
         query: View,
         references: Sequence[PosedView],
-        wide: bool = False,
+        matching: Matching = Matching.STRICT,
         check: Callable[[], None] = lambda: None,
         query_matches: Sequence[Matches] | None = None,
     ) -> Correspondences:

@@ -21,6 +21,7 @@ from mapless_server.method.features.tracks import Tracks
 from mapless_server.method.features.views import Features, PosedView, View
 from mapless_server.method.optim.optimize import SYMMETRIC, solve_columns, take
 from mapless_server.method.pairs.correspond import Correspondences, MatchedReferences, Matcher
+from mapless_server.method.pairs.pair import Matching
 from mapless_server.method.structure import structure as stage
 from mapless_server.method.structure.model import Structure
 from mapless_server.method.structure.observations import (
@@ -351,11 +352,15 @@ def triangulations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def triangulated_by(
-    matcher: Matcher, scene: SyntheticScene, references: Sequence[PosedView], shift: float = 0.0, wide: bool = False
+    matcher: Matcher,
+    scene: SyntheticScene,
+    references: Sequence[PosedView],
+    shift: float = 0.0,
+    matching: Matching = Matching.STRICT,
 ) -> Structure:
     """As `localize` does: matched in the world, triangulated around an origin."""
     nearby = [replace(r, world_from_camera=r.world_from_camera.shifted(np.full(3, -shift))) for r in references]
-    return triangulated_structure(nearby, matcher.correspond(scene.query, references, wide), StructureOptions())
+    return triangulated_structure(nearby, matcher.correspond(scene.query, references, matching), StructureOptions())
 
 
 def test_a_set_of_references_is_triangulated_once_in_any_order(triangulations: list[int]) -> None:
@@ -386,8 +391,9 @@ def parts(structure: Structure) -> tuple[NDArray[Any], ...]:
 def test_other_references_and_wide_matches_have_a_structure_of_their_own(triangulations: list[int]) -> None:
     scene = make_scene(random_for("sets"), SceneOptions(point_count=100, reference_count=4))
     matcher = Matcher()
-    for references, wide in ((scene.references, False), (scene.references, True), (scene.references[:3], False)) * 2:
-        triangulated_by(matcher, scene, references, wide=wide)
+    whole, strict, wide = scene.references, Matching.STRICT, Matching.WIDE
+    for references, kind in ((whole, strict), (whole, wide), (whole[:3], strict)) * 2:
+        triangulated_by(matcher, scene, references, matching=kind)
     assert len(triangulations) == 3
 
 

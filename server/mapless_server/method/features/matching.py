@@ -147,7 +147,7 @@ class StoredPairs(Protocol):
     def find(self, matching: str, pairs: Sequence[tuple[PosedView, PosedView]]) -> Sequence[StoredPair | None]:
         """Returns what is stored of each pair, given `in_order`; None for a pair that is not stored.
 
-        `matching` is what `Matcher.matching` returns. Does not raise.
+        `matching` is what `ReferencePairs.name` returns. Does not raise.
         """
         ...
 

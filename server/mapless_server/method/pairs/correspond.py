@@ -1,26 +1,18 @@
 """Correspondences: matches of keypoints between photographs.
 
-Matches between references, whose poses are known, must also satisfy the epipolar constraint; they depend only on the
-two stored references, so they are made once, ahead of the queries (`scenes.background`) or by the first one that needs
-them, and cached. Matches of the query with each reference come from descriptors alone, or from a network that compares
-all keypoints of both photographs: implementations of `QueryMatching`. Where such a network is slow, it matches only the
-references with the most matches again, and pairs of references ahead of the queries: `PairMatching`.
-
-Between distant references few matches pass the ratio test over all keypoints. Wide correspondences add matches that
-pass it among the keypoints along the epipolar line: many more, of which more are wrong, so they are used only for
-queries that fail otherwise.
+Matches between references are in `pair`. Matches of the query with each reference come from descriptors alone, or from
+a network that compares all keypoints of both photographs: implementations of `QueryMatching`. Where such a network is
+slow, it matches only the references with the most matches again, and pairs of references ahead of the queries:
+`PairMatching`.
 
 How two photographs are matched is in `matching`.
 """
 
 import time
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from mapless_server.cache import LruCache
 
@@ -31,22 +23,15 @@ from ..features.matching import (
     PairMatching,
     QueryMatching,
     SharedThreads,
-    StoredPairs,
 )
-from ..features.nearest import best_of_both, mutual_matches_of_ratios
-from ..features.tracks import Tracks, build_tracks
 from ..features.views import Matches, PosedView, View
-from .agreement import ReferenceErrors, pair_error_px, thinned
-from .epipolar import epipolar_distance_px, epipolar_distances_px
-from .pair import PairKey, PairMatches, in_order, is_one_photograph
-from .stationary import StationaryOptions, stationary_matches
+from .agreement import ReferenceErrors
+from .pair import Matching, PairKey, PairMatches, ReferencePairs, in_order
+from .stationary import StationaryOptions
 from .stationary_filter import references_without_fixed, without_fixed
 
 _PAIRS_THAT_COUNT = 10
 """For `Matcher.pair_s`, about."""
-
-PAIR_RULE = 4
-"""Version of how two references are matched; to be raised by every change that can change a match."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +46,7 @@ class MatchedReferences:
 
     references: tuple[PosedView, ...]
     rule: str
-    cache: LruCache[Any]
+    cache: LruCache[object]
 
     def key(self, *further: Hashable) -> Hashable:
         """Key for a result that depends on the references, their matches and `further` values alone."""
@@ -86,14 +71,6 @@ class Correspondences:
     source: MatchedReferences | None = None
     stationary_count: int = 0
     reference_error_px: ReferenceErrors | None = None
-    _tracks: dict[int | None, Tracks] = field(default_factory=dict, init=False, repr=False)
-
-    def tracks(self, references: Sequence[PosedView], anchor: int | None = None) -> Tracks:
-        """Builds the tracks over the references, once for all stages; `anchor` as in `build_tracks`."""
-        if anchor not in self._tracks:
-            counts = [len(reference.view.features) for reference in references]
-            self._tracks[anchor] = build_tracks(self.reference_pairs, counts, anchor)
-        return self._tracks[anchor]
 
 
 class Matcher:
@@ -104,11 +81,8 @@ class Matcher:
 
     Attributes:
         options: options of matching.
-        pair_matching: matches the query again with its best references, and references ahead of the queries; None if
-            nothing does. Its *strong* pairs of references are only looked up in `stored` by a query, which has no time
-            to make them, and matches the others by nearest neighbours. So its answer depends on which are stored.
+        pairs: the matches of references with one another.
         pair_s: mean time of `pair_matching` for a pair of the last queries, seconds; None before the first.
-        stored: where pairs that are not cached are looked up; None looks up none.
     """
 
     def __init__(
@@ -119,52 +93,47 @@ class Matcher:
         pair_matching: PairMatching | None = None,
     ) -> None:
         self.options = options or CorrespondOptions()
-        self.pair_matching = pair_matching
+        self.pairs = ReferencePairs(self.options, pair_matching)
         self.pair_s: float | None = None
-        self.stationary = StationaryOptions()
-        self.stored: StoredPairs | None = None
         self._threads = SharedThreads(threads)
         self._query_matching = query_matching or NearestNeighbours(self.options.query_ratio, self._threads)
-        self._remembered: LruCache[PairMatches] = LruCache(self.options.remembered_pairs)
-        self._errors: LruCache[float] = LruCache(self.options.remembered_pairs)
-        self._distinct: LruCache[Matches] = LruCache(self.options.remembered_pairs)
-        self._structures: LruCache[Any] = LruCache(self.options.structure_bytes)
+        self._structures: LruCache[object] = LruCache(self.options.structure_bytes)
 
     def correspond(
         self,
         query: View,
         references: Sequence[PosedView],
-        wide: bool = False,
+        matching: Matching = Matching.STRICT,
         check: Callable[[], None] = lambda: None,
         query_matches: Sequence[Matches] | None = None,
     ) -> Correspondences:
-        """Finds matches between all pairs of references, wide ones if `wide`, and of the query with each reference.
+        """Finds matches between all pairs of references, strict or wide ones, and of the query with each reference.
 
         Calls `check` before each pair and does not catch what it raises. `query_matches`, if known already from
         `match_query` or another call with the same references, are used as they are.
         """
         pairs = list(combinations(range(len(references)), 2))
-        self._look_up([in_order(references[i], references[j]) for i, j in pairs], wide)
-        keys = {(i, j): self._key(in_order(references[i], references[j]), wide) for i, j in pairs}
+        self.pairs.look_up([in_order(references[i], references[j]) for i, j in pairs], matching)
 
-        def of_pair(pair: tuple[int, int]) -> PairMatches:
+        def of_pair(pair: tuple[int, int]) -> tuple[PairKey, PairMatches]:
             check()
-            return self._pair(references[pair[0]], references[pair[1]], keys[pair])
+            return self.pairs.find(references[pair[0]], references[pair[1]], matching)
 
-        found = dict(zip(pairs, self._threads.map(of_pair, pairs), strict=True))
+        made = self._threads.map(of_pair, pairs)
+        found = {pair: matches for pair, (_, matches) in zip(pairs, made, strict=True)}
         if query_matches is None:
             query_matches = self.match_query(query, references, check)
-        fixed = references_without_fixed(references, found, frozenset(keys.values()), self.stationary, self._structures)
+        keys, options = frozenset(key for key, _ in made), self.pairs.stationary
+        fixed = references_without_fixed(references, found, keys, options, self._structures)
         of_pairs, matches, count = without_fixed(query, references, found, query_matches, fixed)
-        kept = Correspondences(of_pairs, matches, stationary_count=count)
         # Strong matches of a pair may be stored at any time, so that its matches are not determined.
-        source = MatchedReferences(tuple(references), self.matching(wide), self._structures)
+        source = MatchedReferences(tuple(references), self.pairs.name(matching), self._structures)
         known = source if self.pair_matching is None else None
 
         def error_px(i: int, j: int) -> float | None:
-            return self.error_px(references[i], references[j])
+            return self.pairs.error_px(references[i], references[j])
 
-        return replace(kept, source=known, reference_error_px=error_px)
+        return Correspondences(of_pairs, matches, known, count, error_px)
 
     def match_query(
         self, query: View, references: Sequence[PosedView], check: Callable[[], None] = lambda: None
@@ -239,6 +208,16 @@ class Matcher:
         return self._threads.map(lambda reference: self.rematch(query, reference), references)
 
     @property
+    def pair_matching(self) -> PairMatching | None:
+        """Matches the query again with its best references, and references ahead of the queries; None: nothing does."""
+        return self.pairs.pair_matching
+
+    @property
+    def stationary(self) -> StationaryOptions:
+        """Options of finding what is fixed to the cameras."""
+        return self.pairs.stationary
+
+    @property
     def threads(self) -> int:
         """How many pairs are matched at a time, where no other query matches."""
         return self._threads.threads
@@ -247,146 +226,11 @@ class Matcher:
         """Ends the threads."""
         self._threads.close()
 
-    def matching(self, wide: bool = False, strong: bool = False) -> str:
-        """Returns a name for everything that determines a pair's matches, except for the two references."""
-        options = self.options
-        strict = f"{PAIR_RULE}-{options.reference_ratio}-{options.epipolar_px}"
-        if strong:
-            assert self.pair_matching is not None
-            strict = f"{PAIR_RULE}-{self.pair_matching.name}-{options.epipolar_px}-{options.enough_matches}"
-        return f"wide-{strict}-{options.wide_ratio}-{options.wide_similarity}" if wide else f"strict-{strict}"
-
-    def match_references(self, first: PosedView, second: PosedView, wide: bool = False) -> Matches:
-        """Finds matches between two references, each within `epipolar_px` of the epipolar line of the known poses.
-
-        They are strong ones if the strict matches have been looked up as such; otherwise from nearest neighbours.
-        """
-        return self._pair(first, second, self._key(in_order(first, second), wide)).agreeing
-
-    def _key(self, pair: tuple[PosedView, PosedView], wide: bool) -> PairKey:
-        """The key of the matches of a pair, given `in_order`: strong ones, where they have been looked up."""
-        return PairKey.of(pair, wide, self._remembered.get(PairKey.of(pair, False, True)) is not None)
-
-    def _pair(self, first: PosedView, second: PosedView, key: PairKey) -> PairMatches:
-        pair = in_order(first, second)
-        matches = self._remembered.get(key)
-        if matches is None:
-            if key.strong and not key.wide:  # not cached any more
-                return self._pair(first, second, key._replace(strong=False))
-            strict = self._pair(*pair, self._key(pair, False)).all if key.wide else self._match_strictly(*pair)
-            made = self._widened(*pair, strict) if key.wide else strict
-            matches = PairMatches.of(*pair, made, self.stationary)
-            self._remembered.put(key, matches)
-        return matches if pair[0] is first else matches.swapped()
-
-    def match_pair(
-        self,
-        first: PosedView,
-        second: PosedView,
-        wide: bool = False,
-        strong: bool = False,
-        strict: Matches | None = None,
-        pause: Callable[[], None] = lambda: None,
-    ) -> Matches:
-        """Computes the matches of two references, given `in_order`, anew and without caching them.
-
-        Stationary ones come last: what is fixed to a camera is found by them (see `stationary`).
-
-        Args:
-            first: a reference.
-            second: another one.
-            wide: whether the matches are wide ones.
-            strong: whether to match by `pair_matching`.
-            strict: the matches that are not wide, if they are known.
-            pause: see PairMatching.
-        """
-        if strict is None:
-            strict = self._match_strongly(first, second, pause) if strong else self._match_strictly(first, second)
-        return self._widened(first, second, strict) if wide else strict
-
-    def error_px(self, first: PosedView, second: PosedView) -> float | None:
-        """The error of a pair by `pair_error_px`; None if it has too few matches, or was neither matched nor stored.
-
-        It is computed when it is first asked for, in a millisecond or two.
-        """
-        pair = in_order(first, second)
-        key = pair[0].key, pair[1].key
-        error_px = self._errors.get(key)
-        if error_px is None and (distinct := self._distinct.get(key)) is not None:
-            error_px = pair_error_px(*pair, distinct)
-            self._note_error(*pair, error_px)
-            self._distinct.pop(key)
-        return error_px
-
-    def has_enough(self, nearest: Matches) -> bool:
-        """Whether nearest neighbours find so many matches of a pair that `pair_matching` is not used for it."""
-        return len(nearest) >= self.options.enough_matches
-
-    def _look_up(self, pairs: Sequence[tuple[PosedView, PosedView]], wide: bool) -> None:
-        """Caches those of these pairs that are stored, strong matches if there are any."""
-        if self.stored is None:
-            return
-        strong = self._found(pairs, False, True) if self.pair_matching else [False] * len(pairs)
-        others = [pair for pair, is_strong in zip(pairs, strong, strict=True) if not is_strong]
-        self._found(others, wide, False)
-        if wide and self.pair_matching:
-            self._found([pair for pair, is_strong in zip(pairs, strong, strict=True) if is_strong], wide, True)
-
-    def _found(self, pairs: Sequence[tuple[PosedView, PosedView]], wide: bool, strong: bool) -> list[bool]:
-        """Caches these pairs' stored matches; returns which of the pairs are cached then."""
-        keys = [PairKey.of(pair, wide, strong) for pair in pairs]
-        found = [self._remembered.get(key) is not None for key in keys]
-        missing = [i for i, is_cached in enumerate(found) if not is_cached]
-        if missing and self.stored is not None:
-            stored = self.stored.find(self.matching(wide, strong), [pairs[i] for i in missing])
-            for i, it in zip(missing, stored, strict=True):
-                if it is not None:
-                    self._remembered.put(keys[i], PairMatches.of(*pairs[i], it.matches, self.stationary))
-                    self._note_error(*pairs[i], it.error_px)
-                    found[i] = True
-        return found
-
     def forget(self, keys: Collection[str]) -> None:
         """Removes what was computed from deleted references from the caches, in time linear in their size."""
         gone = frozenset(keys)
-        self._remembered.forget(lambda pair, _: pair.first in gone or pair.second in gone)
-        for of_pairs in (self._errors, self._distinct):
-            of_pairs.forget(lambda pair, _: not gone.isdisjoint(pair))
+        self.pairs.forget(gone)
         self._structures.forget(lambda key, _: not gone.isdisjoint(key[0]))
-
-    def _match_strictly(self, first: PosedView, second: PosedView) -> Matches:
-        ratios = self.options.reference_ratio, self.options.distinct_ratio
-        return self._filtered(
-            first, second, *mutual_matches_of_ratios(first.view.features, second.view.features, ratios)
-        )
-
-    def _match_strongly(self, first: PosedView, second: PosedView, pause: Callable[[], None]) -> Matches:
-        assert self.pair_matching is not None
-        matches = self.pair_matching.match_one(first.view, second.view, pause)
-        return self._filtered(first, second, matches, matches)
-
-    def _note_error(self, first: PosedView, second: PosedView, error_px: float | None) -> None:
-        if error_px is not None:
-            self._errors.put((first.key, second.key), error_px)
-
-    def _filtered(self, first: PosedView, second: PosedView, matches: Matches, distinct: Matches) -> Matches:
-        if is_one_photograph(first, second):
-            return matches[:0]
-        moving = distinct[~stationary_matches(first, second, distinct, self.stationary)]
-        self._distinct.put((first.key, second.key), thinned(moving))
-        stationary = stationary_matches(first, second, matches, self.stationary)
-        agreeing = epipolar_distance_px(first, second, matches) < self.options.epipolar_px
-        return PairMatches(matches[agreeing & ~stationary], matches[stationary]).all
-
-    def _widened(self, first: PosedView, second: PosedView, strict: Matches) -> Matches:
-        """Returns the strict matches, and matches along the epipolar lines of the other keypoints."""
-        if is_one_photograph(first, second):
-            return strict
-        similarity = first.view.features.unit_descriptors() @ second.view.features.unit_descriptors().T
-        similarity[epipolar_distances_px(first, second) >= self.options.epipolar_px] = -1.0
-        added = best_of_both(similarity, self.options.wide_ratio, self.options.wide_similarity)
-        taken = np.isin(added[:, 0], strict[:, 0]) | np.isin(added[:, 1], strict[:, 1])
-        return np.concatenate([strict, added[~taken]])
 
 
 def make_matcher(features: str, threads: int = 1, weights: Path | None = None, device: str = "cpu") -> Matcher:

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,7 +67,7 @@ def references_without_fixed(
     pairs: Mapping[tuple[int, int], PairMatches],
     keys: frozenset[PairKey],
     options: StationaryOptions,
-    cache: LruCache[Any],
+    cache: LruCache[object],
 ) -> ReferencesWithoutFixed | None:
     """Finds what is fixed to the cameras of references; None where no pair shows anything.
 

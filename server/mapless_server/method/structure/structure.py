@@ -100,7 +100,8 @@ def build_structure(
     The reconstruction's references are in the order of `references`; the correspondences are those between them. Every
     point is finite and in front of the references that observe it. `PAPER_STRUCTURE` is the paper's form.
     """
-    tracks = correspondences.tracks(references, None if options.all_references else 0)
+    counts = [len(reference.view.features) for reference in references]
+    tracks = build_tracks(correspondences.reference_pairs, counts, None if options.all_references else 0)
     observations = observe(tracks, references, options.first_noise)
     start = predicted_points(reconstruction, scale, references, tracks)
     if options.optimize and options.all_references:
@@ -120,7 +121,7 @@ def triangulated_structure(
     given = references if source is None else source.references
     order = sorted(range(len(given)), key=lambda i: (given[i].name, given[i].key))
     structure = None if source is None else source.cache.get(source.key(options))
-    if structure is None:
+    if not isinstance(structure, Structure):
         structure = _triangulated(given, order, correspondences.reference_pairs, options)
         if source is not None:
             source.cache.put(source.key(options), structure, structure.size_bytes + ENTRY_BYTES)

@@ -13,6 +13,7 @@ from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.features.views import KeptDepth, PosedView
 from mapless_server.method.options import StageContext
 from mapless_server.method.pairs.correspond import Matcher
+from mapless_server.method.pairs.pair import Matching
 from mapless_server.method.rejection import Rejection
 from mapless_server.security import SceneKey
 from mapless_server.store import Store
@@ -65,7 +66,7 @@ class DepthMaker:
         origin = subject.world_from_camera.translation
         query, *others = neighbours
         given = [replace(it, world_from_camera=it.world_from_camera.shifted(-origin)) for it in (subject, *others)]
-        correspondences = self._matcher.correspond(query.view, (subject, *others), False, check)
+        correspondences = self._matcher.correspond(query.view, (subject, *others), Matching.STRICT, check)
         is_metric = not library.attributes(scene_key).arbitrary_unit
         request = Request(query.view, given, correspondences, is_metric=is_metric)
         (outcome,) = self._network.reconstruct_many([request])
@@ -96,7 +97,7 @@ class DepthMaker:
             raise NotFound("the reference was deleted")
         wanted = [it.reference_id for it in rank_beside(entries, reference_id, SHORTLIST)]
         others = self._indexes.load_existing(library, scene_key, wanted, self._extractor, context)
-        matches = [self._matcher.match_references(subject, other) for other in others]
+        matches = [self._matcher.pairs.match(subject, other) for other in others]
         context.check()
         sharing = [i for i, found in enumerate(matches) if len(found) >= MIN_POINTS]
         centres = [others[i].world_from_camera.translation for i in sharing]
