@@ -13,6 +13,8 @@ from functools import partial
 import numpy as np
 
 from mapless_server.scheduling import (
+    AnyJob,
+    AnyResult,
     Done,
     Ending,
     Fallback,
@@ -22,7 +24,6 @@ from mapless_server.scheduling import (
     Observer,
     Refused,
     Stage,
-    StageResult,
     Step,
     WorkQueueOptions,
 )
@@ -71,17 +72,17 @@ class Server:
     def _finish(self, batch: Batch) -> None:
         (job,) = batch.jobs
         left = int(job.step.bucket)
-        result: StageResult = Done(None)
+        result: AnyResult = Done(None)
         if left:
             fallback = Fallback(lambda: Done(None, Ending.LOW_CONFIDENCE), job.deadline_s - 1)
-            result = Next(Step("work", "again", str(left - 1), ATTEMPT_S), fallback)
+            result = Next((Step("work", "again", str(left - 1), ATTEMPT_S),), fallback)
         self.scheduler.finish(batch, [result], self.now_s)
 
     def ask(self, flow: Flow, kind: str, seconds: float, then: Ended, attempts: int = 0) -> None:
         """Makes a call of so many seconds, and so many further attempts."""
         begin_s = self.now_s
         step = Step("work", kind, str(attempts), seconds)
-        job = Job(flow, step, self.now_s + DEADLINE_S, 1, lambda ending, _: then(ending, self.now_s - begin_s))
+        job: AnyJob = Job(flow, step, self.now_s + DEADLINE_S, 1, lambda ending, _: then(ending, self.now_s - begin_s))
         try:
             self.scheduler.admit(job, self.now_s)
         except Refused as refused:
@@ -229,7 +230,7 @@ def most_booked(given_s: Sequence[float], cost_s: float, in_turns: bool = False)
     shares.charge(active, max(given_s))
 
     def is_admitted(flow: Flow) -> bool:
-        job = Job(flow, Step("work", "any", "0", cost_s), np.inf, 1, lambda ending, value: None)
+        job: AnyJob = Job(flow, Step("work", "any", "0", cost_s), np.inf, 1, lambda ending, value: None)
         try:
             admission.check(job, cost, 0.0)
         except Refused:

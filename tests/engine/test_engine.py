@@ -32,7 +32,7 @@ from support.servers import CAMERA, PHOTO, StandInExtractor, pose, whole
 
 from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.photos import Photo
-from mapless_server.engine.query import Result, Tier
+from mapless_server.engine.query import QueryJob, Result, Tier
 from mapless_server.engine.stages import MAX_LISTINGS, QueryStages
 from mapless_server.errors import InvalidArgument, Unavailable
 from mapless_server.method.features.views import PosedView, View
@@ -40,7 +40,7 @@ from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.judge.judge import LEVELS, JudgeOptions
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
 from mapless_server.scenes import Narrowing, Sphere
-from mapless_server.scheduling import CostModel, Done, Job
+from mapless_server.scheduling import CostModel, Done
 from mapless_server.serve.assembly import engine_over
 from mapless_server.store import NewReference, SelfCalibration, calibrations
 
@@ -195,7 +195,7 @@ class TestTiers:
             (result,) = getattr(stages, job.step.stage)([job])
             if isinstance(result, Done):
                 break
-            job.step = result.step
+            job.step = result.steps[0]
         assert result.value.tier.extractor.name == "cheap"
         assert "strong features was not finished" in hint_of(result.value).message
         assert list(result.value.stage_seconds)[-1] == "strong/unfinished"
@@ -236,7 +236,7 @@ class TestMemory:
         setting.replies["cheap"] = localized(SURE_INLIERS)
         run, sizes = setting.engine.queue.run, list[int]()
 
-        def noted(job: Job) -> Any:
+        def noted(job: QueryJob) -> Any:
             sizes.append(job.size_bytes)
             return run(job)
 

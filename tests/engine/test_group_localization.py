@@ -26,6 +26,7 @@ from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.rpc import Call
 from mapless_server.scenes import Cone, Narrowing
 from mapless_server.scheduling import (
+    AnyJob,
     Flow,
     ItemList,
     Job,
@@ -53,12 +54,12 @@ class Toy(QueueEngine):
         self.options = EngineOptions(workers=2, max_batch=1)
         self.seconds, self.fails_at, self._numbers = seconds, -1, itertools.count(1)
         self.failure: Exception = RuntimeError("planted")
-        self.jobs: weakref.WeakSet[Job] = weakref.WeakSet()
+        self.jobs: weakref.WeakSet[AnyJob] = weakref.WeakSet()
         options = WorkQueueOptions(max_queued_s=max_queued_s, max_bytes=MAX_BYTES)
         stages = {Stage(PREPARE, "host"): compute_items, Stage(JOIN, "host"): compute_items}
         self.queue = WorkQueue(stages, {"host": 2}, options, Observer())
 
-    def query_job(self, query: Query, caller: Caller, source: object = None, on_better: object = None) -> Job:
+    def query_job(self, query: Query, caller: Caller, source: object = None, on_better: object = None) -> AnyJob:
         def compute(_: None, check: object) -> None:
             number = next(self._numbers)
             time.sleep(self.seconds)
@@ -66,11 +67,11 @@ class Toy(QueueEngine):
                 raise self.failure
 
         step = Step(PREPARE, "p", "p", ItemList([None], compute))
-        job = Job(caller.flow, step, caller.deadline_s, 0 if query.is_part else len(query.photo.image))
+        job: AnyJob = Job(caller.flow, step, caller.deadline_s, 0 if query.is_part else len(query.photo.image))
         self.jobs.add(job)
         return job
 
-    async def run(self, job: Job) -> Result:
+    async def run(self, job: AnyJob) -> Result:
         try:
             await self.queue.run(job)
         except Exception as error:
@@ -277,7 +278,7 @@ def test_what_has_been_localized_holds_no_photograph() -> None:
         group = PhotoGroup(engine, [PART] * 12, caller("rig"), "images")
         query_job = engine.query_job
 
-        def watched(*arguments: Any) -> Job:
+        def watched(*arguments: Any) -> AnyJob:
             alive.append(len(engine.jobs))
             return query_job(*arguments)
 

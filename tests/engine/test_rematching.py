@@ -57,7 +57,7 @@ class TestRematching:
         job.step.payload.__dict__["tier"] = 1
         (chosen,) = stages.prepare([job])
         assert isinstance(chosen, Next)
-        run = chosen.step.payload
+        run = chosen.steps[0].payload
         for _ in range(steps):
             run = stages._rematched(run)
         assert not run.unmatched
@@ -79,7 +79,7 @@ class TestRematching:
         while job.step.stage == "prepare":
             (done,) = stages.prepare([job])
             assert isinstance(done, Next)
-            job.step = done.step
+            job.step = done.steps[0]
             steps += 1
         assert steps == 3
         assert [it.tolist() for it in got[0]] == [[[0, 1]], [[0, 2]]]

@@ -23,12 +23,12 @@ from support.toy_queue import (
 )
 
 from mapless_server.scheduling import (
+    AnyJob,
+    AnyResult,
     Done,
     Fatal,
-    Job,
     Refusal,
     Refused,
-    StageResult,
 )
 
 
@@ -51,7 +51,7 @@ class TestEndOfAll:
     async def test_a_lost_device_ends_the_queue(self, is_raised: bool, caplog: pytest.LogCaptureFixture) -> None:
         error = LostDevice("poisoned context")
 
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
+        def compute(jobs: Sequence[AnyJob]) -> list[AnyResult]:
             payloads = [job.step.payload for job in jobs]
             if is_raised and "lost" in payloads:
                 raise error
@@ -75,7 +75,7 @@ class TestEndOfAll:
     async def test_two_threads_that_lose_it_at_once_are_one_end(self) -> None:
         both = threading.Barrier(2, timeout=LIMIT_S)
 
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
+        def compute(jobs: Sequence[AnyJob]) -> list[AnyResult]:
             both.wait()
             raise LostDevice
 
@@ -103,7 +103,7 @@ class TestEndOfAll:
 
     @pytest.mark.parametrize("error", [SystemExit(3), KeyboardInterrupt()])
     async def test_a_stage_that_wants_to_end_the_program_ends_the_queue(self, error: BaseException) -> None:
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
+        def compute(jobs: Sequence[AnyJob]) -> list[AnyResult]:
             raise error
 
         async with Toy(compute) as toy:
@@ -117,7 +117,7 @@ class TestEndOfAll:
         assert "hangs" in str(toy.fatals[0])
 
     async def test_a_long_stage_that_checks_between_steps_does_not_hang(self) -> None:
-        def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
+        def compute(jobs: Sequence[AnyJob]) -> Sequence[AnyResult]:
             until_s = time.monotonic() + (2.0 if jobs[0].step.payload == "long" else 0.1)
             while time.monotonic() < until_s:
                 jobs[-1].check()

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 from support.toy_scheduler import COST_S, LANES, OPTIONS, STAGES, Toy, onward, run_through
 
-from mapless_server.scheduling import Done, Ending, Fallback, Job, Refused, StageResult
+from mapless_server.scheduling import AnyJob, AnyResult, Done, Ending, Fallback, Refused
 from mapless_server.scheduling.jobs import Batch
 
 AT_MOST = 3
@@ -21,7 +21,7 @@ class Events(RuleBasedStateMachine):
     def begin(self) -> None:
         self.toy = Toy()
         self.batches: list[Batch] = []
-        self.admitted: list[Job] = []
+        self.admitted: list[AnyJob] = []
         self.refused = 0
 
     @rule(
@@ -66,12 +66,12 @@ class Events(RuleBasedStateMachine):
     @rule(data=st.data())
     def complete(self, data: st.DataObject) -> None:
         batch = self.batches.pop(data.draw(st.integers(0, len(self.batches) - 1)))
-        verdicts: list[StageResult] = []
+        verdicts: list[AnyResult] = []
         for job in batch.jobs:
             fate = data.draw(st.sampled_from(["onward", "onward", "done", "fails", "fallback"]))
             due_s = self.toy.now_s + data.draw(st.floats(0.0, 3.0))
             fallback = Fallback(lambda: Done("coarse", Ending.DEGRADED), due_s) if fate == "fallback" else None
-            planted: dict[str, StageResult] = {"done": Done(None), "fails": ValueError("planted")}
+            planted: dict[str, AnyResult] = {"done": Done(None), "fails": ValueError("planted")}
             verdicts.append(planted.get(fate) or onward(job, fallback))
         self.toy.scheduler.finish(batch, verdicts, self.toy.now_s)
 
@@ -88,7 +88,7 @@ class Events(RuleBasedStateMachine):
             self.toy.scheduler.expire(self.toy.now_s)
             assert all(self.toy.now_s < job.due_s for job in self.toy.scheduler.jobs)
 
-    def _waits(self, job: Job, lane: str) -> bool:
+    def _waits(self, job: AnyJob, lane: str) -> bool:
         of_lane = {stage.name for stage in STAGES if stage.lane == lane}
         return job.step.stage in of_lane and not any(job in batch.jobs for batch in self.batches)
 

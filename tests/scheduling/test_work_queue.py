@@ -32,6 +32,8 @@ from support.toy_queue import (
 
 from mapless_server.scheduling import (
     Abandoned,
+    AnyJob,
+    AnyResult,
     Done,
     Ending,
     Expired,
@@ -39,7 +41,6 @@ from mapless_server.scheduling import (
     Job,
     Next,
     Refused,
-    StageResult,
     Step,
     WorkQueueOptions,
     count_helper,
@@ -50,7 +51,7 @@ class TestResults:
     async def test_a_job_passes_its_stages_and_records_their_times(self) -> None:
         marks: dict[str, tuple[float, float]] = {}
 
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
+        def compute(jobs: Sequence[AnyJob]) -> list[AnyResult]:
             stage, start_s = jobs[0].step.stage, time.monotonic()
             time.sleep(0.01)
             marks[stage] = (start_s, time.monotonic())
@@ -59,7 +60,7 @@ class TestResults:
         async with Toy(compute) as toy:
             others = await toy.waiting(["x", "y"])
             before_s = time.monotonic()
-            job = Job(Flow("t", "c"), Step("first", "toy", "b", "z"), before_s + FAR_S, 1)
+            job: AnyJob = Job(Flow("t", "c"), Step("first", "toy", "b", "z"), before_s + FAR_S, 1)
             running = asyncio.ensure_future(toy.queue.run(job))
             await until(lambda: toy.queue.load("then").waiting == 3)
             toy.gate.set()
@@ -76,7 +77,7 @@ class TestResults:
     async def test_a_record_has_the_processor_time_of_all_threads(self) -> None:
         """An equal share for each job of a batch: waiting costs nothing, a helping thread counts."""
 
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
+        def compute(jobs: Sequence[AnyJob]) -> list[AnyResult]:
             if jobs[0].step.stage == "first":
                 time.sleep(0.05)
                 return [then(job) for job in jobs]
@@ -88,7 +89,7 @@ class TestResults:
 
         async with Toy(compute) as toy:
             others = await toy.waiting(["x", "y"])
-            job = Job(Flow("t", "c"), Step("first", "toy", "b", "z"), time.monotonic() + FAR_S, 1)
+            job: AnyJob = Job(Flow("t", "c"), Step("first", "toy", "b", "z"), time.monotonic() + FAR_S, 1)
             running = asyncio.ensure_future(toy.queue.run(job))
             await until(lambda: toy.queue.load("then").waiting == 3)
             toy.gate.set()
@@ -102,10 +103,10 @@ class TestResults:
         """One notification, work for two."""
         both = threading.Barrier(2, timeout=LIMIT_S)
 
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
+        def compute(jobs: Sequence[AnyJob]) -> list[AnyResult]:
             if jobs[0].step.stage == "then":
                 time.sleep(0.05)  # until both threads wait
-                return [Next(Step("first", "toy", "b", job.step.payload)) for job in jobs]
+                return [Next((Step("first", "toy", "b", job.step.payload),)) for job in jobs]
             both.wait()
             return [Done(job.step.payload) for job in jobs]
 
@@ -127,7 +128,7 @@ class TestFailure:
     @settings(max_examples=25, deadline=None)
     @given(st.lists(st.booleans(), min_size=1, max_size=3 * MAX_BATCH))
     async def test_the_failing_jobs_of_a_batch_fail_alone(self, fails: list[bool]) -> None:
-        def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
+        def compute(jobs: Sequence[AnyJob]) -> Sequence[AnyResult]:
             for job in jobs:
                 if job.step.payload != "later" and fails[job.step.payload]:
                     raise PlantedError(job.step.payload)
@@ -144,7 +145,7 @@ class TestFailure:
     async def test_any_exception_is_the_jobs_alone(self, error: Exception) -> None:
         """Some of them mean something to futures and coroutines."""
 
-        def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
+        def compute(jobs: Sequence[AnyJob]) -> Sequence[AnyResult]:
             if jobs[0].step.payload == "bad":
                 raise error
             return echo(jobs)
@@ -157,7 +158,7 @@ class TestFailure:
 
     @pytest.mark.parametrize("surplus", [-1, 1])
     async def test_a_stage_with_the_wrong_number_of_results_fails_all(self, surplus: int) -> None:
-        def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
+        def compute(jobs: Sequence[AnyJob]) -> Sequence[AnyResult]:
             if "right" in [job.step.payload for job in jobs]:
                 return echo(jobs)
             return [Done("whose?")] * (len(jobs) + surplus)
@@ -170,7 +171,7 @@ class TestFailure:
 
     @pytest.mark.parametrize("fits", [1, 2, 3, 5])
     async def test_out_of_memory_halves_the_batch_for_good(self, fits: int) -> None:
-        def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
+        def compute(jobs: Sequence[AnyJob]) -> Sequence[AnyResult]:
             if len(jobs) > fits and jobs[0].step.bucket == "large":
                 raise MemoryError
             return echo(jobs)
@@ -188,7 +189,7 @@ class TestFailure:
         """An exception that is being handled holds the frames that it came through, and the tensors in them."""
         held: list[weakref.ref[Any]] = []
 
-        def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
+        def compute(jobs: Sequence[AnyJob]) -> Sequence[AnyResult]:
             assert not any(it() for it in held)
             tensor = {len(jobs)} - {1}
             if tensor:
@@ -203,7 +204,7 @@ class TestFailure:
     async def test_a_batch_size_that_was_too_much_once_stays_so(self) -> None:
         """Though a later half of the same batch would have allowed more."""
 
-        def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
+        def compute(jobs: Sequence[AnyJob]) -> Sequence[AnyResult]:
             if len(jobs) > (1 if 0 in [job.step.payload for job in jobs] else 2):
                 raise MemoryError
             return echo(jobs)
@@ -239,7 +240,7 @@ class TestCallersWhoLeave:
         """The caller learns it at once; the thread is not interrupted."""
         began, asks, noticed = threading.Event(), threading.Event(), threading.Event()
 
-        def compute(jobs: Sequence[Job]) -> Sequence[StageResult]:
+        def compute(jobs: Sequence[AnyJob]) -> Sequence[AnyResult]:
             if jobs[0].step.payload == "next":
                 return echo(jobs)
             jobs[0].check()
@@ -278,7 +279,7 @@ class TestCallersWhoLeave:
         """Callers come, leave at any moment, run out of time, fail and go through one stage or two."""
         random_ = random.Random(seed)
 
-        def compute(jobs: Sequence[Job]) -> list[StageResult]:
+        def compute(jobs: Sequence[AnyJob]) -> list[AnyResult]:
             if any(job.step.payload % 7 == 0 for job in jobs):
                 raise PlantedError
             return [then(job) if job.step.stage == "first" else Done(job.step.payload) for job in jobs]

@@ -32,7 +32,7 @@ from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
 from mapless_server.engine.options import EngineOptions
-from mapless_server.engine.query import Result, Tier
+from mapless_server.engine.query import QueryJob, Result, Tier
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.stages import Method
 from mapless_server.method.bundle.estimate import PoseStage
@@ -40,7 +40,7 @@ from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.observability.metrics import Metrics
-from mapless_server.scheduling import CostModel, Flow, Job
+from mapless_server.scheduling import CostModel, Flow
 from mapless_server.security import RateLimiter
 from mapless_server.serve.assembly import MakeEngine, StartupError, engine_options, engine_over, make_tiers
 from mapless_server.serve.warm_up import ROUNDS, warm_up, warm_up_stronger
@@ -71,7 +71,7 @@ async def test_the_real_method_localizes_the_rendered_scene(tmp_path: Path) -> N
     async with warm(tmp_path, make_tiers(Settings(data_dir=tmp_path))) as engine:
         run = engine.run
 
-        async def watched(job: Job) -> Result:
+        async def watched(job: QueryJob) -> Result:
             results.append(await run(job))
             return results[-1]
 

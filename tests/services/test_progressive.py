@@ -15,7 +15,7 @@ import pytest
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.errors import Overloaded
 from mapless_server.rpc import Call
-from mapless_server.scheduling import Flow, Job, Step
+from mapless_server.scheduling import AnyJob, Flow, Job, Step
 from mapless_server.services.localization import FutureCoarseAnswer, LocalizationService, coarse_then_final
 from mapless_server.services.messages.answers import answer_frames_of
 
@@ -92,14 +92,14 @@ class Refusing:
     """Refuses every job, and notes which there were."""
 
     def __init__(self) -> None:
-        self.jobs: list[weakref.ref[Job]] = []
+        self.jobs: list[weakref.ref[AnyJob]] = []
 
-    def query_job(self, query: Any, caller: Any, *, on_better: Any = None) -> Job:
-        job = Job(Flow("", ""), Step("prepare", "", "", on_better), math.inf, 0)
+    def query_job(self, query: Any, caller: Any, *, on_better: Any = None) -> AnyJob:
+        job: AnyJob = Job(Flow("", ""), Step("prepare", "", "", on_better), math.inf, 0)
         self.jobs.append(weakref.ref(job))
         return job
 
-    async def run(self, job: Job) -> Any:
+    async def run(self, job: AnyJob) -> Any:
         raise Overloaded("planted")
 
 

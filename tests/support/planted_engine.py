@@ -11,7 +11,7 @@ import numpy as np
 from mapless.geometry import RigidTransform
 from mapless_server.engine.options import EngineOptions, EscalationOptions
 from mapless_server.engine.photos import Description, Photo
-from mapless_server.engine.query import Caller, Query, Result, Tier
+from mapless_server.engine.query import Caller, Query, QueryJob, Result, Tier
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.bundle.estimate import PoseStage
 from mapless_server.method.features.views import Features, PosedView, View
@@ -21,7 +21,7 @@ from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Hint, Rejection, RejectionReason
 from mapless_server.scenes import Narrowing, Sphere
-from mapless_server.scheduling import Flow, Job
+from mapless_server.scheduling import Flow
 from mapless_server.security import SceneKey
 from mapless_server.serve.assembly import engine_over
 from mapless_server.store import Store
@@ -103,7 +103,7 @@ class Setting:
         query = Query(SCENE, photo=Photo(PHOTO, CAMERA, "image"), options=LocalizeOptions(), **values)
         return self.run(query, caller(deadline_s))[0]
 
-    def run(self, query: Query, caller: Caller) -> tuple[Result, Job]:
+    def run(self, query: Query, caller: Caller) -> tuple[Result, QueryJob]:
         job = self.engine.query_job(query, caller)
         return self.loop.run_until_complete(self.engine.run(job)), job
 

@@ -9,15 +9,17 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from mapless_server.scheduling import (
+    AnyFallback,
+    AnyJob,
+    AnyNext,
+    AnyResult,
     Done,
     Failure,
-    Fallback,
     Fatal,
     Flow,
     Job,
     Next,
     Stage,
-    StageResult,
     Step,
     WorkQueue,
     WorkQueueOptions,
@@ -51,13 +53,13 @@ def failure_of(error: Exception) -> Failure:
     return Failure.OUT_OF_MEMORY if isinstance(error, MemoryError) else Failure.JOB_FAILED
 
 
-def echo(jobs: Sequence[Job]) -> Sequence[StageResult]:
+def echo(jobs: Sequence[AnyJob]) -> Sequence[AnyResult]:
     return [Done(job.step.payload) for job in jobs]
 
 
-def then(job: Job, payload: Any = None, fallback: Fallback | None = None) -> Next:
+def then(job: AnyJob, payload: Any = None, fallback: AnyFallback | None = None) -> AnyNext:
     """To the second stage."""
-    return Next(Step("then", "toy", "b", job.step.payload if payload is None else payload), fallback)
+    return Next((Step("then", "toy", "b", job.step.payload if payload is None else payload),), fallback)
 
 
 class Toy:
@@ -97,7 +99,7 @@ class Toy:
         assert not [it.name for it in threading.enumerate() if it.name.startswith("toy-")]
         assert self.queue.job_count == 0
 
-    def _serve(self, jobs: Sequence[Job]) -> Sequence[StageResult]:
+    def _serve(self, jobs: Sequence[AnyJob]) -> Sequence[AnyResult]:
         payloads = [job.step.payload for job in jobs]
         if payloads == ["plug"]:
             self._plugged.release()

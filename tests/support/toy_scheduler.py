@@ -7,15 +7,16 @@ from typing import Any
 import pytest
 
 from mapless_server.scheduling import (
+    AnyFallback,
+    AnyJob,
+    AnyResult,
     Done,
     Ending,
-    Fallback,
     Flow,
     Job,
     Next,
     Refused,
     Stage,
-    StageResult,
     Step,
     WorkQueueOptions,
 )
@@ -66,7 +67,7 @@ class Toy:
         self.observer = CountingObserver()
         self.scheduler = Scheduler(STAGES, LANES, options, self.observer, quota=quota)
         self.ends: dict[int, list[tuple[Ending, Any]]] = {}
-        self.jobs: list[Job] = []
+        self.jobs: list[AnyJob] = []
         self.now_s = 0.0
         for stage, cost_s in COST_S.items():
             self.learn(stage, "toy", cost_s)
@@ -81,20 +82,22 @@ class Toy:
         size_bytes: int = 1,
         stage: str = "prepare",
         bucket: str = "b",
-    ) -> Job:
+    ) -> AnyJob:
         number = len(self.jobs)
         ends = self.ends[number] = []
         step = Step(stage, "toy", bucket, number)
-        job = Job(Flow("t", client), step, deadline_s, size_bytes, lambda ending, value: ends.append((ending, value)))
+        job: AnyJob = Job(
+            Flow("t", client), step, deadline_s, size_bytes, lambda ending, value: ends.append((ending, value))
+        )
         self.jobs.append(job)
         return job
 
-    def admit(self, **what: Any) -> Job:
+    def admit(self, **what: Any) -> AnyJob:
         job = self.job(**what)
         self.scheduler.admit(job, self.now_s)
         return job
 
-    def ending_of(self, job: Job) -> Ending | None:
+    def ending_of(self, job: AnyJob) -> Ending | None:
         ends = self.ends[self.jobs.index(job)]
         assert len(ends) <= 1
         return ends[0][0] if ends else None
@@ -104,7 +107,7 @@ class Toy:
         assert batch is not None
         return batch
 
-    def finish(self, batch: Batch, *verdicts: StageResult, seconds: float | None = None) -> None:
+    def finish(self, batch: Batch, *verdicts: AnyResult, seconds: float | None = None) -> None:
         cost_s = COST_S[batch.stage.name] * len(batch.jobs)  # so that predictions stay what they are
         self.now_s = max(self.now_s, batch.start_s + (cost_s if seconds is None else seconds))
         self.scheduler.finish(batch, verdicts, self.now_s)
@@ -121,12 +124,12 @@ class Toy:
         return caught.value
 
 
-def onward(job: Job, fallback: Fallback | None = None) -> StageResult:
+def onward(job: AnyJob, fallback: AnyFallback | None = None) -> AnyResult:
     """To the stage that usually follows."""
     stage = next(it for it in STAGES if it.name == job.step.stage)
     if stage.then is None:
         return Done("result")
-    return Next(Step(stage.then, "toy", job.step.bucket, job.step.payload), fallback)
+    return Next((Step(stage.then, "toy", job.step.bucket, job.step.payload),), fallback)
 
 
 def run_through(toy: Toy) -> None:

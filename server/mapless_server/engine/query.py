@@ -15,7 +15,7 @@ from mapless_server.method.bundle.priors import NO_PRIORS, Priors
 from mapless_server.method.options import StageContext, Variant
 from mapless_server.scenes import Selection
 from mapless_server.scenes.retrieval.ranking import THINNED_LATER
-from mapless_server.scheduling import Step
+from mapless_server.scheduling import Job, StageResult, Step
 from mapless_server.store import SceneAttributes, calibration_kind
 
 from .photos import Photo, QueryViews
@@ -324,7 +324,7 @@ class QueryRun:
         return self.best or self.ambiguous
 
     @property
-    def first_step(self) -> Step:
+    def first_step(self) -> Step[QueryRun]:
         """The first step of the query in its tier."""
         kind = self.kind
         return Step(PREPARE, kind, kind, self)
@@ -340,3 +340,9 @@ class QueryRun:
         # Only the first tier waits for its references' features: before a stronger one there is an answer.
         waits = self.best is None
         return self.source.load(self.query.scene_key, reference_ids, tier.extractor, self.context, waits)
+
+
+QueryStep = Step[QueryRun]
+QueryJob = Job[QueryRun, Result]
+QueryStageResult = StageResult[QueryRun, Result]
+"""The queue's types with a query's payload and value."""

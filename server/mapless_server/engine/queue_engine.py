@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Awaitable, Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from typing import Any, TypeVar, cast
+from typing import TypeVar
 
 from mapless_server.errors import DeadlineExceeded, Overloaded, RequestError, Unavailable
 from mapless_server.method.options import StageContext
@@ -16,6 +16,7 @@ from mapless_server.scheduling import (
     Failure,
     Fatal,
     Flow,
+    ItemJob,
     ItemList,
     Job,
     Observer,
@@ -32,7 +33,7 @@ from mapless_server.security import SceneKey
 from .failures import failure_of
 from .options import EngineOptions
 from .photos import Description, Photo, QueryViews
-from .query import COARSE, PREPARE, REFINE, Caller, Query, QueryRun, ReferenceSource, Result, Tier
+from .query import COARSE, PREPARE, REFINE, Caller, Query, QueryJob, QueryRun, ReferenceSource, Result, Tier
 from .references import References
 from .stages import Method, QueryStages
 
@@ -115,7 +116,7 @@ class QueueEngine:
         source: ReferenceSource | None = None,
         *,
         on_better: Callable[[Result], None] | None = None,
-    ) -> Job:
+    ) -> QueryJob:
         """Makes the job of localizing a photograph, for `run`; its `records` list the stages that it has been through.
 
         `source` replaces the references, for the warm-up. `on_better` is called on the event loop, before the answer,
@@ -130,10 +131,10 @@ class QueueEngine:
         size_bytes = 0 if query.is_part else query.photo.size_bytes  # which `hold` counts
         return Job(caller.flow, run.first_step, caller.deadline_s, size_bytes)
 
-    async def run(self, job: Job) -> Result:
+    async def run(self, job: QueryJob) -> Result:
         """Computes a query's job and returns its result."""
         with _as_request_errors():
-            return cast(Result, await self.queue.run(job))
+            return await self.queue.run(job)
 
     @contextmanager
     def hold(self, queries: Sequence[Query], caller: Caller) -> Iterator[None]:
@@ -176,7 +177,7 @@ class QueueEngine:
         References that do not exist any more are left out if `are_listed`, that is, if the caller did not name them.
         """
         auditor = self.references.auditor(scene_key, () if are_listed else reference_ids)
-        audits = await self._each(AUDIT, reference_ids, auditor.audit, caller, 0, jobs=1)
+        audits = await self._each(AUDIT, reference_ids, auditor.audit, caller, 0, most_jobs=1)
         return auditor.generation, [audit for audit in audits if audit is not None]
 
     async def check_coverage(self, scene_key: SceneKey, view: Viewpoint, caller: Caller) -> tuple[int, Coverage]:
@@ -210,19 +211,18 @@ class QueueEngine:
         compute: ComputeItem[ItemT, ResultT],
         caller: Caller,
         size_bytes: int,
-        jobs: int | None = None,
+        most_jobs: int | None = None,
         continues: bool = False,
     ) -> list[ResultT]:
         """Computes items in several jobs, at most as many as there are threads, so that other jobs run in between."""
         work = ItemList(items, compute)
-        jobs = min(jobs or self.options.workers, len(items))
+        jobs = min(most_jobs or self.options.workers, len(items))
         step = Step(stage, stage, stage, work)
-        submissions = [
-            asyncio.ensure_future(
-                self.queue.run(Job(caller.flow, step, caller.deadline_s, size_bytes // jobs, continues=continues))
-            )
-            for _ in range(jobs)
-        ]
+
+        def job() -> ItemJob[ItemT, ResultT]:
+            return Job(caller.flow, step, caller.deadline_s, size_bytes // jobs, continues=continues)
+
+        submissions = [asyncio.ensure_future(self.queue.run(job())) for _ in range(jobs)]
         with _as_request_errors():
             try:
                 outcomes = await asyncio.gather(*(_unless_refused(it) for it in submissions))
@@ -271,7 +271,7 @@ def check_tiers(tiers: Sequence[Tier]) -> None:
         raise ValueError("tiers must be one or more, each with an extractor and a matcher of its own")
 
 
-async def _unless_refused(submission: Awaitable[Any]) -> Refused | None:
+async def _unless_refused(submission: Awaitable[None]) -> Refused | None:
     try:
         await submission
     except Refused as refused:

@@ -23,13 +23,26 @@ from mapless_server.method.pipeline import Coarse, Pipeline, Prepared, tracked_s
 from mapless_server.method.rejection import Hint, Hypothesis, Rejection, RejectionReason
 from mapless_server.scenes import ANYWHERE, Selection
 from mapless_server.scenes.library import FeaturesMissing
-from mapless_server.scheduling import Abandoned, Done, Ending, Failure, Fallback, Job, Next, StageResult, Step
+from mapless_server.scheduling import Abandoned, Done, Ending, Failure, Fallback, Next, Step
 
 from . import tracking
 from .choosing import is_searched, load_chosen, may_be_elsewhere, turned_to_match, with_chosen, with_named
 from .failures import failure_of
 from .options import EscalationOptions
-from .query import COARSE, PREPARE, REFINE, TRACK, UNFINISHED, Query, QueryRun, Result, Tier
+from .query import (
+    COARSE,
+    PREPARE,
+    REFINE,
+    TRACK,
+    UNFINISHED,
+    Query,
+    QueryJob,
+    QueryRun,
+    QueryStageResult,
+    QueryStep,
+    Result,
+    Tier,
+)
 from .tiers import (
     better_of,
     inlier_count,
@@ -94,21 +107,23 @@ class QueryStages:
         self._gives_up = gives_up
         self._is_alone = is_alone
 
-    def prepare(self, jobs: Sequence[Job]) -> list[StageResult]:
+    def prepare(self, jobs: Sequence[QueryJob]) -> list[QueryStageResult]:
         """Loads references, finds features and computes correspondences."""
         return [self._stage_result(job.step.payload, self._prepare, job) for job in jobs]
 
-    def coarse(self, jobs: Sequence[Job]) -> list[StageResult]:
+    def coarse(self, jobs: Sequence[QueryJob]) -> list[QueryStageResult]:
         """Reconstructs many queries together, and estimates the metric scale of each."""
         runs: list[QueryRun] = [job.step.payload for job in jobs]
         parts = self._method.reconstruct([run.part for run in runs])
         return [self._stage_result(run, self._after_coarse, part) for run, part in zip(runs, parts, strict=True)]
 
-    def refine(self, jobs: Sequence[Job]) -> list[StageResult]:
+    def refine(self, jobs: Sequence[QueryJob]) -> list[QueryStageResult]:
         """Computes structure, matches and pose."""
         return [self._stage_result(job.step.payload, self._refine) for job in jobs]
 
-    def _stage_result(self, run: QueryRun, compute: Callable[..., StageResult], *arguments: Any) -> StageResult:
+    def _stage_result(
+        self, run: QueryRun, compute: Callable[..., QueryStageResult], *arguments: Any
+    ) -> QueryStageResult:
         """Computes a stage; a failure ends the query, or returns the answer that an earlier tier has given."""
         try:
             return compute(run, *arguments)
@@ -131,7 +146,7 @@ class QueryStages:
                 log.warning("%s failed; the first answer is given", name, exc_info=error)
             return self._unfinished(run)
 
-    def _prepare(self, run: QueryRun, job: Job) -> StageResult:
+    def _prepare(self, run: QueryRun, job: QueryJob) -> QueryStageResult:
         tier, query = self._tiers[run.tier], run.query
         if run.view is not None:  # its first step is done
             return self._matched_further(self._rematched(run) if self._has_time_to_rematch(run, tier) else run)
@@ -191,7 +206,7 @@ class QueryStages:
             matches[i] = it
         return run.but(query_matches=tuple(matches), unmatched=others)
 
-    def _matched_further(self, run: QueryRun) -> StageResult:
+    def _matched_further(self, run: QueryRun) -> QueryStageResult:
         """Matches the next reference, or goes on with the query if all are matched or no time is left for more."""
         tier, query = self._tiers[run.tier], run.query
         assert run.view is not None
@@ -216,7 +231,7 @@ class QueryStages:
         until_s = run.start_s + REMATCH_SHARE * (until_s - run.start_s)
         return time.monotonic() + (tier.pipeline.matcher.pair_s or 0.0) <= until_s
 
-    def _tracked(self, run: QueryRun, tier: Tier) -> StageResult | None:
+    def _tracked(self, run: QueryRun, tier: Tier) -> QueryStageResult | None:
         """Answers from the references near the pose prior; None if they do not suffice, and notes the time it took."""
         seconds, begin_s = run.context.stage_seconds, time.monotonic()
         found = self._track(run, tier)
@@ -253,7 +268,7 @@ class QueryStages:
         result = replace(self._result(tracked, answer), tier=tier)
         return result if isinstance(result.answer.outcome, Localization) else None
 
-    def _after_coarse(self, run: QueryRun, part: Coarse | Answer | Exception) -> StageResult:
+    def _after_coarse(self, run: QueryRun, part: Coarse | Answer | Exception) -> QueryStageResult:
         if isinstance(part, Exception):
             raise part
         if isinstance(part, Answer):
@@ -271,15 +286,15 @@ class QueryStages:
         if not run.query.allow_coarse:
             return self._next(run, step)
         done = Done(coarse, Ending.DEGRADED)
-        return Next(step, Fallback(lambda: done, run.deadline_s - ANSWER_MARGIN_S))
+        return Next((step,), Fallback(lambda: done, run.deadline_s - ANSWER_MARGIN_S))
 
-    def _refine(self, run: QueryRun) -> StageResult:
+    def _refine(self, run: QueryRun) -> QueryStageResult:
         answer = self._method.refine(run.part)
         if run.query.is_part and answer.support is None:
             answer = replace(answer, support=self._method.tracked_support(run.part.prepared))
         return self._conclude(run, answer)
 
-    def _conclude(self, run: QueryRun, answer: Answer) -> StageResult:
+    def _conclude(self, run: QueryRun, answer: Answer) -> QueryStageResult:
         """Ends a search: returns the better of two answers, or searches elsewhere or in a stronger tier for another."""
         place = None
         if isinstance(answer.outcome, Rejection):
@@ -311,13 +326,13 @@ class QueryStages:
             return self._search(replace(self._further(run, query, 0, result), tries_turns=True))
         return self._stronger(run, query, result)
 
-    def _stronger(self, run: QueryRun, query: Query, result: Result) -> StageResult:
+    def _stronger(self, run: QueryRun, query: Query, result: Result) -> QueryStageResult:
         """Searches with stronger features if a result is doubtful and there are any, and otherwise returns it."""
         if run.tier + 1 < len(self._tiers) and is_doubtful(result.answer, self._doubt_in(run)):
             return self._search(self._further(run, query, run.tier + 1, result))
         return Done(result, _ending(result))
 
-    def _at_place(self, run: QueryRun, place: Hypothesis, ambiguous: Result) -> StageResult:
+    def _at_place(self, run: QueryRun, place: Hypothesis, ambiguous: Result) -> QueryStageResult:
         """Computes the pose from the references of one place alone."""
         kept = [i for i, it in enumerate(run.references) if it.name in place.references]
         matches = None if run.query_matches is None else tuple(run.query_matches[i] for i in kept)
@@ -335,7 +350,7 @@ class QueryStages:
         limits = time.monotonic(), self._give_up_s(run)
         return QueryRun(query, run.source, run.views, run.deadline_s, run.on_better, tier, best, *limits)
 
-    def _search(self, run: QueryRun) -> StageResult:
+    def _search(self, run: QueryRun) -> QueryStageResult:
         return self._unfinished(run) if self._gives_up(run) else self._next(run, run.first_step)
 
     def _searches_elsewhere(self, run: QueryRun, answer: Answer) -> bool:
@@ -356,13 +371,13 @@ class QueryStages:
         doubtful_trust = trust_in_scene(options.doubtful_trust, calibration.trust_quantiles)
         return replace(options, doubtful_trust=doubtful_trust)
 
-    def _next(self, run: QueryRun, step: Step, alternative: Step | None = None) -> Next:
-        """Goes on to a step; an earlier tier's answer is returned in time if neither step leads to a better one."""
+    def _next(self, run: QueryRun, *steps: QueryStep) -> Next[QueryRun, Result]:
+        """Goes on to one of the steps; an earlier tier's answer is returned in time if none leads to a better one."""
         if run.earlier is None:
-            return Next(step)
-        return Next(step, Fallback(lambda: self._unfinished(run), run.give_up_s), alternative)
+            return Next(steps)
+        return Next(steps, Fallback(lambda: self._unfinished(run), run.give_up_s))
 
-    def _unfinished(self, run: QueryRun) -> Done:
+    def _unfinished(self, run: QueryRun) -> Done[Result]:
         assert run.earlier is not None
         unfinished = {f"{self._tiers[run.tier].features}{UNFINISHED}": time.monotonic() - run.start_s}
         answer = with_untried(run, run.earlier.answer, self._tiers[run.tier])

@@ -22,8 +22,14 @@ threads that compute what the scheduler selects, and callers that wait on an eve
 
 from .admission import WorkQueueOptions
 from .costs import CostModel
+from .items import ComputeItem, ItemJob, ItemList, compute_items
 from .jobs import (
     Abandoned,
+    AnyFallback,
+    AnyJob,
+    AnyNext,
+    AnyResult,
+    AnyStep,
     Done,
     Ending,
     Expired,
@@ -42,10 +48,15 @@ from .jobs import (
     Step,
 )
 from .processor import count_helper, processor_s
-from .work_queue import ComputeItem, Failure, Fatal, ItemList, WorkQueue, compute_items
+from .work_queue import Failure, Fatal, WorkQueue
 
 __all__ = [
     "Abandoned",
+    "AnyFallback",
+    "AnyJob",
+    "AnyNext",
+    "AnyResult",
+    "AnyStep",
     "ComputeItem",
     "CostModel",
     "Done",
@@ -55,6 +66,7 @@ __all__ = [
     "Fallback",
     "Fatal",
     "Flow",
+    "ItemJob",
     "ItemList",
     "Job",
     "Next",

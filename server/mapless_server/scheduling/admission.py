@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from .jobs import Flow, Job, Refusal, Refused
+from .jobs import AnyJob, Flow, Refusal, Refused
 from .shares import Shares
 
 
@@ -63,13 +63,13 @@ class Ledger:
     def __init__(self, shares: Shares) -> None:
         """Counts those who have jobs in the shares, too."""
         self._shares = shares
-        self.jobs: set[Job] = set()
-        self._aside: set[Job] = set()
+        self.jobs: set[AnyJob] = set()
+        self._aside: set[AnyJob] = set()
         self._clients: dict[Flow, _Holdings] = {}
         self._callers: dict[tuple[str, str], _Holdings] = {}
         self._all = _Holdings()
 
-    def open(self, job: Job, cost_s: Counter[str]) -> None:
+    def open(self, job: AnyJob, cost_s: Counter[str]) -> None:
         """Books an admitted job."""
         self.jobs.add(job)
         self._shares.enter(job.flow)
@@ -78,7 +78,7 @@ class Ledger:
             holdings.size_bytes += job.size_bytes
         self.rebook(job, cost_s)
 
-    def rebook(self, job: Job, cost_s: Counter[str]) -> None:
+    def rebook(self, job: AnyJob, cost_s: Counter[str]) -> None:
         """Replaces the computing time predicted for a job, by lane."""
         for holdings in self._holding(job.flow):
             for lane, seconds in job.booked_s.items():  # Counter's methods take ten times as long
@@ -87,21 +87,21 @@ class Ledger:
                 holdings.booked_s[lane] += seconds
         job.booked_s = cost_s
 
-    def set_aside(self, job: Job) -> None:
+    def set_aside(self, job: AnyJob) -> None:
         """Counts a job for nothing but its memory, because it waits until a thread is idle otherwise."""
         self.rebook(job, Counter())
         self._aside.add(job)
         for holdings in self._holding(job.flow):
             holdings.aside += 1
 
-    def resume(self, job: Job, cost_s: Counter[str]) -> None:
+    def resume(self, job: AnyJob, cost_s: Counter[str]) -> None:
         """Undoes `set_aside`, with the computing time that is now predicted."""
         self._aside.remove(job)
         for holdings in self._holding(job.flow):
             holdings.aside -= 1
         self.rebook(job, cost_s)
 
-    def close(self, job: Job) -> None:
+    def close(self, job: AnyJob) -> None:
         """Removes a job that has ended."""
         if job in self._aside:
             self.resume(job, Counter())
@@ -241,7 +241,7 @@ class Admission:
         """Refuses every job from now on."""
         self._is_closed = True
 
-    def check(self, job: Job, cost_s: Counter[str], now_s: float) -> None:
+    def check(self, job: AnyJob, cost_s: Counter[str], now_s: float) -> None:
         """Raises Refused if a job with this predicted computing time, by lane, cannot be admitted."""
         ledger = self._ledger
         self._check_size(job.size_bytes)
@@ -297,7 +297,7 @@ class Admission:
         if size_bytes > most:
             raise Refused(Refusal.TOO_LARGE, f"the call holds {size_bytes} bytes, {most} are allowed")
 
-    def fits(self, job: Job, cost_s: Counter[str]) -> bool:
+    def fits(self, job: AnyJob, cost_s: Counter[str]) -> bool:
         """Whether an admitted job may continue although it now needs more than it was admitted with.
 
         The only job may, since no other job waits.
@@ -307,7 +307,7 @@ class Admission:
         added_s = {lane: own_s - job.booked_s[lane] for lane, own_s in cost_s.items()}
         return all(it <= 0 or self._excess_s(job.flow, lane, it) <= 0 for lane, it in added_s.items())
 
-    def has_turn(self, job: Job, cost_s: Counter[str]) -> bool:
+    def has_turn(self, job: AnyJob, cost_s: Counter[str]) -> bool:
         """Whether an admitted job, its client's only one, may continue although the share is too small for it.
 
         It may if it would be done soon although all others got as much of the server, as a first job is admitted.

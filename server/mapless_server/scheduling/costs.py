@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from statistics import median_low
 from typing import NamedTuple
 
-from .jobs import Flow, Job, Stage, Step
+from .jobs import AnyJob, AnyStep, Flow, Stage
 
 FIRST_GUESS_S = 0.25
 """Predicted before anything is observed."""
@@ -115,7 +115,7 @@ class StageCosts:
         self._model = model
         self._stages = stages
 
-    def of(self, step: Step, flow: Flow, now_s: float) -> Counter[str]:
+    def of(self, step: AnyStep, flow: Flow, now_s: float) -> Counter[str]:
         """Predicted computing time, by lane, of a caller's step and of those that usually follow."""
         cost_s: Counter[str] = Counter()
         stage: Stage | None = self._stages[step.stage]
@@ -127,11 +127,11 @@ class StageCosts:
             kind, is_certain = step.later_kind or step.kind, False
         return cost_s
 
-    def of_step(self, job: Job, now_s: float) -> float:
+    def of_step(self, job: AnyJob, now_s: float) -> float:
         """Predicted computing time of a job's current step."""
         return self._model.predict(job.step.stage, job.step.kind, job.flow, now_s)
 
-    def learn(self, job: Job, seconds: float, is_done: bool, now_s: float) -> None:
+    def learn(self, job: AnyJob, seconds: float, is_done: bool, now_s: float) -> None:
         """Records what a job took in its stage, and that one that is done does not reach those that usually follow."""
         stage, kind = self._stages[job.step.stage], job.step.kind
         self._model.observe(stage.name, kind, job.flow, seconds, now_s)

@@ -1,12 +1,17 @@
-"""The types of the work queue: jobs, their steps, what stages return, how jobs end, lanes and sizes of batches."""
+"""The types of the work queue: jobs, their steps, what stages return, and how jobs end."""
 
 import math
 import time
-from collections import Counter, deque
-from collections.abc import Callable, Collection, Sequence
+from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+
+PayloadT = TypeVar("PayloadT")
+"""The input of the job's stages."""
+ValueT = TypeVar("ValueT")
+"""The job's result."""
 
 
 class Flow(NamedTuple):
@@ -110,7 +115,7 @@ class StageLoad(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
+class Step(Generic[PayloadT]):
     """The next computation of a job.
 
     Attributes:
@@ -124,40 +129,45 @@ class Step:
     stage: str
     kind: str
     bucket: str
-    payload: Any
+    payload: PayloadT
     later_kind: str = ""
 
 
 @dataclass(frozen=True, eq=False)
-class Done:
+class Done(Generic[ValueT]):
     """The job is complete; `value` is its result."""
 
-    value: Any
+    value: ValueT
     ending: Ending = Ending.OK
 
 
 @dataclass(frozen=True, eq=False)
-class Fallback:
+class Fallback(Generic[ValueT]):
     """Makes the result that is given at `at_s`, by the queue's clock, if there is no better one."""
 
-    make: Callable[[], Done]
+    make: Callable[[], Done[ValueT]]
     at_s: float
 
 
 @dataclass(frozen=True, eq=False)
-class Next:
+class Next(Generic[PayloadT, ValueT]):
     """The job needs another step. From now on it ends with the fallback, if there is one, instead of expiring.
 
-    The fallback is also given at once if the step would end too late; before that an alternative, a cheaper step, is
-    tried. A step that costs too much beside the other jobs waits until a thread would be idle otherwise.
+    With a fallback, the first of the steps that is predicted to end in time, and to cost no more than there is room for
+    beside the other jobs, is computed. If none is, the last waits until a thread would be idle otherwise, and the
+    fallback is given at once if that would be too late. So the steps are in order of preference, and the last is the
+    cheapest. Without a fallback the first is computed.
     """
 
-    step: Step
-    fallback: Fallback | None = None
-    alternative: Step | None = None
+    steps: tuple[Step[PayloadT], ...]
+    fallback: Fallback[ValueT] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.steps:
+            raise ValueError("Next.steps must have at least one step")
 
 
-StageResult = Next | Done | Exception
+StageResult = Next[PayloadT, ValueT] | Done[ValueT] | Exception
 """What a stage returns for one job."""
 
 
@@ -203,7 +213,7 @@ class _Life:
 
 
 @dataclass(eq=False)
-class Job:
+class Job(Generic[PayloadT, ValueT]):
     """A call's work, from admission to its end.
 
     Attributes:
@@ -228,14 +238,14 @@ class Job:
     """
 
     flow: Flow
-    step: Step
+    step: Step[PayloadT]
     deadline_s: float
     size_bytes: int
-    on_end: Callable[[Ending, Any], None] = lambda *_: None
+    on_end: Callable[[Ending, ValueT | Exception], None] = lambda *_: None
     records: list[StageRecord] = field(default_factory=list)
     continues: bool = False
     used_s: float = 0.0
-    fallback: Fallback | None = None
+    fallback: Fallback[ValueT] | None = None
     waits_since_s: float = 0.0
     begins_until_s: float | None = None
     booked_s: Counter[str] = field(default_factory=Counter)
@@ -267,11 +277,19 @@ class Job:
         """Makes a function that raises Abandoned if the job has ended; stages call it between steps, on any thread."""
         return self._life.check
 
-    def end(self, ending: Ending, value: Any) -> None:
+    def end(self, ending: Ending, value: ValueT | Exception) -> None:
         """Ends the job; called by the scheduler only."""
         assert not self.is_over
         self._life.over = True
         self.on_end(ending, value)
+
+
+AnyStep = Step[Any]
+AnyFallback = Fallback[Any]
+AnyNext = Next[Any, Any]
+AnyResult = StageResult[Any, Any]
+AnyJob = Job[Any, Any]
+"""Jobs of all kinds wait together: the scheduler neither reads their payloads nor makes their results."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,76 +300,9 @@ class Batch:
     """
 
     stage: Stage
-    jobs: tuple[Job, ...]
+    jobs: tuple[AnyJob, ...]
     start_s: float
     number: int
-
-
-_ARRIVALS = 64
-
-
-@dataclass
-class Lane:
-    """A group of threads.
-
-    Attributes:
-        threads: number of threads.
-        stages: the stages that they compute, in the order in which jobs go through them.
-        queues: the jobs that wait for each of them.
-        spare: those that wait for each until a thread would be idle otherwise.
-        free: number of idle threads.
-        passed_over: batches since the first stage that has waiting jobs was served.
-        busy_s: sum of the threads' computing times so far.
-        long: numbers of the batches that are computed of which a step is predicted to take more than a quantum.
-        arrivals: of the last jobs that have come to wait: owner, predicted time with later stages, time of arrival.
-    """
-
-    threads: int
-    stages: Sequence[Stage]
-    queues: Sequence[Collection[Job]]
-    spare: Sequence[Collection[Job]]
-    free: int
-    passed_over: int = 0
-    busy_s: float = 0.0
-    long: set[int] = field(default_factory=set)
-    arrivals: deque[tuple[Flow, float, float]] = field(default_factory=lambda: deque(maxlen=_ARRIVALS))
-
-    @property
-    def has_one_left(self) -> bool:
-        """Whether all threads but one compute long steps."""
-        return len(self.long) >= self.threads - 1 > 0
-
-
-_TRY_LARGER_AFTER = 64
-"""Batches of the size that a bucket is limited to, before a larger one is tried; twice as many after each trial."""
-
-
-@dataclass
-class BatchLimit:
-    """The number of jobs of a bucket that fit in memory together.
-
-    Attributes:
-        size: the number.
-        batches: batches of this size that have fitted since it changed.
-        trials: how often a larger size was tried.
-        fits: the size before the last trial, which had fitted; 0 before any, or if something has failed since.
-    """
-
-    size: int
-    batches: int = 0
-    trials: int = 0
-    fits: int = 0
-
-    def fitted(self, size: int) -> None:
-        """Counts a batch; raises the limit by one when it has been kept for long enough."""
-        self.batches += size == self.size
-        if self.batches >= _TRY_LARGER_AFTER << min(self.trials, 10):
-            self.size, self.batches, self.trials, self.fits = self.size + 1, 0, self.trials + 1, self.size
-
-    def failed(self, size: int) -> None:
-        """Lowers the limit, since a batch did not fit: to the size before the trial, otherwise to half of the batch."""
-        lower = self.fits if 0 < self.fits < size else size // 2
-        self.size, self.batches, self.fits = max(1, min(lower, self.size)), 0, 0
 
 
 class Observer:

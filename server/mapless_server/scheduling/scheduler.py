@@ -4,28 +4,28 @@ A state machine without threads, waiting or a clock: times are passed in, so tha
 """
 
 import itertools
-import math
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from typing import Any
 
 from .admission import Admission, Ledger, WorkQueueOptions
 from .costs import MAX_OF_CALLERS, CostModel, StageCosts
 from .expected import Expected
 from .fair_queue import FairQueue
+from .further import Further, When
 from .jobs import (
     Abandoned,
+    AnyFallback,
+    AnyJob,
+    AnyNext,
+    AnyResult,
+    AnyStep,
     Batch,
-    BatchLimit,
     Done,
     Ending,
     Expired,
-    Fallback,
     Flow,
-    Job,
-    Lane,
     Next,
     Observer,
     Quota,
@@ -34,16 +34,13 @@ from .jobs import (
     Stage,
     StageLoad,
     StageRecord,
-    StageResult,
-    Step,
 )
+from .lanes import BatchLimit, Lane
 from .shares import Shares
 from .timers import Timers
 
 FIRST_STAGE_INTERVAL = 4
 """One of so many batches of a lane is of the first stage, if several stages wait."""
-
-_TRY_ONE_IN = 8
 
 
 class Scheduler:
@@ -76,27 +73,25 @@ class Scheduler:
         self._stages = {stage.name: stage for stage in stages}
         self._stage_costs = StageCosts(self.costs, self._stages)
         self._shares = Shares()
-        self._queues: dict[str, FairQueue[Job]] = {stage.name: FairQueue(self._shares) for stage in stages}
+        self._queues: dict[str, FairQueue[AnyJob]] = {stage.name: FairQueue(self._shares) for stage in stages}
         # Steps of admitted jobs that need more room than there is: computed by threads that are idle otherwise.
-        self._spare: dict[str, FairQueue[Job]] = {stage.name: FairQueue(self._shares) for stage in stages}
-        # When a job was last refused because of those admitted, and when one of a caller that has not most of these.
-        self._refused_s = self._crowded_s = -math.inf
+        self._spare: dict[str, FairQueue[AnyJob]] = {stage.name: FairQueue(self._shares) for stage in stages}
         self._running: Counter[str] = Counter()
-        self._lanes = {}
+        self._lanes: dict[str, Lane] = {}
         for name, count in lanes.items():
             own = [stage for stage in stages if stage.lane == name]
             queues, spare = ([them[stage.name] for stage in own] for them in (self._queues, self._spare))
             self._lanes[name] = Lane(count, own, queues, spare, count)
         self._limits: dict[tuple[str, str], BatchLimit] = {}
-        self._declined: Counter[tuple[str, str]] = Counter()
-        self._first_steps: OrderedDict[tuple[tuple[str, str], str], Step] = OrderedDict()
+        self._first_steps: OrderedDict[tuple[tuple[str, str], str], AnyStep] = OrderedDict()
         self._ledger = Ledger(self._shares)
         self._admission = Admission(options, lanes, self._ledger)
+        self._further = Further(options, self._stages, self._lanes, self._stage_costs, self._ledger, self._admission)
         self._timers = Timers()
         self._batch_number = itertools.count(1)
 
     @property
-    def jobs(self) -> frozenset[Job]:
+    def jobs(self) -> frozenset[AnyJob]:
         """The jobs that are admitted and have not ended."""
         return frozenset(self._ledger.jobs)
 
@@ -120,7 +115,7 @@ class Scheduler:
         queue, spare = self._queues[stage], self._spare[stage]
         return StageLoad(len(queue) + len(spare), queue.cost_s, self._running[stage])
 
-    def admit(self, job: Job, now_s: float) -> None:
+    def admit(self, job: AnyJob, now_s: float) -> None:
         """Admits a job, which then ends exactly once; raises Refused without any change."""
         cost_s = self._stage_costs.of(job.step, job.flow, now_s)
         if not job.continues:
@@ -147,7 +142,7 @@ class Scheduler:
         """Undoes `hold`."""
         self._ledger.release(flow, size_bytes)
 
-    def check_room(self, flow: Flow, step: Step, now_s: float) -> None:
+    def check_room(self, flow: Flow, step: AnyStep, now_s: float) -> None:
         """Raises Refused if a caller's job would not be admitted, whatever its deadline.
 
         That is a job as the caller's last one with this stage as its first, or with this step if there was none.
@@ -171,7 +166,7 @@ class Scheduler:
         has_one_left = lane.has_one_left
         expected: Expected | None = None
 
-        def is_allowed(job: Job) -> bool:
+        def is_allowed(job: AnyJob) -> bool:
             nonlocal expected
             if not has_one_left:
                 return True
@@ -193,7 +188,7 @@ class Scheduler:
             self._observer.waited(stage.name, now_s - job.waits_since_s)
         return self._begin(lane, stage, jobs, now_s)
 
-    def _take_spare(self, lane: Lane, is_allowed: Callable[[Job], bool], now_s: float) -> Batch | None:
+    def _take_spare(self, lane: Lane, is_allowed: Callable[[AnyJob], bool], now_s: float) -> Batch | None:
         """Selects, for a thread that nothing else waits for, steps that need more room than there was."""
         stages = [it for it, queue in zip(lane.stages, lane.spare, strict=True) if any(map(is_allowed, queue))]
         if not stages:
@@ -205,7 +200,7 @@ class Scheduler:
             self._ledger.resume(job, self._admission.bookable(self._stage_costs.of(job.step, job.flow, now_s)))
         return self._begin(lane, stages[-1], jobs, now_s)
 
-    def _begin(self, lane: Lane, stage: Stage, jobs: tuple[Job, ...], now_s: float) -> Batch:
+    def _begin(self, lane: Lane, stage: Stage, jobs: tuple[AnyJob, ...], now_s: float) -> Batch:
         lane.free -= 1
         for job in jobs:
             job.is_computed = True
@@ -215,7 +210,7 @@ class Scheduler:
             lane.long.add(batch.number)
         return batch
 
-    def finish(self, batch: Batch, results: Sequence[StageResult], now_s: float, processor_s: float = 0.0) -> None:
+    def finish(self, batch: Batch, results: Sequence[AnyResult], now_s: float, processor_s: float = 0.0) -> None:
         """Handles the results of a batch: each of its jobs ends or continues, unless it has ended meanwhile.
 
         The batch took `processor_s` of processor time.
@@ -254,10 +249,10 @@ class Scheduler:
             else:
                 self._end(job, self._ending_of(result), result, now_s)
 
-    def cancel(self, job: Job, now_s: float) -> None:
+    def cancel(self, job: AnyJob, now_s: float) -> None:
         """Ends a job whose caller does not wait for it any more."""
         if not job.is_over:
-            self._end(job, Ending.CANCELLED, None, now_s)
+            self._end(job, Ending.CANCELLED, Abandoned(), now_s)
 
     def expire(self, now_s: float) -> None:
         """Ends the jobs that are due, waiting or being computed."""
@@ -296,18 +291,11 @@ class Scheduler:
             yield
         except Refused as refused:
             if refused.reason in (Refusal.QUEUE_FULL, Refusal.TOO_MUCH_MEMORY):
-                self._refused_s = now_s
-                if not self._has_most(flow):
-                    self._crowded_s = now_s
+                self._further.refused(flow, now_s)
             self._observer.refused(refused.reason)
             raise
 
-    def _has_most(self, flow: Flow) -> bool:
-        """Whether a caller's admitted jobs take longer than those of all others together."""
-        ledger = self._ledger
-        return any(2 * ledger.booked_s_of_caller(lane, flow) > ledger.booked_s(lane) for lane in self._lanes)
-
-    def _remember(self, flow: Flow, step: Step) -> None:
+    def _remember(self, flow: Flow, step: AnyStep) -> None:
         """Keeps the first step of a caller's last job, without its payload, for `check_room`."""
         key = flow.group, step.stage
         if (known := self._first_steps.get(key)) is None or known.kind != step.kind:
@@ -316,70 +304,29 @@ class Scheduler:
         if len(self._first_steps) > MAX_OF_CALLERS:
             self._first_steps.popitem(last=False)
 
-    def _continue(self, job: Job, result: Next, now_s: float) -> None:
-        """Queues a job for its next step, or, if that would end too late or cost too much, for the alternative.
-
-        If neither is worthwhile, the job waits for an idle thread; or, if no thread will be idle because other callers
-        ask for more than their share, for its turn; or it ends with its fallback.
-        """
-        job.step, job.fallback = result.step, result.fallback
-        cost_s = self._stage_costs.of(job.step, job.flow, now_s)
-        in_order_s = cost_s.total()
+    def _continue(self, job: AnyJob, result: AnyNext, now_s: float) -> None:
+        """Queues a job for its next step, or ends it with its fallback; see `Next` and `Further`."""
+        job.fallback = result.fallback
         if job.fallback is None:
+            job.step = result.steps[0]
+            cost_s = self._stage_costs.of(job.step, job.flow, now_s)
+            in_order_s = cost_s.total()
             cost_s &= job.booked_s  # it was admitted for no more
-        elif not self._is_worthwhile(job, cost_s, now_s):
-            if result.alternative is not None:  # never tried anyway: that could cost what the alternative gives
-                self._continue(job, Next(result.alternative, job.fallback), now_s)
+        else:
+            job.step, when, cost_s = self._further.choose(job, result.steps, now_s)
+            in_order_s = cost_s.total()
+            if when is When.NEVER:
+                self._give_fallback(job, job.fallback, now_s)
                 return
-            if self._may_wait(job, cost_s, now_s):
+            if when is When.WHEN_IDLE:
                 self._ledger.set_aside(job)
                 job.begins_until_s = job.due_s - in_order_s
                 self._enqueue(job, in_order_s, now_s)
                 return
-            if not (self._has_turn(job, cost_s, now_s) or self._is_tried_anyway(job.step)):
-                self._give_fallback(job, job.fallback, now_s)
-                return
         self._ledger.rebook(job, self._admission.bookable(cost_s))
         self._enqueue(job, in_order_s, now_s)
 
-    def _is_worthwhile(self, job: Job, cost_s: Counter[str], now_s: float) -> bool:
-        """Whether a job's next step fits within the bounds and ends before the job is due."""
-        lane = self._lanes[self._stages[job.step.stage].lane]
-        coming_first = lane.stages[lane.stages.index(self._stages[job.step.stage]) :]
-        wait_s = sum(
-            self._stage_costs.of_step(other, now_s) for stage in coming_first for other in self._queues[stage.name]
-        )
-        return self._admission.fits(job, cost_s) and now_s + wait_s / lane.threads + cost_s.total() <= job.due_s
-
-    def _may_wait(self, job: Job, cost_s: Counter[str], now_s: float) -> bool:
-        """Whether a step beyond the bounds can be computed in time when all that is admitted has been.
-
-        It does not wait if jobs were refused lately: more come than is computed, so that its turn would never come.
-        """
-        if self._is_recent(self._refused_s, now_s):
-            return False
-        before_s = (
-            (self._ledger.booked_s(name) + sum(self._spare[it.name].cost_s for it in lane.stages)) / lane.threads
-            for name, lane in self._lanes.items()
-        )
-        return now_s + max(before_s) + cost_s.total() <= job.due_s
-
-    def _has_turn(self, job: Job, cost_s: Counter[str], now_s: float) -> bool:
-        """Whether a step beyond the bounds takes turns with the jobs of callers that ask for more than their share."""
-        is_crowded = self._is_recent(self._crowded_s, now_s)
-        if is_crowded or not self._is_recent(self._refused_s, now_s) or not self._admission.has_turn(job, cost_s):
-            return False
-        return now_s + self._options.max_queued_s <= job.due_s
-
-    def _is_recent(self, refused_s: float, now_s: float) -> bool:
-        return now_s - refused_s <= self._options.max_queued_s
-
-    def _is_tried_anyway(self, step: Step) -> bool:
-        """Whether to try a step against its prediction: once in a while, since only computing corrects a prediction."""
-        self._declined[step.stage, step.kind] += 1
-        return self._declined[step.stage, step.kind] % _TRY_ONE_IN == 0
-
-    def _enqueue(self, job: Job, cost_s: float, now_s: float) -> None:
+    def _enqueue(self, job: AnyJob, cost_s: float, now_s: float) -> None:
         """Lets a job wait for its step; the cost includes later stages."""
         stage = self._stages[job.step.stage]
         job.waits_since_s = now_s
@@ -387,16 +334,16 @@ class Scheduler:
         self._lanes[stage.lane].arrivals.append((job.flow, cost_s, now_s))
         self._timers.set(job)
 
-    def _queue_of(self, job: Job) -> FairQueue[Job]:
+    def _queue_of(self, job: AnyJob) -> FairQueue[AnyJob]:
         """The queue in which a job waits for its step."""
         return (self._queues if job.begins_until_s is None else self._spare)[job.step.stage]
 
     def _pop_batch(
-        self, queue: FairQueue[Job], stage: Stage, is_allowed: Callable[[Job], bool], now_s: float
-    ) -> tuple[Job, ...]:
+        self, queue: FairQueue[AnyJob], stage: Stage, is_allowed: Callable[[AnyJob], bool], now_s: float
+    ) -> tuple[AnyJob, ...]:
         """Removes the next job and others to be computed with it, and charges for them what is predicted."""
 
-        def charge_s(job: Job) -> float:
+        def charge_s(job: AnyJob) -> float:
             job.charged_step_s = self._stage_costs.of_step(job, now_s)
             return job.charged_step_s
 
@@ -409,7 +356,7 @@ class Scheduler:
                 jobs.append(queue.pop(charge_s, lambda job: job.step.bucket == bucket))
         return tuple(jobs)
 
-    def _end(self, job: Job, ending: Ending, value: Any, now_s: float) -> None:
+    def _end(self, job: AnyJob, ending: Ending, value: object, now_s: float) -> None:
         stage, queue = self._stages[job.step.stage], self._queue_of(job)
         if job in queue:
             queue.remove(job)
@@ -422,6 +369,6 @@ class Scheduler:
             self._quota.settle(job.flow.tenant, job.flow.named_caller, job.charged_s, used_s, now_s)
         self._observer.ended(stage.name, ending)
 
-    def _give_fallback(self, job: Job, fallback: Fallback, now_s: float) -> None:
+    def _give_fallback(self, job: AnyJob, fallback: AnyFallback, now_s: float) -> None:
         done = fallback.make()
         self._end(job, done.ending, done.value, now_s)

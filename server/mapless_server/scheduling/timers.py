@@ -4,7 +4,7 @@ import heapq
 import itertools
 import weakref
 
-from .jobs import Job
+from .jobs import AnyJob
 
 _OUTDATED = 16
 """So many outdated timers are kept in any case, so that they are not swept out too often."""
@@ -17,7 +17,7 @@ class Timers:
     """
 
     def __init__(self) -> None:
-        self._due: list[tuple[float, int, weakref.ref[Job]]] = []
+        self._due: list[tuple[float, int, weakref.ref[AnyJob]]] = []
         self._tick = itertools.count()
         self._sweeps_at = _OUTDATED
 
@@ -31,12 +31,12 @@ class Timers:
             heapq.heappop(self._due)
         return None
 
-    def pop_due(self, now_s: float) -> Job | None:
+    def pop_due(self, now_s: float) -> AnyJob | None:
         """Removes and returns the next job that is due; None if none is."""
         due_s = self.next_due_s
         return heapq.heappop(self._due)[2]() if due_s is not None and due_s <= now_s else None
 
-    def set(self, job: Job) -> None:
+    def set(self, job: AnyJob) -> None:
         """Adds a job, or moves it to the time at which it is due now."""
         if job.timer_s == job.due_s:
             return
@@ -48,6 +48,6 @@ class Timers:
             self._sweeps_at = 2 * len(self._due) + _OUTDATED
 
 
-def _is_current(due_s: float, job: Job | None) -> bool:
+def _is_current(due_s: float, job: AnyJob | None) -> bool:
     """Whether this timer's job has not ended, and is not due at another time now."""
     return job is not None and not job.is_over and job.due_s == due_s

@@ -5,29 +5,35 @@ import logging
 import math
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import Enum
 from functools import partial
-from typing import Any, Generic, TypeVar
 
 from .admission import WorkQueueOptions
-from .jobs import Batch, Done, Ending, Flow, Job, Next, Observer, Quota, Stage, StageLoad, StageResult, Step
+from .jobs import (
+    AnyJob,
+    AnyResult,
+    AnyStep,
+    Batch,
+    Ending,
+    Flow,
+    Job,
+    Observer,
+    PayloadT,
+    Quota,
+    Stage,
+    StageLoad,
+    ValueT,
+)
 from .processor import processor_s
 from .scheduler import Scheduler
 
 log = logging.getLogger(__name__)
 
-ItemT = TypeVar("ItemT")
-ResultT = TypeVar("ResultT")
-
-ComputeBatch = Callable[[Sequence[Job]], Sequence[StageResult]]
+ComputeBatch = Callable[[Sequence[AnyJob]], Sequence[AnyResult]]
 """Computes a step of jobs of one stage and bucket: a result for each, in order. If it raises instead, the batch is
 computed again in halves, so that only the job that causes the exception fails."""
-
-ComputeItem = Callable[[ItemT, Callable[[], None]], ResultT]
-"""Computes one item of an `ItemList`; calls the given function between its steps, which raises if the job has ended."""
 
 
 class Failure(Enum):
@@ -142,7 +148,7 @@ class WorkQueue:
             for thread in self._threads:
                 thread.start()
 
-    async def run(self, job: Job) -> Any:
+    async def run(self, job: Job[PayloadT, ValueT]) -> ValueT:
         """Submits a job and waits for its result; cancelling the wait cancels the job.
 
         ValueError if the job has been run already; Refused if there is no room for it; Expired if its deadline passed;
@@ -151,9 +157,9 @@ class WorkQueue:
         if job.is_over:
             raise ValueError("a job that has ended cannot be run again")
         loop = asyncio.get_running_loop()
-        future: asyncio.Future[Any] = loop.create_future()
+        future: asyncio.Future[ValueT] = loop.create_future()
 
-        def on_end(_: Ending, value: Any) -> None:  # in whatever thread ends the job
+        def on_end(_: Ending, value: ValueT | Exception) -> None:  # in whatever thread ends the job
             self._for_loop.append(partial(loop.call_soon_threadsafe, _resolve, future, value))
 
         job.on_end = on_end
@@ -184,7 +190,7 @@ class WorkQueue:
             with self._lock:
                 self._scheduler.release(flow, size_bytes)
 
-    def check_room(self, flow: Flow, step: Step) -> None:
+    def check_room(self, flow: Flow, step: AnyStep) -> None:
         """Raises Refused if a caller's next job would not be admitted, whatever its deadline.
 
         It is taken for one like the last whose first step had the same stage, or with this step if there was none.
@@ -324,7 +330,7 @@ class WorkQueue:
                 if not self._for_loop:  # jobs that are due have ended, otherwise
                     self._wakes_threads[lane].wait()
 
-    def _compute_batch(self, stage: Stage, jobs: Sequence[Job]) -> list[StageResult]:
+    def _compute_batch(self, stage: Stage, jobs: Sequence[AnyJob]) -> list[AnyResult]:
         """Computes the stage's result for each job; if the stage raises, computes halves of the batch."""
         try:
             results = list(self._compute[stage.name](jobs))
@@ -358,7 +364,7 @@ class WorkQueue:
         return failure
 
 
-def _resolve(future: asyncio.Future[Any], value: Any) -> None:
+def _resolve(future: asyncio.Future[ValueT], value: ValueT | Exception) -> None:
     if future.done():
         return
     if isinstance(value, StopIteration):  # which a future does not accept
@@ -367,32 +373,3 @@ def _resolve(future: asyncio.Future[Any], value: Any) -> None:
         future.set_exception(value)
     else:
         future.set_result(value)
-
-
-class ItemList(Generic[ItemT, ResultT]):
-    """Items that several jobs compute together, one item per step, so that jobs of other callers run in between.
-
-    If the queue admits only one of the jobs, it computes all items.
-
-    Attributes:
-        results: in the order of the items; complete when all jobs have ended.
-    """
-
-    def __init__(self, items: Sequence[ItemT], compute: ComputeItem[ItemT, ResultT]) -> None:
-        self._remaining = deque(enumerate(items))
-        self._compute = compute
-        self.results: list[ResultT] = [None] * len(items)  # type: ignore[list-item]  # each is set before it is read
-
-    def compute_next(self, job: Job) -> StageResult:
-        """Computes one item, if one is left; the job is done with the last."""
-        try:
-            index, item = self._remaining.popleft()
-        except IndexError:
-            return Done(None)
-        self.results[index] = self._compute(item, job.check)
-        return Next(job.step) if self._remaining else Done(None)
-
-
-def compute_items(jobs: Sequence[Job]) -> list[StageResult]:
-    """Computes the next item of each job; the `ComputeBatch` of stages whose payload is an `ItemList`."""
-    return [job.step.payload.compute_next(job) for job in jobs]

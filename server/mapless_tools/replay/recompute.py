@@ -31,6 +31,7 @@ from mapless_server.engine.query import (
     UNFINISHED,
     Caller,
     Query,
+    QueryJob,
     QueryRun,
     Result,
     Tier,
@@ -246,15 +247,15 @@ class _Recomputing:
         unrefined = Method(refine=lambda coarse: coarse_answer(coarse) or refine(coarse))
         self._method = unrefined if _is_cut_short(request, then) else Method()
 
-    def query_job(self, query: Query, caller: Caller, source: object = None, on_better: object = None) -> Job:
+    def query_job(self, query: Query, caller: Caller, source: object = None, on_better: object = None) -> QueryJob:
         field = query.photo.field
         extractor, part = self._tiers[0].extractor, self._parts[field]
         recorded = RecordedSource(self._call, part, self._blobs, extractor, field in self._described)
         views = QueryViews(query.photo, self.options.image_limits)
         return Job(Flow("", ""), QueryRun(query, recorded, views, math.inf).first_step, math.inf, 0)
 
-    async def run(self, job: Job) -> Result:
-        run: QueryRun = job.step.payload
+    async def run(self, job: QueryJob) -> Result:
+        run = job.step.payload
         gives_up = given_up(self._stages[run.query.photo.field], self._tiers)
         stages = QueryStages(self._tiers, self.options.escalation, self._method, gives_up)
         return await asyncio.to_thread(_compute, stages, job)
@@ -267,15 +268,15 @@ class _Recomputing:
         return await asyncio.to_thread(compute)
 
 
-def _compute(stages: QueryStages, job: Job) -> Result:
+def _compute(stages: QueryStages, job: QueryJob) -> Result:
     of_name = {PREPARE: stages.prepare, COARSE: stages.coarse, REFINE: stages.refine}
     while True:
         (result,) = of_name[job.step.stage]([job])
         if isinstance(result, Done):
-            return cast(Result, result.value)
+            return result.value
         if isinstance(result, Exception):
             raise result
-        job.step = result.step
+        job.step = result.steps[0]
 
 
 def given_up(stages: Sequence[str], tiers: Sequence[Tier]) -> Callable[[QueryRun], bool]:

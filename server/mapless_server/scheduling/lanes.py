@@ -1,0 +1,74 @@
+"""Lanes of threads, and how many jobs of a bucket fit in memory together: what the scheduler keeps of them."""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from .fair_queue import FairQueue
+from .jobs import AnyJob, Flow, Stage
+
+_ARRIVALS = 64
+
+
+@dataclass
+class Lane:
+    """A group of threads.
+
+    Attributes:
+        threads: number of threads.
+        stages: the stages that they compute, in the order in which jobs go through them.
+        queues: the jobs that wait for each of them.
+        spare: those that wait for each until a thread would be idle otherwise.
+        free: number of idle threads.
+        passed_over: batches since the first stage that has waiting jobs was served.
+        busy_s: sum of the threads' computing times so far.
+        long: numbers of the batches that are computed of which a step is predicted to take more than a quantum.
+        arrivals: of the last jobs that have come to wait: owner, predicted time with later stages, time of arrival.
+    """
+
+    threads: int
+    stages: Sequence[Stage]
+    queues: Sequence[FairQueue[AnyJob]]
+    spare: Sequence[FairQueue[AnyJob]]
+    free: int
+    passed_over: int = 0
+    busy_s: float = 0.0
+    long: set[int] = field(default_factory=set)
+    arrivals: deque[tuple[Flow, float, float]] = field(default_factory=lambda: deque(maxlen=_ARRIVALS))
+
+    @property
+    def has_one_left(self) -> bool:
+        """Whether all threads but one compute long steps."""
+        return len(self.long) >= self.threads - 1 > 0
+
+
+_TRY_LARGER_AFTER = 64
+"""Batches of the size that a bucket is limited to, before a larger one is tried; twice as many after each trial."""
+
+
+@dataclass
+class BatchLimit:
+    """The number of jobs of a bucket that fit in memory together.
+
+    Attributes:
+        size: the number.
+        batches: batches of this size that have fitted since it changed.
+        trials: how often a larger size was tried.
+        fits: the size before the last trial, which had fitted; 0 before any, or if something has failed since.
+    """
+
+    size: int
+    batches: int = 0
+    trials: int = 0
+    fits: int = 0
+
+    def fitted(self, size: int) -> None:
+        """Counts a batch; raises the limit by one when it has been kept for long enough."""
+        self.batches += size == self.size
+        if self.batches >= _TRY_LARGER_AFTER << min(self.trials, 10):
+            self.size, self.batches, self.trials, self.fits = self.size + 1, 0, self.trials + 1, self.size
+
+    def failed(self, size: int) -> None:
+        """Lowers the limit, since a batch did not fit: to the size before the trial, otherwise to half of the batch."""
+        lower = self.fits if 0 < self.fits < size else size // 2
+        self.size, self.batches, self.fits = max(1, min(lower, self.size)), 0, 0
