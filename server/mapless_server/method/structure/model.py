@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform, Similarity
 
 from ..features.tracks import Tracks
-from .observations import KeypointNoise
 
 if TYPE_CHECKING:  # services do not load what computes
-    pass
+    from .observations import KeypointNoise
 
 
 class ScaleStage(str, Enum):
