@@ -18,6 +18,7 @@ the conversion between values and messages, report/ the HTML report of an answer
 from . import aio
 from .answers import (
     Accuracy,
+    Attempt,
     Debug,
     Diagnostics,
     FramedPose,
@@ -70,6 +71,7 @@ __all__ = [
     "UNCHANGED",
     "Accuracy",
     "AlreadyExists",
+    "Attempt",
     "Calibration",
     "Camera",
     "Client",

@@ -91,6 +91,28 @@ class ScaleEstimate:
 
 
 @dataclass(frozen=True)
+class Attempt:
+    """One attempt at the pose of a photograph.
+
+    Attributes:
+        rung: what was done differently from the other attempts, "wide" for instance.
+        features: the local features used.
+        outcome: "localized", the reason of its rejection, such as "too_few_matches", or how it ended without a verdict:
+            "unfinished", "out_of_memory" or "failed".
+        duration_s: computing time, seconds.
+        processor_s: processor time, seconds.
+        chosen: whether the answer came from it.
+    """
+
+    rung: str
+    features: str
+    outcome: str
+    duration_s: float
+    processor_s: float
+    chosen: bool = False
+
+
+@dataclass(frozen=True)
 class Diagnostics:
     """What an answer was computed from, by what software, and in what time.
 
@@ -107,6 +129,7 @@ class Diagnostics:
         captured: whether the server keeps the call for a time, including the photograph.
         processor_s: processor time of the server's own threads for this photograph, seconds.
         stationary_keypoint_count: keypoints that were left out because they are fixed to the camera, such as a bonnet.
+        attempts: the attempts that were made, in order; none of a server older than 0.4.
     """
 
     request_id: str
@@ -127,6 +150,7 @@ class Diagnostics:
     captured: bool = False
     processor_s: float = 0.0
     stationary_keypoint_count: int = 0
+    attempts: tuple[Attempt, ...] = ()
 
     @property
     def is_tracked(self) -> bool:

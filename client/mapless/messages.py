@@ -14,7 +14,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 import numpy as np
 
 from . import names, wire
-from .answers import Accuracy, Debug, Diagnostics, LocalizationResult, Rejected
+from .answers import Accuracy, Attempt, Debug, Diagnostics, LocalizationResult, Rejected
 from .geodesy import Datum, GeoPose
 from .geometry import Array, Camera, Quaternion, RigidTransform, Similarity
 from .groups import GroupRejected, ImageReport, RigLocalization, SequenceLocalization
@@ -96,6 +96,11 @@ def _debug(message: pb.Debug, path: str) -> Debug:
     )
 
 
+def _attempt(message: pb.Attempt, path: str) -> Attempt:
+    times = {"duration_s": _seconds(message.duration), "processor_s": _seconds(message.processor_duration)}
+    return read(Attempt, message, path, **times)
+
+
 def _diagnostics(message: pb.Diagnostics, path: str) -> Diagnostics:
     stage_s = {timing.stage: _seconds(timing.duration) for timing in message.stages}
     times = {
@@ -119,6 +124,7 @@ def _image_report(message: Any, path: str) -> ImageReport:
 
 _READERS: dict[Any, Callable[[Any, str], Any]] = {
     Accuracy: _accuracy,
+    Attempt: _attempt,
     Array: lambda covariance, path: np.array(covariance.row_major).reshape(6, 6),
     Calibration: calibration_from_message,
     Camera: wire.camera_from_message,

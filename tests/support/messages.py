@@ -38,4 +38,7 @@ def essence(answer: pb.LocalizeResponse, with_stages: bool = False) -> bytes:
         kept.diagnostics.ClearField(name)
     for stage in kept.diagnostics.stages:
         stage.ClearField("duration")
+    for attempt in kept.diagnostics.attempts:
+        attempt.ClearField("duration")
+        attempt.ClearField("processor_duration")
     return bytes(kept.SerializeToString(deterministic=True))

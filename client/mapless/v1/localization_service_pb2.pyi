@@ -473,7 +473,7 @@ class Hypothesis(_message.Message):
     def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., inlier_count: _Optional[int] = ..., references: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class Diagnostics(_message.Message):
-    __slots__ = ("request_id", "backend", "weights_sha256", "features", "variant", "store_generation", "references", "scale", "stages", "queue_duration", "total_duration", "processed_width_px", "processed_height_px", "server_version", "retrieval", "captured", "processor_duration", "stationary_keypoint_count")
+    __slots__ = ("request_id", "backend", "weights_sha256", "features", "variant", "store_generation", "references", "scale", "stages", "queue_duration", "total_duration", "processed_width_px", "processed_height_px", "server_version", "retrieval", "captured", "processor_duration", "attempts", "stationary_keypoint_count")
     REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
     BACKEND_FIELD_NUMBER: _ClassVar[int]
     WEIGHTS_SHA256_FIELD_NUMBER: _ClassVar[int]
@@ -491,6 +491,7 @@ class Diagnostics(_message.Message):
     RETRIEVAL_FIELD_NUMBER: _ClassVar[int]
     CAPTURED_FIELD_NUMBER: _ClassVar[int]
     PROCESSOR_DURATION_FIELD_NUMBER: _ClassVar[int]
+    ATTEMPTS_FIELD_NUMBER: _ClassVar[int]
     STATIONARY_KEYPOINT_COUNT_FIELD_NUMBER: _ClassVar[int]
     request_id: str
     backend: str
@@ -509,8 +510,25 @@ class Diagnostics(_message.Message):
     retrieval: str
     captured: bool
     processor_duration: _duration_pb2.Duration
+    attempts: _containers.RepeatedCompositeFieldContainer[Attempt]
     stationary_keypoint_count: int
-    def __init__(self, request_id: _Optional[str] = ..., backend: _Optional[str] = ..., weights_sha256: _Optional[str] = ..., features: _Optional[str] = ..., variant: _Optional[_Union[Variant, str]] = ..., store_generation: _Optional[int] = ..., references: _Optional[_Iterable[_Union[ReferenceUse, _Mapping]]] = ..., scale: _Optional[_Union[ScaleEstimate, _Mapping]] = ..., stages: _Optional[_Iterable[_Union[StageTiming, _Mapping]]] = ..., queue_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., total_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., processed_width_px: _Optional[int] = ..., processed_height_px: _Optional[int] = ..., server_version: _Optional[str] = ..., retrieval: _Optional[str] = ..., captured: bool = ..., processor_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., stationary_keypoint_count: _Optional[int] = ...) -> None: ...
+    def __init__(self, request_id: _Optional[str] = ..., backend: _Optional[str] = ..., weights_sha256: _Optional[str] = ..., features: _Optional[str] = ..., variant: _Optional[_Union[Variant, str]] = ..., store_generation: _Optional[int] = ..., references: _Optional[_Iterable[_Union[ReferenceUse, _Mapping]]] = ..., scale: _Optional[_Union[ScaleEstimate, _Mapping]] = ..., stages: _Optional[_Iterable[_Union[StageTiming, _Mapping]]] = ..., queue_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., total_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., processed_width_px: _Optional[int] = ..., processed_height_px: _Optional[int] = ..., server_version: _Optional[str] = ..., retrieval: _Optional[str] = ..., captured: bool = ..., processor_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., attempts: _Optional[_Iterable[_Union[Attempt, _Mapping]]] = ..., stationary_keypoint_count: _Optional[int] = ...) -> None: ...
+
+class Attempt(_message.Message):
+    __slots__ = ("rung", "features", "outcome", "duration", "processor_duration", "chosen")
+    RUNG_FIELD_NUMBER: _ClassVar[int]
+    FEATURES_FIELD_NUMBER: _ClassVar[int]
+    OUTCOME_FIELD_NUMBER: _ClassVar[int]
+    DURATION_FIELD_NUMBER: _ClassVar[int]
+    PROCESSOR_DURATION_FIELD_NUMBER: _ClassVar[int]
+    CHOSEN_FIELD_NUMBER: _ClassVar[int]
+    rung: str
+    features: str
+    outcome: str
+    duration: _duration_pb2.Duration
+    processor_duration: _duration_pb2.Duration
+    chosen: bool
+    def __init__(self, rung: _Optional[str] = ..., features: _Optional[str] = ..., outcome: _Optional[str] = ..., duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., processor_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., chosen: bool = ...) -> None: ...
 
 class ReferenceUse(_message.Message):
     __slots__ = ("name", "match_count", "inlier_count", "similarity")

@@ -22,6 +22,18 @@ from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.scheduling import Ending, Observer, Refusal, StageLoad
 from mapless_server.security import ENDLESS_METHODS
 
+from .buckets import (
+    BATCH_BUCKETS,
+    CALL_BUCKETS,
+    DEVIATION_BUCKETS,
+    INLIER_BUCKETS,
+    LAG_BUCKETS,
+    PIXEL_BUCKETS,
+    RADIUS_BUCKETS,
+    RATIO_BUCKETS,
+    STAGE_BUCKETS,
+    WAIT_BUCKETS,
+)
 from .scraped import Scraped
 
 STAGES = ("prepare", "coarse", "refine", "join", "describe", "retrieve", "audit", "coverage")
@@ -67,22 +79,6 @@ WAITING = {
 LOCALIZED = "localized"
 """The outcome of an answer that is a pose."""
 
-CALL_BUCKETS = (0.01, 0.025, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8, 1, 1.5, 2, 3, 5, 10, 30)
-"""Seconds; an edge at each likely service level, and at the default deadline."""
-WAIT_BUCKETS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5)
-STAGE_BUCKETS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10)
-LAG_BUCKETS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5)
-"""Seconds; the event loop is never to be blocked for longer than 0.02."""
-BATCH_BUCKETS = (1, 2, 4, 8, 16, 32, 64)
-INLIER_BUCKETS = (10, 20, 30, 50, 75, 100, 150, 200, 300, 500, 1000, 2000)
-"""50: below, stronger features are tried."""
-RATIO_BUCKETS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1)
-PIXEL_BUCKETS = (0.1, 0.2, 0.3, 0.5, 0.75, 1, 1.5, 2, 3, 4)
-DEVIATION_BUCKETS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
-"""0.05: the scale's gate."""
-RADIUS_BUCKETS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5)
-"""Metres; 0.2: above, a pose is doubtful."""
-
 _CODES = (
     *("OK", "CANCELLED", "INVALID_ARGUMENT", "DEADLINE_EXCEEDED", "NOT_FOUND", "ALREADY_EXISTS", "PERMISSION_DENIED"),
     *("RESOURCE_EXHAUSTED", "INTERNAL", "UNAVAILABLE", "DATA_LOSS", "UNAUTHENTICATED"),
@@ -91,6 +87,9 @@ _OTHER = "other"
 _MAX_CHILDREN = 64
 """Far above the number of stages and operations. There may be more buckets, of which there is one for every number of
 references and size of image: further ones are counted together, as "other"."""
+
+_MAX_ATTEMPTS = 1000
+"""Above the number of rungs times that of outcomes."""
 
 M = TypeVar("M", bound=MetricWrapperBase)
 
@@ -108,10 +107,10 @@ class Registry(CollectorRegistry):
 class _Children(Generic[M]):
     """The children of a metric by label values, limited in number; a dict, because every call looks up some."""
 
-    def __init__(self, metric: M, known: Iterable[tuple[str, ...]] = ()) -> None:
+    def __init__(self, metric: M, known: Iterable[tuple[str, ...]] = (), unknown: int = _MAX_CHILDREN) -> None:
         self._metric = metric
         self._children = {values: metric.labels(*values) for values in known}
-        self._limit = len(self._children) + _MAX_CHILDREN
+        self._limit = len(self._children) + unknown
 
     def __call__(self, *values: str) -> M:
         child = self._children.get(values)
@@ -216,6 +215,10 @@ class Metrics(Observer, BackgroundObserver):
     def tracked(self, suffices: bool) -> None:
         """A query has a pose prior that may say which references are near; whether these sufficed."""
         self._tracking("tracked" if suffices else "searched").inc()
+
+    def attempted(self, rung: str, outcome: str) -> None:
+        """An attempt at an answered query's pose ended."""
+        self._attempts(rung, outcome).inc()
 
     def answered_coarsely(self, seconds: float) -> None:
         """A call got a coarse answer, to be refined, this long after it arrived."""
@@ -345,6 +348,8 @@ class Metrics(Observer, BackgroundObserver):
         self._outcomes = {LOCALIZED, *(reason.value for reason in RejectionReason)}
         answers = self._counter("mapless_answers", "Answers, by outcome.", ["outcome"])
         self._answers = _Children(answers, [(outcome,) for outcome in sorted(self._outcomes)])
+        attempts = self._counter("mapless_attempts", "Attempts at the poses of answered queries.", ["rung", "outcome"])
+        self._attempts = _Children(attempts, unknown=_MAX_ATTEMPTS)
         self._stage_seconds = _Children(
             histogram("mapless_stage_seconds", "Time of a stage of the method.", STAGE_BUCKETS, ["stage", "tier"])
         )

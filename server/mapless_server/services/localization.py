@@ -242,6 +242,8 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         """Reports an answer, a rejection or the message of any localization, to the log and the metrics."""
         for result in results:
             self._metrics.stages(result.stage_seconds)
+            for attempt in result.attempts:
+                self._metrics.attempted(attempt.rung, attempt.outcome)
             if TRACK in result.stage_seconds:
                 self._metrics.tracked(result.is_tracked)
         if isinstance(outcome, Rejection):

@@ -91,6 +91,7 @@ def _essence(response: Any) -> Any:
             "queue_duration",
             "total_duration",
             "processor_duration",
+            "attempts",
             "server_version",
             "captured",
         ):

@@ -306,6 +306,10 @@ def diagnostics_to_message(result: Result, options: LocalizeOptions) -> pb.Diagn
     message.references.extend(_reference_uses(result))
     for stage, seconds in result.stage_seconds.items():
         message.stages.add(stage=stage).duration.FromNanoseconds(round(1e9 * seconds))
+    for it in result.attempts:
+        attempt = message.attempts.add(rung=it.rung, features=it.features, outcome=it.outcome, chosen=it.is_chosen)
+        attempt.duration.FromNanoseconds(round(1e9 * it.seconds))
+        attempt.processor_duration.FromNanoseconds(round(1e9 * it.processor_s))
     return message
 
 
