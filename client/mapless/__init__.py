@@ -10,7 +10,8 @@ localizes a photograph with the server of MAPLESS_ADDRESS (default localhost:500
 
 has all calls of the interface; `mapless.aio.Client` is the same for asyncio.
 
-Begin with `Client` (client.py) and its calls (calls/), which return the values of answers.py, groups.py and results.py.
+Begin with `Client` (client.py) and its calls (calls/), which return the values of answers.py, groups.py
+and results.py; diagnostics.py has what they were computed from.
 geometry.py states the conventions of frames and units. connection.py has retries and deadlines, wire.py and messages.py
 the conversion between values and messages, report/ the HTML report of an answer, cli/ the command `mapless`.
 """
@@ -18,21 +19,17 @@ the conversion between values and messages, report/ the HTML report of an answer
 from . import aio
 from .answers import (
     Accuracy,
-    Attempt,
-    Debug,
-    Diagnostics,
     FramedPose,
     Hint,
     Hypothesis,
     IntrinsicsCheck,
     LocalizationResult,
     PriorCheck,
-    ReferenceUse,
     Rejected,
-    ScaleEstimate,
 )
 from .cameras import read_camera, read_cameras, read_pose
 from .client import Client
+from .diagnostics import Attempt, Debug, Diagnostics, ReferenceUse, ScaleEstimate
 from .errors import (
     AlreadyExists,
     DataLoss,

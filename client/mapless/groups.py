@@ -3,8 +3,9 @@
 from dataclasses import dataclass, field
 from datetime import datetime
 
-from .answers import Accuracy, Diagnostics, Hint, Hypothesis, PriorCheck, pose_lines, rejection_text
+from .answers import Accuracy, Hint, Hypothesis, PriorCheck, pose_lines, rejection_text
 from .axes import Axes, pose_to
+from .diagnostics import Diagnostics
 from .geodesy import GeoPose
 from .geometry import Array, Camera, RigidTransform, Similarity
 from .priors import Priors

@@ -14,7 +14,8 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 import numpy as np
 
 from . import names, wire
-from .answers import Accuracy, Attempt, Debug, Diagnostics, LocalizationResult, Rejected
+from .answers import Accuracy, LocalizationResult, Rejected
+from .diagnostics import Attempt, Debug, Diagnostics
 from .geodesy import Datum, GeoPose
 from .geometry import Array, Camera, Quaternion, RigidTransform, Similarity
 from .groups import GroupRejected, ImageReport, RigLocalization, SequenceLocalization

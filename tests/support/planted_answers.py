@@ -5,7 +5,8 @@ from datetime import datetime, timezone
 
 import numpy as np
 
-from mapless.answers import Accuracy, Debug, Diagnostics, Hint, LocalizationResult, PriorCheck, ReferenceUse, Rejected
+from mapless.answers import Accuracy, Hint, LocalizationResult, PriorCheck, Rejected
+from mapless.diagnostics import Debug, Diagnostics, ReferenceUse
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless.lenses import RadialTangential
 

@@ -15,7 +15,7 @@ from rich.console import Console
 from support import corner
 
 from mapless import Camera, Client, LocalizationResult, Rejected, RigidTransform
-from mapless.answers import Debug, Diagnostics, ReferenceUse
+from mapless.diagnostics import Debug, Diagnostics, ReferenceUse
 from mapless_server.method.features.extractors import SiftExtractor
 from mapless_server.method.features.nearest import mutual_matches
 from mapless_tools.child import ChildServer

@@ -15,7 +15,8 @@ from support.images import encode
 from typer.testing import CliRunner
 
 from mapless import Datum, Quaternion, Reference, Scene
-from mapless.answers import Accuracy, Debug, Diagnostics, Hint, Hypothesis, LocalizationResult, ReferenceUse, Rejected
+from mapless.answers import Accuracy, Hint, Hypothesis, LocalizationResult, Rejected
+from mapless.diagnostics import Debug, Diagnostics, ReferenceUse
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_tools.cli.app import app
 from mapless_tools.view.drawing import ellipsoid

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.answers import Debug, ReferenceUse
+from mapless.diagnostics import Debug, ReferenceUse
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless.results import Reference
 

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..answers import Diagnostics, LocalizationResult, PriorCheck, Rejected
+from ..answers import LocalizationResult, PriorCheck, Rejected
+from ..diagnostics import Diagnostics
 from ..geometry import Array, Camera, RigidTransform
 from ..lenses import lens_model_of
 from .markup import UNKNOWN, angle, duration, length, reference_id, section, table, text

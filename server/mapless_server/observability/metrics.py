@@ -9,12 +9,9 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
-from typing import Generic, TypeVar
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, GCCollector, Histogram, PlatformCollector
+from prometheus_client import Counter, Gauge, GCCollector, Histogram, PlatformCollector
 from prometheus_client import ProcessCollector as ProcessMetrics
-from prometheus_client.metrics import MetricWrapperBase
-from prometheus_client.metrics_core import Metric
 
 from mapless.v1 import localization_service_pb2, reference_service_pb2
 from mapless_server.method.rejection import RejectionReason
@@ -35,6 +32,7 @@ from .buckets import (
     WAIT_BUCKETS,
 )
 from .scraped import Scraped
+from .series import OTHER, Children, Registry
 
 STAGES = ("prepare", "coarse", "refine", "join", "describe", "retrieve", "audit", "coverage")
 """Stages of the queue."""
@@ -83,42 +81,8 @@ _CODES = (
     *("OK", "CANCELLED", "INVALID_ARGUMENT", "DEADLINE_EXCEEDED", "NOT_FOUND", "ALREADY_EXISTS", "PERMISSION_DENIED"),
     *("RESOURCE_EXHAUSTED", "INTERNAL", "UNAVAILABLE", "DATA_LOSS", "UNAUTHENTICATED"),
 )
-_OTHER = "other"
-_MAX_CHILDREN = 64
-"""Far above the number of stages and operations. There may be more buckets, of which there is one for every number of
-references and size of image: further ones are counted together, as "other"."""
-
 _MAX_ATTEMPTS = 1000
 """Above the number of rungs times that of outcomes."""
-
-M = TypeVar("M", bound=MetricWrapperBase)
-
-
-class Registry(CollectorRegistry):
-    """A registry without the creation times of series, which would double their number."""
-
-    def collect(self) -> Iterable[Metric]:
-        """Implements Collector."""
-        for family in super().collect():
-            family.samples = [sample for sample in family.samples if not sample.name.endswith("_created")]
-            yield family
-
-
-class _Children(Generic[M]):
-    """The children of a metric by label values, limited in number; a dict, because every call looks up some."""
-
-    def __init__(self, metric: M, known: Iterable[tuple[str, ...]] = (), unknown: int = _MAX_CHILDREN) -> None:
-        self._metric = metric
-        self._children = {values: metric.labels(*values) for values in known}
-        self._limit = len(self._children) + unknown
-
-    def __call__(self, *values: str) -> M:
-        child = self._children.get(values)
-        if child is None:
-            if len(self._children) >= self._limit:
-                values = (_OTHER,) * len(values)
-            child = self._children[values] = self._metric.labels(*values)
-        return child
 
 
 class Metrics(Observer, BackgroundObserver):
@@ -149,11 +113,11 @@ class Metrics(Observer, BackgroundObserver):
 
     def call_started(self, method: str) -> None:
         """A call arrived; `method` is "/package.Service/Method"."""
-        self._started(*self._methods.get(method, (_OTHER, _OTHER))).inc()
+        self._started(*self._methods.get(method, (OTHER, OTHER))).inc()
 
     def call_handled(self, method: str, code: str, seconds: float, trace_id: str = "") -> None:
         """A call ended with a gRPC status; the trace's id becomes the exemplar."""
-        service_and_name = self._methods.get(method, (_OTHER, _OTHER))
+        service_and_name = self._methods.get(method, (OTHER, OTHER))
         self._handled(*service_and_name, code).inc()
         if method in ENDLESS_METHODS:
             return  # it lasts as long as its caller watches, which is no latency
@@ -244,7 +208,7 @@ class Metrics(Observer, BackgroundObserver):
             scale_deviation: relative deviation of the scaled trajectory.
             accuracy_radius_m: the reported 68 % radius.
         """
-        self._answers(outcome if outcome in self._outcomes else _OTHER).inc()
+        self._answers(outcome if outcome in self._outcomes else OTHER).inc()
         _observe(self._inliers, inlier_count)
         if match_count and inlier_count is not None:
             _observe(self._inlier_ratio, inlier_count / match_count)
@@ -312,12 +276,12 @@ class Metrics(Observer, BackgroundObserver):
         known = list(self._methods.values())
         finite = [labelled for method, labelled in self._methods.items() if method not in ENDLESS_METHODS]
         codes = [(*method, code) for method in known for code in _CODES]
-        self._started = _Children(self._counter("grpc_server_started", "Calls that arrived.", labels), known)
+        self._started = Children(self._counter("grpc_server_started", "Calls that arrived.", labels), known)
         handled = self._counter("grpc_server_handled", "Calls that ended, by status.", [*labels, "grpc_code"])
-        self._handled = _Children(handled, codes)
+        self._handled = Children(handled, codes)
         text = "Time from arrival to answer; of endless streams none."
         handling = self._histogram("grpc_server_handling_seconds", text, CALL_BUCKETS, labels)
-        self._handling = _Children(handling, finite)
+        self._handling = Children(handling, finite)
 
     def _make_queue_metrics(self) -> None:
         stage = ["stage"]
@@ -326,36 +290,36 @@ class Metrics(Observer, BackgroundObserver):
         self._admitted = counter("mapless_admitted", "Jobs admitted to the queue.")
         self._admitted_cost = counter("mapless_admitted_cost_seconds", "Computing time predicted for admitted jobs.")
         refused = counter("mapless_admission_rejected", "Jobs not admitted, by reason.", ["reason"])
-        self._refused = _Children(refused, [(reason.value,) for reason in Refusal])
+        self._refused = Children(refused, [(reason.value,) for reason in Refusal])
         waited = histogram("mapless_queue_wait_seconds", "Time that jobs waited for a stage.", WAIT_BUCKETS, stage)
-        self._waited = _Children(waited, stages)
+        self._waited = Children(waited, stages)
         self._depth = gauge("mapless_queue_depth", "Jobs that wait.", stage)
         self._cost = gauge("mapless_queue_cost_seconds", "Computing time predicted for jobs that wait.", stage)
         self._inflight = gauge("mapless_inflight", "Jobs that are computed.", stage)
         self.watch_queue(lambda _: StageLoad(0, 0.0, 0))
         ended = counter("mapless_jobs_terminated", "Admitted jobs that ended.", ["stage", "outcome"])
-        self._ended = _Children(ended, [(name, ending.value) for name in STAGES for ending in Ending])
-        self._batch_size = _Children(histogram("mapless_batch_size", "Jobs in a batch.", BATCH_BUCKETS, stage), stages)
+        self._ended = Children(ended, [(name, ending.value) for name in STAGES for ending in Ending])
+        self._batch_size = Children(histogram("mapless_batch_size", "Jobs in a batch.", BATCH_BUCKETS, stage), stages)
         seconds = histogram("mapless_batch_seconds", "Computing time of a batch.", STAGE_BUCKETS, stage)
-        self._batch_seconds = _Children(seconds, stages)
-        self._batches = _Children(counter("mapless_batches", "Batches, by shape.", ["stage", "bucket"]))
+        self._batch_seconds = Children(seconds, stages)
+        self._batches = Children(counter("mapless_batches", "Batches, by shape.", ["stage", "bucket"]))
         busy = counter("mapless_busy_seconds", "Time in which the device or a worker computed.", stage)
-        self._busy = _Children(busy, stages)
+        self._busy = Children(busy, stages)
         self._heartbeat = gauge("mapless_scheduler_heartbeat_timestamp_seconds", "When the scheduler was last alive.")
 
     def _make_answer_metrics(self) -> None:
         histogram = self._histogram
         self._outcomes = {LOCALIZED, *(reason.value for reason in RejectionReason)}
         answers = self._counter("mapless_answers", "Answers, by outcome.", ["outcome"])
-        self._answers = _Children(answers, [(outcome,) for outcome in sorted(self._outcomes)])
+        self._answers = Children(answers, [(outcome,) for outcome in sorted(self._outcomes)])
         attempts = self._counter("mapless_attempts", "Attempts at the poses of answered queries.", ["rung", "outcome"])
-        self._attempts = _Children(attempts, unknown=_MAX_ATTEMPTS)
-        self._stage_seconds = _Children(
+        self._attempts = Children(attempts, unknown=_MAX_ATTEMPTS)
+        self._stage_seconds = Children(
             histogram("mapless_stage_seconds", "Time of a stage of the method.", STAGE_BUCKETS, ["stage", "tier"])
         )
         text = "Queries with a pose prior that may say which references are near: tracked, or searched in full."
         tracking = self._counter("mapless_tracking", text, ["outcome"])
-        self._tracking = _Children(tracking, [("tracked",), ("searched",)])
+        self._tracking = Children(tracking, [("tracked",), ("searched",)])
         self._coarse_answer = histogram(
             "mapless_coarse_answer_seconds", "Time from arrival to a coarse answer that is to be refined.", CALL_BUCKETS
         )
@@ -375,7 +339,7 @@ class Metrics(Observer, BackgroundObserver):
         counter, gauge, histogram = self._counter, self._gauge, self._histogram
         self._lag = histogram("mapless_event_loop_lag_seconds", "How late timers of the loop ran.", LAG_BUCKETS)
         stored = histogram("mapless_store_op_seconds", "Time of the store's operations.", STAGE_BUCKETS, ["op"])
-        self._store_seconds = _Children(stored)
+        self._store_seconds = Children(stored)
         self._store_errors = counter("mapless_store_errors", "Operations of the store that failed by a fault of ours.")
         self._counted = {
             name: counter(f"mapless_{name}", text, [label] if label else ())

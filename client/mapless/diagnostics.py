@@ -1,0 +1,126 @@
+"""What an answer was computed from: references, matches, attempts, software and times."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .geometry import Array
+
+
+@dataclass(frozen=True)
+class ReferenceUse:
+    """What one reference contributes: its matches with the photograph, and how many of them are inliers of the pose.
+
+    `similarity` is the cosine similarity to the photograph, -1 to 1, if the server chose the reference; else 0.
+    """
+
+    name: str
+    match_count: int
+    inlier_count: int
+    similarity: float = 0.0
+
+
+@dataclass(frozen=True)
+class ScaleEstimate:
+    """The reconstruction's metric scale.
+
+    Attributes:
+        metres_per_unit: the scale.
+        stage: how it was estimated, "TRIANGULATION" or "TRAJECTORY".
+        deviation: relative deviation of the scaled camera trajectory's radius from the true one.
+    """
+
+    metres_per_unit: float
+    stage: str
+    deviation: float
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One attempt at the pose of a photograph.
+
+    Attributes:
+        rung: what was done differently from the other attempts, "wide" for instance.
+        features: the local features used.
+        outcome: "localized", the reason of its rejection, such as "too_few_matches", or how it ended without a verdict:
+            "unfinished", "out_of_memory" or "failed".
+        duration_s: computing time, seconds.
+        processor_s: processor time, seconds.
+        chosen: whether the answer came from it.
+    """
+
+    rung: str
+    features: str
+    outcome: str
+    duration_s: float
+    processor_s: float
+    chosen: bool = False
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """What an answer was computed from, by what software, and in what time.
+
+    Attributes:
+        request_id: identifies the call in the server's log.
+        backend, weights_sha256, features, variant, store_generation, server_version: software, options and data used.
+        references: the references used, in the order given or chosen.
+        scale: None if its stage was not reached.
+        stage_s: seconds by stage, in order.
+        queue_s, total_s: time in the queue and total time in the server, seconds.
+        processed_width_px, processed_height_px: size of the processed image.
+        retrieval: descriptor that chose the references; empty if they were used as given; "pose-prior" if the
+            photograph was tracked.
+        captured: whether the server keeps the call for a time, including the photograph.
+        processor_s: processor time of the server's own threads for this photograph, seconds.
+        stationary_keypoint_count: keypoints that were left out because they are fixed to the camera, such as a bonnet.
+        attempts: the attempts that were made, in order; none of a server older than 0.4.
+    """
+
+    request_id: str
+    backend: str
+    weights_sha256: str
+    features: str
+    variant: str
+    store_generation: int
+    references: tuple[ReferenceUse, ...]
+    scale: ScaleEstimate | None
+    stage_s: Mapping[str, float]
+    queue_s: float
+    total_s: float
+    processed_width_px: int
+    processed_height_px: int
+    server_version: str
+    retrieval: str = ""
+    captured: bool = False
+    processor_s: float = 0.0
+    stationary_keypoint_count: int = 0
+    attempts: tuple[Attempt, ...] = ()
+
+    @property
+    def is_tracked(self) -> bool:
+        """Whether the references nearest to the pose prior gave the answer, without a search."""
+        return self.retrieval == "pose-prior"
+
+
+@dataclass(frozen=True, eq=False)
+class Debug:
+    """The 2D-3D matches that support a pose; pixels are those of the original photographs.
+
+    Attributes:
+        query_px: (M, 2) keypoints in the photograph.
+        x_in_world: (M, 3) the points, metres.
+        is_inlier: (M,) whether the match agrees with the pose.
+        error_px: (M,) reprojection errors, pixels of the processed image; NaN if undefined.
+        reference: (M,) index into `Diagnostics.references` of a reference that shows the point.
+        reference_px: (M, 2) the point's pixel in that reference.
+    """
+
+    query_px: Array
+    x_in_world: Array
+    is_inlier: NDArray[np.bool_]
+    error_px: Array
+    reference: NDArray[np.intp]
+    reference_px: Array
