@@ -96,15 +96,16 @@ def mirrored(of: PlaceOf) -> Iterator[Case]:
 
 def turned(of: PlaceOf) -> Iterator[Case]:
     """Rasters that are turned by 90, 180 and 270 degrees, with their intrinsics."""
-    for folder, references in [(KITCHEN, 10), (LOCKERS, 10), (FOUNTAIN, 5), (MEETING, 10)]:
-        place = of(folder, references)
-        for frame in place.queries(2):
+    places = [of(*it) for it in ((KITCHEN, 10), (LOCKERS, 10), (FOUNTAIN, 5), (MEETING, 10))]
+    asked = [(place, frame) for place in places for frame in place.queries(2)]
+    for quarters in (1, 2, 3):
+        for place, frame in asked:
             camera, pose = frame.camera, frame.world_from_camera
-            for quarters in (1, 2, 3):
+            for _ in range(quarters):
                 camera, pose = quarter_turn(camera, pose)
-                case = _case("turned", place, frame, Expected.RIGHT_OR_REJECTED, f"turned by {90 * quarters}")
-                image = _changed(frame, lambda pixels, by=quarters: np.rot90(pixels, by))
-                yield replace(case, image=image, camera=camera, true_pose=pose)
+            case = _case("turned", place, frame, Expected.RIGHT_OR_REJECTED, f"turned by {90 * quarters}")
+            image = _changed(frame, lambda pixels, by=quarters: np.rot90(pixels, by))
+            yield replace(case, image=image, camera=camera, true_pose=pose)
 
 
 def quarter_turn(camera: Camera, world_from_camera: RigidTransform) -> tuple[Camera, RigidTransform]:
