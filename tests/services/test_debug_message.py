@@ -15,7 +15,6 @@ from mapless.lenses import Fisheye, RadialTangential
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.method.bundle.estimate import PoseEstimate, PoseStage, Support
 from mapless_server.method.features.views import Photograph, PosedView, View
-from mapless_server.method.optim.perturbation import reprojection_errors_px
 from mapless_server.method.pose.pnp import PnpOptions
 from mapless_server.services.messages.debug import MAX_MATCHES, debug_to_message
 
@@ -48,9 +47,7 @@ def support_of(
     references = tuple(PosedView(r.key, r.name, sent(r.view, camera), r.world_from_camera) for r in scene.references)
     estimate = None
     if world_from_query is not None:
-        points = structure.x_in_world[matches.point]
-        pixels = query.features.keypoints[matches.keypoint].astype(float)
-        errors = reprojection_errors_px(query.camera, world_from_query, points, pixels)
+        errors = matches.seen(query, structure.x_in_world).errors_px(world_from_query)
         inliers = errors < PnpOptions().inlier_px
         estimate = PoseEstimate(world_from_query, PoseStage.REFINED, inliers, errors, np.eye(6))
     return Support(query, references, structure, matches, estimate, ORIGIN)

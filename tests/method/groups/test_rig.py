@@ -25,7 +25,7 @@ from mapless_server.method.optim.perturbation import rotation_vector
 from mapless_server.method.pose.generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
 from mapless_server.method.pose.pnp import PnpOptions
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
-from mapless_server.method.structure.model import MetricScale, ScaleStage
+from mapless_server.method.structure.model import MetricScale, PixelPoints, ScaleStage
 
 WORLD_FROM_RIG = RigidTransform(rotation_from_vector([0.1, 0.2, -0.1]), np.array([0.3, 0.1, -3.8]))
 CAMERAS = looking((-0.5, 0, -4), (0.2, -0.1, -4.2), (0.6, 0.2, -3.9))
@@ -317,7 +317,7 @@ def planted(
         wrong = random.permutation(count)[: round(wrong_share * count)]
         pixels[wrong] = random.uniform([0, 0], [CAMERA.width_px, CAMERA.height_px], (len(wrong), 2))
         fixed = RigidTransform(rig_from_camera.rotation, rig_from_camera.translation / unit)
-        cameras.append(CameraMatches(CAMERA, fixed, pixels, x_in_world))
+        cameras.append(CameraMatches(PixelPoints(CAMERA, x_in_world, pixels), fixed))
     return cameras
 
 

@@ -270,13 +270,12 @@ def test_halves_move_by_the_steps_of_each_alone() -> None:
     support = support_of()
     assert support.estimate is not None
     matches, camera = support.matches, support.query.camera
-    points = support.structure.x_in_world[matches.point]
-    pixels = support.query.features.keypoints[matches.keypoint].astype(np.float64)
+    seen = matches.seen(support.query, support.structure.x_in_world)
     pose, random = support.estimate.world_from_camera, np.random.default_rng(0)
     halves = random.random((3, len(matches))) < 0.5
-    shifts = halves_of._shifts_nearby(camera, points, pixels, halves, pose, DISTANCE_M)
-    in_camera = pose.inverse().apply(points)
-    jacobian, residual = np.moveaxis(pose_jacobian(camera, in_camera), 2, 0), camera.project(in_camera) - pixels
+    shifts = halves_of._shifts_nearby(seen, halves, pose, DISTANCE_M)
+    in_camera = pose.inverse().apply(seen.x_in_world)
+    jacobian, residual = np.moveaxis(pose_jacobian(camera, in_camera), 2, 0), camera.project(in_camera) - seen.pixels
     for half, shift in zip(halves & (np.linalg.norm(residual, axis=1) < halves_of.PNP.inlier_px), shifts, strict=True):
         motion = np.zeros(6)
         for _ in range(halves_of.LINEAR_STEPS):
@@ -334,7 +333,8 @@ def test_halves_of_references_with_wrong_poses_disagree() -> None:
     support = solved(scene)
     votes = votes_of(support, true_correspondences(scene).query_matches)
     shift = np.array([1.0, 0.0, 0.0])
-    moved = replace(votes, x_in_world=votes.x_in_world + np.where((votes.reference % 2 == 0)[:, None], shift, 0.0))
+    shifted = votes.seen.x_in_world + np.where((votes.reference % 2 == 0)[:, None], shift, 0.0)
+    moved = replace(votes, seen=replace(votes.seen, x_in_world=shifted))
     assert disagreement_of_references(support, votes, DISTANCE_M) < 0.01
     assert disagreement_of_references(support, moved, DISTANCE_M) > 0.05
 

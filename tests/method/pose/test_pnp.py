@@ -9,10 +9,10 @@ from support.scenes import CAMERA, random_for
 
 from mapless.geometry import RigidTransform
 from mapless_server.method.bundle.estimate import PoseEstimate, PoseStage
-from mapless_server.method.optim.perturbation import reprojection_errors_px
 from mapless_server.method.pose import pnp
 from mapless_server.method.pose.pnp import PnpOptions, ransac, solve_pose
 from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.structure.model import PixelPoints
 
 
 def solve(problem: Problem, initial: RigidTransform = POSE, options: PnpOptions | None = None) -> PoseEstimate:
@@ -54,10 +54,10 @@ def test_many_matches_are_thinned_not_cut() -> None:
 def test_a_sample_gives_the_pose_of_all_matches(outlier_share: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where too few of the sample agree, RANSAC sees all matches: the same bits."""
     _, structure, _ = problem = planted(random_for("sample", outlier_share), 400, 0.5, outlier_share)
-    pixels = problem[0].features.keypoints.astype(float)
-    fast = ransac(CAMERA, structure.x_in_world, pixels, None, PnpOptions())
+    seen = PixelPoints(CAMERA, structure.x_in_world, problem[0].features.pixels())
+    fast = ransac(seen, None, PnpOptions())
     monkeypatch.setattr(pnp, "SAMPLE", 10**9)
-    plain = ransac(CAMERA, structure.x_in_world, pixels, None, PnpOptions())
+    plain = ransac(seen, None, PnpOptions())
     assert fast is not None
     assert plain is not None
     assert_pose_close(fast, plain, metres=1e-3, degrees=0.01)
@@ -131,7 +131,7 @@ def test_poselib_has_the_options_that_are_passed(monkeypatch: pytest.MonkeyPatch
         return poselib.CameraPose(), {}
 
     monkeypatch.setattr(poselib, "estimate_absolute_pose", spy)
-    ransac(CAMERA, np.zeros((6, 3)), np.zeros((6, 2)), None, PnpOptions())
+    ransac(PixelPoints(CAMERA, np.zeros((6, 3)), np.zeros((6, 2))), None, PnpOptions())
     assert len(given) == 2
     assert given[0].keys() <= poselib.RansacOptions({}).keys()
     assert given[1].keys() <= poselib.BundleOptions({}).keys()
@@ -141,18 +141,18 @@ def test_ransac_starts_from_the_initial_pose() -> None:
     """So few iterations find a pose among 90 % wrong matches only when they begin at it."""
     view, structure, _ = planted(random_for("start"), 200, 0.5, outlier_share=0.9)
     options = PnpOptions(min_iterations=1, max_iterations=1)
-    pixels = view.features.keypoints.astype(float)
-    begun = ransac(CAMERA, structure.x_in_world, pixels, POSE, options)
+    begun = ransac(PixelPoints(CAMERA, structure.x_in_world, view.features.pixels()), POSE, options)
     assert begun is not None
     assert_pose_close(begun, POSE, metres=0.05, degrees=0.5)
 
 
 def test_a_pose_that_is_not_finite_is_none() -> None:
     _, structure, _ = at_one_point(20)
-    assert ransac(CAMERA, structure.x_in_world, np.full((20, 2), 300.0), None, PnpOptions()) is None
+    assert ransac(PixelPoints(CAMERA, structure.x_in_world, np.full((20, 2), 300.0)), None, PnpOptions()) is None
 
 
 def test_reprojection_errors_are_nan_behind_the_camera() -> None:
     x_in_world = POSE.apply(np.array([[0.0, 0.0, 2.0], [0.1, 0.0, 2.0], [0.0, 0.0, -2.0]]))
-    errors_px = reprojection_errors_px(CAMERA, POSE, x_in_world, np.array([[479.5, 359.5], [479.5, 359.5], [0, 0]]))
+    seen = PixelPoints(CAMERA, x_in_world, np.array([[479.5, 359.5], [479.5, 359.5], [0, 0]]))
+    errors_px = seen.errors_px(POSE)
     np.testing.assert_allclose(errors_px, [0.0, 0.1 / 2 * 816.0, np.nan], atol=1e-9)

@@ -22,7 +22,7 @@ from mapless_server.method.optim.perturbation import moved
 from mapless_server.method.pose import with_priors as informed
 from mapless_server.method.pose.pnp import PnpOptions, solve_pose
 from mapless_server.method.pose.with_priors import ransac_with_gravity, refine_pose, solve_pairs
-from mapless_server.method.structure.model import PointMatches, Structure
+from mapless_server.method.structure.model import PixelPoints, PointMatches, Structure
 
 POSE = RigidTransform(rotation_from_vector([0.2, -0.3, 0.1]), np.array([0.4, -0.2, -4.0]))
 DOWNS = {"y down": [0, 1, 0], "y up": [0, -1, 0], "z up": [0, 0, -1], "x up": [-1, 0, 0], "askew": [0.6, 0.0, 0.8]}
@@ -84,7 +84,7 @@ def test_two_matches_of_one_point_have_no_pose() -> None:
 def test_the_planted_pose_is_found_with_gravity_a_degree_off(wrong: int) -> None:
     for seed in range(4):
         x_in_world, pixels = seen(random_for("ransac", wrong, seed), 100, wrong=wrong)
-        poses = ransac_with_gravity(CAMERA, x_in_world, pixels, Priors(gravity=gravity(noise_deg=1)), 4.0)
+        poses = ransac_with_gravity(PixelPoints(CAMERA, x_in_world, pixels), Priors(gravity=gravity(noise_deg=1)), 4.0)
         assert_pose_close(poses[0], POSE, metres=0.05, degrees=0.6)
 
 
@@ -108,7 +108,7 @@ def test_the_refinement_is_at_a_minimum_of_matches_and_priors() -> None:
         scale = informed.LOSS_SCALE_SIGMA**2
         return float((scale * np.log1p(squared / scale)).sum()) + informed.PRIOR_WEIGHT * priors.cost(pose)
 
-    found = refine_pose(CAMERA, x_in_world, pixels, POSE, priors, steps=MinimizeOptions(40, 1e-12))
+    found = refine_pose(PixelPoints(CAMERA, x_in_world, pixels), POSE, priors, steps=MinimizeOptions(40, 1e-12))
     for axis in np.eye(6):
         for step in (-1e-4, 1e-4):
             assert cost(moved(found, step * axis)) > cost(found)

@@ -249,6 +249,6 @@ def read_as(view: View, camera: Camera) -> View:
     """
     features, lens = view.features, replace(view.camera, distortion=view.distortion)
     if camera.distortion is not None or lens.distortion is not None:
-        pixels = lens.project(lens.rays(features.keypoints.astype(np.float64)))
+        pixels = lens.project(lens.rays(features.pixels()))
         features = replace(features, keypoints=undistort_pixels(pixels, camera).astype(np.float32))
     return replace(view, camera=camera.pinhole(), features=features, distortion=camera.distortion)

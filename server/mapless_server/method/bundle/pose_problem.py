@@ -38,7 +38,7 @@ from mapless.geometry import Array, RigidTransform
 from ..features.views import PosedView, View
 from ..optim.bounds import check_bounds
 from ..optim.optimize import MinimizeOptions, minimize
-from ..optim.perturbation import reprojection_errors_px, world_jacobian
+from ..optim.perturbation import world_jacobian
 from ..structure.model import PointMatches, Structure
 from ..structure.structure import StructureOptions, tracks_with_query
 from .bundle import BundleProblem, bundle_of
@@ -146,10 +146,8 @@ class AdjustInput:
     options: AdjustOptions
 
     def errors_px(self, world_from_query: RigidTransform, rows: slice = slice(None)) -> Array:
-        """Reprojection errors (M,) of matches at a pose, pixels; infinite behind the camera."""
-        pixels = self.query.features.keypoints[self.matches.keypoint[rows]].astype(np.float64)
-        x_in_world = self.structure.x_in_world[self.matches.point[rows]]
-        return reprojection_errors_px(self.query.camera, world_from_query, x_in_world, pixels)
+        """Reprojection errors (M,) of matches at a pose, pixels; NaN behind the camera."""
+        return self.matches.select(rows).seen(self.query, self.structure.x_in_world).errors_px(world_from_query)
 
     def with_points(self, used: NDArray[np.intp], points: Array) -> "AdjustInput":
         """Moves the points of the `used` matches to `points` (P, 3), in the order of the structure."""

@@ -15,7 +15,6 @@ from mapless.geometry import Array, RigidTransform, Similarity
 
 from ..bundle.priors import NO_PRIORS, Priors
 from ..features.views import PosedView, ReconstructedView, Reconstruction, View
-from ..optim.perturbation import reprojection_errors_px
 from ..pairs.correspond import Correspondences
 from ..pose.pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, format_false_alarms, log10_false_alarms, ransac
 from ..pose.with_priors import informed_pose
@@ -85,15 +84,13 @@ class GeometricReconstructor:
     ) -> Triangulation | Rejection:
         query, references = request.query, request.references
         matches = vote(structure, [len(r.view.features) for r in references], correspondences)
-        x_in_world = structure.x_in_world[matches.point]
-        pixels = query.features.keypoints[matches.keypoint].astype(np.float64)
-        priors = request.priors
+        seen, priors = matches.seen(query, structure.x_in_world), request.priors
         enough = len(matches) >= PNP.min_matches
-        pose = ransac(query.camera, x_in_world, pixels, None, PNP) if enough else None
+        pose = ransac(seen, None, PNP) if enough else None
         rejection, inliers = self._judge(query, structure, matches, pose, NO_PRIORS)
         without_priors = rejection
         if rejection and enough and priors:
-            informed = informed_pose(query.camera, x_in_world, pixels, pose, priors, PNP.inlier_px)
+            informed = informed_pose(seen, pose, priors, PNP.inlier_px)
             pose = informed.world_from_camera if informed else None
             rejection, inliers = self._judge(query, structure, matches, pose, priors)
         if rejection:
@@ -113,8 +110,7 @@ class GeometricReconstructor:
         if pose is None:
             message = f"the photograph matches {len(matches)} of {len(structure.x_in_world)} points of the references"
             return _no_overlap(message, matches), np.zeros(len(matches), bool)
-        x_in_world, pixels = structure.x_in_world[matches.point], query.features.keypoints[matches.keypoint]
-        inliers = reprojection_errors_px(query.camera, pose, x_in_world, pixels.astype(np.float64)) < inlier_px
+        inliers = matches.seen(query, structure.x_in_world).errors_px(pose) < inlier_px
         expected = log10_false_alarms(query.camera, matches, inliers, inlier_px) + priors.log10_chance(pose)
         if expected <= MAX_LOG10_FALSE_ALARMS:
             return None, inliers
@@ -168,7 +164,7 @@ def _map(
         np.zeros(shape, np.float32),
         local_from_world.transform_pose(world_from_camera),
     )
-    pixels = view.features.keypoints[keypoints].astype(np.float64)
+    pixels = view.features.pixels(keypoints)
     rows, columns, inside = maps.cells(pixels, view.camera)
     x_in_camera = world_from_camera.inverse().apply(points[inside])
     maps.point_map[rows[inside], columns[inside]] = local_from_world.scale * x_in_camera

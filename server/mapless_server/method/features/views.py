@@ -17,6 +17,9 @@ from mapless.lenses import Distortion, Fisheye, RadialTangential, lens_model_of
 Matches = NDArray[np.int32]
 """(M, 2): keypoint indices in the first and in the second of two views."""
 
+Rows = NDArray[np.intp] | NDArray[np.int32] | NDArray[np.bool_] | slice
+"""Which rows of an array: indices, a mask or a range."""
+
 Ignored = NDArray[np.bool_]
 """(H, W): pixels of an image that show nothing of the place, by the mask that was given with it."""
 
@@ -55,6 +58,10 @@ class Features:
     def size_bytes(self) -> int:
         """Memory of the arrays, bytes."""
         return self.keypoints.nbytes + self.descriptors.nbytes + self.sizes_px.nbytes
+
+    def pixels(self, rows: Rows = slice(None)) -> Array:
+        """Some keypoints, or all, (R, 2) in double precision."""
+        return self.keypoints[rows].astype(np.float64)
 
     def every(self, step: int) -> "Features":
         """The features 0, step, 2 step, ..."""

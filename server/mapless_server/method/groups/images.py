@@ -88,8 +88,7 @@ class MatchedImage:
 
     def camera_matches(self, rig_from_camera: RigidTransform) -> CameraMatches:
         """Returns the tracked matches as pixels and points of a camera with this pose in the rig."""
-        pixels = self.query.features.keypoints[self.tracked.keypoint].astype(np.float64)
-        return CameraMatches(self.query.camera, rig_from_camera, pixels, self.structure.x_in_world[self.tracked.point])
+        return CameraMatches(self.tracked.seen(self.query, self.structure.x_in_world), rig_from_camera)
 
     def matches_at(self, world_from_camera: RigidTransform) -> PointMatches:
         """Returns the tracked matches and those of a guided search from a pose."""

@@ -14,13 +14,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Generic
 
-import numpy as np
-
 from mapless.geometry import Array
 
 from ..bundle.priors import PriorCheck, Priors
 from ..optim.optimize import MinimizeOptions, minimize
-from ..optim.perturbation import covariance_in_world, reprojection_errors_px
+from ..optim.perturbation import covariance_in_world
 from ..structure.model import PointMatches
 from .images import MatchedImage, PosedImage
 from .problem import ADJUST, GroupProblem, GroupState, S
@@ -109,6 +107,5 @@ def adjust_jointly(
 
 def _matched(source: MatchedImage, matches: PointMatches, x_in_world: Array, state: GroupState) -> PosedImage:
     pose = state.camera_from_world(source.image).inverse()
-    pixels = source.query.features.keypoints[matches.keypoint].astype(np.float64)
-    errors_px = reprojection_errors_px(source.query.camera, pose, x_in_world[matches.point], pixels)
+    errors_px = matches.seen(source.query, x_in_world).errors_px(pose)
     return PosedImage(source, pose, matches, errors_px < ADJUST.inlier_px, errors_px)

@@ -18,7 +18,7 @@ from ..bundle.unknowns import Bundle, Poses
 from ..features.tracks import Tracks
 from ..features.views import PosedView
 from ..optim.optimize import solve_step
-from ..optim.perturbation import reprojection_errors_px, world_jacobian
+from ..optim.perturbation import world_jacobian
 from ..structure.model import PointMatches
 from ..structure.structure import tracks_with_query
 from .images import MatchedImage
@@ -89,8 +89,7 @@ class Part:
 def part_of(source: MatchedImage, matches: PointMatches, state: GroupState) -> Part:
     """Selects the part of a photograph from its matches with small errors, evenly thinned."""
     structure, pose = source.structure, state.camera_from_world(source.image).inverse()
-    pixels = source.query.features.keypoints[matches.keypoint].astype(np.float64)
-    errors_px = reprojection_errors_px(source.query.camera, pose, structure.x_in_world[matches.point], pixels)
+    errors_px = matches.seen(source.query, structure.x_in_world).errors_px(pose)
     used = np.flatnonzero(errors_px < ADJUST.max_error_px)
     used = used[:: max(1, -(-len(used) // MAX_MATCHES))]
     tracks, chosen = tracks_with_query(structure, matches.point[used], matches.keypoint[used], len(source.references))

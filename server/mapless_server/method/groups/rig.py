@@ -128,7 +128,7 @@ def _start(
 ) -> RigidTransform | Rejection:
     """Returns the pose with most inliers, from generalized PnP or from the own pose of an image."""
     cameras = [it.camera_matches(rig_from_camera[it.image]) for it in matched_images]
-    total = sum(len(camera.pixels) for camera in cameras)
+    total = sum(map(len, cameras))
     if total < PNP.min_matches:
         message = f"{total} 2D-3D matches in {len(cameras)} images, {PNP.min_matches} needed"
         return Rejection(RejectionReason.TOO_FEW_MATCHES, message)

@@ -87,14 +87,11 @@ def _matches_apart(matched: Sequence[PosedImage], distance_m: float) -> float:
     """`agreement.disagreement_of_matches` for all photographs together."""
     cameras = []
     for it, mounting in zip(matched, _mounting(matched), strict=True):
-        source, matches = it.source, it.matches
-        rows = np.flatnonzero(~matches.guided) if not matches.guided.all() else np.arange(len(matches))
-        pixels = source.query.features.keypoints[matches.keypoint[rows]].astype(np.float64)
-        x_in_world = source.structure.x_in_world[matches.point[rows]]
-        cameras.append(CameraMatches(source.query.camera, mounting, pixels, x_in_world))
+        seen = it.matches.unguided().seen(it.source.query, it.source.structure.x_in_world)
+        cameras.append(CameraMatches(seen, mounting))
 
     def half(random: np.random.Generator) -> list[NDArray[np.bool_]]:
-        return [np.asarray(random.permutation(len(it.pixels)) % 2 == 0) for it in cameras]
+        return [np.asarray(random.permutation(len(it.seen)) % 2 == 0) for it in cameras]
 
     return _median_disagreement(cameras, half, distance_m, None)
 
@@ -107,7 +104,7 @@ def _references_apart(matched: Sequence[PosedImage], distance_m: float) -> float
         source = it.source
         votes = _votes(it)
         number = np.array([names.setdefault(r.key, len(names)) for r in source.references], np.intp)
-        cameras.append(CameraMatches(source.query.camera, mounting, votes.pixels, votes.x_in_world))
+        cameras.append(CameraMatches(votes.seen, mounting))
         owners.append(number[votes.reference])
         keypoints.append(votes.keypoint)
     counts = np.bincount(np.concatenate(owners), minlength=len(names))
@@ -151,11 +148,7 @@ def _median_disagreement(
             rows = [np.flatnonzero(it) for it in halves]
             if keypoints is not None:
                 rows = [r[np.unique(k[r], return_index=True)[1]] for r, k in zip(rows, keypoints, strict=True)]
-            some = [
-                CameraMatches(it.camera, it.rig_from_camera, it.pixels[r], it.x_in_world[r])
-                for it, r in zip(cameras, rows, strict=True)
-                if len(r)
-            ]
+            some = [it[r] for it, r in zip(cameras, rows, strict=True) if len(r)]
             pose = rig_ransac(some, PNP) if sum(map(len, rows)) >= 4 else None
             centres.append(None if pose is None else pose.translation)
         first, second = centres

@@ -121,7 +121,7 @@ class _Compared:
         if pose is None and self.support.two_view is not None:
             pose = find_pose(all_matches, LINES)
         elif pose is None:
-            pose = ransac(view.camera, points, all_matches.pixels, None, PNP)
+            pose = ransac(all_matches.points, None, PNP)
         return 0.0 if pose is None else score(all_matches, pose, LINES)
 
     def scored(self, camera: Camera) -> tuple[float, Camera]:

@@ -19,15 +19,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, Camera, RigidTransform
+from mapless.geometry import Array, RigidTransform
 
 from ..bundle.estimate import Support
 from ..features.views import Matches, PosedView, View
 from ..optim.optimize import cauchy_weight
-from ..optim.perturbation import pose_jacobian, reprojection_errors_px
+from ..optim.perturbation import pose_jacobian
 from ..pose.pnp import PnpOptions, ransac
 from ..pose.two_view_matches import TwoViewMatches
-from ..structure.model import PointMatches, Structure
+from ..structure.model import PixelPoints, PointMatches, Structure
 
 MOST_POINTS = 2000
 """The shares that references find are computed from so many points, evenly thinned."""
@@ -73,21 +73,15 @@ class Votes:
     Attributes:
         reference: (V,) index of the reference.
         keypoint: (V,) index of the query's keypoint.
-        x_in_world: (V, 3) the point.
-        pixels: (V, 2) the keypoint.
+        seen: the points and the keypoints' pixels.
     """
 
     reference: NDArray[np.intp]
     keypoint: NDArray[np.intp]
-    x_in_world: Array
-    pixels: Array
+    seen: PixelPoints
 
     def __getitem__(self, rows: NDArray[np.bool_]) -> "Votes":
-        return Votes(self.reference[rows], self.keypoint[rows], self.x_in_world[rows], self.pixels[rows])
-
-    def errors_px(self, camera: Camera, world_from_camera: RigidTransform) -> Array:
-        """Distances (V,) of the points' projections from the keypoints, pixels; NaN behind the camera."""
-        return reprojection_errors_px(camera, world_from_camera, self.x_in_world, self.pixels)
+        return Votes(self.reference[rows], self.keypoint[rows], self.seen[rows])
 
     def keypoint_count(self, rows: NDArray[np.bool_]) -> int:
         """Number of different keypoints among the selected rows (V,)."""
@@ -112,24 +106,18 @@ def votes_on(
     point = point_of[offsets[reference] + pairs[:, 1]]
     known = point >= 0
     keypoint = pairs[known, 0]
-    pixels = query.features.keypoints[keypoint].astype(np.float64)
-    return Votes(reference[known], keypoint, structure.x_in_world[point[known]], pixels)
+    seen = PixelPoints(query.camera, structure.x_in_world[point[known]], query.features.pixels(keypoint))
+    return Votes(reference[known], keypoint, seen)
 
 
 def disagreement_of_matches(support: Support, distance_m: float) -> float:
     """Distance between the cameras that random halves of the matches give, as a share of `distance_m`; at most 1."""
-    matches, structure = support.matches, support.structure
-    rows = np.flatnonzero(~matches.guided)
-    if not len(rows):
-        rows = np.arange(len(matches))
-    x_in_world = structure.x_in_world[matches.point[rows]]
-    pixels = support.query.features.keypoints[matches.keypoint[rows]].astype(np.float64)
+    seen = support.matches.unguided().seen(support.query, support.structure.x_in_world)
 
     def random_half(random: np.random.Generator) -> NDArray[np.bool_]:
-        return np.asarray(random.permutation(len(rows)) % 2 == 0)
+        return np.asarray(random.permutation(len(seen)) % 2 == 0)
 
-    camera, pose = support.query.camera, _pose(support)
-    return _median_disagreement(camera, x_in_world, pixels, random_half, distance_m, pose)
+    return _median_disagreement(seen, random_half, distance_m, _pose(support))
 
 
 def disagreement_of_references(support: Support, votes: Votes, distance_m: float) -> float:
@@ -142,8 +130,7 @@ def disagreement_of_references(support: Support, votes: Votes, distance_m: float
     def half_of_votes(random: np.random.Generator) -> NDArray[np.bool_]:
         return np.asarray(half_of_references(counts, random)[votes.reference])
 
-    camera, key = support.query.camera, votes.keypoint
-    return _median_disagreement(camera, votes.x_in_world, votes.pixels, half_of_votes, distance_m, _pose(support), key)
+    return _median_disagreement(votes.seen, half_of_votes, distance_m, _pose(support), votes.keypoint)
 
 
 def half_of_references(counts: NDArray[np.intp], random: np.random.Generator) -> NDArray[np.bool_]:
@@ -162,9 +149,7 @@ def _pose(support: Support) -> RigidTransform:
 
 
 def _median_disagreement(
-    camera: Camera,
-    x_in_world: Array,
-    pixels: Array,
+    seen: PixelPoints,
     draw_half: Callable[[np.random.Generator], NDArray[np.bool_]],
     distance_m: float,
     pose: RigidTransform,
@@ -175,12 +160,12 @@ def _median_disagreement(
     firsts = np.array([draw_half(random) for _ in range(SPLITS)])
     halves = np.stack([firsts, ~firsts], axis=1).reshape(2 * SPLITS, -1)
     if keypoint is not None:
-        rows, halves = _first_of_each(keypoint, x_in_world, halves)
-        x_in_world, pixels = x_in_world[rows], pixels[rows]
-    shifts = _shifts_nearby(camera, x_in_world, pixels, halves, pose, distance_m)
+        rows, halves = _first_of_each(keypoint, seen.x_in_world, halves)
+        seen = seen[rows]
+    shifts = _shifts_nearby(seen, halves, pose, distance_m)
     for half, shift in zip(halves, shifts, strict=True):
         if np.isnan(shift[0]) and half.sum() >= 4:
-            found = ransac(camera, x_in_world[half], pixels[half], None, PNP)
+            found = ransac(seen[half], None, PNP)
             shift[:] = np.nan if found is None else found.translation - pose.translation
     apart = np.linalg.norm(shifts[::2] - shifts[1::2], axis=1) / distance_m
     return float(min(NO_AGREEMENT, statistics.median(np.nan_to_num(apart, nan=NO_AGREEMENT).tolist())))
@@ -202,28 +187,21 @@ def _first_of_each(
     return order[starts], halves & (count - (count - halves)[:, of_keypoint] == 1)
 
 
-def _shifts_nearby(
-    camera: Camera,
-    x_in_world: Array,
-    pixels: Array,
-    halves: NDArray[np.bool_],
-    pose: RigidTransform,
-    distance_m: float,
-) -> Array:
+def _shifts_nearby(seen: PixelPoints, halves: NDArray[np.bool_], pose: RigidTransform, distance_m: float) -> Array:
     """Shifts (H, 3) from a pose's centre to those of halves (H, M) of the matches; NaN where the pose is not theirs.
 
     By least squares with the weights of Cauchy's loss, as in `ransac`; residuals are linear in motions so small.
     """
     shifts = np.full((len(halves), 3), np.nan)
-    x_in_camera = pose.inverse().apply(x_in_world)
-    residual = camera.project(x_in_camera) - pixels
+    x_in_camera = pose.inverse().apply(seen.x_in_world)
+    residual = seen.camera.project(x_in_camera) - seen.pixels
     agrees: NDArray[np.bool_] = np.linalg.norm(residual, axis=1) < PNP.inlier_px
     in_half = halves[:, agrees]
     agreeing = in_half.sum(axis=1)
     chosen: NDArray[np.bool_] = (agreeing >= LEAST_AGREEING) & (agreeing > MAJORITY * halves.sum(axis=1))
     if not chosen.any():
         return shifts
-    (x, y), (right, down) = pose_jacobian(camera, x_in_camera[agrees]), residual[agrees].T
+    (x, y), (right, down) = pose_jacobian(seen.camera, x_in_camera[agrees]), residual[agrees].T
     # Of each match what its squared residual |r + J m|^2 and its normal equations at any motion m are sums of.
     products = np.concatenate([x[ROW] * x[COLUMN] + y[ROW] * y[COLUMN], right * x + down * y])
     squared, in_half = right**2 + down**2, in_half[chosen].astype(np.float64)

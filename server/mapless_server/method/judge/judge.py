@@ -257,7 +257,7 @@ def find_rival(support: Support, votes: Votes) -> tuple[Hypothesis, Hypothesis] 
     estimate, camera = support.estimate, support.query.camera
     if estimate is None:
         return None
-    errors_px = votes.errors_px(camera, estimate.world_from_camera)
+    errors_px = votes.seen.errors_px(estimate.world_from_camera)
     own = errors_px < RIVAL_PNP.inlier_px
     wanted = max(RIVAL_MIN_KEYPOINTS, int(np.ceil(RIVAL_MIN_SHARE * votes.keypoint_count(own))))
     candidates = _outliers(votes, own, ~(errors_px < AGREEING_PX), len(support.references))
@@ -270,7 +270,7 @@ def find_rival(support: Support, votes: Votes) -> tuple[Hypothesis, Hypothesis] 
     own_radii = accuracy_from_covariance(estimate.covariance)
     if not _are_apart(estimate.world_from_camera, own_radii, pose, radii):
         return None
-    theirs = votes.errors_px(camera, pose) < RIVAL_PNP.inlier_px
+    theirs = votes.seen.errors_px(pose) < RIVAL_PNP.inlier_px
     counts = [np.bincount(votes.reference[rows], minlength=len(support.references)) for rows in (own, theirs)]
     if counts[1][counts[1] > counts[0]].sum() < RIVAL_MIN_OWN_SHARE * counts[1].sum():
         return None
@@ -283,10 +283,10 @@ def find_rival(support: Support, votes: Votes) -> tuple[Hypothesis, Hypothesis] 
 
 def _second_pose(camera: Camera, votes: Votes, wanted: int) -> tuple[RigidTransform, Accuracy] | None:
     """Finds a pose with enough inliers that are not chance, and its radii."""
-    pose = ransac(camera, votes.x_in_world, votes.pixels, None, RIVAL_PNP)
+    pose = ransac(votes.seen, None, RIVAL_PNP)
     if pose is None:
         return None
-    inliers = votes.errors_px(camera, pose) < RIVAL_PNP.inlier_px
+    inliers = votes.seen.errors_px(pose) < RIVAL_PNP.inlier_px
     keypoint_count, count = len(np.unique(votes.keypoint)), votes.keypoint_count(inliers)
     # The chance of an inlier is proportional to the number of matches of a keypoint.
     disc_share = np.pi * RIVAL_PNP.inlier_px**2 / (camera.width_px * camera.height_px)
@@ -294,7 +294,7 @@ def _second_pose(camera: Camera, votes: Votes, wanted: int) -> tuple[RigidTransf
     if count < wanted or false_alarms(keypoint_count, count, chance) > RIVAL_MAX_LOG10_FALSE_ALARMS:
         return None
     # With a keypoint noise of one pixel.
-    covariance = world_covariance(pose_hessian(camera, pose, votes.x_in_world[inliers]), pose)
+    covariance = world_covariance(pose_hessian(camera, pose, votes.seen.x_in_world[inliers]), pose)
     return pose, accuracy_from_covariance(covariance)
 
 

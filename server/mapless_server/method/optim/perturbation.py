@@ -79,14 +79,6 @@ def motion_jacobian(x_in_camera: Array) -> Array:
     return jacobian
 
 
-def reprojection_errors_px(
-    camera: Camera, world_from_camera: RigidTransform, x_in_world: Array, pixels: Array
-) -> Array:
-    """Distances (M,) between pixels (M, 2) and the projections of points (M, 3); NaN for points behind the camera."""
-    projected = camera.project(world_from_camera.inverse().apply(x_in_world))
-    return np.asarray(np.linalg.norm(projected - pixels, axis=1))
-
-
 def pose_columns(ideal: Array, focal: Array, inverse_depth: Array) -> Array:
     """Derivative (2, 6, M) of projections by a left perturbation of camera_from_world, in the unit of focal lengths.
 

@@ -87,8 +87,8 @@ def fundamental_inliers(
     """
     if len(matches) < MIN_MATCHES:
         return np.zeros(len(matches), bool)
-    x_first = first.features.keypoints[matches[:, 0]].astype(np.float64)
-    x_second = second.features.keypoints[matches[:, 1]].astype(np.float64)
+    x_first = first.features.pixels(matches[:, 0])
+    x_second = second.features.pixels(matches[:, 1])
     options = {"max_epipolar_error": FUNDAMENTAL_PX}
     if iterations is not None:
         options |= {"min_iterations": iterations[0], "max_iterations": iterations[1]}

@@ -19,9 +19,10 @@ import numpy as np
 import poselib
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, Camera, RigidTransform, Similarity
+from mapless.geometry import Array, RigidTransform, Similarity
 
-from ..optim.perturbation import reprojection_errors_px
+from ..features.views import Rows
+from ..structure.model import PixelPoints
 from .pnp import PnpOptions, poselib_camera, poselib_pose
 
 _libc = ctypes.CDLL(None)
@@ -33,25 +34,22 @@ class CameraMatches:
     """One camera of a group, with its matches.
 
     Attributes:
-        camera: the pinhole camera.
+        seen: its matches, M.
         rig_from_camera: its pose in the rig; metres, or units of the rig's frame.
-        pixels: (M, 2) of the matches.
-        x_in_world: (M, 3) metres.
     """
 
-    camera: Camera
+    seen: PixelPoints
     rig_from_camera: RigidTransform
-    pixels: Array
-    x_in_world: Array
 
     def inliers(self, world_from_rig: RigidTransform | Similarity, inlier_px: float) -> NDArray[np.bool_]:
         """Which of the matches (M,) are inliers of a pose."""
-        pose = camera_in_world(world_from_rig, self.rig_from_camera)
-        return reprojection_errors_px(self.camera, pose, self.x_in_world, self.pixels) < inlier_px
+        return self.seen.errors_px(camera_in_world(world_from_rig, self.rig_from_camera)) < inlier_px
 
-    def thinned(self, step: int) -> "CameraMatches":
-        """Returns the camera with every `step`-th match."""
-        return CameraMatches(self.camera, self.rig_from_camera, self.pixels[::step], self.x_in_world[::step])
+    def __len__(self) -> int:
+        return len(self.seen)
+
+    def __getitem__(self, rows: Rows) -> "CameraMatches":
+        return CameraMatches(self.seen[rows], self.rig_from_camera)
 
 
 def camera_in_world(world_from_rig: RigidTransform | Similarity, rig_from_camera: RigidTransform) -> RigidTransform:
@@ -74,14 +72,14 @@ def rig_ransac(cameras: Sequence[CameraMatches], options: PnpOptions) -> RigidTr
     The same matches give the same pose.
     """
     cameras = _bounded(cameras, options.max_matches)
-    if sum(len(camera.pixels) for camera in cameras) < 3:
+    if sum(len(camera) for camera in cameras) < 3:
         return None
     with _repeatable():
         pose, _ = poselib.estimate_generalized_absolute_pose(
-            [camera.pixels for camera in cameras],
-            [camera.x_in_world for camera in cameras],
+            [camera.seen.pixels for camera in cameras],
+            [camera.seen.x_in_world for camera in cameras],
             [poselib_pose(camera.rig_from_camera.inverse()) for camera in cameras],
-            [poselib_camera(camera.camera) for camera in cameras],
+            [poselib_camera(camera.seen.camera) for camera in cameras],
             {
                 "max_reproj_error": options.inlier_px,
                 "min_iterations": options.min_iterations,
@@ -106,10 +104,10 @@ def scaled_ransac(
     cameras = _bounded(cameras, max_matches)
     rays = np.concatenate([_rays(camera) for camera in cameras])
     starts = np.concatenate(
-        [np.broadcast_to(camera.rig_from_camera.translation, (len(camera.pixels), 3)) for camera in cameras]
+        [np.broadcast_to(camera.rig_from_camera.translation, (len(camera), 3)) for camera in cameras]
     )
-    points = np.concatenate([camera.x_in_world for camera in cameras])
-    owner = np.repeat(np.arange(len(cameras)), [len(camera.pixels) for camera in cameras])
+    points = np.concatenate([camera.seen.x_in_world for camera in cameras])
+    owner = np.repeat(np.arange(len(cameras)), [len(camera) for camera in cameras])
     if len(points) < 4 or len(np.unique(owner)) < 2:
         return None
     random, best, best_count, needed = np.random.default_rng(0), None, 3, max_iterations
@@ -148,13 +146,13 @@ def _iterations_needed(inlier_share: float) -> int:
 
 
 def _bounded(cameras: Sequence[CameraMatches], max_matches: int) -> list[CameraMatches]:
-    step = -(-sum(len(camera.pixels) for camera in cameras) // max_matches)
-    return [camera.thinned(max(1, step)) for camera in cameras]
+    step = -(-sum(len(camera) for camera in cameras) // max_matches)
+    return [camera[:: max(1, step)] for camera in cameras]
 
 
 def _rays(camera: CameraMatches) -> Array:
     """Unit directions (M, 3) of the matches' rays in the rig's axes."""
-    rays = camera.camera.rays(camera.pixels) @ camera.rig_from_camera.rotation.T
+    rays = camera.seen.camera.rays(camera.seen.pixels) @ camera.rig_from_camera.rotation.T
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian
+from mapless.geometry import Array, RigidTransform, normalize_jacobian
 
 from ..bundle.dispersion import scale_covariance
 from ..bundle.estimate import PoseEstimate, PoseStage, Support
@@ -28,7 +28,7 @@ from ..optim.bounds import check_bounds
 from ..optim.perturbation import motion_jacobian, perturbed, world_covariance
 from ..pairs.stationary import StationaryOptions, are_moved
 from ..rejection import Rejection, RejectionReason
-from ..structure.model import MetricScale, PointMatches, Structure
+from ..structure.model import MetricScale, PixelPoints, PointMatches, Structure
 from ..structure.observations import FIRST_GUESS
 from .pnp import PnpOptions, false_alarms, ransac
 
@@ -112,8 +112,8 @@ def solve_one_reference(
     if len(matches) < options.min_inliers:
         message = f"{len(matches)} matches with a predicted depth, {options.min_inliers} needed with one reference"
         return Rejection(RejectionReason.TOO_FEW_MATCHES, message)
-    pixels = query.features.keypoints[matches[:, 0]].astype(np.float64)
-    problem = _Problem(query.camera, points, pixels, reference.world_from_camera.translation)
+    seen = PixelPoints(query.camera, points, query.features.pixels(matches[:, 0]))
+    problem = _Problem(seen, reference.world_from_camera.translation)
     solved = _solve(problem, scale.world_from_query, options)
     count = int(solved.inliers.sum())
     if count < options.min_inliers:
@@ -137,11 +137,9 @@ def solve_one_reference(
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Points (M, 3) at predicted depths in the world, the query's pixels (M, 2), and the reference's centre (3,)."""
+    """Points at predicted depths that the query sees, and the reference's centre (3,)."""
 
-    camera: Camera
-    x_in_world: Array
-    pixels: Array
+    seen: PixelPoints
     reference_centre: Array
 
 
@@ -179,14 +177,14 @@ class _Rows:
 
 def _of_rows(problem: _Problem, solved: _Solved, rows: NDArray[np.bool_]) -> tuple[_Problem, _Solved]:
     """The problem and its solution with some of the matches; `rows` is (M,)."""
-    some = replace(problem, x_in_world=problem.x_in_world[rows], pixels=problem.pixels[rows])
+    some = replace(problem, seen=problem.seen[rows])
     return some, replace(solved, inliers=solved.inliers[rows], errors_px=solved.errors_px[rows])
 
 
 def _predicted(reference: PosedView, reconstruction: Reconstruction, scale: MetricScale, matches: Matches) -> Array:
     """Points (M, 3) in the world at the predicted depths of the reference's keypoints; NaN without a depth."""
     camera = reference.view.camera
-    pixels = reference.view.features.keypoints[matches[:, 1]].astype(np.float64)
+    pixels = reference.view.features.pixels(matches[:, 1])
     depth = scale.metres_per_unit * reconstruction.references[0].depth_at(pixels, camera)
     rays = camera.rays(pixels)
     points = rays / rays[:, 2:] * np.where(depth > 0, depth, np.nan)[:, None]
@@ -194,14 +192,14 @@ def _predicted(reference: PosedView, reconstruction: Reconstruction, scale: Metr
 
 
 def _linearize(problem: _Problem, world_from_camera: RigidTransform) -> _Rows:
-    camera, camera_from_world = problem.camera, world_from_camera.inverse()
+    camera, camera_from_world = problem.seen.camera, world_from_camera.inverse()
     focal = np.array([camera.focal_x_px, camera.focal_y_px])
-    x = camera_from_world.apply(problem.x_in_world)
+    x = camera_from_world.apply(problem.seen.x_in_world)
     in_front = x[:, 2] > 1e-6
     x = np.where(in_front[:, None], x, [0.0, 0.0, 1.0])
     projection = normalize_jacobian(x) * focal[:, None]
-    residual = np.where(in_front[:, None], camera.project(x) - problem.pixels, 1e6)
-    along = (problem.x_in_world - problem.reference_centre) @ camera_from_world.rotation.T
+    residual = np.where(in_front[:, None], camera.project(x) - problem.seen.pixels, 1e6)
+    along = (problem.seen.x_in_world - problem.reference_centre) @ camera_from_world.rotation.T
     by_depth = np.einsum("mij,mj->mi", projection, along)
     return _Rows(residual, projection @ motion_jacobian(x), np.where(in_front[:, None], by_depth, 0.0), in_front)
 
@@ -217,7 +215,7 @@ def _solve(problem: _Problem, initial: RigidTransform, options: OneReferenceOpti
     """Refines the candidate with the most inliers: the network's own pose, or one of RANSAC at two thresholds."""
     candidates = [initial]
     for inlier_px in (4.0, 16.0):
-        found = ransac(problem.camera, problem.x_in_world, problem.pixels, initial, PnpOptions(inlier_px=inlier_px))
+        found = ransac(problem.seen, initial, PnpOptions(inlier_px=inlier_px))
         candidates += [found] if found else []
     return _refine(problem, max(candidates, key=lambda it: _inlier_count(problem, it, options)), options)
 
@@ -288,6 +286,6 @@ def score_of(problem: _Problem, solved: _Solved, options: OneReferenceOptions) -
         return -np.inf
     rows = _linearize(problem, solved.world_from_camera)
     areas = options.inlier_sigma**2 * rows.areas(solved.sigma_px, solved.depth_sigma)
-    image = problem.camera.width_px * problem.camera.height_px
+    image = problem.seen.camera.width_px * problem.seen.camera.height_px
     chance = float(np.mean(np.minimum(areas / image, 1.0)))
     return -false_alarms(len(solved.inliers), int(solved.inliers.sum()), chance)

@@ -16,15 +16,15 @@ import poselib
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from mapless.geometry import Array, Camera, RigidTransform
+from mapless.geometry import Camera, RigidTransform
 
 from ..bundle.estimate import PoseEstimate, PoseStage
 from ..bundle.priors import NO_PRIORS, Priors
 from ..features.views import View
 from ..optim.bounds import check_bounds
-from ..optim.perturbation import pose_hessian, reprojection_errors_px, world_covariance
+from ..optim.perturbation import pose_hessian, world_covariance
 from ..rejection import Rejection, RejectionReason
-from ..structure.model import PointMatches, Structure
+from ..structure.model import PixelPoints, PointMatches, Structure
 from .with_priors import informed_pose
 
 SAMPLE, SAMPLE_INLIERS, SAMPLE_ITERATIONS = 80, 32, 300
@@ -81,25 +81,24 @@ def solve_pose(
     """
     if len(matches) < options.min_matches:
         return Rejection(RejectionReason.TOO_FEW_MATCHES, f"{len(matches)} 2D-3D matches, {options.min_matches} needed")
-    camera, x_in_world = query.camera, structure.x_in_world[matches.point]
-    pixels = query.features.keypoints[matches.keypoint].astype(np.float64)
-    refined = ransac(camera, x_in_world, pixels, world_from_query_initial, options)
+    seen = matches.seen(query, structure.x_in_world)
+    refined = ransac(seen, world_from_query_initial, options)
     candidates = [(PoseStage.REFINED, refined)] if refined else []
     candidates.append((PoseStage.INITIAL, world_from_query_initial))
-    errors = [reprojection_errors_px(camera, pose, x_in_world, pixels) for _, pose in candidates]
-    stage, pose = candidates[int(np.argmax([(e < options.inlier_px).sum() for e in errors]))]
+    inlier_counts = [(seen.errors_px(pose) < options.inlier_px).sum() for _, pose in candidates]
+    stage, pose = candidates[int(np.argmax(inlier_counts))]
     if not priors:
-        return _estimate(camera, x_in_world, pixels, stage, pose, options)
-    informed = informed_pose(camera, x_in_world, pixels, pose, priors, options.inlier_px)
+        return _estimate(seen, stage, pose, options)
+    informed = informed_pose(seen, pose, priors, options.inlier_px)
     assert informed  # `pose` at the least
     if informed.without_priors is not pose:
         stage = PoseStage.REFINED
-    without_priors = _estimate(camera, x_in_world, pixels, stage, informed.without_priors, options)
+    without_priors = _estimate(seen, stage, informed.without_priors, options)
     if isinstance(without_priors, Rejection):
         return without_priors
     if not informed.used:
         return replace(without_priors, prior_checks=informed.checks)
-    found = _estimate(camera, x_in_world, pixels, PoseStage.REFINED, informed.world_from_camera, options)
+    found = _estimate(seen, PoseStage.REFINED, informed.world_from_camera, options)
     if isinstance(found, Rejection):
         return found
     covariance = informed.used.sharpened(found.covariance, found.world_from_camera)
@@ -107,39 +106,36 @@ def solve_pose(
 
 
 def _estimate(
-    camera: Camera, x_in_world: Array, pixels: Array, stage: PoseStage, pose: RigidTransform, options: PnpOptions
+    seen: PixelPoints, stage: PoseStage, pose: RigidTransform, options: PnpOptions
 ) -> PoseEstimate | Rejection:
     """The estimate of a pose, with inliers, errors and covariance; PNP_FAILED for fewer than four inliers."""
-    errors_px = reprojection_errors_px(camera, pose, x_in_world, pixels)
+    errors_px = seen.errors_px(pose)
     inliers = errors_px < options.inlier_px
     if inliers.sum() < 4:
-        message = f"no pose explains more than {inliers.sum()} of {len(pixels)} matches"
+        message = f"no pose explains more than {inliers.sum()} of {len(seen)} matches"
         return Rejection(RejectionReason.PNP_FAILED, message)
     # Of half-normal lengths in two dimensions the median is sqrt(2 ln 2) sigma.
     sigma_px = max(0.1, float(np.median(errors_px[inliers])) / np.sqrt(2 * np.log(2)))
-    covariance = world_covariance(pose_hessian(camera, pose, x_in_world[inliers]) / sigma_px**2, pose)
+    covariance = world_covariance(pose_hessian(seen.camera, pose, seen.x_in_world[inliers]) / sigma_px**2, pose)
     return PoseEstimate(pose, stage, inliers, errors_px, covariance)
 
 
-def ransac(
-    camera: Camera, x_in_world: Array, pixels: Array, world_from_camera: RigidTransform | None, options: PnpOptions
-) -> RigidTransform | None:
+def ransac(seen: PixelPoints, world_from_camera: RigidTransform | None, options: PnpOptions) -> RigidTransform | None:
     """Estimates a pose by P3P in RANSAC with a final Cauchy refinement (PoseLib); None without a finite pose.
 
     Of many matches RANSAC sees a sample first. If enough of it agrees with a pose, all its inliers refine that pose;
     otherwise RANSAC sees all matches.
     """
-    step = -(-len(pixels) // options.max_matches)
-    x_in_world, pixels = x_in_world[::step], pixels[::step]
+    seen = seen[:: -(-len(seen) // options.max_matches)]
     initial = None if world_from_camera is None else poselib_pose(world_from_camera.inverse())
     pose = None
-    if len(pixels) >= 2 * SAMPLE:
-        sample = np.arange(SAMPLE) * len(pixels) // SAMPLE
-        pose, found = _ransac(camera, x_in_world[sample], pixels[sample], initial, options, SAMPLE_ITERATIONS, 0)
+    if len(seen) >= 2 * SAMPLE:
+        sample = np.arange(SAMPLE) * len(seen) // SAMPLE
+        pose, found = _ransac(seen[sample], initial, options, SAMPLE_ITERATIONS, 0)
         enough = found.get("num_inliers", 0) >= SAMPLE_INLIERS
-        pose = _refined(camera, x_in_world, pixels, pose, options) if enough else None
+        pose = _refined(seen, pose, options) if enough else None
     if pose is None:
-        pose, _ = _ransac(camera, x_in_world, pixels, initial, options, options.max_iterations)
+        pose, _ = _ransac(seen, initial, options, options.max_iterations)
     rotation, translation = np.asarray(pose.R), np.asarray(pose.t)
     if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
         return None
@@ -147,9 +143,7 @@ def ransac(
 
 
 def _ransac(
-    camera: Camera,
-    x_in_world: Array,
-    pixels: Array,
+    seen: PixelPoints,
     initial: poselib.CameraPose | None,
     options: PnpOptions,
     max_iterations: int,
@@ -162,22 +156,18 @@ def _ransac(
         "max_iterations": min(options.max_iterations, max_iterations),
         "seed": 0,
     }
-    refinement = _refinement(options, refinement_steps)
-    return poselib.estimate_absolute_pose(
-        pixels, x_in_world, poselib_camera(camera), ransac_options, refinement, initial
-    )
+    camera, refinement = poselib_camera(seen.camera), _refinement(options, refinement_steps)
+    return poselib.estimate_absolute_pose(seen.pixels, seen.x_in_world, camera, ransac_options, refinement, initial)
 
 
-def _refined(
-    camera: Camera, x_in_world: Array, pixels: Array, pose: poselib.CameraPose, options: PnpOptions
-) -> poselib.CameraPose:
+def _refined(seen: PixelPoints, pose: poselib.CameraPose, options: PnpOptions) -> poselib.CameraPose:
     """Refines a pose by its inliers, twice: at a pose that rests on a sample some are missing."""
-    its_camera, refinement = poselib_camera(camera), _refinement(options, REFINEMENT_STEPS)
+    camera, refinement = poselib_camera(seen.camera), _refinement(options, REFINEMENT_STEPS)
     for thinning in (2, 1):
-        points, observed = x_in_world[::thinning], pixels[::thinning]
-        off = camera.project(points @ np.asarray(pose.R).T + np.asarray(pose.t)) - observed
-        inliers = np.einsum("ni,ni->n", off, off) < options.inlier_px**2
-        pose, _ = poselib.refine_absolute_pose(observed[inliers], points[inliers], pose, its_camera, refinement)
+        some = seen[::thinning]
+        off = seen.camera.project(some.x_in_world @ np.asarray(pose.R).T + np.asarray(pose.t)) - some.pixels
+        inliers = some[np.einsum("ni,ni->n", off, off) < options.inlier_px**2]
+        pose, _ = poselib.refine_absolute_pose(inliers.pixels, inliers.x_in_world, pose, camera, refinement)
     return pose
 
 

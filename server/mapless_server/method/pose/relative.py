@@ -24,7 +24,7 @@ from mapless.geometry import Array, Camera, RigidTransform
 
 from ..features.views import PosedView, View
 from ..optim.bounds import check_bounds
-from ..optim.perturbation import reprojection_errors_px
+from ..structure.model import PixelPoints
 from .pnp import PnpOptions, poselib_camera, poselib_pose, ransac
 from .two_view_matches import TwoViewMatches
 
@@ -78,9 +78,9 @@ class Evidence:
     keypoint: NDArray[np.intp]
 
     @property
-    def pixels(self) -> Array:
-        """Pixels (N, 2) of the 2D-3D matches."""
-        return self.query.features.keypoints[self.keypoint].astype(np.float64)
+    def points(self) -> PixelPoints:
+        """The points of the 2D-3D matches, and their keypoints."""
+        return PixelPoints(self.query.camera, self.x_in_world, self.query.features.pixels(self.keypoint))
 
 
 def disc_chance(camera: Camera, inlier_px: float) -> float:
@@ -128,9 +128,8 @@ def _scores_along(
     lines = evidence.two_view.sampson_along_px(rotation, centre, direction, distance) / options.epipolar_px
     total = -np.log10(band_chance(camera, options.epipolar_px)) * _truncated(lines)
     if len(evidence.x_in_world):
-        weight, pixels = -np.log10(disc_chance(camera, inlier_px)), evidence.pixels
-        poses = [RigidTransform(rotation, centre + it * direction) for it in distance]
-        errors = [reprojection_errors_px(camera, pose, evidence.x_in_world, pixels) for pose in poses]
+        weight, points = -np.log10(disc_chance(camera, inlier_px)), evidence.points
+        errors = [points.errors_px(RigidTransform(rotation, centre + it * direction)) for it in distance]
         total = total + weight * _truncated(np.array(errors) / inlier_px)
     return np.asarray(total)
 
@@ -143,7 +142,7 @@ def _truncated(residuals: Array) -> Array:
 def _from_points(evidence: Evidence, options: RelativePoseOptions) -> list[RigidTransform]:
     if len(evidence.x_in_world) < options.pnp.min_matches:
         return []
-    pose = ransac(evidence.query.camera, evidence.x_in_world, evidence.pixels, None, options.pnp)
+    pose = ransac(evidence.points, None, options.pnp)
     return [pose] if pose else []
 
 
@@ -219,7 +218,7 @@ def _distances(evidence: Evidence, reference: int, rotation: Array, centre: Arra
     """Distances from the reference that each match with another reference, and each 2D-3D match, gives."""
     others = evidence.two_view[evidence.two_view.reference != reference]
     normal = np.cross(others.ray @ rotation.T, others.reference_ray)
-    rays = evidence.query.camera.rays(evidence.pixels) @ rotation.T
+    rays = evidence.query.camera.rays(evidence.points.pixels) @ rotation.T
     across, offset = np.cross(direction, rays), np.cross(evidence.x_in_world - centre, rays)
     with np.errstate(invalid="ignore", divide="ignore"):
         by_lines = (normal * (others.reference_centre - centre)).sum(axis=1) / (normal @ direction)
@@ -230,9 +229,8 @@ def _distances(evidence: Evidence, reference: int, rotation: Array, centre: Arra
 def _pixels(evidence: Evidence, rows: NDArray[np.bool_], reference: int) -> tuple[Array, Array]:
     """Pixels (M, 2) of the given matches in their reference, and in the query."""
     two_view, view = evidence.two_view, evidence.references[reference].view
-    theirs = view.features.keypoints[two_view.reference_keypoint[rows]]
-    ours = evidence.query.features.keypoints[two_view.keypoint[rows]]
-    return theirs.astype(np.float64), ours.astype(np.float64)
+    ours = evidence.query.features.pixels(two_view.keypoint[rows])
+    return view.features.pixels(two_view.reference_keypoint[rows]), ours
 
 
 def _finite(pose: poselib.CameraPose) -> list[RigidTransform]:

@@ -19,7 +19,6 @@ from ..bundle.estimate import PoseEstimate, PoseStage, Support, TwoViewSupport
 from ..bundle.pose_problem import AdjustOptions
 from ..features.tracks import Tracks
 from ..features.views import PosedView, View
-from ..optim.perturbation import reprojection_errors_px
 from ..options import IntrinsicsSigma
 from ..pairs.correspond import Correspondences
 from ..structure.match import MatchOptions, match_points, vote
@@ -115,9 +114,8 @@ class _Problem:
 
     def at(self, pose: RigidTransform, estimate: PoseEstimate | None = None) -> _Solution:
         """Finds the inliers of a pose."""
-        evidence, matches = self.evidence, self.matches
-        query, pixels = evidence.query, evidence.query.features.keypoints[matches.keypoint].astype(np.float64)
-        errors_px = reprojection_errors_px(query.camera, pose, self.structure.x_in_world[matches.point], pixels)
+        evidence, matches, query = self.evidence, self.matches, self.evidence.query
+        errors_px = matches.seen(query, self.structure.x_in_world).errors_px(pose)
         inliers = errors_px < self.adjust.inlier_px
         # A keypoint with a point gives its equations there.
         rest = evidence.two_view[~np.isin(evidence.two_view.keypoint, matches.keypoint[inliers])]

@@ -11,8 +11,6 @@ The refinement has fixed points, and the pose alone as unknowns (PoseLib's has n
 With few inliers, a pose from two matches and gravity needs fewer samples in RANSAC than one from three matches. Gravity
 is known to about a degree, which is many pixels, so such a pose is only a hypothesis: it is scored with a tolerance as
 large as gravity's error in the image, and the best are refined with gravity as one measurement among others.
-
-A pinhole camera sees the points (N, 3) of the world at the pixels (N, 2).
 """
 
 import math
@@ -22,11 +20,12 @@ import numpy as np
 import poselib
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, Camera, RigidTransform
+from mapless.geometry import Array, RigidTransform
 
 from ..bundle.priors import NO_PRIORS, GravityPrior, PriorCheck, Priors
 from ..optim.optimize import MinimizeOptions, cauchy_cost, cauchy_weight, damped_step, minimize
-from ..optim.perturbation import moved, pose_jacobian, reprojection_errors_px, world_jacobian
+from ..optim.perturbation import moved, pose_jacobian, world_jacobian
+from ..structure.model import PixelPoints
 
 SIGMA_PX = 1.0
 """Standard deviation of a right match."""
@@ -83,100 +82,84 @@ class InformedPose:
 
 
 def informed_pose(
-    camera: Camera, x_in_world: Array, pixels: Array, found: RigidTransform | None, priors: Priors, inlier_px: float
+    seen: PixelPoints, found: RigidTransform | None, priors: Priors, inlier_px: float
 ) -> InformedPose | None:
     """Chooses between the pose from the photograph and those from priors; None if there is none.
 
     `found` is world_from_camera from the photograph alone, None if there is none; `inlier_px` the largest reprojection
     error of a right match.
     """
-    seen = camera, x_in_world, pixels
 
     def cost(pose: RigidTransform) -> float:
         """Truncated sum of squared errors, in standard deviations of a keypoint, plus `Priors.penalty`."""
-        errors_px = reprojection_errors_px(camera, pose, x_in_world, pixels)
+        errors_px = seen.errors_px(pose)
         squared = (np.where(errors_px < inlier_px, errors_px, inlier_px) / SIGMA_PX) ** 2
         return float(squared.sum()) + priors.penalty(pose)
 
     best, others = found, []
-    if found is None or _inlier_count(*seen, found, inlier_px) < ENOUGH_INLIERS:
-        others = _from_priors(*seen, priors, inlier_px)
+    if found is None or _inlier_count(seen, found, inlier_px) < ENOUGH_INLIERS:
+        others = _from_priors(seen, priors, inlier_px)
     if others:
         costs = [cost(pose) for pose in others]
         # Better by one match at least; otherwise it is the same pose found in another way.
         least = math.inf if found is None else cost(found)
         if min(costs) < least - (inlier_px / SIGMA_PX) ** 2:
             best = others[int(np.argmin(costs))]
-    return None if best is None else _with_priors(*seen, best, priors, inlier_px)
+    return None if best is None else _with_priors(seen, best, priors, inlier_px)
 
 
-def _from_priors(
-    camera: Camera, x_in_world: Array, pixels: Array, priors: Priors, inlier_px: float
-) -> list[RigidTransform]:
+def _from_priors(seen: PixelPoints, priors: Priors, inlier_px: float) -> list[RigidTransform]:
     """Candidates from priors: the pose prior, and poses by RANSAC with gravity."""
     poses = []
     if priors.pose:
-        poses.append(refine_pose(camera, x_in_world, pixels, priors.pose.world_from_camera, priors))
+        poses.append(refine_pose(seen, priors.pose.world_from_camera, priors))
     if priors.gravity:
-        poses += ransac_with_gravity(camera, x_in_world, pixels, priors, inlier_px)
+        poses += ransac_with_gravity(seen, priors, inlier_px)
     return poses
 
 
-def _with_priors(
-    camera: Camera, x_in_world: Array, pixels: Array, pose: RigidTransform, priors: Priors, inlier_px: float
-) -> InformedPose:
+def _with_priors(seen: PixelPoints, pose: RigidTransform, priors: Priors, inlier_px: float) -> InformedPose:
     """Checks the priors and refines a pose, which has `MIN_INLIERS` inliers or more, with the consistent ones."""
-    seen = camera, x_in_world, pixels
-    alone = refine_pose(*seen, pose, NO_PRIORS)
-    before, after = (_inlier_count(*seen, it, inlier_px) for it in (pose, alone))
+    alone = refine_pose(seen, pose, NO_PRIORS)
+    before, after = (_inlier_count(seen, it, inlier_px) for it in (pose, alone))
     if after < max(MIN_INLIERS, MIN_KEPT_SHARE * before):
         alone = pose
     # The inverse covariance of the pose error if the matches' errors were independent.
-    information = _Problem(*seen, alone, NO_PRIORS).linearize(alone)[1]
+    information = _Problem(seen, alone, NO_PRIORS).linearize(alone)[1]
     covariance = np.linalg.inv(information / PRIOR_WEIGHT + WEAK_INFORMATION)
     checks = priors.check(alone, np.asarray(covariance, np.float64))
     used = priors.consistent(checks)
-    return InformedPose(refine_pose(*seen, pose, used) if used else pose, pose, checks, used)
+    return InformedPose(refine_pose(seen, pose, used) if used else pose, pose, checks, used)
 
 
-def _inlier_count(camera: Camera, x_in_world: Array, pixels: Array, pose: RigidTransform, inlier_px: float) -> int:
-    return int((reprojection_errors_px(camera, pose, x_in_world, pixels) < inlier_px).sum())
+def _inlier_count(seen: PixelPoints, pose: RigidTransform, inlier_px: float) -> int:
+    return int((seen.errors_px(pose) < inlier_px).sum())
 
 
 def refine_pose(
-    camera: Camera,
-    x_in_world: Array,
-    pixels: Array,
+    seen: PixelPoints,
     world_from_camera: RigidTransform,
     priors: Priors,
     loss_scale_sigma: float = LOSS_SCALE_SIGMA,
     steps: MinimizeOptions = STEPS,
 ) -> RigidTransform:
     """Minimizes the cost, starting from a pose; all priors are used, and no points behind the camera at the start."""
-    problem = _Problem(camera, x_in_world, pixels, world_from_camera, priors, loss_scale_sigma)
-    return minimize(problem, world_from_camera, steps)
+    return minimize(_Problem(seen, world_from_camera, priors, loss_scale_sigma), world_from_camera, steps)
 
 
 class _Problem:
     """The cost and its derivatives by the pose error; see `optimize.Problem`."""
 
     def __init__(
-        self,
-        camera: Camera,
-        x_in_world: Array,
-        pixels: Array,
-        start: RigidTransform,
-        priors: Priors,
-        loss_scale_sigma: float = LOSS_SCALE_SIGMA,
+        self, seen: PixelPoints, start: RigidTransform, priors: Priors, loss_scale_sigma: float = LOSS_SCALE_SIGMA
     ) -> None:
-        in_front = start.inverse().apply(x_in_world)[:, 2] > 0
-        self.camera, self.x_in_world, self.pixels = camera, x_in_world[in_front], pixels[in_front]
+        self.seen = seen[start.inverse().apply(seen.x_in_world)[:, 2] > 0]
         self.priors, self.loss_scale_sigma = priors, loss_scale_sigma
 
     def residuals(self, pose: RigidTransform) -> tuple[Array, Array]:
         """Points in the camera frame (N, 3), and reprojection errors (N, 2) in standard deviations."""
-        x_in_camera = (self.x_in_world - pose.translation) @ pose.rotation
-        return x_in_camera, (self.camera.project(x_in_camera) - self.pixels) / SIGMA_PX
+        x_in_camera = (self.seen.x_in_world - pose.translation) @ pose.rotation
+        return x_in_camera, (self.seen.camera.project(x_in_camera) - self.seen.pixels) / SIGMA_PX
 
     def cost(self, pose: RigidTransform) -> float:
         """Cost at a pose; NaN if a point is behind the camera, so that the step is rejected."""
@@ -188,7 +171,7 @@ class _Problem:
         """Half the cost's gradient (6,) and its information (6, 6), in ROS's order."""
         x_in_camera, residual = self.residuals(pose)
         weight = cauchy_weight((residual**2).sum(axis=1), self.loss_scale_sigma)
-        jacobian = pose_jacobian(self.camera, x_in_camera) / SIGMA_PX
+        jacobian = pose_jacobian(self.seen.camera, x_in_camera) / SIGMA_PX
         weighted, to_camera = weight * jacobian, np.linalg.inv(world_jacobian(pose))
         by_pose = weighted[0] @ residual[:, 0] + weighted[1] @ residual[:, 1]
         hessian = weighted[0] @ jacobian[0].T + weighted[1] @ jacobian[1].T
@@ -205,9 +188,7 @@ class _Problem:
         return None if error is None else moved(pose, error)
 
 
-def ransac_with_gravity(
-    camera: Camera, x_in_world: Array, pixels: Array, priors: Priors, inlier_px: float
-) -> list[RigidTransform]:
+def ransac_with_gravity(seen: PixelPoints, priors: Priors, inlier_px: float) -> list[RigidTransform]:
     """Finds the best hypotheses and refines them with all priors; none if no two matches give a pose.
 
     `inlier_px` is the largest reprojection error of a right match.
@@ -215,26 +196,25 @@ def ransac_with_gravity(
     gravity = priors.gravity
     if gravity is None:
         raise ValueError("there is no gravity prior")
-    if len(pixels) < 2:
+    if len(seen) < 2:
         return []
-    step = -(-len(pixels) // MAX_MATCHES)
-    x_in_world, pixels = x_in_world[::step], pixels[::step]
+    seen = seen[:: -(-len(seen) // MAX_MATCHES)]
     # An angle error in pixels; a shift of the camera compensates half of it.
-    wide_px = math.hypot(inlier_px, 0.5 * camera.focal_x_px * min(gravity.sigma, 0.1))
-    hypotheses = _Hypotheses(camera, x_in_world, pixels, wide_px)
+    wide_px = math.hypot(inlier_px, 0.5 * seen.camera.focal_x_px * min(gravity.sigma, 0.1))
+    hypotheses = _Hypotheses(seen, wide_px)
     rng = np.random.default_rng(0)
-    rays = camera.rays(pixels)
+    rays = seen.camera.rays(seen.pixels)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     drawn, wanted = 0, float(MAX_SAMPLES)
     while drawn < min(wanted, MAX_SAMPLES):
-        hypotheses.add(*solve_pairs(gravity, rays, x_in_world, _pairs(rng, len(pixels), BATCH)))
+        hypotheses.add(*solve_pairs(gravity, rays, seen.x_in_world, _pairs(rng, len(seen), BATCH)))
         drawn += BATCH
         wanted = _samples_needed(hypotheses.inlier_share)
     # Refined first with a loss as wide as gravity's error, then with a narrow one.
     scales = max(wide_px / 2 / SIGMA_PX, LOSS_SCALE_SIGMA), LOSS_SCALE_SIGMA
     poses = hypotheses.best()
     for scale in scales:
-        poses = [refine_pose(camera, x_in_world, pixels, pose, priors, scale) for pose in poses]
+        poses = [refine_pose(seen, pose, priors, scale) for pose in poses]
     return poses
 
 
@@ -281,10 +261,10 @@ def _samples_needed(inlier_share: float) -> float:
 class _Hypotheses:
     """The best poses camera_from_world, by the truncated sum of their squared errors."""
 
-    def __init__(self, camera: Camera, x_in_world: Array, pixels: Array, tolerance_px: float) -> None:
-        self._focal = np.array([camera.focal_x_px, camera.focal_y_px])
-        self._ideal = camera.rays(pixels)[:, :2]
-        self._x_in_world, self._tolerance_px = x_in_world, tolerance_px
+    def __init__(self, seen: PixelPoints, tolerance_px: float) -> None:
+        self._focal = np.array([seen.camera.focal_x_px, seen.camera.focal_y_px])
+        self._ideal = seen.camera.rays(seen.pixels)[:, :2]
+        self._x_in_world, self._tolerance_px = seen.x_in_world, tolerance_px
         self._costs, self._poses = np.zeros(0), np.zeros((0, 3, 4))
         self.inlier_share = 0.0
 

@@ -107,7 +107,7 @@ def search(
 
     The similarity of a point and a keypoint is the largest over the descriptors of the point's observations.
     """
-    keypoints = query.features.keypoints.astype(np.float64)
+    keypoints = query.features.pixels()
     projected = query.camera.project(world_from_query.inverse().apply(structure.x_in_world))
     size = np.array([query.camera.width_px, query.camera.height_px])
     inside = ((projected > -options.radius_px) & (projected < size + options.radius_px)).all(axis=1)

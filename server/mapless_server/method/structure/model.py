@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, RigidTransform, Similarity
+from mapless.geometry import Array, Camera, RigidTransform, Similarity
 
 from ..features.tracks import Tracks
 
 if TYPE_CHECKING:  # services do not load what computes
+    from ..features.views import Rows, View
     from .observations import KeypointNoise
 
 
@@ -155,6 +156,32 @@ class Structure:
 
 
 @dataclass(frozen=True, eq=False)
+class PixelPoints:
+    """Points, and where a photograph shows them.
+
+    Attributes:
+        camera: pinhole camera of the photograph.
+        x_in_world: (N, 3) metres.
+        pixels: (N, 2) in pixels of the camera.
+    """
+
+    camera: Camera
+    x_in_world: Array
+    pixels: Array
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    def __getitem__(self, rows: Rows) -> PixelPoints:
+        return PixelPoints(self.camera, self.x_in_world[rows], self.pixels[rows])
+
+    def errors_px(self, world_from_camera: RigidTransform) -> Array:
+        """Distances (N,) of the points' projections from their pixels at a pose; NaN behind the camera."""
+        projected = self.camera.project(world_from_camera.inverse().apply(self.x_in_world))
+        return np.asarray(np.linalg.norm(projected - self.pixels, axis=1))
+
+
+@dataclass(frozen=True, eq=False)
 class PointMatches:
     """2D-3D matches; each point and each keypoint occurs at most once.
 
@@ -173,8 +200,16 @@ class PointMatches:
     def __len__(self) -> int:
         return len(self.point)
 
-    def select(self, rows: NDArray[np.bool_]) -> PointMatches:
-        """Some of the matches; `rows` is (M,)."""
+    def unguided(self) -> PointMatches:
+        """The matches of the whole image; all, if all were searched near projections."""
+        return self if self.guided.all() else self.select(~self.guided)
+
+    def seen(self, query: View, x_in_world: Array) -> PixelPoints:
+        """The matched points, of all points (P, 3) of the structure, with the query's keypoints."""
+        return PixelPoints(query.camera, x_in_world[self.point], query.features.pixels(self.keypoint))
+
+    def select(self, rows: Rows) -> PointMatches:
+        """Some of the matches."""
         return PointMatches(self.point[rows], self.keypoint[rows], self.guided[rows], self.radius_px)
 
     def and_last(

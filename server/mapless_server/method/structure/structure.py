@@ -202,7 +202,7 @@ def trustworthy(observations: Observations, x_in_world: Array, options: Structur
 def observe(tracks: Tracks, references: Sequence[PosedView], noise: KeypointNoise) -> Observations:
     """Makes the observations of tracks over these references."""
     poses, cameras = [r.world_from_camera.inverse() for r in references], [r.view.camera for r in references]
-    keypoints = np.concatenate([r.view.features.keypoints for r in references]).astype(np.float64)
+    pixels = np.concatenate([r.view.features.pixels() for r in references])
     rows = keypoint_offsets(references)[tracks.view] + tracks.keypoint
     sizes_px = np.concatenate([r.view.features.sizes_px for r in references]).astype(np.float64)[rows]
 
@@ -211,7 +211,7 @@ def observe(tracks: Tracks, references: Sequence[PosedView], noise: KeypointNois
 
     return Observations(
         tracks,
-        columns(keypoints[rows]),
+        columns(pixels[rows]),
         sizes_px,
         noise.sigma_px(sizes_px),
         of_view([it.rotation for it in poses]),

@@ -17,7 +17,7 @@ from mapless_server.method.judge.judge import JudgeOptions, judge
 from mapless_server.method.optim.perturbation import world_covariance
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pose.pnp import PnpOptions, false_alarms, ransac
-from mapless_server.method.structure.model import PointMatches
+from mapless_server.method.structure.model import PixelPoints, PointMatches
 
 from .neighbourhood import Neighbourhood, PairMatches, build_neighbourhood, match_points, observed_points
 from .resection import CameraFit, Free, ObservedPoints, fit_camera
@@ -214,7 +214,7 @@ def compare(subject: PosedView, neighbours: Sequence[PosedView], pairs: PairMatc
     fits: dict[Free, CameraFit] = {}
     if len(points) >= _RANSAC.min_matches:
         camera, given = subject.view.camera, subject.world_from_camera
-        found = ransac(camera, points.x_in_world, points.pixel, None, _RANSAC)
+        found = ransac(PixelPoints(camera, points.x_in_world, points.pixel), None, _RANSAC)
         starts = (given,) if found is None else (given, found)
         for free in Free:
             # Where there are several minima, more freedom can lead to a worse one.

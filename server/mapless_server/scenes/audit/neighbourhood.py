@@ -120,7 +120,7 @@ def observed_points(subject: PosedView, neighbourhood: Neighbourhood, found: Poi
     """The points of the matches, where they are seen, and how accurately."""
     features = subject.view.features
     return ObservedPoints(
-        features.keypoints[found.keypoint].astype(np.float64),
+        features.pixels(found.keypoint),
         neighbourhood.structure.x_in_world[found.point],
         neighbourhood.point_covariance[found.point],
         np.asarray(neighbourhood.structure.noise.sigma_px(features.sizes_px[found.keypoint].astype(np.float64))),

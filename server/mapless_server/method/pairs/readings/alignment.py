@@ -209,10 +209,7 @@ def _relative_poses(views: Views, matched: Sequence[MatchedPair]) -> list[tuple[
     found = []
     for item in matched:
         first, second = (views[i] for i in item.pair)
-        points = [
-            it.view.features.keypoints[item.matches[:, side]].astype(np.float64)
-            for side, it in enumerate((first, second))
-        ]
+        points = [it.view.features.pixels(item.matches[:, side]) for side, it in enumerate((first, second))]
         pose, _ = poselib.estimate_relative_pose(points[0], points[1], _pinhole(first), _pinhole(second), {}, {})
         rotation = np.asarray(pose.R)  # second_from_first
         centre = -rotation.T @ np.asarray(pose.t)
