@@ -25,8 +25,8 @@ def problem_of(case: str, moved: float = 0.0) -> tuple[BundleProblem, Bundle]:
     structure, matches = true_structure(scene, NOISE)
     used = np.arange(len(matches))
     given = AdjustInput(scene.query, scene.references, structure, matches, AdjustOptions())
-    problem, state = pose_problem(given, used, scene.world_from_query)
-    random = random_for(case, "moved")
+    problem, start = pose_problem(given, used, scene.world_from_query)
+    state, random = start.bundle, random_for(case, "moved")
     motion = random.normal(0, moved, (len(state.poses.rotation), 6))
     return problem, state.moved(motion, random.normal(0, moved, state.points.shape))
 
@@ -54,10 +54,13 @@ def cheated_estimate(
 def test_gradient_equals_finite_differences_of_the_cost(moved: float, tolerance: float) -> None:
     """Half of it, as in least squares. Away from the start the prior's error is differentiated as if it were small."""
     problem, state = problem_of("gradient", moved)
-    equations = problem.linearize(state)
+    equations = problem.linearize(problem.at(state))
     gradient = np.concatenate([equations.pose_gradient, equations.point_gradient.T.ravel()])
     assert_jacobian(
-        2 * gradient, lambda v: problem.cost(from_vector(state, v)), np.zeros(len(gradient)), tolerance=tolerance
+        2 * gradient,
+        lambda v: problem.cost(problem.at(from_vector(state, v))),
+        np.zeros(len(gradient)),
+        tolerance=tolerance,
     )
 
 
@@ -65,21 +68,21 @@ def test_the_optimum_is_near_that_of_many_steps() -> None:
     """By less than a standard deviation of the residuals."""
     for case in range(3):
         problem, state = problem_of(f"near {case}", 1e-3)
-        far = minimize(problem, state, MinimizeOptions(60, 1e-14))
-        near = optimum(problem, state, AdjustOptions())
+        far = minimize(problem, problem.at(state), MinimizeOptions(60, 1e-14))
+        near = optimum(problem, problem.at(state), AdjustOptions())
         assert problem.query_motion_sigma(far, near, problem.linearize(far)) < 1
 
 
 def residuals(problem: BundleProblem, state: Bundle) -> Array:
     """(O, 2)."""
-    return problem.by_view.linearized(state)[0].T
+    return problem.at(state).residual.T
 
 
 def test_a_point_that_is_not_determined_gives_no_step() -> None:
     problem, state = problem_of("singular")
-    equations = problem.linearize(state)
+    equations = problem.linearize(problem.at(state))
     equations.point_block[:, 3] = 0.0
-    assert problem.step(state, equations, 1e-4) is None
+    assert problem.step(problem.at(state), equations, 1e-4) is None
 
 
 # The adjustment

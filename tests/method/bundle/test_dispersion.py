@@ -23,13 +23,14 @@ def planted(case: str, references: int = 4, points: int = 40) -> tuple[BundlePro
         AdjustInput(scene.query, scene.references, structure, matches, AdjustOptions()), used, pose
     )
     motion = random_for(case, "moved").normal(0, 1e-3, (references + 1, 6))
-    return problem, start.moved(motion, np.zeros_like(start.points))
+    return problem, start.bundle.moved(motion, np.zeros_like(start.bundle.points))
 
 
 def dense(problem: BundleProblem, state: Bundle, left_out: int | None = None) -> tuple[Array, Array]:
     """Matrix and gradient of the cameras, from the whole system without the observations of one reference."""
     seen = problem.by_view
-    residual, by_point, by_pose = seen.linearized(state)
+    there = seen.at(state)
+    residual, by_point, by_pose = there.residual, there.by_point, there.by_pose
     weight = 1 / (1 + (residual**2).sum(axis=0) / problem.loss_scale_sigma**2)
     cameras = 6 * len(state.poses.rotation)
     jacobian = np.zeros((2, len(weight), cameras + 3 * len(state.points)))

@@ -279,17 +279,17 @@ def test_reduced_equations_equal_those_of_plain_rows() -> None:
     scene = make_scene(random_for("reduced"), SceneOptions(point_count=25, reference_count=3))
     structure, matches = true_structure(scene, NOISE)
     given = AdjustInput(scene.query, scene.references, structure, matches, AdjustOptions())
-    problem, state = pose_problem(given, np.arange(len(matches)), scene.world_from_query)
-    wide, there = with_intrinsics(problem, state, scene.query)
-    there = replace(there, intrinsics=np.array([1e-3, 0.5, -0.5, 2e-3]))
+    problem, start = pose_problem(given, np.arange(len(matches)), scene.world_from_query)
+    wide, bundle = with_intrinsics(problem, start.bundle, scene.query)
+    there = wide.at(replace(bundle, intrinsics=np.array([1e-3, 0.5, -0.5, 2e-3])))
     point, view = wide.by_view.point, wide.by_view.view
-    residual, by_point, by_pose = wide.by_view.linearized(there)
-    cameras, count = 24, len(state.points)
+    residual, by_point, by_pose = there.residual, there.by_point, there.by_pose
+    cameras, count = 24, len(bundle.points)
     jacobian = np.zeros((len(point), 2, cameras + 4 + 3 * count))
     for o, (p, v) in enumerate(zip(point, view, strict=True)):
         jacobian[o, :, 6 * v : 6 * v + 6] = by_pose[:, :, o]
         jacobian[o, :, cameras + 4 + 3 * p : cameras + 7 + 3 * p] = by_point[:, :, o]
-    jacobian[view == 3, :, cameras : cameras + 4] = wide.keypoint_motion
+    jacobian[view == 3, :, cameras : cameras + 4] = np.moveaxis(wide.by_view.by_intrinsics, 2, 0)
     weighted = jacobian / (1 + (residual**2).sum(axis=0) / wide.loss_scale_sigma**2)[:, None, None]
     matrix = np.einsum("oka,okb->ab", weighted, jacobian)
     gradient = np.einsum("oka,ko->a", weighted, residual)

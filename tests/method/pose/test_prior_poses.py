@@ -242,14 +242,14 @@ def test_gradient_with_priors_equals_finite_differences() -> None:
     scene, structure, matches = scene_of("gradient")
     used = np.arange(len(matches))
     given = AdjustInput(scene.query, scene.references, structure, matches, AdjustOptions())
-    problem, state = pose_problem(given, used, scene.world_from_query)
+    problem, start = pose_problem(given, used, scene.world_from_query)
     problem = replace(problem, priors=all_priors(scene.world_from_query, 0.01), prior_weight=4.0)
-    gradient = problem.linearize(state).pose_gradient[-6:]
+    gradient = problem.linearize(start).pose_gradient[-6:]
 
     def cost(motion: Array) -> float:
-        motions = np.zeros((len(state.poses.rotation), 6))
+        motions = np.zeros((len(start.bundle.poses.rotation), 6))
         motions[-1] = motion
-        return problem.cost(state.moved(motions, np.zeros_like(state.points)))
+        return problem.cost(problem.at(start.bundle.moved(motions, np.zeros_like(start.bundle.points))))
 
     assert_jacobian(2 * gradient, cost, np.zeros(6), tolerance=1e-5)
 

@@ -124,15 +124,14 @@ def test_planes_are_in_the_normal_equations_as_in_the_cost() -> None:
     chosen = np.arange(len(found.x_in_world))
     observations, start, _ = bundle_of(found.tracks, references, found, chosen)
     assert found.planes is not None
-    given = start.poses[:-1]
-    problem = BundleProblem(observations, found.tracks.view, given, np.zeros((12, 12)), 1e6, planes=found.planes)
+    problem = BundleProblem.of(observations, start.poses[:-1], 1e6, found.planes)
     start = start.moved(np.zeros((3, 6)), np.random.default_rng(0).normal(0, 0.05, start.points.shape))
-    equations, step = problem.linearize(start), 1e-6
+    equations, step = problem.linearize(problem.at(start)), 1e-6
     for point in (0, len(chosen) - 1):
         for axis in range(3):
             change = np.zeros((len(chosen), 3))
             change[point, axis] = step
-            ahead, behind = (problem.cost(start.moved(np.zeros((3, 6)), sign * change)) for sign in (1, -1))
+            ahead, behind = (problem.cost(problem.at(start.moved(np.zeros((3, 6)), sign * change))) for sign in (1, -1))
             assert 2 * equations.point_gradient[axis, point] == pytest.approx((ahead - behind) / (2 * step), rel=1e-3)
 
 

@@ -20,8 +20,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapless.geometry import Array
-
 from ..features.tracks import Tracks
 from ..features.views import Matches, PosedView, View
 from ..options import IntrinsicsSigma
@@ -29,9 +27,11 @@ from ..structure.model import MetricScale, PointMatches, Structure
 from ..structure.structure import query_tracks, with_query_points
 from .dispersion import scale_covariance
 from .estimate import PoseEstimate, PoseStage, Support
+from .intrinsics import IntrinsicsTerms
 from .pose_problem import (
     AdjustInput,
     AdjustOptions,
+    Solved,
     adjusted_estimate,
     errors_of_pose,
     optimum,
@@ -39,16 +39,12 @@ from .pose_problem import (
     shares_camera,
 )
 from .priors import NO_PRIORS, Priors
-from .recalibrate import Solved, is_suspicious, recalibrated
+from .recalibrate import is_suspicious, recalibrated
 
 SHARED_CAMERA = 0.03
 """Share of the intrinsics' usual errors that differ between photographs of one camera. What they share is in the
 references' points too, and moves the pose but little: focus and stabilization remain. With 0.1 the covariance of these
 errors exceeds all others in scenes of one camera, where radii hold too often."""
-
-
-Optimum = tuple[AdjustInput, Solved]
-"""What was adjusted, with points of the query's own, and what was solved."""
 
 
 def adjust_pose(
@@ -81,7 +77,7 @@ def adjust_pose(
     """
     given = AdjustInput(query, references, structure, matches, options)
 
-    def adjusted(start: PoseEstimate, active: Priors) -> tuple[PoseEstimate, Optimum | None] | None:
+    def adjusted(start: PoseEstimate, active: Priors) -> tuple[PoseEstimate, Solved | None] | None:
         return _adjusted(given, start, active, intrinsics, query_matches)
 
     # If no prior is used, the answer is bit-identical to the one without priors.
@@ -98,15 +94,15 @@ def adjust_pose(
     return replace(answer, prior_checks=checks)
 
 
-def _with_priors(alone: PoseEstimate, where: Optimum, priors: Priors) -> PoseEstimate | None:
+def _with_priors(alone: PoseEstimate, where: Solved, priors: Priors) -> PoseEstimate | None:
     """The estimate with priors that are consistent with the one without, from whose optimum it starts.
 
     What the photograph says of the pose's errors is computed there.
     """
-    given, (problem, start, used) = where
-    with_priors = problem.replaced(priors=priors, prior_weight=given.options.error_inflation**2)
-    bundle = optimum(with_priors, start, given.options)
-    found = adjusted_estimate(given, used, alone, bundle, (alone.covariance, alone.intrinsics))
+    options = where.given.options
+    with_priors = replace(where.problem, priors=priors, prior_weight=options.error_inflation**2)
+    solved = replace(where, there=optimum(with_priors, where.there, options))
+    found = adjusted_estimate(solved, alone, (alone.covariance, alone.intrinsics))
     return found and _sharpened(_of_matches(found, len(alone.inliers)), priors)
 
 
@@ -125,7 +121,7 @@ def _adjusted(
     priors: Priors,
     intrinsics: IntrinsicsSigma | None,
     query_matches: Sequence[Matches],
-) -> tuple[PoseEstimate, Optimum | None] | None:
+) -> tuple[PoseEstimate, Solved | None] | None:
     """Returns the estimate at the optimum with priors, and where that is; None if it diverges or has too few matches.
 
     Points of the query's own are chosen at its pose, with whatever error the intrinsics give it, so they hide a part
@@ -141,7 +137,7 @@ def _adjusted(
     if plain is None:
         return None
     found, where = plain
-    better = recalibrated(given, found, priors, terms[2], where[1])
+    better = recalibrated(where, found, priors, terms)
     if better is found and own:
         more, where = first or _at_optimum(given, found, priors, terms, own) or plain
         better = replace(more, intrinsics=found.intrinsics)
@@ -161,14 +157,16 @@ def _at_optimum(
     given: AdjustInput,
     estimate: PoseEstimate,
     priors: Priors,
-    terms: tuple[View, Array, Array, Array],
+    terms: IntrinsicsTerms,
     own: Tracks | None = None,
-) -> tuple[PoseEstimate, Optimum] | None:
+) -> tuple[PoseEstimate, Solved] | None:
     """The estimate at the optimum, with points of the query's own tracks, and where it was found."""
     count, pose, options = len(given.matches), estimate.world_from_camera, given.options
     if own:
-        points = given.query, given.references, given.structure, given.matches, own, pose, options.query_points
-        structure, matches = with_query_points(*points)
+        query = PosedView("", "", given.query, pose)
+        structure, matches = with_query_points(
+            query, given.references, given.structure, given.matches, own, options.query_points
+        )
         given = replace(given, structure=structure, matches=matches)
     errors_px = np.concatenate([estimate.errors_px, given.errors_px(pose, slice(count, None))])
     start_inliers = np.concatenate([estimate.inliers, np.ones(len(given.matches) - count, bool)])
@@ -176,23 +174,20 @@ def _at_optimum(
     if len(used) < 3:  # two equations each, for six unknowns
         return None
     problem, start = pose_problem(given, used, pose)
-    with_priors = problem.replaced(priors=priors, prior_weight=options.error_inflation**2)
-    bundle = optimum(with_priors, start, options)
+    with_priors = replace(problem, priors=priors, prior_weight=options.error_inflation**2)
+    solved = Solved(given, problem, optimum(with_priors, start, options), used)
     before = replace(estimate, inliers=start_inliers, errors_px=errors_px)
-    errors = errors_of_pose(given.query, problem, bundle, options, terms)
-    found = adjusted_estimate(given, used, before, bundle, errors)
-    if found is None:
-        return None
-    return _of_matches(found, count), (given, (problem, bundle, used))
+    found = adjusted_estimate(solved, before, errors_of_pose(solved, terms))
+    return None if found is None else (_of_matches(found, count), solved)
 
 
 def intrinsics_terms(
     query: View, references: Sequence[PosedView], intrinsics: IntrinsicsSigma | None
-) -> tuple[View, Array, Array, Array]:
-    """A photograph with its intrinsics as given, for `errors_of_pose`."""
+) -> IntrinsicsTerms:
+    """A photograph with its intrinsics as given, and standard deviations; None for the defaults."""
     usual = (intrinsics or IntrinsicsSigma()).of(query.camera)
     is_shared = intrinsics is None and shares_camera(query, references)
-    return query, np.zeros(4), usual, SHARED_CAMERA * usual if is_shared else usual
+    return IntrinsicsTerms(query, usual, SHARED_CAMERA * usual if is_shared else usual)
 
 
 def with_covariance(
@@ -227,9 +222,9 @@ def with_covariance(
         return estimate
     pose, is_initial = estimate.world_from_camera, estimate.stage is PoseStage.INITIAL
     given = AdjustInput(support.query, references, support.structure, support.matches, options)
-    problem, bundle = pose_problem(given, used, pose)
-    terms = intrinsics_terms(support.query, references, intrinsics)
-    errors = errors_of_pose(support.query, problem, bundle, options, terms, is_initial)
+    problem, there = pose_problem(given, used, pose)
+    solved, terms = Solved(given, problem, there, used), intrinsics_terms(support.query, references, intrinsics)
+    errors = errors_of_pose(solved, terms, is_initial)
     if errors is None:
         return estimate
     covariance, evidence = errors
@@ -241,7 +236,7 @@ def with_covariance(
     if evidence is None:
         return found
     # The pose stays as it is; but an error is not seen in full before it is estimated.
-    estimated = recalibrated(given, found, NO_PRIORS, terms[2], (problem, bundle, used)).intrinsics
-    if estimated is not None and estimated.contradicted(options.contradiction, terms[2]).any():
+    estimated = recalibrated(solved, found, NO_PRIORS, terms).intrinsics
+    if estimated is not None and estimated.contradicted(options.contradiction, terms.prior_sigma).any():
         found = replace(found, intrinsics=estimated)
     return found

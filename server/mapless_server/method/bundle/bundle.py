@@ -12,9 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +26,7 @@ from ..optim.perturbation import world_jacobian
 from ..structure.model import DepthPlanes, Structure
 from ..structure.observations import Observations
 from ..structure.structure import observe
-from .normal_equations import NormalEquations, ViewColumns
+from .normal_equations import Linearized, NormalEquations, ViewColumns
 from .priors import NO_PRIORS, Priors
 from .unknowns import Bundle, Poses
 
@@ -39,49 +37,40 @@ class BundleProblem:
 
     Attributes:
         observations: observations of the points in all views; the views' poses are not used.
-        view: (O,) index of the view of each observation.
+        by_view: the same sorted by view, with the motion of the query's keypoints by errors of its intrinsics, if these
+            are unknowns, and planes near which the points lie by stored depths, at the references' given poses: motions
+            of these by millimetres do not matter for depths known to centimetres.
         given: poses of the references.
         information: C^-1, (6 (V - 1), 6 (V - 1)), of the prior on the references' poses; 0 leaves them free.
         loss_scale_sigma: scale of the Cauchy loss, in standard deviations.
         priors: priors on the query's pose.
         prior_weight: factor on their cost, relative to that of the observations.
-        keypoint_motion: (O_q, 2, I) of the query's observations, in their order, by errors of its intrinsics, in
-            standard deviations; I = 0 if they are no unknowns.
         intrinsics_information: (I,) inverse variances of the prior on these errors.
         intrinsics_offset: (I,) errors of the intrinsics that are removed already; the prior's mean is minus these.
-        planes: planes near which the points lie by stored depths, at the references' given poses: motions of these by
-            millimetres do not matter for depths known to centimetres.
         least_curvature: least curvature of the loss along a residual, as a share of its weight. Along a residual
             Cauchy's loss curves less than its weight says, so below 1 steps are longer and fewer (Triggs et al.,
             Bundle adjustment: a modern synthesis, 2000); the minimum is the same.
     """
 
     observations: Observations
-    view: NDArray[np.intp]
+    by_view: ViewColumns
     given: Poses
     information: Array
     loss_scale_sigma: float
     priors: Priors = NO_PRIORS
     prior_weight: float = 1.0
-    keypoint_motion: Array = field(default_factory=lambda: np.zeros((0, 2, 0)))
     intrinsics_information: Array = field(default_factory=lambda: np.zeros(0))
     intrinsics_offset: Array = field(default_factory=lambda: np.zeros(0))
-    planes: DepthPlanes | None = None
     least_curvature: float = 1.0
 
-    @cached_property
-    def by_view(self) -> ViewColumns:
-        """The observations sorted by view, in columns."""
-        sorted_by_view = ViewColumns.of(self.observations, self.view, len(self.given.rotation) + 1, self.planes)
-        return sorted_by_view.with_keypoint_motion(self.keypoint_motion)
-
-    def replaced(self, **changes: Any) -> BundleProblem:
-        """Returns the problem with other priors or `keypoint_motion`; the same observations are not sorted again."""
-        other, by_view = replace(self, **changes), self.by_view
-        if "keypoint_motion" in changes:
-            by_view = by_view.with_keypoint_motion(other.keypoint_motion)
-        vars(other)["by_view"] = by_view
-        return other
+    @staticmethod
+    def of(
+        observations: Observations, given: Poses, loss_scale_sigma: float, planes: DepthPlanes | None = None
+    ) -> BundleProblem:
+        """The problem with free references."""
+        count = len(given.rotation)
+        by_view = ViewColumns.of(observations, count + 1, planes)
+        return BundleProblem(observations, by_view, given, np.zeros((6 * count,) * 2), loss_scale_sigma)
 
     @property
     def query_rows(self) -> slice:
@@ -93,9 +82,13 @@ class BundleProblem:
         """Motion (V - 1, 6) of each reference from its given pose."""
         return bundle.poses[:-1].motion_from(self.given)
 
-    def cost(self, bundle: Bundle) -> float:
+    def at(self, bundle: Bundle) -> Linearized:
+        """The values of a bundle, linearized: few are only compared by their cost."""
+        return self.by_view.at(bundle)
+
+    def cost(self, there: Linearized) -> float:
         """Cost of the values; NaN if a point is behind a camera."""
-        squared = (self.by_view.linearized(bundle)[0] ** 2).sum(axis=0)
+        bundle, squared = there.bundle, (there.residual**2).sum(axis=0)
         motion = self.reference_motion(bundle).ravel()
         prior = float(motion @ self.information @ motion)
         if bundle.intrinsics.size:
@@ -106,9 +99,9 @@ class BundleProblem:
             prior += self.by_view.planes.cost(bundle.points)
         return cauchy_cost(squared, self.loss_scale_sigma) + prior
 
-    def linearize(self, bundle: Bundle) -> NormalEquations:
+    def linearize(self, there: Linearized) -> NormalEquations:
         """See `optimize.Problem`."""
-        equations = self.by_view.equations(bundle, self.loss_scale_sigma, self.least_curvature)
+        bundle, equations = there.bundle, self.by_view.equations(there, self.loss_scale_sigma, self.least_curvature)
         query = self.query_rows
         references, intrinsics = slice(query.start), slice(query.stop, None)
         equations.pose_block[references, references] += self.information
@@ -125,22 +118,23 @@ class BundleProblem:
             equations.pose_block[query, query] += self.prior_weight * to_world.T @ information @ to_world
         return equations
 
-    def step(self, bundle: Bundle, equations: NormalEquations, damping: float) -> Bundle | None:
+    def step(self, there: Linearized, equations: NormalEquations, damping: float) -> Linearized | None:
         """See `optimize.Problem`."""
         matrix, gradient, points = equations.reduced(damping)
         motion = solve_step(matrix, gradient)
         if motion is None:
             return None
         cameras = self.query_rows.stop
-        return bundle.moved(motion[:cameras].reshape(-1, 6), points.steps(motion), motion[cameras:])
+        moved = there.bundle.moved(motion[:cameras].reshape(-1, 6), points.steps(motion), motion[cameras:])
+        return self.at(moved)
 
-    def query_motion_sigma(self, before: Bundle, after: Bundle, equations: NormalEquations) -> float:
+    def query_motion_sigma(self, before: Linearized, after: Linearized, equations: NormalEquations) -> float:
         """Length of the query's motion, intrinsics included, in standard deviations by the residuals.
 
         These are as if points and references were known, so the motion is no longer than this.
         """
-        motion = after.poses[-1:].motion_from(before.poses[-1:]).ravel()
-        step = np.concatenate([motion, after.intrinsics - before.intrinsics])
+        old, new = before.bundle, after.bundle
+        step = np.concatenate([new.poses[-1:].motion_from(old.poses[-1:]).ravel(), new.intrinsics - old.intrinsics])
         unknowns = slice(self.query_rows.start, None)
         return math.sqrt(step @ equations.pose_block[unknowns, unknowns] @ step)
 

@@ -168,10 +168,10 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
             them.
     """
     seen, bundle, thinning = _thinned(problem.by_view, bundle, max_matches)
-    residual, by_point, by_pose = seen.linearized(bundle)
-    weight = cauchy_weight((residual**2).sum(axis=0), problem.loss_scale_sigma)
-    residual, weight = residual / weight, weight**2
-    equations = seen.equations(bundle, problem.loss_scale_sigma, 1.0, (residual, by_point, by_pose), weight)
+    there = seen.at(bundle)
+    weight = cauchy_weight((there.residual**2).sum(axis=0), problem.loss_scale_sigma)
+    residual, weight = there.residual / weight, weight**2
+    equations = seen.equations(replace(there, residual=residual), problem.loss_scale_sigma, weight=weight)
     data, gradient, points = equations.reduced(DAMPING)
     query, posed = problem.query_rows, slice(problem.query_rows.stop)
     prior, prior_gradient = np.zeros_like(data), np.zeros_like(gradient)
@@ -194,7 +194,7 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
     to_rest = np.hstack([-solved[0, :, :-1].T, np.eye(len(data) - posed.stop)])
     regions = _regions(seen)
     to_both = np.vstack([np.hstack([-to_pose, np.zeros((6, len(to_rest)))]), to_rest])
-    influences, known = _by_region(seen, regions, to_both, residual, by_pose, weight, points)
+    influences, known = _by_region(seen, regions, to_both, residual, there.by_pose, weight, points)
     if not (np.isfinite(poses).all() and np.isfinite(influences).all()):
         return None
     found = Dispersion(poses[1:] - poses[0], influences[:, :6], poses[0], _gap(seen, bundle))

@@ -17,7 +17,7 @@ measure how the estimate changes without each of these parts.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -155,32 +155,44 @@ class IntrinsicsEvidence:
         return options.contradicted(self.value, self.sigma, usual, self.given.width_px)
 
 
+@dataclass(frozen=True, eq=False)
+class IntrinsicsTerms:
+    """A photograph's intrinsics as they are known without its matches.
+
+    Attributes:
+        given: the photograph, with its intrinsics as given.
+        prior_sigma: (4,) see `IntrinsicsEvidence`.
+        held_sigma: (4,) the same where the pose was computed: less for a camera that the references share, more for
+            parameters that the photograph contradicts.
+        removed: (4,) errors that are removed from the intrinsics at which they are linearized.
+    """
+
+    given: View
+    prior_sigma: Array
+    held_sigma: Array
+    removed: Array = field(default_factory=lambda: np.zeros(4))
+
+
 def intrinsics_evidence(
     equations: IntrinsicsEquations,
-    given: View,
-    removed: Array,
-    prior_sigma: Array,
-    held_sigma: Array,
+    terms: IntrinsicsTerms,
+    to_world: Array,
+    suspicion: ContradictionOptions,
     inflation: float,
     region_factor: float,
-    suspicion: ContradictionOptions,
-    to_world: Array,
 ) -> IntrinsicsEvidence | None:
     """Computes the evidence from normal equations of the errors of the intrinsics; None if they are singular.
 
     Args:
         equations: the normal equations of these errors.
-        given: the photograph, with its intrinsics as given.
-        removed: (4,) errors that are removed from the intrinsics at which they are linearized.
-        prior_sigma: (4,) see `IntrinsicsEvidence`.
-        held_sigma: (4,) the same where the pose was computed: less for a camera that the references share, more for
-            parameters that the photograph contradicts.
-        inflation: see `IntrinsicsEquations.estimate`.
-        region_factor: see `UncertaintyOptions`.
+        terms: the photograph, and its intrinsics without the matches.
+        to_world: (6, 6) derivative of the world error by the pose's unknowns.
         suspicion: an error that exceeds this counts in full in the pose's covariance: given intrinsics are right or far
             off, and the latter more often than a normal distribution says.
-        to_world: (6, 6) derivative of the world error by the pose's unknowns.
+        inflation: see `IntrinsicsEquations.estimate`.
+        region_factor: see `UncertaintyOptions`.
     """
+    given, removed, prior_sigma, held_sigma = terms.given, terms.removed, terms.prior_sigma, terms.held_sigma
     try:
         # Of an error that moves no keypoint, k1 of a lens model without such a coefficient, only the prior is known.
         is_seen = np.diag(np.diag(equations.matrices[0]) > 0)

@@ -6,7 +6,6 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,16 +42,18 @@ class ViewColumns:
     planes: DepthPlanes | None = None
 
     @staticmethod
-    def of(
-        observations: Observations, view: NDArray[np.intp], view_count: int, planes: DepthPlanes | None = None
-    ) -> ViewColumns:
-        """Makes the columns from rows and the view (O,) of each; `planes` as in BundleProblem."""
+    def of(observations: Observations, view_count: int, planes: DepthPlanes | None = None) -> ViewColumns:
+        """Makes the columns from rows; `planes` as in BundleProblem."""
+        view = observations.tracks.view
         order = np.argsort(view, kind="stable")
         focal, offset = take(observations.focal, order), take(observations.offset, order)
         return ViewColumns(observations.point[order], view[order], view_count, focal, offset, planes=planes)
 
     def with_keypoint_motion(self, keypoint_motion: Array) -> ViewColumns:
-        """Returns the columns with the `keypoint_motion` (O_q, 2, I) of a BundleProblem."""
+        """Returns the columns with errors of the query's intrinsics as unknowns.
+
+        `keypoint_motion` is the derivative (O_q, 2, I) of its observations, in their order, in standard deviations.
+        """
         return replace(self, by_intrinsics=np.ascontiguousarray(np.moveaxis(keypoint_motion, 0, 2)))
 
     @cached_property
@@ -62,7 +63,7 @@ class ViewColumns:
         return tuple(slice(*part) for part in itertools.pairwise(ends))
 
     @cached_property
-    def sums(self) -> Any:
+    def sums(self) -> csc_array:
         """(P, O) sparse: a product with it sums over the observations of each point."""
         count = len(self.point)
         shape = int(self.point.max(initial=-1)) + 1, count
@@ -79,17 +80,8 @@ class ViewColumns:
         columns = take(self.focal, kept), take(self.offset, kept), by_intrinsics
         return ViewColumns(point, view, self.view_count, *columns, self.planes and self.planes[chosen])
 
-    def linearized(self, bundle: Bundle) -> tuple[Array, Array, Array]:
-        """Residuals (2, O), NaN behind the camera, and derivatives by the point (2, 3, O) and the pose (2, 6, O).
-
-        They are kept with the bundle: its cost needs the residuals, and few bundles are not linearized too.
-        """
-        known: tuple[ViewColumns, tuple[Array, Array, Array]] | None = vars(bundle).get("_linearized")
-        if known is None or known[0] is not self:
-            vars(bundle)["_linearized"] = known = self, self._linearized(bundle)
-        return known[1]
-
-    def _linearized(self, bundle: Bundle) -> tuple[Array, Array, Array]:
+    def at(self, bundle: Bundle) -> Linearized:
+        """The residuals at the values of a bundle, with their derivatives."""
         rotation = take(columns(bundle.poses.rotation), self.view)
         x_in_world = take(np.ascontiguousarray(bundle.points.T), self.point)
         x, y, z = apply_columns(rotation, x_in_world) + take(bundle.poses.translation.T, self.view)
@@ -100,25 +92,20 @@ class ViewColumns:
         residual = ideal * self.focal + self.offset
         if bundle.intrinsics.size:
             residual[:, self.parts[-1]] += np.einsum("aio,i->ao", self.by_intrinsics, bundle.intrinsics)
-        return residual, by_point, by_pose
+        return Linearized(bundle, residual, by_point, by_pose)
 
     def equations(
-        self,
-        bundle: Bundle,
-        loss_scale_sigma: float,
-        least_curvature: float = 1.0,
-        linearized: tuple[Array, Array, Array] | None = None,
-        weight: Array | None = None,
+        self, there: Linearized, loss_scale_sigma: float, least_curvature: float = 1.0, weight: Array | None = None
     ) -> NormalEquations:
         """The normal equations of the observations alone, for a Cauchy loss of this scale.
 
-        `linearized` is the result of the method of that name, if it is known, and `weight` (O,) replaces the loss's.
+        `weight` (O,) replaces the loss's.
 
         With `least_curvature` below 1 derivatives J become (I - (1 - c) r r^T / |r|^2) J and residuals r become r / c,
         which leaves the gradient as it is. For a weight w the loss curves by w (2 w - 1) along r. But c^2 is least at
         w = 1/2 and 1 far away, where the curvature is negative.
         """
-        residual, by_point, by_pose = linearized or self.linearized(bundle)
+        residual, by_point, by_pose = there.residual, there.by_point, there.by_pose
         squared, last, by_intrinsics = (residual**2).sum(axis=0), self.parts[-1], self.by_intrinsics
         weight = cauchy_weight(squared, loss_scale_sigma) if weight is None else weight
         if least_curvature < 1:
@@ -146,10 +133,26 @@ class ViewColumns:
             normal = self.planes.normal.T
             weighted = normal * self.planes.information
             point_block += symmetric_products(weighted[None], normal[None])
-            point_gradient += weighted * self.planes.distance(bundle.points)
+            point_gradient += weighted * self.planes.distance(there.bundle.points)
         pose_block, pose_gradient = _block_diagonal(blocks), np.concatenate(gradients)
         by_camera = weighted_pose, weighted_intrinsics
         return NormalEquations(self, pose_block, pose_gradient, point_block, point_gradient, by_point, *by_camera)
+
+
+@dataclass(frozen=True, eq=False)
+class Linearized:
+    """Values of the unknowns, and the residuals of O observations there with their derivatives.
+
+    Attributes:
+        bundle: the values.
+        residual: (2, O) in standard deviations; NaN behind the camera.
+        by_point, by_pose: (2, 3, O) and (2, 6, O), derivatives by the point and by a left perturbation of the pose.
+    """
+
+    bundle: Bundle
+    residual: Array
+    by_point: Array
+    by_pose: Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -44,9 +44,15 @@ from ..structure.structure import StructureOptions, tracks_with_query
 from .bundle import BundleProblem, bundle_of
 from .dispersion import UncertaintyOptions, disperse, dispersed_covariance
 from .estimate import PoseEstimate, PoseStage
-from .intrinsics import ContradictionOptions, IntrinsicsEvidence, intrinsics_evidence, keypoint_motion
-from .normal_equations import NormalEquations
-from .unknowns import Bundle
+from .intrinsics import (
+    ContradictionOptions,
+    IntrinsicsEvidence,
+    IntrinsicsTerms,
+    intrinsics_evidence,
+    keypoint_motion,
+)
+from .normal_equations import Linearized, NormalEquations
+from .unknowns import Bundle, Poses
 
 LEAST_DAMPING = 1e-9
 """Keeps the points determined where they are eliminated at the given poses."""
@@ -156,39 +162,65 @@ class AdjustInput:
         return replace(self, structure=replace(self.structure, x_in_world=x_in_world))
 
 
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """What was solved of a query's adjustment.
+
+    Attributes:
+        given: what the pose was adjusted to.
+        problem: the problem, without priors on the pose or with them.
+        there: values of its unknowns, at its optimum or near it.
+        used: indices of the matches that it uses.
+    """
+
+    given: AdjustInput
+    problem: BundleProblem
+    there: Linearized
+    used: NDArray[np.intp]
+
+    @property
+    def bundle(self) -> Bundle:
+        """The values alone."""
+        return self.there.bundle
+
+
 def pose_problem(
-    given: AdjustInput, used: NDArray[np.intp], world_from_query: RigidTransform, information: Array | None = None
-) -> tuple[BundleProblem, Bundle]:
+    given: AdjustInput,
+    used: NDArray[np.intp],
+    world_from_query: RigidTransform,
+    known: tuple[Array, Poses] | None = None,
+) -> tuple[BundleProblem, Linearized]:
     """Sets up the problem of one query without priors, and its start; `used` are the indices of the matches to use.
 
-    `information` is that of the prior on the references' poses, which is estimated if None.
+    `known` are the information of the prior on the references' poses, which is estimated if None, and all poses of the
+    start, which are the given ones if None.
     """
     query, references, structure, matches = given.query, given.references, given.structure, given.matches
     views = [*references, PosedView("", "", query, world_from_query)]
     tracks, chosen = tracks_with_query(structure, matches.point[used], matches.keypoint[used], len(references))
     observations, start, depth_m = bundle_of(tracks, views, structure, chosen)
     poses = start.poses[:-1]
-    free = np.zeros((6 * len(references),) * 2)
     planes = structure.planes[chosen] if structure.planes is not None else None
-    problem = BundleProblem(observations, tracks.view, poses, free, given.options.loss_scale_sigma, planes=planes)
-    if information is not None:
-        return problem.replaced(information=information), start
+    problem = BundleProblem.of(observations, poses, given.options.loss_scale_sigma, planes)
+    if known is not None:
+        return replace(problem, information=known[0]), problem.at(replace(start, poses=known[1]))
     centres = np.array([it.world_from_camera.translation for it in references])
     observing = np.unique(tracks.view)[:-1]  # the last is the query
     focal_px = float(np.median([references[i].view.camera.focal_x_px for i in observing]))
     level_px = structure.noise.level_px
     errors = pose_errors(centres, poses.rotation, world_from_query.translation, level_px, focal_px, depth_m, observing)
-    matrix, gradient, _ = problem.linearize(start).reduced(LEAST_DAMPING)
+    there = problem.at(start)
+    matrix, gradient, _ = problem.linearize(there).reduced(LEAST_DAMPING)
     own, drift = most_probable(errors, matrix, gradient)
     covariance = errors.covariance(own, drift)
-    return problem.replaced(information=np.asarray(np.linalg.inv(covariance), np.float64)), start
+    return replace(problem, information=np.asarray(np.linalg.inv(covariance), np.float64)), there
 
 
-def optimum(problem: BundleProblem, start: Bundle, options: AdjustOptions) -> Bundle:
+def optimum(problem: BundleProblem, start: Linearized, options: AdjustOptions) -> Linearized:
     """The values at the minimum of a problem, as near to it as matters for the query's pose."""
-    curved = problem.replaced(least_curvature=options.least_curvature)
+    curved = replace(problem, least_curvature=options.least_curvature)
 
-    def is_near(before: Bundle, after: Bundle, equations: NormalEquations) -> bool:
+    def is_near(before: Linearized, after: Linearized, equations: NormalEquations) -> bool:
         return curved.query_motion_sigma(before, after, equations) < options.min_motion_sigma
 
     return minimize(curved, start, MinimizeOptions(options.iterations, options.min_decrease), is_near)
@@ -196,11 +228,12 @@ def optimum(problem: BundleProblem, start: Bundle, options: AdjustOptions) -> Bu
 
 def with_intrinsics(problem: BundleProblem, bundle: Bundle, query: View) -> tuple[BundleProblem, Bundle]:
     """Adds errors of the query's intrinsics to the unknowns of a problem, without a prior on them."""
-    is_query = problem.view == len(problem.given.rotation)
     observations = problem.observations
+    is_query = observations.tracks.view == len(problem.given.rotation)
     motion = keypoint_motion(query.camera, query.distortion, observations.pixel[:, is_query].T)
     motion = motion / observations.sigma_px[is_query, None, None]
-    wider = problem.replaced(keypoint_motion=motion, intrinsics_information=np.zeros(4), intrinsics_offset=np.zeros(4))
+    by_view, none = problem.by_view.with_keypoint_motion(motion), np.zeros(4)
+    wider = replace(problem, by_view=by_view, intrinsics_information=none, intrinsics_offset=none)
     return wider, replace(bundle, intrinsics=np.zeros(4))
 
 
@@ -210,15 +243,11 @@ def shares_camera(query: View, references: Sequence[PosedView]) -> bool:
 
 
 def adjusted_estimate(
-    given: AdjustInput,
-    used: NDArray[np.intp],
-    estimate: PoseEstimate,
-    bundle: Bundle,
-    errors: tuple[Array, IntrinsicsEvidence | None] | None,
+    solved: Solved, estimate: PoseEstimate, errors: tuple[Array, IntrinsicsEvidence | None] | None
 ) -> PoseEstimate | None:
     """Returns the estimate at the optimum; None if it has diverged. `errors` are what `errors_of_pose` returns."""
-    pose, options = bundle.world_from_query, given.options
-    errors_px = given.with_points(used, bundle.points).errors_px(pose)
+    pose, options = solved.bundle.world_from_query, solved.given.options
+    errors_px = solved.given.with_points(solved.used, solved.bundle.points).errors_px(pose)
     inliers = errors_px < options.inlier_px
     if errors is None or inliers.sum() < max(1, options.min_kept_share * estimate.inliers.sum()):
         return None
@@ -226,26 +255,21 @@ def adjusted_estimate(
 
 
 def errors_of_pose(
-    query: View,
-    problem: BundleProblem,
-    bundle: Bundle,
-    options: AdjustOptions,
-    intrinsics: tuple[View, Array, Array, Array],
-    is_offset: bool = False,
+    solved: Solved, intrinsics: IntrinsicsTerms, is_offset: bool = False
 ) -> tuple[Array, IntrinsicsEvidence | None] | None:
     """A pose's covariance without scale and priors, and the evidence of errors of its intrinsics; None for neither.
 
-    `intrinsics`: the query with its intrinsics as given, the errors that are removed from them, and the standard
-    deviations `prior_sigma` and `held_sigma` of `intrinsics_evidence`. `is_offset` as for `dispersed_covariance`.
+    `is_offset` as for `dispersed_covariance`.
     """
-    pose = bundle.world_from_query
-    dispersion = disperse(*with_intrinsics(problem, bundle, query), options.uncertainty.max_matches)
+    pose, options = solved.bundle.world_from_query, solved.given.options
+    wider, bundle = with_intrinsics(solved.problem, solved.bundle, solved.given.query)
+    dispersion = disperse(wider, bundle, options.uncertainty.max_matches)
     if dispersion is None:
         return None
     assert dispersion.intrinsics is not None
     covariance = dispersed_covariance(dispersion, pose, options.uncertainty, is_offset)
-    factors = options.error_inflation, options.uncertainty.region_factor, options.suspicion
-    evidence = intrinsics_evidence(dispersion.intrinsics, *intrinsics, *factors, world_jacobian(pose))
+    to_world, factors = world_jacobian(pose), (options.error_inflation, options.uncertainty.region_factor)
+    evidence = intrinsics_evidence(dispersion.intrinsics, intrinsics, to_world, options.suspicion, *factors)
     return (covariance if evidence is None else covariance + evidence.pose_covariance), evidence
 
 

@@ -9,14 +9,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array
-
-from .bundle import BundleProblem
 from .estimate import PoseEstimate
-from .intrinsics import PRINCIPAL, ContradictionOptions, IntrinsicsEvidence, corrected_view
+from .intrinsics import PRINCIPAL, ContradictionOptions, IntrinsicsEvidence, IntrinsicsTerms, corrected_view
 from .pose_problem import (
     AdjustInput,
     AdjustOptions,
+    Solved,
     adjusted_estimate,
     errors_of_pose,
     optimum,
@@ -25,7 +23,6 @@ from .pose_problem import (
     with_intrinsics,
 )
 from .priors import Priors
-from .unknowns import Bundle
 
 WIDE_SIGMA = np.array([0.3, 0.3, 0.3, 1.0])
 """Of an estimated parameter: focal length and k1, and principal point as a share of the width."""
@@ -38,27 +35,24 @@ LEAST_MATCHES = 20
 ROUGHLY = 2.0
 """Factor on `AdjustOptions.min_motion_sigma` before the photograph is read again."""
 
-Solved = tuple[BundleProblem, Bundle, NDArray[np.intp]]
-"""A problem, its solution, and the indices of the matches that it uses."""
 
-
-def recalibrated(given: AdjustInput, found: PoseEstimate, priors: Priors, usual: Array, solved: Solved) -> PoseEstimate:
+def recalibrated(solved: Solved, found: PoseEstimate, priors: Priors, terms: IntrinsicsTerms) -> PoseEstimate:
     """The estimate with the parameters that the photograph contradicts; the one found if it contradicts none.
 
-    `solved` is where the estimate was found; `usual` (4,) are the standard deviations of the intrinsics.
+    `solved` is where the estimate was found, with the intrinsics as given.
     """
-    query, options = given.query, given.options
+    given, query, options, usual = solved.given, solved.given.query, solved.given.options, terms.prior_sigma
     held, untried = usual, np.ones(4, bool)
     wide = np.maximum(usual, WIDE_SIGMA * np.array([1, query.camera.width_px, query.camera.width_px, 1]))
     if not is_suspicious(found, options):
         return found
     # With all estimated, the wrong ones stand out: an error that is held looks like errors of the others.
-    guide = _with_errors(given, found, priors, usual, wide, solved) or found
+    guide = _with_errors(given, found, priors, replace(terms, held_sigma=wide), solved) or found
     while (worst := _contradicted(guide, options.suspicion, untried)) is not None:
         untried[list(worst)] = False
         freed = held.copy()
         freed[list(worst)] = wide[list(worst)]
-        better = _with_errors(given, guide, priors, usual, freed)
+        better = _with_errors(given, guide, priors, replace(terms, held_sigma=freed))
         if better is None or better.intrinsics is None:
             continue
         if better.intrinsics.contradicted(options.contradiction)[list(worst)].any():
@@ -108,42 +102,39 @@ def _contradicted(
 
 
 def _with_errors(
-    given: AdjustInput, found: PoseEstimate, priors: Priors, usual: Array, held: Array, solved: Solved | None = None
+    given: AdjustInput, found: PoseEstimate, priors: Priors, terms: IntrinsicsTerms, solved: Solved | None = None
 ) -> PoseEstimate | None:
-    """The estimate with intrinsics as unknowns of prior standard deviations `held`; None if it fails."""
+    """The estimate with intrinsics as unknowns, which the terms hold; None if it fails."""
     assert found.intrinsics is not None
     query, options, errors, pose = given.query, given.options, found.intrinsics.removed, found.world_from_camera
     small = LINEAR_CHANGE * np.array([1, query.camera.width_px, query.camera.width_px, 1])
     rough = replace(options, min_motion_sigma=ROUGHLY * options.min_motion_sigma)
     read = replace(given, query=found.view or query)  # the photograph as it is read with these errors removed
-    moved, bundle, change, information = read, None, None, None
+    moved, change, known = read, None, None
     for left in reversed(range(options.rounds)):
         if solved is None:
             errors_px = read.errors_px(pose)
             used = np.flatnonzero(errors_px < options.max_error_px)
         else:
-            problem, start, used = solved
+            problem, start, used = solved.problem, solved.there, solved.used
         if len(used) < LEAST_MATCHES:
             return None
         if solved is None:
-            problem, start = pose_problem(moved, used, pose, information)
-            start = start if bundle is None else replace(start, poses=bundle.poses)
+            problem, start = pose_problem(moved, used, pose, known)
         solved = None
-        problem = problem.replaced(priors=priors, prior_weight=options.error_inflation**2)
+        problem = replace(problem, priors=priors, prior_weight=options.error_inflation**2)
         if not left or (change is not None and (np.abs(change) < small).all()):
             break
-        wider, there = with_intrinsics(problem, start, read.query)
-        wider = wider.replaced(intrinsics_information=held**-2.0, intrinsics_offset=errors)
-        bundle = optimum(wider, there, rough)
-        pose, change, information = bundle.world_from_query, bundle.intrinsics, problem.information
+        wider, there = with_intrinsics(problem, start.bundle, read.query)
+        wider = replace(wider, intrinsics_information=terms.held_sigma**-2.0, intrinsics_offset=errors)
+        bundle = optimum(wider, wider.at(there), rough).bundle
+        pose, change, known = bundle.world_from_query, bundle.intrinsics, (problem.information, bundle.poses)
         errors = errors + change
-        if np.abs(errors / held).max() > MAX_HELD:
+        if np.abs(errors / terms.held_sigma).max() > MAX_HELD:
             return None
         read = replace(given, query=corrected_view(query, errors))
         moved = replace(moved.with_points(used, bundle.points), query=read.query)
-    terms = (query, errors, usual, held)
     before = replace(found, inliers=errors_px < options.inlier_px)
-    bundle = optimum(problem, start, options)
-    its_errors = errors_of_pose(read.query, problem, bundle, options, terms)
-    better = adjusted_estimate(read, used, before, bundle, its_errors)
+    solved = Solved(read, problem, optimum(problem, start, options), used)
+    better = adjusted_estimate(solved, before, errors_of_pose(solved, replace(terms, removed=errors)))
     return better and replace(better, view=read.query)

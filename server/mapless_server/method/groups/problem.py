@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform
 
 from ..bundle.bundle import BundleProblem, bundle_of
-from ..bundle.normal_equations import NormalEquations
+from ..bundle.normal_equations import Linearized, NormalEquations
 from ..bundle.pose_problem import LEAST_DAMPING, AdjustOptions, most_probable, pose_errors
 from ..bundle.priors import Priors
 from ..bundle.unknowns import Bundle, Poses
@@ -161,6 +161,10 @@ class Point(Generic[S]):
         last = self.state.camera_from_world(block.image)
         return Bundle(self.references[block.references].and_last(last), self.points[index])
 
+    def at(self, index: int, block: ImageBlock) -> Linearized:
+        """Returns the values of one block, linearized."""
+        return block.problem.at(self.bundle(index, block))
+
 
 class GroupProblem(Generic[S]):
     """The cost of a group and its derivatives; see `optimize.Problem`.
@@ -208,11 +212,8 @@ class GroupProblem(Generic[S]):
         observations, start, depth_m = bundle_of(part.tracks, views, structure, part.chosen)
         observations = replace(observations, sigma_px=observations.sigma_px * np.sqrt(shared.times(part)))
         references = np.array([self._index(it) for it in source.references])
-        free = np.zeros((6 * len(references),) * 2)
         planes = None if structure.planes is None else structure.planes[part.chosen]
-        problem = BundleProblem(
-            observations, part.tracks.view, start.poses[:-1], free, ADJUST.loss_scale_sigma, planes=planes
-        )
+        problem = BundleProblem.of(observations, start.poses[:-1], ADJUST.loss_scale_sigma, planes)
         return ImageBlock(source.image, problem, references, structure.noise.level_px, depth_m)
 
     def _index(self, reference: PosedView) -> int:
@@ -225,17 +226,17 @@ class GroupProblem(Generic[S]):
         The size of the errors is estimated from the photograph with the most observations; they are relative to the
         place of the last photograph.
         """
-        index = max(range(len(self.blocks)), key=lambda i: len(self.blocks[i].problem.view))
+        index = max(range(len(self.blocks)), key=lambda i: len(self.blocks[i].problem.by_view.view))
         block, given = self.blocks[index], self.start.references
         bundle = self.start.bundle(index, block)
-        observing = np.unique(block.problem.view)[:-1]  # the last is the photograph
+        observing = np.unique(block.problem.by_view.view)[:-1]  # the last is the photograph
         views = [reference.view for _, reference in self._references.values()]
         focal_px = float(np.median([views[i].camera.focal_x_px for i in block.references[observing]]))
         size = block.level_px, focal_px, block.depth_m
         centre = bundle.world_from_query.translation
         its = given[block.references]
         errors = pose_errors(its.centres, its.rotation, centre, *size, observing)
-        matrix, gradient, _ = block.problem.linearize(bundle).reduced(LEAST_DAMPING)
+        matrix, gradient, _ = block.problem.linearize(block.problem.at(bundle)).reduced(LEAST_DAMPING)
         own, drift = most_probable(errors, matrix, gradient)
         last = self.start.state.camera_from_world(self.blocks[-1].image).inverse().translation
         errors = pose_errors(given.centres, given.rotation, last, *size, block.references[observing])
@@ -243,7 +244,7 @@ class GroupProblem(Generic[S]):
 
     def cost(self, point: Point[S]) -> float:
         """Cost of a point of the search; NaN if a structure point is behind a camera."""
-        data = sum(block.problem.cost(point.bundle(i, block)) for i, block in enumerate(self.blocks))
+        data = sum(block.problem.cost(point.at(i, block)) for i, block in enumerate(self.blocks))
         poses = {image: point.state.camera_from_world(image).inverse() for image in self.priors}
         prior = sum(self.priors[image].cost(pose) for image, pose in poses.items())
         motion = self._reference_motion(point)
@@ -255,7 +256,7 @@ class GroupProblem(Generic[S]):
 
     def linearize(self, point: Point[S]) -> list[NormalEquations]:
         """See `optimize.Problem`."""
-        return [block.problem.linearize(point.bundle(i, block)) for i, block in enumerate(self.blocks)]
+        return [block.problem.linearize(point.at(i, block)) for i, block in enumerate(self.blocks)]
 
     def _columns(self, point: Point[S]) -> list[Array]:
         return [block.columns(self.reference_count, point.state) for block in self.blocks]

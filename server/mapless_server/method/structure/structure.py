@@ -17,10 +17,10 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, RigidTransform
+from mapless.geometry import Array
 
 from ..features.tracks import Tracks, build_tracks, keypoint_offsets
-from ..features.views import Matches, PosedView, Reconstruction, View
+from ..features.views import Matches, PosedView, Reconstruction
 from ..optim.bounds import check_bounds
 from ..optim.optimize import columns, length, take
 from ..pairs.correspond import Correspondences
@@ -261,19 +261,18 @@ def query_tracks(
 
 
 def with_query_points(
-    query: View,
+    query: PosedView,
     references: Sequence[PosedView],
     structure: Structure,
     matches: PointMatches,
     tracks: Tracks,
-    world_from_query: RigidTransform,
     options: StructureOptions,
 ) -> tuple[Structure, PointMatches]:
     """Adds the points of `query_tracks`, triangulated with the query at a pose, and the query's matches with them.
 
     Most are observed by a single reference; those that do not fit the pose, or have too little parallax, are left out.
     """
-    observations = observe(tracks, [*references, PosedView("", "", query, world_from_query)], structure.noise)
+    observations = observe(tracks, [*references, query], structure.noise)
     refined = refine_points(observations, triangulate(observations), replace(options, model_noise=False))
     found = refined.observations.tracks
     chosen = np.zeros(found.point_count, bool)
