@@ -4,7 +4,10 @@ import math
 from typing import Any
 
 from mapless import Accuracy
+from mapless_tools.dataset import Dataset
 from mapless_tools.evaluate.metrics import QueryResult
+from mapless_tools.evaluate.plan import EvaluationOptions
+from mapless_tools.evaluate.run import Evaluation
 
 
 def query_result(
@@ -25,3 +28,9 @@ def query_result(
         message=message if missed else "",
         **(common | fields),
     )
+
+
+def evaluation(*results: QueryResult, metric: bool = True, references: int | None = None) -> Evaluation:
+    """Of a folder whose references have a trajectory of radius 4."""
+    dataset = Dataset("kitchen", (), metric, "survey")
+    return Evaluation(dataset, EvaluationOptions(references), 30, 4.0, results)

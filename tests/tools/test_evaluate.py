@@ -11,14 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
-from support.evaluations import query_result
+from support.evaluations import evaluation, query_result
 
 from mapless import IntrinsicsCheck
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_tools.bench.report import BenchResult, BenchScene, Figures, Latency, as_json, markdown, met
 from mapless_tools.charts import INK, figure_of, inline_svg, new_axes, plot, use_logarithms
 from mapless_tools.child import Memory
-from mapless_tools.dataset import Dataset
 from mapless_tools.evaluate.metrics import QueryResult, pose_error, quantile, summarize
 from mapless_tools.evaluate.plan import EvaluationOptions, split_frames
 from mapless_tools.evaluate.report import print_report, to_json
@@ -28,11 +27,6 @@ from mapless_tools.evaluate.run import Evaluation
 def result(translation: float, rotation_deg: float = 0.01, latency_ms: float = 100.0) -> QueryResult:
     own = {"reference_distance": 2.0, "latency_ms": latency_ms, "stage_ms": {"decode": 10.0, "pnp": 30.0}}
     return query_result("q", translation, rotation_deg, (100, 200), "2 of [8] matches", **own)
-
-
-def evaluation(*results: QueryResult, metric: bool = True, references: int | None = None) -> Evaluation:
-    dataset = Dataset("kitchen", (), metric, "survey")
-    return Evaluation(dataset, EvaluationOptions(references), 30, 4.0, results)
 
 
 MISSED = result(math.inf)

@@ -11,11 +11,13 @@ from mapless_tools.output_files import finite, whole_file, write_json
 from .benchmarks import Benchmark
 from .metrics import RECALL_BARS, summarize
 from .plan import setting_name
+from .rungs import RIGHT_DEG, RIGHT_M, rungs_of, wrong_count
 from .suite import Run, Suite
 from .tables import Group, groups_of
 
 JSON_FILE, RUNS_FILE, QUERIES_FILE = "evaluation.json", "evaluation.csv", "queries.csv"
 RULES = (
+    f"A localized query is wrong that is off by more than {RIGHT_M:g} m or {RIGHT_DEG:g} degrees.",
     "Medians and recall are over all queries of a scene; one that was rejected counts as infinitely wrong.",
     "Averages are means of the scenes' medians; infinite (failed, null) if one of them is.",
     "Translation errors are distances of camera centres; rotation errors the angle between orientations.",
@@ -50,7 +52,11 @@ def as_json(suite: Suite, groups: Sequence[Group]) -> dict[str, Any]:
             for scene in suite.scenes
         ],
         "runs": [
-            {**run_figures(run), "queries_file": f"{run.journal.path.parent.name}/{run.journal.path.name}"}
+            {
+                **run_figures(run),
+                "rungs": [asdict(it) for it in rungs_of(run.results, RIGHT_M)],
+                "queries_file": f"{run.journal.path.parent.name}/{run.journal.path.name}",
+            }
             for run in suite.runs
         ],
         "averages": [average for group in groups for average in _averages(group)],
@@ -74,6 +80,7 @@ def run_figures(run: Run) -> dict[str, Any]:
         "queries": summary.query_count,
         "queries_of_benchmark": run.split.test_count,
         "localized": summary.localized_count,
+        "wrong": wrong_count(run.results, RIGHT_M),
         "median_translation_cm": finite(100 * summary.median_translation),
         "median_rotation_deg": finite(summary.median_rotation_deg),
         "p90_translation_cm": finite(100 * summary.p90_translation),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapless import Accuracy, IntrinsicsCheck
+from mapless import Accuracy, Attempt, IntrinsicsCheck
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
 
 RECALL_BARS = {"1cm_1deg": (0.01, 1.0), "5cm_5deg": (0.05, 5.0), "25cm_2deg": (0.25, 2.0)}
@@ -18,11 +18,11 @@ RECALL_BARS = {"1cm_1deg": (0.01, 1.0), "5cm_5deg": (0.05, 5.0), "25cm_2deg": (0
 class QueryResult:
     """The result of one query; a rejected one has infinite errors, counts of 0, and no pose.
 
-    Lengths are in the dataset's unit; `reference_distance` is the median distance from the true camera centre to those
-    of its references. The accuracy has the claimed radii, positions in the dataset's unit; None without a pose, or for
-    a pose without radii, as is trust. Intrinsics checks are those of the answer, or of the rejection. The latency is
-    measured by the client, `stage_ms` and `processor_ms` in the server. The best reference has the most inliers. The
-    pose is the answered world_from_camera: x y z and the quaternion x y z w.
+    Lengths are in the dataset's unit; `reference_distance` is the median distance from the true camera centre to
+    those of its references. The accuracy has the claimed radii, positions in the dataset's unit; None without a
+    pose, or for a pose without radii, as is trust. Intrinsics checks are those of the answer, or of the rejection.
+    The latency is measured by the client, `stage_ms`, `processor_ms` and those of attempts in the server. The best
+    reference has the most inliers. The pose is the answered world_from_camera: x y z and the quaternion x y z w.
     """
 
     name: str
@@ -44,6 +44,7 @@ class QueryResult:
     trust: float | None = None
     intrinsics_checks: tuple[IntrinsicsCheck, ...] = ()
     processor_ms: float = 0.0
+    attempts: tuple[Attempt, ...] = ()
 
     @property
     def localized(self) -> bool:

@@ -1,7 +1,7 @@
 """The report of an evaluation for people (tables) and for programs (JSON)."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -14,6 +14,7 @@ from mapless_tools.output_files import finite
 
 from .metrics import QueryResult, Summary, summarize
 from .run import Evaluation
+from .rungs import RIGHT_DEG, RIGHT_M, RIGHT_SHARE, Rung, largest_error, rungs_of, wrong_count
 
 RULES = (
     "Medians, p90 and recall are over all queries; one that was rejected counts as infinitely wrong.",
@@ -21,6 +22,8 @@ RULES = (
     f"before, matches count {NEARBY_WEIGHT:g}. Its true pose is not looked at.",
     "Latency: time of one Localize call as the client sees it, one after the other, on this machine; choosing the "
     "references is not in it, nor is the first call in p50 and p95.",
+    f"A localized query is wrong that is off by more than {RIGHT_M:g} m or {RIGHT_DEG:g} degrees; where the unit is "
+    f"arbitrary, by more than {100 * RIGHT_SHARE:g} % of the radius of the references' trajectory, or as many degrees.",
 )
 SCALE_FREE = (
     "Where a folder's unit of length is arbitrary, errors are in it, and the method's own thresholds, in metres, "
@@ -47,6 +50,7 @@ def to_json(evaluation: Evaluation) -> dict[str, Any]:
         "version": __version__,
         "queries": summary.query_count,
         "localized": summary.localized_count,
+        "wrong": wrong_count(evaluation.results, _largest_error(evaluation)),
         "median_translation_m": finite(summary.median_translation) if metric else None,
         "median_rotation_deg": finite(summary.median_rotation_deg),
         "p90_translation_m": finite(summary.p90_translation) if metric else None,
@@ -62,6 +66,7 @@ def to_json(evaluation: Evaluation) -> dict[str, Any]:
         },
         "stage_share": dict(summary.stage_share),
         "rejections": dict(summary.rejections),
+        "rungs": [asdict(it) for it in rungs_of(evaluation.results, _largest_error(evaluation))],
         "rules": [*RULES] if metric else [*RULES, SCALE_FREE],
         "per_query": [_query(result, metric) for result in evaluation.results],
     }
@@ -74,7 +79,8 @@ def print_report(evaluation: Evaluation, console: Console) -> None:
     split = "leave one out" if options.reference_count is None else f"{evaluation.reference_count} references"
     table = Table("", "", title=f"{dataset.name}: {split}, K = {options.k}", show_header=False, title_justify="left")
     for name, value in {
-        "localized": f"{summary.localized_count} of {summary.query_count}",
+        "localized": f"{summary.localized_count} of {summary.query_count}, "
+        f"{wrong_count(evaluation.results, _largest_error(evaluation))} of them wrong",
         **_accuracy_rows(evaluation, summary),
         "latency": f"p50 {summary.latency_p50_ms:.0f} ms, p95 {summary.latency_p95_ms:.0f} ms, "
         f"first call {summary.latency_first_ms:.0f} ms",
@@ -87,10 +93,36 @@ def print_report(evaluation: Evaluation, console: Console) -> None:
     }.items():
         table.add_row(name, value)
     console.print(table, highlight=False, markup=False)
+    rungs = rungs_of(evaluation.results, _largest_error(evaluation))
+    if rungs:
+        console.print(_rungs_table(rungs), highlight=False, markup=False)
     for rejected in (r for r in evaluation.results if not r.localized):
         console.print(f"  {rejected.name}: {rejected.rejection}: {rejected.message}", highlight=False, markup=False)
     for rule in RULES if dataset.metric else (*RULES, SCALE_FREE):
         console.print(rule, highlight=False, markup=False)
+
+
+RUNG_HEAD = ("attempt", "tried", "answered", "rescued", "wrong", "processor s")
+RUNG_NOTES = (
+    "Tried: photographs on which the attempt was made; answered: whose answer came from it; of these rescued: those "
+    "localized right although no pose was accepted before; wrong: localized wrongly, whatever was accepted before.",
+)
+
+
+def rung_cells(rung: Rung) -> tuple[str, ...]:
+    """A line of the table of attempts."""
+    return rung.rung, *map(str, (rung.tried, rung.answered, rung.rescued, rung.wrong)), f"{rung.processor_s:.1f}"
+
+
+def _rungs_table(rungs: Sequence[Rung]) -> Table:
+    table = Table(*RUNG_HEAD, title="Attempts", caption=" ".join(RUNG_NOTES), title_justify="left")
+    for rung in rungs:
+        table.add_row(*rung_cells(rung))
+    return table
+
+
+def _largest_error(evaluation: Evaluation) -> float:
+    return largest_error(evaluation.dataset.metric, evaluation.trajectory_radius)
 
 
 def format_length(value: float, metric: bool) -> str:
@@ -189,5 +221,6 @@ def _query(result: QueryResult, metric: bool) -> dict[str, Any]:
         "latency_ms": result.latency_ms,
         "processor_ms": result.processor_ms,
         "stage_ms": dict(result.stage_ms),
+        "attempts": [asdict(attempt) for attempt in result.attempts],
         "references": list(result.references),
     }

@@ -139,6 +139,7 @@ def _result(
         trust=found.trust if found else None,
         intrinsics_checks=answer.intrinsics_checks,
         processor_ms=1000 * diagnostics.processor_s,
+        attempts=diagnostics.attempts,
     )
 
 

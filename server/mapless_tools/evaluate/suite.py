@@ -14,7 +14,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from mapless import Accuracy, Client, IntrinsicsCheck, MaplessError
+from mapless import Accuracy, Attempt, Client, IntrinsicsCheck, MaplessError
 from mapless_server import __version__
 from mapless_server.networks.weights import CATALOGUE
 from mapless_server.networks.weights.folder import Status, look_up, recorded
@@ -235,6 +235,7 @@ def _result(line: dict[str, Any]) -> QueryResult:
     line["pose"] = None if line["pose"] is None else tuple(line["pose"])
     line["accuracy"] = None if line["accuracy"] is None else Accuracy(**line["accuracy"])
     line["intrinsics_checks"] = tuple(IntrinsicsCheck(**check) for check in line["intrinsics_checks"])
+    line["attempts"] = tuple(Attempt(**attempt) for attempt in line["attempts"])
     return QueryResult(**line)
 
 

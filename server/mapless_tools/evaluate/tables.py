@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from .benchmarks import BENCHMARKS, DENSE, Benchmark, Median, PaperMethod
 from .metrics import RECALL_BARS, QueryResult, Summary, summarize
 from .plan import Method, setting_name
-from .report import format_stages
+from .report import RUNG_HEAD, RUNG_NOTES, format_stages, rung_cells
+from .rungs import RIGHT_M, rungs_of
 from .suite import Run, Suite
 
 Key = tuple[str, int, Method]
@@ -135,7 +136,7 @@ def tables_of(group: Group) -> tuple[Table, ...]:
     tables += [_by_setting(group), _recall(group), _by_scene(group)]
     if len({method.scale for method in group.methods}) > 1:
         tables.append(_scales(group))
-    return tuple(table for table in (*tables, _timing(group)) if table.rows)
+    return tuple(table for table in (*tables, _timing(group), _attempts(group)) if table.rows)
 
 
 def format_median(translation_cm: float, rotation_deg: float) -> str:
@@ -237,6 +238,16 @@ def _timing(group: Group) -> Table:
         rows.append(Row(cells, OURS))
     head = ("run", "p50 ms", "p95 ms", "first ms", "time by stage", "claimed 68 % radius held, %", "rejected")
     return Table("Time of a call, the server's own claims, and rejections", head, tuple(rows), wide=True)
+
+
+def _attempts(group: Group) -> Table:
+    rows = []
+    for method in group.methods:
+        results = [it for (_, _, own), run in group.runs.items() if own == method for it in run.results]
+        for rung in rungs_of(results, RIGHT_M):
+            name, *figures = rung_cells(rung)
+            rows.append(Row((f"{name}, {method.label}" if len(group.methods) > 1 else name, *figures), OURS))
+    return Table("Attempts, of all scenes and settings", RUNG_HEAD, tuple(rows), RUNG_NOTES)
 
 
 def _average_notes(group: Group) -> tuple[str, ...]:
