@@ -20,7 +20,7 @@ from pydantic import (
     model_validator,
 )
 
-from mapless_server.method.choices import AUTO, BACKENDS, BEST_VARIANTS, FEATURES, NETWORKS, OFF, STORED
+from mapless_server.choices import AUTO, BACKENDS, BEST_VARIANTS, FEATURES, NETWORKS, OFF, STORED
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -17,7 +17,7 @@ import pytest
 import yaml  # type: ignore[import-untyped]
 from support.manifests import OLDEST, Json, built, check_confined, check_valid, needs_kubectl
 
-from mapless_server.method.choices import AUTO, BEST_VARIANTS
+from mapless_server.choices import AUTO, BEST_VARIANTS
 from mapless_server.networks.weights.catalogue import CATALOGUE
 from mapless_server.security import assess_binding
 from mapless_server.serve.run import CLOSING_LIMIT_S, NOTIFY_S

@@ -12,10 +12,10 @@ from support.scenes import random_for
 from mapless_server.engine.joint import pose_rig, pose_sequence
 from mapless_server.engine.query import Query, Result
 from mapless_server.method.bundle.priors import NO_PRIORS
+from mapless_server.method.features.views import ReferenceErrors
 from mapless_server.method.groups.images import GroupImage
 from mapless_server.method.groups.rig import RigEstimate
 from mapless_server.method.groups.sequence import SequenceEstimate
-from mapless_server.method.pairs.agreement import ReferenceErrors
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
 from mapless_server.store import SceneAttributes
 

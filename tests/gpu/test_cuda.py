@@ -28,7 +28,7 @@ from support.small_networks import (
     view_of,
 )
 
-from mapless_server.method.choices import NETWORKS
+from mapless_server.choices import NETWORKS
 from mapless_server.method.coarse import Outcome, Request, reconstruct_one
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.method.coarse.token_cache import TokenCacheOptions

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from pydantic import SecretStr
 
-from mapless_server.method.choices import BACKENDS, BEST_VARIANTS
+from mapless_server.choices import BACKENDS, BEST_VARIANTS
 from mapless_server.method.features.extractors import FEATURES, make_extractor
 from mapless_server.networks.weights import CheckpointError
 from mapless_server.settings import (

@@ -24,10 +24,10 @@ from support.waiting import wait_until
 from mapless import Client, DeadlineExceeded, LocalizationResult, NewReference, Rejected, Unavailable, wire
 from mapless.geometry import Camera, RigidTransform
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
+from mapless_server.choices import NETWORKS
 from mapless_server.engine.query import Tier
 from mapless_server.engine.stages import Method
 from mapless_server.method import pipeline
-from mapless_server.method.choices import NETWORKS
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.method.features.extractors import SiftExtractor
 from mapless_server.method.pipeline import Pipeline

@@ -13,7 +13,7 @@ from support.small_networks import photograph as photograph_of
 from support.small_networks import references_of, small_runner
 
 from mapless.geometry import Camera
-from mapless_server.method.choices import NETWORKS
+from mapless_server.choices import NETWORKS
 from mapless_server.method.coarse import reconstruct_one
 from mapless_server.method.coarse.network import NetworkReconstructor
 from mapless_server.method.features.views import Features, Reconstruction, View

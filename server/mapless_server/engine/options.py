@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass, field
 
+from mapless_server.bounds import check_bounds
 from mapless_server.images import ImageLimits
-from mapless_server.method.optim.bounds import check_bounds
 from mapless_server.scheduling import WorkQueueOptions
 
 

@@ -2,14 +2,13 @@
 
 Begin with `localize`, the stages in order. A room imports only rooms above it in this list, which has no circle:
 
-choices          names of backends and features, for settings
 rejection        "no pose" is a result
-optim/           Levenberg-Marquardt, robust losses, small motions of poses, options that check themselves
-options          the forms of the method that a request can choose; cancelling and timing of a computation
+optim/           Levenberg-Marquardt, robust losses, small motions of poses
 features/        features of photographs, their matches, tracks
 pairs/           matches of posed photographs; whether photographs agree with their poses, and why not if not
 structure/       metric points of the references, 2D-3D matches of the query
 bundle/          bundle adjustment of everything together; covariance; priors
+options          the forms of the method that a request can choose; cancelling and timing of a computation
 pose/            pose estimators: from points, lines, depths, several cameras
 coarse/          query and references reconstructed together, up to scale; the metric scale
 judge/           whether a pose is accepted, and its trust; the answer and its hints

@@ -49,7 +49,7 @@ class NetworkRunner:
     """Runs a network. Safe to call from several threads; a thread of its own computes, in order of arrival.
 
     Attributes:
-        name: one of `method.choices.NETWORKS`.
+        name: one of `choices.NETWORKS`.
         weights_sha256: hash of the checkpoint.
         device: the device on which it computes.
         dtype: type of the computation in transformer blocks, and of tokens.

@@ -15,10 +15,10 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 
+from mapless_server.bounds import check_bounds
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.method.features.matching import StoredPair
 from mapless_server.method.features.views import PosedView
-from mapless_server.method.optim.bounds import check_bounds
 from mapless_server.method.options import StageContext
 from mapless_server.method.pairs.pair import in_order
 from mapless_server.store import Store

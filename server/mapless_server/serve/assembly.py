@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
+from mapless_server.choices import AUTO, BEST_VARIANTS, OFF, STORED
 from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.query import Tier
 from mapless_server.engine.queue_engine import QueueEngine, check_tiers
@@ -14,7 +15,6 @@ from mapless_server.engine.references import References
 from mapless_server.engine.stages import Method
 from mapless_server.extras import install_hint
 from mapless_server.images import ImageLimits
-from mapless_server.method.choices import AUTO, BEST_VARIANTS, OFF, STORED
 from mapless_server.method.coarse import Reconstructor
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.features.extractors import FeatureExtractor, make_extractor

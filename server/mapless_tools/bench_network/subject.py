@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mapless_server.method.choices import NETWORKS
+from mapless_server.choices import NETWORKS
 from mapless_server.networks.encoder import PATCH_PX
 from mapless_server.networks.mapanything import MapAnything, MapAnythingSizes
 from mapless_server.networks.network import Network, NetworkOutput

@@ -13,7 +13,7 @@ from enum import Enum
 import numpy as np
 
 from mapless.geometry import Array
-from mapless_server.method.optim.bounds import check_bounds
+from mapless_server.bounds import check_bounds
 
 
 class Kind(str, Enum):

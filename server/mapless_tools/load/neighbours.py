@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mapless_server.method.optim.bounds import check_bounds
+from mapless_server.bounds import check_bounds
 from mapless_server.security import create_token
 from mapless_server.settings import PREFIX
 from mapless_tools.child import CONNECT

@@ -10,7 +10,7 @@ from statistics import median
 from typing import Any
 
 from mapless import Client, RigidTransform
-from mapless_server.method.optim.bounds import check_bounds
+from mapless_server.bounds import check_bounds
 from mapless_tools.child import ChildServer, child_module
 from mapless_tools.demo import Photograph
 from mapless_tools.output_files import markdown_table

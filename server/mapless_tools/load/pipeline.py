@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mapless_server.method.optim.bounds import check_bounds
+from mapless_server.bounds import check_bounds
 from mapless_server.settings import available_cores
 from mapless_tools.demo import Place
 from mapless_tools.progress import Progress

@@ -41,7 +41,7 @@ from support.small_networks import (
 )
 
 from mapless.geometry import RigidTransform, rotation_from_vector
-from mapless_server.method.choices import NETWORKS
+from mapless_server.choices import NETWORKS
 from mapless_server.method.coarse import Request, make, reconstruct_one
 from mapless_server.method.coarse.geometric import GeometricReconstructor
 from mapless_server.method.coarse.make import make_reconstructor

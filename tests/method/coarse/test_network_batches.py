@@ -25,7 +25,7 @@ from support.grey_network import (
 from support.small_networks import small_request, small_runner
 
 from mapless.geometry import Camera
-from mapless_server.method.choices import NETWORKS
+from mapless_server.choices import NETWORKS
 from mapless_server.method.coarse import Request, reconstruct_one
 from mapless_server.method.coarse.grids import Grid
 from mapless_server.method.coarse.network import NetworkReconstructor

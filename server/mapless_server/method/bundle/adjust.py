@@ -22,7 +22,6 @@ import numpy as np
 
 from ..features.tracks import Tracks
 from ..features.views import Matches, PosedView, View
-from ..options import IntrinsicsSigma
 from ..structure.model import MetricScale, PointMatches, Structure
 from ..structure.structure import query_tracks, with_query_points
 from .dispersion import scale_covariance
@@ -40,6 +39,7 @@ from .pose_problem import (
 )
 from .priors import NO_PRIORS, Priors
 from .recalibrate import is_suspicious, recalibrated
+from .unknowns import IntrinsicsSigma
 
 SHARED_CAMERA = 0.03
 """Share of the intrinsics' usual errors that differ between photographs of one camera. What they share is in the

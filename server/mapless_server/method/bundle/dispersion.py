@@ -74,9 +74,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
+from mapless_server.bounds import check_bounds
 
 from ..features.tracks import summed
-from ..optim.bounds import check_bounds
 from ..optim.optimize import cauchy_weight, take
 from ..optim.perturbation import world_jacobian
 from .bundle import BundleProblem

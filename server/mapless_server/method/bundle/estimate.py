@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
-from ..features.views import Matches, PosedView, View
-from ..options import IntrinsicsSigma
+from ..features.views import Matches, PosedView, ReferenceErrors, View
 from ..structure.model import PointMatches, Structure
 from .priors import PriorCheck
+from .unknowns import IntrinsicsSigma
 
 if TYPE_CHECKING:  # services do not load what computes
-    from ..pairs.agreement import ReferenceErrors
     from .intrinsics import IntrinsicsEvidence
 
 

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera
 from mapless.lenses import Distortion, RadialTangential
+from mapless_server.bounds import check_bounds
 
 from ..features.views import View, undistort_pixels
-from ..optim.bounds import check_bounds
-from ..options import IntrinsicsSigma
+from .unknowns import IntrinsicsSigma
 
 PRINCIPAL = (1, 2)
 """Which of the four errors are those of the principal point."""

@@ -34,9 +34,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
+from mapless_server.bounds import check_bounds
 
 from ..features.views import PosedView, View
-from ..optim.bounds import check_bounds
 from ..optim.optimize import MinimizeOptions, minimize
 from ..optim.perturbation import world_jacobian
 from ..structure.model import PointMatches, Structure

@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, RigidTransform
+from mapless.geometry import Array, Camera, RigidTransform
+from mapless_server.bounds import check_bounds
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +73,30 @@ class Bundle:
     def world_from_query(self) -> RigidTransform:
         """The query's pose."""
         return RigidTransform(self.poses.rotation[-1], self.poses.translation[-1]).inverse()
+
+
+@dataclass(frozen=True)
+class IntrinsicsSigma:
+    """Standard deviations of a photograph's intrinsics.
+
+    Attributes:
+        focal_share: of both focal lengths together, as a share of them. Lenses change by this much with focus and
+            temperature, and calibrations are not more repeatable.
+        principal_share: of each coordinate of the principal point, as a share of the image's width.
+        k1: of the first radial coefficient.
+    """
+
+    focal_share: float = 0.003
+    principal_share: float = 0.003
+    k1: float = 0.01
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "focal_share principal_share k1", above=0, at_most=1)
+
+    def of(self, camera: Camera) -> Array:
+        """Standard deviations (4,) of s, of the principal point in pixels of this camera, and of k1."""
+        principal_px = self.principal_share * camera.width_px
+        return np.array([self.focal_share, principal_px, principal_px, self.k1])
 
 
 def _rotations(vectors: Array) -> Array:

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mapless.geometry import Array, Camera
+from mapless_server.bounds import check_bounds
 from mapless_server.networks.encoder import PATCH_PX
 
 from ..features.views import Ignored, undistort_pixels
-from ..optim.bounds import check_bounds
 
 PIXEL_LIMIT = 37 * 28 * PATCH_PX**2
 """Of 518x392."""

@@ -10,9 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mapless_server.choices import AUTO, BACKENDS, NETWORKS
 from mapless_server.networks.weights import WeightsMissing, find_weights, named
 
-from ..choices import AUTO, BACKENDS, NETWORKS
 from . import Reconstructor
 from .geometric import GeometricReconstructor
 

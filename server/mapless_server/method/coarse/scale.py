@@ -27,10 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, Similarity
+from mapless_server.bounds import check_bounds
 
 from ..features.tracks import keypoint_offsets
 from ..features.views import PosedView, Reconstruction
-from ..optim.bounds import check_bounds
 from ..options import ScaleStrategy
 from ..pairs.correspond import Correspondences
 from ..pairs.epipolar import triangulate_depths

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from mapless.geometry import Camera
+from mapless_server.bounds import check_bounds
 from mapless_server.cache import LruCache
 
-from ..optim.bounds import check_bounds
 from .grids import Grid
 
 

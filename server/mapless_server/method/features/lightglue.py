@@ -8,9 +8,9 @@ import torch
 from numpy.typing import NDArray
 
 from mapless.geometry import Camera
+from mapless_server.bounds import check_bounds
 from mapless_server.networks.lightglue import LightGlue
 
-from ..optim.bounds import check_bounds
 from .views import Features, Matches, PosedView, View
 
 NOTHING: Matches = np.empty((0, 2), np.int32)

@@ -9,10 +9,10 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
+from mapless_server.bounds import check_bounds
+from mapless_server.choices import EDGEPOINT2
 from mapless_server.scheduling import count_helper
 
-from ..choices import EDGEPOINT2
-from ..optim.bounds import check_bounds
 from .nearest import mutual_matches
 from .views import Matches, PosedView, View
 

@@ -219,6 +219,10 @@ class KeptDepth:
         return KeypointDepths(np.where(inside, self.depth[rows, columns], np.float32(np.nan)), self.relative_sigma)
 
 
+ReferenceErrors = Callable[[int, int], float | None]
+"""Returns the error of a pair of a query's references, by their indices; None if it is not known."""
+
+
 @dataclass(frozen=True, eq=False)
 class PosedView:
     """A reference as the method uses it.

@@ -15,11 +15,10 @@ from mapless.geometry import Array, RigidTransform
 
 from ..bundle.estimate import Support
 from ..bundle.priors import NO_PRIORS, Priors
-from ..features.views import Matches, PosedView, View
+from ..features.views import Matches, PosedView, ReferenceErrors, View
 from ..judge.answer import Answer, Localization
 from ..judge.evidence import findable_count, hull_share
 from ..judge.fixed import moved_matches, without
-from ..pairs.agreement import ReferenceErrors
 from ..pairs.stationary import StationaryOptions
 from ..pose.generalized import CameraMatches
 from ..pose.pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, false_alarms, format_false_alarms

@@ -19,8 +19,8 @@ from mapless.lenses import Fisheye
 
 from ..bundle.estimate import Support
 from ..bundle.intrinsics import IntrinsicsEvidence, corrected, read_as
+from ..bundle.unknowns import IntrinsicsSigma
 from ..features.views import View
-from ..options import IntrinsicsSigma
 from ..pose.pnp import PnpOptions, ransac
 from ..pose.relative import Evidence, RelativePoseOptions, find_pose, score
 from ..pose.two_view_matches import TwoViewMatches

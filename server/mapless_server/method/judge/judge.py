@@ -37,12 +37,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Camera, RigidTransform, rotation_angle_deg
+from mapless_server.bounds import check_bounds
 
 from ..bundle.estimate import Support
 from ..bundle.intrinsics import ContradictionOptions
 from ..bundle.radii import Accuracy, accuracy_from_covariance
 from ..features.views import Matches
-from ..optim.bounds import check_bounds
 from ..optim.perturbation import pose_hessian, world_covariance
 from ..pose.pnp import PnpOptions, false_alarms, ransac
 from ..rejection import Advice, Hint, Hypothesis, Rejection, RejectionReason

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from itertools import combinations
 
 from ..bundle.estimate import Support
-from ..pairs.agreement import MAX_ERROR_PX, ReferenceErrors
+from ..features.views import ReferenceErrors
+from ..pairs.agreement import MAX_ERROR_PX
 from ..rejection import Advice, Hint, Rejection, RejectionReason
 
 MIN_SHARE, MIN_INLIERS = 0.1, 6

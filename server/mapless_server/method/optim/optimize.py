@@ -32,8 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array
-
-from .bounds import check_bounds
+from mapless_server.bounds import check_bounds
 
 X = TypeVar("X")
 E = TypeVar("E")

@@ -11,8 +11,6 @@ ahead, and of the same one moving back, are the same.
 The error does not depend on the unit of length, nor on the choice of the world's axes.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,10 +33,6 @@ AMBIGUOUS_SHARE = 0.25
 
 _MOST_MATCHES = 150
 LARGEST_ERROR_PX = _SIDE_PX = 1024.0
-
-
-ReferenceErrors = Callable[[int, int], float | None]
-"""Returns the error of a pair of a query's references, by their indices; None if it is not known."""
 
 
 def thinned(matches: Matches) -> Matches:

@@ -24,8 +24,7 @@ from ..features.matching import (
     QueryMatching,
     SharedThreads,
 )
-from ..features.views import Matches, PosedView, View
-from .agreement import ReferenceErrors
+from ..features.views import Matches, PosedView, ReferenceErrors, View
 from .pair import Matching, PairKey, PairMatches, ReferencePairs, in_order
 from .stationary import StationaryOptions
 from .stationary_filter import references_without_fixed, without_fixed

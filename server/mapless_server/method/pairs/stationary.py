@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera
+from mapless_server.bounds import check_bounds
 
 from ..features.views import Matches, PosedView, View, grid_shape
-from ..optim.bounds import check_bounds
 
 
 @dataclass(frozen=True)

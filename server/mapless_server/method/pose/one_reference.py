@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, normalize_jacobian
+from mapless_server.bounds import check_bounds
 
 from ..bundle.dispersion import scale_covariance
 from ..bundle.estimate import PoseEstimate, PoseStage, Support
 from ..features.tracks import Tracks
 from ..features.views import Matches, PosedView, Reconstruction, View
-from ..optim.bounds import check_bounds
 from ..optim.perturbation import motion_jacobian, perturbed, world_covariance
 from ..pairs.stationary import StationaryOptions, are_moved
 from ..rejection import Rejection, RejectionReason

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from mapless.geometry import Camera, RigidTransform
+from mapless_server.bounds import check_bounds
 
 from ..bundle.estimate import PoseEstimate, PoseStage
 from ..bundle.priors import NO_PRIORS, Priors
 from ..features.views import View
-from ..optim.bounds import check_bounds
 from ..optim.perturbation import pose_hessian, world_covariance
 from ..rejection import Rejection, RejectionReason
 from ..structure.model import PixelPoints, PointMatches, Structure

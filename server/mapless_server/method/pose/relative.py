@@ -21,9 +21,9 @@ import poselib
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform
+from mapless_server.bounds import check_bounds
 
 from ..features.views import PosedView, View
-from ..optim.bounds import check_bounds
 from ..structure.model import PixelPoints
 from .pnp import PnpOptions, poselib_camera, poselib_pose, ransac
 from .two_view_matches import TwoViewMatches

@@ -17,9 +17,9 @@ from mapless.geometry import Array, RigidTransform
 from ..bundle.adjust import adjust_pose
 from ..bundle.estimate import PoseEstimate, PoseStage, Support, TwoViewSupport
 from ..bundle.pose_problem import AdjustOptions
+from ..bundle.unknowns import IntrinsicsSigma
 from ..features.tracks import Tracks
 from ..features.views import PosedView, View
-from ..options import IntrinsicsSigma
 from ..pairs.correspond import Correspondences
 from ..structure.match import MatchOptions, match_points, vote
 from ..structure.model import PointMatches, Structure

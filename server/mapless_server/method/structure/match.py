@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from mapless.geometry import RigidTransform
+from mapless_server.bounds import check_bounds
 
 from ..features.views import PosedView, View
-from ..optim.bounds import check_bounds
 from ..pairs.correspond import Correspondences
 from .model import PointMatches, Structure
 

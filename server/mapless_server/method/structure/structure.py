@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array
+from mapless_server.bounds import check_bounds
 
 from ..features.tracks import Tracks, build_tracks, keypoint_offsets
 from ..features.views import Matches, PosedView, Reconstruction
-from ..optim.bounds import check_bounds
 from ..optim.optimize import columns, length, take
 from ..pairs.correspond import Correspondences
 from .model import MetricScale, PointMatches, Structure

@@ -25,9 +25,9 @@ from dataclasses import astuple, dataclass
 import numpy as np
 
 from mapless.geometry import Array
+from mapless_server.bounds import check_bounds
 from mapless_server.method.bundle.radii import Accuracy, growth
 from mapless_server.method.judge.judge import LEVELS
-from mapless_server.method.optim.bounds import check_bounds
 from mapless_server.store import SelfCalibration
 
 RIGHT_SHARE, RIGHT_DEG = 0.05, 5.0

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
+from mapless_server.bounds import check_bounds
 from mapless_server.method.bundle.priors import PosePrior, PositionPrior, Priors
-from mapless_server.method.optim.bounds import check_bounds
 
 PRIOR_MARGIN_M = 10.0
 """References further than this from where the camera may be are not considered: they see other things."""

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapless.geometry import Array, RigidTransform
+from mapless_server.bounds import check_bounds
 from mapless_server.method.bundle.priors import PosePrior
-from mapless_server.method.optim.bounds import check_bounds
 
 from .index import Entries, Rows, Vector
 from .narrowing import Narrowing

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from mapless_server.method.optim.bounds import check_bounds
+from mapless_server.bounds import check_bounds
 from mapless_server.security import SceneKey, key_of
 
 from .calls import BlobDeleted, CapturedCall, CaptureError, DamagedCapture, decode_call, encode_call

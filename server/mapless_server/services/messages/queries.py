@@ -33,8 +33,9 @@ from mapless_server.method.bundle.priors import (
     Priors,
     check_covariance,
 )
+from mapless_server.method.bundle.unknowns import IntrinsicsSigma
 from mapless_server.method.features.views import seen_share
-from mapless_server.method.options import IntrinsicsSigma, LocalizeOptions
+from mapless_server.method.options import LocalizeOptions
 from mapless_server.scenes import ANYWHERE, Cone, Narrowing, Sphere
 from mapless_server.security import SceneKey, key_of
 from mapless_server.store import SceneAttributes

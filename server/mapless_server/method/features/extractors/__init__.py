@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Camera
+from mapless_server.choices import EDGEPOINT2, FEATURES
 
-from ...choices import EDGEPOINT2, FEATURES
 from ..views import Ignored, View
 from .sift import SiftExtractor, SiftOptions
 

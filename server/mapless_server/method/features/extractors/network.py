@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...optim.bounds import check_bounds
+from mapless_server.bounds import check_bounds
 
 
 @dataclass(frozen=True)

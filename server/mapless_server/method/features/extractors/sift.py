@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Camera
+from mapless_server.bounds import check_bounds
 
-from ...optim.bounds import check_bounds
 from ..masks import are_usable, usable_pixels
 from ..views import Ignored, View, reduce_image, view_of
 
