@@ -131,9 +131,9 @@ def compared(monkeypatch: pytest.MonkeyPatch) -> Counter[int]:
     counts: Counter[int] = Counter()
 
     def counting(usual: Callable[..., Any]) -> Callable[..., Any]:
-        def compare(first: Features, second: Features, *options: Any) -> Any:
+        def compare(first: Features, second: Features, *options: Any, **named: Any) -> Any:
             counts[round(1e3 * float(first.keypoints[0, 0] + second.keypoints[0, 0]))] += 1
-            return usual(first, second, *options)
+            return usual(first, second, *options, **named)
 
         return compare
 

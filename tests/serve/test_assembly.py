@@ -7,6 +7,7 @@ import pytest
 from support.programs import printed
 
 from mapless_server.method.features.extractors import make_extractor
+from mapless_server.method.features.nearest import Arithmetic, fastest_arithmetic
 from mapless_server.method.pairs.correspond import make_matcher
 from mapless_server.method.pairs.pair import Matching
 from mapless_server.networks.weights import WeightsMissing
@@ -71,7 +72,8 @@ def test_auto_leaves_out_what_is_missing_and_logs_it(
     with caplog.at_level(logging.INFO):
         (tier,) = make_tiers(settings(tmp_path, features="auto"))
     assert tier.extractor.name.startswith("sift")
-    (record,) = caplog.records
+    arithmetic, record = caplog.records
+    assert arithmetic.getMessage() == "descriptors are multiplied as float32"
     assert expected in record.getMessage()
     assert "\n" not in record.getMessage()
     assert record.getMessage().startswith(f"features auto: sift; with {names} more ")
@@ -90,7 +92,9 @@ def test_auto_uses_the_best_features_whose_weights_are_there(tmp_path: Path, cap
             assert feature_names(settings(tmp_path), device) == ("edgepoint2-l64",)
         (tier,) = make_tiers(settings(tmp_path, device="cpu"))
     assert tier.extractor.name.startswith("edgepoint2-l64-")
-    (record,) = caplog.records
+    chosen, record = caplog.records
+    assert chosen.getMessage() == f"descriptors are multiplied as {fastest_arithmetic().value}"
+    assert tier.pipeline.matcher.pairs.arithmetic is fastest_arithmetic()
     assert record.getMessage().startswith("features auto: edgepoint2-l64; with aliked and aliked-")
     assert record.getMessage().endswith("run `mapless-server weights fetch aliked aliked-lightglue`")
 
@@ -135,7 +139,7 @@ def test_light_glue_matches_alone_on_gpus_only(tmp_path: Path, monkeypatch: pyte
 
     monkeypatch.setattr(assembly, "find_weights", find)
     for device in ("cpu", "cuda"):
-        assembly._make_matcher("aliked", settings(tmp_path), device).close()
+        assembly._make_matcher("aliked", settings(tmp_path), device, Arithmetic.FLOAT32).close()
         assert looked_for == [] if device == "cpu" else ["aliked-lightglue"]
 
 

@@ -164,7 +164,8 @@ class SceneExplainer:
 
     def _free_matches(self, first: PosedView, second: PosedView) -> Matches:
         """Matches of what is not fixed to a camera, that one fundamental matrix explains; the poses take no part."""
-        matches = mutual_matches(first.view.features, second.view.features, self._matcher.options.distinct_ratio, True)
+        ratio, arithmetic = self._matcher.options.distinct_ratio, self._matcher.pairs.arithmetic
+        matches = mutual_matches(first.view.features, second.view.features, ratio, True, arithmetic)
         fixed = stationary_matches(first, second, matches, self._matcher.stationary)
         return consistent(first.view, second.view, matches[~fixed])
 

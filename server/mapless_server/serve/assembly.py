@@ -18,6 +18,7 @@ from mapless_server.images import ImageLimits
 from mapless_server.method.coarse import Reconstructor
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.features.extractors import FeatureExtractor, make_extractor
+from mapless_server.method.features.nearest import Arithmetic, fastest_arithmetic
 from mapless_server.method.pairs.correspond import Matcher, make_matcher
 from mapless_server.method.pairs.pair import Matching
 from mapless_server.method.pipeline import Pipeline
@@ -151,7 +152,8 @@ def engine_over(
         depths = DepthFinder(store.database, observed, kind)
     library = ReferenceLibrary(store, depths if any(tier.uses_depths for tier in tiers) else None)
     indexes = SceneIndexes(store, library, descriptor, first, options.index_cache_bytes)
-    pairs = PairMatches(tiers[0].pipeline.matcher.options.reference_ratio, CACHED_AUDIT_PAIRS)
+    matcher = tiers[0].pipeline.matcher
+    pairs = PairMatches(matcher.options.reference_ratio, CACHED_AUDIT_PAIRS, matcher.pairs.arithmetic)
     agreements = SceneAgreements(store, indexes, library, first, tiers[0].pipeline.matcher, observed)
     tools = SceneTools(library, indexes, descriptor, first, pairs)
     references = References(tools, extractors, options.image_limits, agreements)
@@ -219,12 +221,14 @@ def make_tiers(settings: Settings) -> tuple[Tier, ...]:
     device = device_for(settings)
     missing = _Missing()
     extractors = _make_extractors(settings, device, missing)
-    first = next(iter(extractors))
+    first, cores = next(iter(extractors)), available_cores()
+    arithmetic = Arithmetic.FLOAT32 if [*extractors] == [WITHOUT_WEIGHTS] else fastest_arithmetic()
+    log.info("descriptors are multiplied as %s", arithmetic.value)
     matchers = {
         # A stronger tier on a CPU has LightGlue, half a second per pair.
-        name: make_matcher(name, available_cores(), _find_light_glue(name, settings, missing))
+        name: make_matcher(name, cores, _find_light_glue(name, settings, missing), arithmetic=arithmetic)
         if device == "cpu" and name != first
-        else _make_matcher(name, settings, device)
+        else _make_matcher(name, settings, device, arithmetic)
         for name in extractors
     }
     _log_features(settings, extractors, missing)
@@ -376,15 +380,16 @@ def _make_extractor(name: str, settings: Settings, device: str) -> FeatureExtrac
     return make_extractor(name, find_weights(name, settings.weights_dir), device)
 
 
-def _make_matcher(name: str, settings: Settings, device: str) -> Matcher:
+def _make_matcher(name: str, settings: Settings, device: str, arithmetic: Arithmetic) -> Matcher:
     """Makes a matcher: nearest neighbours, or LightGlue on a GPU if its weights are present."""
     network = _light_glue_of(name)
     if device != "cpu" and network is not None:
         try:
-            return make_matcher(name, available_cores(), find_weights(network, settings.weights_dir), device)
+            weights = find_weights(network, settings.weights_dir)
+            return make_matcher(name, available_cores(), weights, device, arithmetic)
         except WeightsMissing as error:
             log.warning("features %s: matched by nearest neighbours: %s", name, error)
-    return make_matcher(name, available_cores())
+    return make_matcher(name, available_cores(), arithmetic=arithmetic)
 
 
 def _find_light_glue(features: str, settings: Settings, missing: _Missing) -> Path | None:

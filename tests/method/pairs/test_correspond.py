@@ -71,12 +71,11 @@ def test_mutual_matches_equal_brute_force(n: int, m: int, noise: float, ratio: f
 
 
 @pytest.mark.parametrize(("n", "m"), [(2, 3), (130, 500), (300, 128)])
-def test_products_of_whole_numbers_are_those_of_floats(n: int, m: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_products_of_whole_numbers_are_those_of_floats(n: int, m: int) -> None:
     """To the last bit, since sums of up to 127^2 64 are exact as float32; largest numbers included."""
-    torch = pytest.importorskip("torch", reason="the networks extra is not installed")
-    if not nearest._is_exact(torch):
+    pytest.importorskip("torch", reason="the networks extra is not installed")
+    if not nearest.has_exact_products():
         pytest.skip("the processor has no products of int8 that do not saturate")
-    monkeypatch.setattr(nearest, "_multiplies_exactly", lambda _: True)  # however slow they are here
     random = random_for("whole", n, m)
     first, second = (
         replace(features(np.zeros((k, 64))), descriptors=random.integers(-127, 128, (k, 64)).astype(np.int8))
@@ -85,11 +84,11 @@ def test_products_of_whole_numbers_are_those_of_floats(n: int, m: int, monkeypat
     first.descriptors[0] = second.descriptors[-1] = 127
     a, b = (it.descriptors.astype(np.float32) for it in (first, second))
     expected = a @ b.T * second.inverse_lengths * first.inverse_lengths[:, None]
-    blocks = [block.copy() for block in nearest.cosine_blocks(first, second)]
+    blocks = [block.copy() for block in nearest.cosine_blocks(first, second, nearest.Arithmetic.INT8)]
     assert np.concatenate(blocks).tobytes() == expected.tobytes()
     plain = first.unit_descriptors() @ second.unit_descriptors().T
     for either in (False, True):
-        matches = mutual_matches(first, second, 0.99, either)
+        matches = mutual_matches(first, second, 0.99, either, nearest.Arithmetic.INT8)
         assert matches.tolist() == best_of_both(plain.copy(), 0.99, either=either).tolist()
 
 
@@ -230,9 +229,9 @@ def matched_pairs(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Features, Featu
     calls: list[tuple[Features, Features]] = []
 
     def spy(usual: Callable[..., Any]) -> Callable[..., Any]:
-        def compare(first: Features, second: Features, *options: Any) -> Any:
+        def compare(first: Features, second: Features, *options: Any, **named: Any) -> Any:
             calls.append((first, second))
-            return usual(first, second, *options)
+            return usual(first, second, *options, **named)
 
         return compare
 

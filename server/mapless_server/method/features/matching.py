@@ -13,7 +13,7 @@ from mapless_server.bounds import check_bounds
 from mapless_server.choices import EDGEPOINT2
 from mapless_server.scheduling import count_helper
 
-from .nearest import mutual_matches
+from .nearest import Arithmetic, mutual_matches
 from .views import Matches, PosedView, View
 
 ItemT = TypeVar("ItemT")
@@ -199,9 +199,10 @@ class SharedThreads:
 class NearestNeighbours:
     """Matches mutual nearest neighbours that pass the ratio test, for any descriptor."""
 
-    def __init__(self, ratio: float, threads: SharedThreads) -> None:
+    def __init__(self, ratio: float, threads: SharedThreads, arithmetic: Arithmetic = Arithmetic.FLOAT32) -> None:
         self.ratio = ratio
         self._threads = threads
+        self._arithmetic = arithmetic
 
     def match(self, query: View, references: Sequence[PosedView], check: Callable[[], None]) -> Sequence[Matches]:
         """See QueryMatching.match."""
@@ -211,6 +212,6 @@ class NearestNeighbours:
 
         def with_one(reference: PosedView) -> Matches:
             check()
-            return mutual_matches(ours, reference.view.features, self.ratio)
+            return mutual_matches(ours, reference.view.features, self.ratio, arithmetic=self._arithmetic)
 
         return tuple(self._threads.map(with_one, references))

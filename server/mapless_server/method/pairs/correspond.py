@@ -24,6 +24,7 @@ from ..features.matching import (
     QueryMatching,
     SharedThreads,
 )
+from ..features.nearest import Arithmetic
 from ..features.views import Matches, PosedView, ReferenceErrors, View
 from .pair import Matching, PairKey, PairMatches, ReferencePairs, in_order
 from .stationary import StationaryOptions
@@ -90,12 +91,13 @@ class Matcher:
         threads: int = 1,
         query_matching: QueryMatching | None = None,
         pair_matching: PairMatching | None = None,
+        arithmetic: Arithmetic = Arithmetic.FLOAT32,
     ) -> None:
         self.options = options or CorrespondOptions()
-        self.pairs = ReferencePairs(self.options, pair_matching)
+        self.pairs = ReferencePairs(self.options, pair_matching, arithmetic)
         self.pair_s: float | None = None
         self._threads = SharedThreads(threads)
-        self._query_matching = query_matching or NearestNeighbours(self.options.query_ratio, self._threads)
+        self._query_matching = query_matching or NearestNeighbours(self.options.query_ratio, self._threads, arithmetic)
         self._structures: LruCache[object] = LruCache(self.options.structure_bytes)
 
     def correspond(
@@ -232,7 +234,13 @@ class Matcher:
         self._structures.forget(lambda key, _: not gone.isdisjoint(key[0]))
 
 
-def make_matcher(features: str, threads: int = 1, weights: Path | None = None, device: str = "cpu") -> Matcher:
+def make_matcher(
+    features: str,
+    threads: int = 1,
+    weights: Path | None = None,
+    device: str = "cpu",
+    arithmetic: Arithmetic = Arithmetic.FLOAT32,
+) -> Matcher:
     """Makes the matcher for an extractor.
 
     Args:
@@ -241,6 +249,7 @@ def make_matcher(features: str, threads: int = 1, weights: Path | None = None, d
         weights: of the features' LightGlue; None takes nearest neighbours alone. On a CUDA device LightGlue matches the
             query; on a CPU, where it is slow, it is the `Matcher.pair_matching`.
         device: "cpu" or a CUDA device, for LightGlue.
+        arithmetic: of nearest neighbours.
 
     Raises:
         ValueError: unknown name, or features without a LightGlue.
@@ -250,7 +259,7 @@ def make_matcher(features: str, threads: int = 1, weights: Path | None = None, d
     if features not in OPTIONS:
         raise ValueError(f"unknown features {features!r}; known: {', '.join(OPTIONS)}")
     if weights is None:
-        return Matcher(OPTIONS[features], threads)
+        return Matcher(OPTIONS[features], threads, arithmetic=arithmetic)
     from mapless_server.networks.lightglue import load_lightglue
 
     from ..features.lightglue import LightGlueMatching
@@ -258,5 +267,5 @@ def make_matcher(features: str, threads: int = 1, weights: Path | None = None, d
     network, sha256 = load_lightglue(features, weights)
     light_glue = LightGlueMatching(network, device, sha256=sha256)
     if device == "cpu":
-        return Matcher(OPTIONS[features], threads, pair_matching=light_glue)
-    return Matcher(OPTIONS[features], threads, light_glue)
+        return Matcher(OPTIONS[features], threads, pair_matching=light_glue, arithmetic=arithmetic)
+    return Matcher(OPTIONS[features], threads, light_glue, arithmetic=arithmetic)

@@ -17,7 +17,7 @@ import numpy as np
 from mapless_server.cache import LruCache
 
 from ..features.matching import CorrespondOptions, PairMatching, StoredPairs
-from ..features.nearest import best_of_both, mutual_matches_of_ratios
+from ..features.nearest import Arithmetic, best_of_both, mutual_matches_of_ratios
 from ..features.views import Matches, PosedView
 from .agreement import pair_error_px, thinned
 from .epipolar import epipolar_distance_px, epipolar_distances_px
@@ -123,12 +123,19 @@ class ReferencePairs:
         options: options of matching.
         pair_matching: makes the strong matches; None if nothing does.
         stationary: options of finding what is fixed to the cameras.
+        arithmetic: of nearest neighbours.
         stored: where pairs that are not cached are looked up; None looks up none.
     """
 
-    def __init__(self, options: CorrespondOptions, pair_matching: PairMatching | None = None) -> None:
+    def __init__(
+        self,
+        options: CorrespondOptions,
+        pair_matching: PairMatching | None = None,
+        arithmetic: Arithmetic = Arithmetic.FLOAT32,
+    ) -> None:
         self.options = options
         self.pair_matching = pair_matching
+        self.arithmetic = arithmetic
         self.stationary = StationaryOptions()
         self.stored: StoredPairs | None = None
         self._cached: LruCache[PairMatches] = LruCache(options.remembered_pairs)
@@ -242,10 +249,9 @@ class ReferencePairs:
             of_pairs.forget(lambda pair, _: not gone.isdisjoint(pair))
 
     def _match_strictly(self, first: PosedView, second: PosedView) -> Matches:
-        ratios = self.options.reference_ratio, self.options.distinct_ratio
-        return self._filtered(
-            first, second, *mutual_matches_of_ratios(first.view.features, second.view.features, ratios)
-        )
+        ratios, features = (self.options.reference_ratio, self.options.distinct_ratio), first.view.features
+        matches, distinct = mutual_matches_of_ratios(features, second.view.features, ratios, self.arithmetic)
+        return self._filtered(first, second, matches, distinct)
 
     def _match_strongly(self, first: PosedView, second: PosedView, pause: Callable[[], None]) -> Matches:
         assert self.pair_matching is not None
