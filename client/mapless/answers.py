@@ -180,12 +180,12 @@ class LocalizationResult:
         arbitrary_unit: whether lengths are in the scene's own, arbitrary unit, also where a name says metres.
         scale_source: what its lengths rest on: "REFERENCES", or "NETWORK" for a single reference.
         pose_stage: "REFINED" or "INITIAL"; "COARSE" for an unverified pose, either of a call with `allow_coarse` that
-            ran out of time, or the first of `localize_progressively`.
+            ran out of time, or the first of `localize_progressively` with it.
         inlier_count, match_count: number of 2D-3D matches that agree with the pose, and of all matches.
         reprojection_error_px: median of the inliers, pixels of the processed image.
         debug: the matches that support it, if requested.
         capture_time, session_from_camera: as they were sent.
-        is_final: False only for the coarse answer of `localize_progressively`, which another answer follows.
+        is_final: False only for answers of `localize_progressively` which another one follows.
     """
 
     world_from_camera: RigidTransform
@@ -294,9 +294,10 @@ def pose_lines(pose: RigidTransform, accuracy: Accuracy | None, is_arbitrary: bo
 
 
 def _outcome(answer: LocalizationResult) -> str:
+    follows = "" if answer.is_final else "; the final answer follows"
     if answer.pose_stage == "COARSE":
-        return "coarse pose" if answer.is_final else "coarse pose, the refined one follows"
-    return "localized" if answer.trust is None else f"localized, trust {answer.trust:.3f}"
+        return f"coarse pose{follows}"
+    return f"localized{follows}" if answer.trust is None else f"localized, trust {answer.trust:.3f}{follows}"
 
 
 def _support(answer: LocalizationResult) -> str:

@@ -171,12 +171,13 @@ class Connection:
     async def streamed(
         self, method: str, request: Message, read: Callable[[Any], Any], timeout_s: float | None
     ) -> AsyncGenerator[Any, None]:
-        """Yields the answers of a call whose response is a stream: the first early one, if any, and the final one.
+        """Yields the answers of a call whose response is a stream: early ones, if any, and the final one.
 
-        `is_final` of an answer distinguishes them. A call that fails after its early answer is retried like any other,
-        and then only the final answer is yielded. The stream is cancelled when the caller stops reading.
+        `is_final` of an answer distinguishes them. A call that fails after an early answer is retried like any other,
+        and then only the final answer is yielded, since earlier ones could be worse than those yielded already. The
+        stream is cancelled when the caller stops reading.
         """
-        retries, had_early = Retries(self, method, timeout_s), False
+        retries, had_early, is_repeated = Retries(self, method, timeout_s), False, False
         while True:
             final = None
             try:
@@ -186,7 +187,7 @@ class Connection:
                             answer = read(response)
                         if answer.is_final:
                             final = answer
-                        elif not had_early:
+                        elif not is_repeated:
                             had_early = True
                             yield answer
                 if final is None:
@@ -195,6 +196,7 @@ class Connection:
             except MaplessError as error:
                 if final is None:
                     await retries.pause_after(error)
+                    is_repeated = had_early
                     continue
             yield final
             return

@@ -234,15 +234,19 @@ namespace Mapless
             return CallAsync(LocalizeMethod, request, request.Scene, timeout, cancellation);
         }
 
-        /// <summary>As LocalizeAsync; a coarse pose may come before the answer, in the caller's context.</summary>
+        /// <summary>
+        /// As LocalizeAsync; onBetter gets each better answer before the final one, in the caller's context, none or one mostly:
+        /// localizations in which the server has little trust, and first, where Options.AllowCoarse is set, a coarse pose that
+        /// nothing has checked.
+        /// </summary>
         public async Task<LocalizeResponse> LocalizeProgressivelyAsync(
             LocalizeRequest request,
-            Action<MaplessAnswer> onCoarse,
+            Action<MaplessAnswer> onBetter,
             TimeSpan timeout,
             CancellationToken cancellation = default)
         {
             var attempts = new Attempts(this, timeout, cancellation);
-            bool hadCoarse = false;
+            bool hadBetter = false, isRepeated = false;
             while (true)
             {
                 Server server = NextServer();
@@ -258,10 +262,10 @@ namespace Mapless
                             {
                                 return message.Answer;
                             }
-                            if (!hadCoarse)
+                            if (!isRepeated)
                             {
-                                hadCoarse = true;
-                                onCoarse?.Invoke(new MaplessAnswer(message.Answer));
+                                hadBetter = true;
+                                onBetter?.Invoke(new MaplessAnswer(message.Answer));
                             }
                         }
                     }
@@ -269,6 +273,7 @@ namespace Mapless
                 catch (RpcException error) when (attempts.CanRepeat(server, error))
                 {
                     await attempts.PauseAsync().ConfigureAwait(true);
+                    isRepeated = hadBetter; // what comes earlier could be worse than what was given already
                     continue;
                 }
                 throw new RpcException(new Status(StatusCode.Internal, "the stream ended before the answer"));

@@ -69,7 +69,7 @@ def test_low_trust_is_warned_of() -> None:
 
 
 @pytest.mark.parametrize(
-    ("is_final", "first"), [(False, "coarse pose, the refined one follows"), (True, "coarse pose")]
+    ("is_final", "first"), [(False, "coarse pose; the final answer follows"), (True, "coarse pose")]
 )
 def test_a_coarse_pose_is_not_called_localized(is_final: bool, first: str) -> None:
     coarse = localized(

@@ -161,7 +161,7 @@ def test_the_cpp_client_repeats_and_reads_newer_answers(localize: Callable[..., 
     with hosted(handler) as address:
         code, printed = localize(address)
     first, position, _, last = printed.splitlines()
-    assert (code, first) == (3, "coarse pose, the refined one follows")
+    assert (code, first) == (3, "localized; the final answer follows")
     assert position.startswith("position  4.000 2.000 -1.000 m")
     assert last == "not localized: 77: of tomorrow"
     assert handler.calls == ["/mapless.v1.LocalizationService/LocalizeProgressively"] * 3

@@ -139,10 +139,10 @@ def test_watching_is_counted_without_a_latency(metrics: Metrics) -> None:
 
 def test_a_stream_has_a_latency_and_a_first_answer_latency(metrics: Metrics) -> None:
     before, method = samples_of(metrics), "/mapless.v1.LocalizationService/LocalizeProgressively"
-    metrics.answered_coarsely(0.25)
+    metrics.answered_early(0.25)
     metrics.call_handled(method, "OK", 0.5, "")
     sums = {name: value for (name, _), value in changed(before, samples_of(metrics)).items() if name.endswith("_sum")}
-    assert sums == {"mapless_coarse_answer_seconds_sum": 0.25, "grpc_server_handling_seconds_sum": 0.5}
+    assert sums == {"mapless_early_answer_seconds_sum": 0.25, "grpc_server_handling_seconds_sum": 0.5}
 
 
 def test_a_batch_adds_to_size_time_and_busy_seconds(metrics: Metrics) -> None:

@@ -135,14 +135,15 @@ def test_the_coarse_pose_is_near_the_refined_and_a_little_worse(
         )
         for frame in fountain.frames[::5]:
             others = [it.name for it in fountain.frames if it is not frame]
-            answers = list(client.localize_progressively(frame.image_path, frame.camera, "fountain", others))
+            photograph = frame.image_path, frame.camera, "fountain", others
+            answers = list(client.localize_progressively(*photograph, allow_coarse=True))
             assert [it.is_final for it in answers] == [False, True]
             for answer in answers:
                 assert isinstance(answer, LocalizationResult)
                 error = answer.world_from_camera.translation - frame.world_from_camera.translation
                 errors_m[answer.is_final].append(float(np.linalg.norm(error)))
         other = church.frames[0]
-        (only,) = client.localize_progressively(other.image_path, other.camera, "fountain")
+        (only,) = client.localize_progressively(other.image_path, other.camera, "fountain", allow_coarse=True)
     assert not isinstance(only, LocalizationResult)
     assert max(errors_m[False]) < 0.02
     assert np.median(errors_m[True]) < 0.005

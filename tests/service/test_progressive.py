@@ -82,8 +82,11 @@ def server(shared: Serving) -> Iterator[Serving]:
     wait_until(lambda: shared.job_count == 0)
 
 
-def asking(server: Serving, timeout: float | None = LIMIT_S, metadata: Any = (), **fields: Any) -> Any:
+def asking(
+    server: Serving, timeout: float | None = LIMIT_S, metadata: Any = (), allow_coarse: bool = True, **fields: Any
+) -> Any:
     request = localize_request("s")
+    request.options.allow_coarse = allow_coarse
     request.MergeFrom(pb.LocalizeRequest(**fields))
     return server.stub.LocalizeProgressively(request, timeout=timeout, metadata=metadata)
 
@@ -147,12 +150,13 @@ def corner_request(world_from_camera: RigidTransform, **options: Any) -> pb.Loca
 @pytest.mark.parametrize(
     ("options", "count"),
     [
-        ({}, 2),
+        ({}, 1),
+        ({"allow_coarse": True}, 2),
         ({"axes": pb.AXES_ROS, "include_debug": True, "allow_coarse": True}, 2),
-        ({"variant": pb.VARIANT_FULL, "reference_count": 4}, 2),
-        ({"variant": pb.VARIANT_COARSE}, 1),
+        ({"variant": pb.VARIANT_FULL, "reference_count": 4, "allow_coarse": True}, 2),
+        ({"variant": pb.VARIANT_COARSE, "allow_coarse": True}, 1),
     ],
-    ids=["default", "all that can be asked for", "the paper's", "coarse alone"],
+    ids=["default", "coarse first", "all that can be asked for", "the paper's", "coarse alone"],
 )
 def test_the_last_message_is_what_localize_answers_bit_for_bit(
     corner: LocalizationServiceStub, options: dict[str, Any], count: int
@@ -177,6 +181,13 @@ def test_what_cannot_be_localized_is_rejected_once(corner: LocalizationServiceSt
     assert only.is_final
     assert only.answer.WhichOneof("outcome") == "rejection"
     assert essence(only.answer, True) == essence(corner.Localize(request, timeout=LIMIT_S), True)
+
+
+def test_a_pose_that_nothing_has_checked_is_not_sent_unasked(server: Serving) -> None:
+    server.method.gate.set()
+    (only,) = asking(server, allow_coarse=False)
+    assert only.is_final
+    assert only.answer.localization.pose_stage == pb.POSE_STAGE_REFINED
 
 
 def test_a_coarse_pose_may_turn_out_to_be_none(server: Serving) -> None:
@@ -217,24 +228,20 @@ def test_a_cancelled_stream_frees_its_place_and_ends_refining(server: Serving) -
     assert len(list(asking(server))) == 2
 
 
-def test_a_deadline_after_the_coarse_pose_is_a_detailed_error(server: Serving) -> None:
+def test_a_deadline_before_any_pose_is_a_detailed_error(server: Serving) -> None:
     def asked(limit_s: float) -> MaplessError:
-        call = asking(server, limit_s)
-        assert not next(call).is_final
-        failure = ending(call)
-        if not failure.request_id:  # by the caller's own library: a busy machine answers too late
-            raise TimeoutError
+        failure = ending(asking(server, limit_s, allow_coarse=False))
+        if not failure.request_id or not server.method.refining.acquire(blocking=False):
+            raise TimeoutError  # a busy machine answers too late, or begins too late
         return failure
 
     failure = with_enough_time(asked, grpc.RpcError, TimeoutError)
     assert (failure.code, failure.reason) == ("DEADLINE_EXCEEDED", "DEADLINE_EXCEEDED")
-    assert failure.request_id
     assert server.method.given_up.acquire(timeout=LIMIT_S)
 
 
 def test_where_a_coarse_pose_suffices_the_deadline_ends_it(server: Serving) -> None:
-    options = pb.LocalizeOptions(allow_coarse=True)
-    first, last = with_enough_time(lambda limit_s: list(asking(server, limit_s, options=options)), grpc.RpcError)
+    first, last = with_enough_time(lambda limit_s: list(asking(server, limit_s)), grpc.RpcError)
     assert (first.is_final, last.is_final) == (False, True)
     assert last.answer.localization == first.answer.localization
     assert last.answer.localization.pose_stage == pb.POSE_STAGE_COARSE
@@ -271,18 +278,39 @@ def test_watchers_see_the_answer_once_and_it_counts_once(server: Serving) -> Non
     seen.cancel()
 
 
-def test_of_two_tiers_the_better_gives_the_final_answer(tmp_path: Path) -> None:
+@pytest.fixture
+def doubting(tmp_path: Path) -> Iterator[Serving]:
+    """A server of two tiers, whose answers are doubtful, so that the stronger features try again."""
     with staged(tmp_path, features=("cheap", "strong")) as both:
-        both.method.trust = 0.01  # doubtful, so the stronger features try again
+        both.method.trust = 0.01
         both.method.gate.set()
-        messages = list(asking(both))
-    assert [it.is_final for it in messages] == [False, True]
-    assert messages[0].answer.diagnostics.features == "cheap"
-    assert messages[1].answer.diagnostics.features == "strong"
+        yield both
 
 
-def test_the_log_has_the_time_of_the_coarse_answer(server: Serving, caplog: pytest.LogCaptureFixture) -> None:
-    counted = server.server.value("mapless_coarse_answer_seconds_count")
+@pytest.mark.parametrize("allow_coarse", [True, False])
+def test_an_accepted_answer_is_sent_while_a_better_one_is_sought(doubting: Serving, allow_coarse: bool) -> None:
+    messages = list(asking(doubting, allow_coarse=allow_coarse))
+    coarse, refined = pb.POSE_STAGE_COARSE, pb.POSE_STAGE_REFINED
+    expected = [("cheap", refined, False), ("strong", refined, True)]
+    assert [(it.answer.diagnostics.features, it.answer.localization.pose_stage, it.is_final) for it in messages] == [
+        *([("cheap", coarse, False)] if allow_coarse else []),
+        *expected,
+    ]
+    accepted = messages[-2].answer.localization
+    assert accepted.HasField("covariance")
+    assert accepted.trust == pytest.approx(0.01)
+
+
+def test_an_answer_that_stays_the_best_is_sent_once_before(doubting: Serving) -> None:
+    """The stronger features find nothing: what was sent is the final answer, too."""
+    doubting.method.outcomes = [None, Rejection(RejectionReason.GATE, "planted")]
+    first, last = asking(doubting, allow_coarse=False)
+    assert (first.is_final, last.is_final) == (False, True)
+    assert first.answer.localization == last.answer.localization
+
+
+def test_the_log_has_the_time_of_the_first_answer(server: Serving, caplog: pytest.LogCaptureFixture) -> None:
+    counted = server.server.value("mapless_early_answer_seconds_count")
     with caplog.at_level("INFO", "mapless_server.rpc.guard"):
         call = asking(server, metadata=(("x-request-id", "logged"),))
         next(call)
@@ -292,8 +320,8 @@ def test_the_log_has_the_time_of_the_coarse_answer(server: Serving, caplog: pyte
     (line,) = (it for it in caplog.records if it.getMessage() == "LocalizeProgressively OK")
     fields: Any = vars(line)["fields"]
     assert fields["request_id"] == "logged"
-    assert 0 < fields["coarse_ms"] <= fields["duration_ms"]
-    assert server.server.value("mapless_coarse_answer_seconds_count") == counted + 1
+    assert 0 < fields["first_ms"] <= fields["duration_ms"]
+    assert server.server.value("mapless_early_answer_seconds_count") == counted + 1
     assert {"prepare", "coarse", "refine"} == set(fields["stages_ms"])
     assert (fields["outcome"], fields["pose_stage"], fields["code"]) == ("localized", "refined", "OK")
     assert fields["bytes_out"] > 0

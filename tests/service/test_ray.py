@@ -136,6 +136,7 @@ def answered(address: str, request: bytes) -> bytes:
 
 def answered_twice(address: str, request: bytes) -> tuple[bool, bytes]:
     """Whether there was a coarse answer before the final one, and the final one."""
+    request += pb.LocalizeRequest(options=pb.LocalizeOptions(allow_coarse=True)).SerializeToString()  # is merged
     with grpc.insecure_channel(address, [("grpc.max_send_message_length", -1)]) as channel:
         stream = channel.unary_stream("/mapless.v1.LocalizationService/LocalizeProgressively")
         *coarse, final = map(pb.LocalizeProgressivelyResponse.FromString, stream(request, timeout=LIMIT_S))

@@ -1,4 +1,4 @@
-"""A coarse answer comes once, before the final one, and an error in its place."""
+"""Better answers come in order, before the final one, and an error in its place."""
 
 import asyncio
 import gc
@@ -16,7 +16,7 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.errors import Overloaded
 from mapless_server.rpc import Call
 from mapless_server.scheduling import AnyJob, Flow, Job, Step
-from mapless_server.services.localization import FutureCoarseAnswer, LocalizationService, coarse_then_final
+from mapless_server.services.localization import GiveBetter, LocalizationService, better_then_final
 from mapless_server.services.messages.answers import answer_frames_of
 
 FINAL = pb.LocalizeResponse(localization=pb.Localization(inlier_count=100))
@@ -27,44 +27,50 @@ def message(number: int) -> pb.LocalizeResponse:
 
 
 class Planted:
-    """A final answer that waits for `may_end`, after these coarse ones."""
+    """A final answer that waits for `may_end`, after these better and better ones."""
 
-    def __init__(self, coarse: Sequence[int] = (), end: Exception | None = None) -> None:
-        self._coarse, self._end = coarse, end
+    def __init__(self, better: Sequence[int] = (), end: Exception | None = None) -> None:
+        self._better, self._end = better, end
         self.may_end = asyncio.Event()
 
-    async def answer(self, coarse: FutureCoarseAnswer) -> pb.LocalizeResponse:
-        for number in self._coarse:
-            coarse.set_result(message(number))
+    async def answer(self, give: GiveBetter) -> pb.LocalizeResponse:
+        for number in self._better:
+            give(message(number))
         await self.may_end.wait()
         if self._end is not None:
             raise self._end
         return FINAL
 
     def messages(self) -> Any:
-        return coarse_then_final(self.answer)
+        return better_then_final(self.answer)
 
 
 def seen(response: pb.LocalizeProgressivelyResponse) -> tuple[int, bool]:
     return response.answer.localization.inlier_count, response.is_final
 
 
-@pytest.mark.parametrize(("coarse", "expected"), [((), []), ((1,), [(1, False)])])
-async def test_there_are_two_messages_at_most_and_the_order_is_kept(
-    coarse: Sequence[int], expected: list[tuple[int, bool]]
-) -> None:
+@pytest.mark.parametrize("better", [(), (1,), (1, 2, 3)])
+async def test_all_messages_come_in_order_and_the_final_one_last(better: Sequence[int]) -> None:
     """Even where the final answer is there before the first message is read."""
-    planted = Planted(coarse)
+    planted = Planted(better)
     planted.may_end.set()
-    assert [seen(it) async for it in planted.messages()] == [*expected, (100, True)]
+    assert [seen(it) async for it in planted.messages()] == [*((it, False) for it in better), (100, True)]
 
 
-@pytest.mark.parametrize("coarse", [(), (1,)])
-async def test_an_error_comes_in_the_place_of_the_final_answer(coarse: Sequence[int]) -> None:
-    planted = Planted(coarse, KeyError("planted"))
+async def test_a_better_answer_is_sent_before_the_final_one_is_known() -> None:
+    planted = Planted([1, 2])
+    messages = planted.messages()
+    assert [seen(await asyncio.wait_for(anext(messages), 10)) for _ in range(2)] == [(1, False), (2, False)]
+    planted.may_end.set()
+    assert [seen(it) async for it in messages] == [(100, True)]
+
+
+@pytest.mark.parametrize("better", [(), (1,), (1, 2)])
+async def test_an_error_comes_in_the_place_of_the_final_answer(better: Sequence[int]) -> None:
+    planted = Planted(better, KeyError("planted"))
     planted.may_end.set()
     messages = planted.messages()
-    for number in coarse:
+    for number in better:
         assert seen(await anext(messages)) == (number, False)
     with pytest.raises(KeyError, match="planted"):
         await anext(messages)
@@ -111,10 +117,8 @@ def test_a_progressive_call_leaves_its_job_in_no_cycle() -> None:
 
     async def test() -> None:
         call = Call("id", time.monotonic(), math.inf)
-        coarse = asyncio.get_running_loop().create_future()
         with suppress(Overloaded):
-            await service._answer(request, cast(Any, query), answer_frames_of(request), call, coarse)
-        coarse.cancel()
+            await service._answer(request, cast(Any, query), answer_frames_of(request), call, [].append)
 
     gc.collect()
     gc.disable()

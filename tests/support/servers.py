@@ -190,6 +190,7 @@ class Staged:
         given_up: released by each that is ended because its caller has left.
         coarse: the coarse pose; None if there is none.
         outcome: refined; None for the first reference's pose.
+        outcomes: of the next refinements, before all have that one.
         trust: of that pose.
     """
 
@@ -198,6 +199,7 @@ class Staged:
     given_up: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
     coarse: RigidTransform | None = field(default_factory=lambda: pose(COARSE_X_M))
     outcome: Rejection | None = None
+    outcomes: list[Rejection | None] = field(default_factory=list)
     trust: float = 0.9
 
     def __post_init__(self) -> None:
@@ -225,7 +227,8 @@ class Staged:
             raise
         self._stand_in.trust = self.trust
         answer = self._stand_in(*asked)
-        return answer if self.outcome is None else replace(answer, outcome=self.outcome)
+        outcome = self.outcomes.pop(0) if self.outcomes else self.outcome
+        return answer if outcome is None else replace(answer, outcome=outcome)
 
     def _coarse_answer(self, coarse: Any) -> Answer | None:
         if self.coarse is None:

@@ -36,9 +36,9 @@ int Run(char** arguments) {
   for (int i = 0; i < 6; ++i) numbers[i] = std::stod(arguments[4 + i]);
   *request.mutable_intrinsics() = mapless::Pinhole(static_cast<int>(numbers[0]), static_cast<int>(numbers[1]), numbers[2],
                                                    numbers[3], numbers[4], numbers[5]);
-  const auto answer = client.LocalizeProgressively(request, [](const mapless::v1::LocalizeResponse& coarse) {
-    std::puts("coarse pose, the refined one follows");
-    Print(coarse);
+  const auto answer = client.LocalizeProgressively(request, [](const mapless::v1::LocalizeResponse& better) {
+    std::puts("localized; the final answer follows");
+    Print(better);
   });
   if (!answer.has_localization()) {
     const auto& rejection = answer.rejection();

@@ -179,13 +179,13 @@ v1::LocalizeResponse Client::Localize(const v1::LocalizeRequest& request, Timeou
 }
 
 v1::LocalizeResponse Client::LocalizeProgressively(const v1::LocalizeRequest& request,
-                                                   const std::function<void(const v1::LocalizeResponse&)>& on_coarse,
+                                                   const std::function<void(const v1::LocalizeResponse&)>& on_better,
                                                    Timeout timeout) const {
   Attempts attempts(options_, *servers_, timeout);
-  bool had_coarse = false;
+  bool had_better = false, is_repeated = false;
   while (true) {
     Server& server = servers_->Next();
-    grpc::ClientContext context;  // the call is cancelled where `on_coarse` throws
+    grpc::ClientContext context;  // the call is cancelled where `on_better` throws
     Prepare(context, request, attempts.Deadline());
     const auto reader = server.localization->LocalizeProgressively(&context, request);
     v1::LocalizeProgressivelyResponse message;
@@ -195,9 +195,9 @@ v1::LocalizeResponse Client::LocalizeProgressively(const v1::LocalizeRequest& re
         attempts.Answered(server);
         if (message.is_final()) {
           answer = message.answer();
-        } else if (on_coarse && !had_coarse) {
-          had_coarse = true;
-          on_coarse(message.answer());
+        } else if (on_better && !is_repeated) {
+          had_better = true;
+          on_better(message.answer());
         }
       }
     } catch (...) {
@@ -209,6 +209,7 @@ v1::LocalizeResponse Client::LocalizeProgressively(const v1::LocalizeRequest& re
     if (answer) return *answer;
     if (status.ok()) Throw({grpc::StatusCode::INTERNAL, "the stream ended before the answer"}, context);
     if (!attempts.Pause(server, status, context)) Throw(status, context);
+    is_repeated = had_better;  // what comes earlier could be worse than what was given already
   }
 }
 

@@ -72,7 +72,8 @@ async def _localize_request(
         reference_count: number of references that the server chooses; 0 for its default.
         rerank_references: whether the server chooses among `references`, of which there may then be up to 1000.
         allow_coarse: whether to return a pose that could not be refined before the deadline, with
-            `LocalizationResult.pose_stage` "COARSE" and no covariance, instead of raising `DeadlineExceeded`.
+            `LocalizationResult.pose_stage` "COARSE" and no covariance, instead of raising `DeadlineExceeded`;
+            `localize_progressively` yields it first, too.
         coverage: share of right answers to accept, above 0 and below 1; 0 for the server's default.
         ignore_calibration: whether radii and trust are computed as if the scene had no calibration.
         confidential: whether the photograph is used for this answer only: neither captured nor shown to watchers.
@@ -145,16 +146,17 @@ async def localize(  # noqa: D103, it has the docstring of the request
 async def localize_progressively(
     connection: Connection, *asked: Any, **named: Any
 ) -> AsyncIterator[LocalizationResult | Rejected]:
-    """Localizes a photograph; yields a coarse pose as soon as there is one, then the answer of `localize`.
+    """Localizes a photograph; yields each better answer as soon as there is one, and then the answer of `localize`.
 
-    Yields at most two answers. The first, if there is one, is a `LocalizationResult` with `pose_stage` "COARSE": an
-    unverified pose without covariance, accuracy and trust. The last, with `is_final`, is the answer of `localize`,
-    possibly a very different pose or `Rejected`; an error is raised instead of it.
+    Answers before the last are `LocalizationResult`s without `is_final`: the first that is accepted, if the server goes
+    on because it has little trust in it, and each better one. With `allow_coarse` a pose with `pose_stage` "COARSE" may
+    come first, which nothing has checked, without covariance, accuracy and trust. The last, with `is_final`, is the
+    answer of `localize`, possibly a very different pose or `Rejected`; an error is raised instead of it.
 
-    The call is cancelled when the caller stops reading. If the connection breaks after the first answer, the call is
-    retried like any other, and only the last answer is yielded.
+    The call is cancelled when the caller stops reading. If the connection breaks after an answer, the call is retried
+    like any other, and only the last answer is yielded.
 
-    Args and deadline are those of `localize`; the deadline holds for both answers together.
+    Args and deadline are those of `localize`; the deadline holds for all answers together.
     """
     request, timeout_s = await _localize_request(connection, *asked, **named), named.get("timeout_s")
     async with aclosing(connection.streamed("LocalizeProgressively", request, _streamed, timeout_s)) as answers:

@@ -336,9 +336,12 @@ def _add_localize(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument("--variant", default="", help="best, full, no_structure or coarse")
     command.add_argument("--scale-strategy", default="", help="two_stage, triangulation or trajectory")
-    command.add_argument("--allow-coarse", action="store_true", help="accept a coarse pose if time runs out")
     command.add_argument(
-        "--progressive", action="store_true", help="print a coarse pose as soon as there is one, then the answer"
+        "--allow-coarse", action="store_true",
+        help="accept a coarse pose if time runs out; with --progressive, print it first",
+    )  # fmt: skip
+    command.add_argument(
+        "--progressive", action="store_true", help="print each better answer as soon as there is one, then the last"
     )
     command.add_argument("--parallel", type=int, default=2, help="concurrent calls for a folder (default: %(default)s)")
     shown = command.add_argument_group("output")

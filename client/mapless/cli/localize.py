@@ -211,7 +211,7 @@ def _read(path: Path, field: str) -> bytes:
 def _answers(
     client: Client, photo: Photo, image: ImageSource, mask: ImageSource | None, arguments: argparse.Namespace
 ) -> Iterator[LocalizationResult | Rejected]:
-    """Yields the answer; with --progressive, a coarse pose may come first."""
+    """Yields the answer; with --progressive, others may come first."""
     options: dict[str, Any] = {
         "priors": priors(arguments),
         "mask": mask,

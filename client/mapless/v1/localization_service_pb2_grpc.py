@@ -126,22 +126,25 @@ class LocalizationServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def LocalizeProgressively(self, request, context):
-        """Localizes one photograph, and answers twice: at once with the coarse pose, as soon as there is one, and then with what
-        Localize would have answered. For callers who can do something with a pose that nothing has checked, before a better
-        one comes. The messages, in order:
+        """Localizes one photograph, and sends what it has so far while a better answer is computed: for callers who can do
+        something with a pose before the last one comes. The messages, in order:
 
-        * At most one coarse answer: a Localization with POSE_STAGE_COARSE, of the server's first features where it has several.
-        It comes only where the reconstruction gives a pose that no hard limit of the request's priors turns down; it is
-        never a rejection. See POSE_STAGE_COARSE for what it is worth, which is not said in numbers: it has no covariance,
-        accuracy or trust, and may turn out to be wrong, by another pose or by a rejection.
+        * Where LocalizeOptions.allow_coarse is set, at most one coarse pose first: a Localization with POSE_STAGE_COARSE, of the
+        server's first features where it has several. It comes only where the reconstruction gives a pose that no hard limit
+        of the request's priors turns down. See POSE_STAGE_COARSE for what it is worth, which is not said in numbers: it has no
+        covariance, accuracy or trust, and may turn out to be wrong, by another pose or by a rejection.
+        * Any number of localizations, none or one mostly: the first that is accepted, at once, if the server goes on because it
+        has little trust in it, and then each better one while it still goes on. They are complete answers, as Localize would
+        give them if it had no more time, but for `debug`; a better one, or a rejection as AMBIGUOUS, may still follow.
         * Exactly one final answer, Localize's to the same request: the same numbers, bit for bit, but for the times and the id
         in its Diagnostics. With LocalizeOptions.allow_coarse it may be a coarse one, too. Nothing comes after it.
 
-        Errors are Localize's, in the place of the final answer: a DEADLINE_EXCEEDED, for instance, may come after a coarse
-        answer, which then is all there is. The call waits, is computed and is charged as Localize is: the coarse answer neither
-        delays the final one nor is delayed by a caller that reads slowly. Cancelling the call ends the computation. Without a
-        deadline the server's default for unary calls holds, for both messages together; a message that was made in time may be
-        read for 10 s more, after which the call ends with DEADLINE_EXCEEDED, reason READ_LATE.
+        Only the final answer can be a rejection. Errors are Localize's, in the place of the final answer, also after other
+        messages. The call waits, is computed and is charged as Localize is: earlier messages neither delay the final one nor are
+        delayed by a caller that reads slowly. At its deadline the best localization so far is the final answer. Cancelling the
+        call ends the computation. Without a deadline the server's default for unary calls holds, for all messages together; a
+        message that was made in time may be read for 10 s more, after which the call ends with DEADLINE_EXCEEDED, reason
+        READ_LATE.
 
         The request is the same on purpose: either method can be asked the same question.
         buf:lint:ignore RPC_REQUEST_STANDARD_NAME

@@ -31,9 +31,10 @@ export function described(answer: LocalizeResponse | undefined, isFinal: boolean
   }
   if (answer?.outcome.case !== "localization") return "No answer.";
   const { accuracy, trust, inlierCount } = answer.outcome.value;
-  if (!isFinal || !accuracy) return "Coarse pose; a better one follows.";
+  if (!accuracy) return isFinal ? "Coarse pose." : "Coarse pose; a better one follows.";
   const radius = accuracy.position95M < 1 ? `${(100 * accuracy.position95M).toFixed(1)} cm` : `${accuracy.position95M.toFixed(2)} m`;
-  return `Localized: within ${radius} in 95 % of cases, ${inlierCount} matches, trust ${(trust ?? 0).toFixed(2)}.`;
+  const found = `within ${radius} in 95 % of cases, ${inlierCount} matches, trust ${(trust ?? 0).toFixed(2)}`;
+  return isFinal ? `Localized: ${found}.` : `So far: ${found}; a better pose may follow.`;
 }
 
 /** The element with an id, which the page has. */

@@ -131,7 +131,7 @@ class Session {
     show(described(answer, isFinal));
     const pose = answer?.outcome.case === "localization" ? answer.outcome.value.inAxes?.worldFromSession : undefined;
     if (!pose?.rotation || !pose.translationM) {
-      this.sessionFromWorld = undefined; // also where a rejection follows a coarse pose
+      this.sessionFromWorld = undefined; // also where a rejection follows a pose
       return;
     }
     const worldFromSession = new XRRigidTransform({ ...pose.translationM, w: 1 }, pose.rotation);

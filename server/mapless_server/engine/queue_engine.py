@@ -120,8 +120,9 @@ class QueueEngine:
         """Makes the job of localizing a photograph, for `run`; its `records` list the stages that it has been through.
 
         `source` replaces the references, for the warm-up. `on_better` is called on the event loop, before the answer,
-        with the first tier's localization before its refinement, if there is one; nothing has checked it. It is called
-        again if references are deleted while they are used. The answer does not depend on it.
+        with each localization that is better than those before, while further attempts follow; first with the coarse
+        pose, which nothing has checked, where the query allows it. It is called again if references are deleted while
+        they are used. The answer does not depend on it.
         """
         views = QueryViews(query.photo, self.options.image_limits)
         run = QueryRun(query, source or self.references, views, caller.deadline_s)

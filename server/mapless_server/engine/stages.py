@@ -275,7 +275,7 @@ class QueryStages:
             return self._conclude(run, part)
         kind = run.kind
         step = Step(REFINE, kind, kind, run.but(part=part))
-        if run.earlier is not None or not (run.query.allow_coarse or run.on_better is not None):
+        if run.earlier is not None or not run.query.allow_coarse:
             return self._next(run, step)
         answer = self._method.coarse_answer(part)
         if answer is None or not answer.is_finite:
@@ -283,8 +283,6 @@ class QueryStages:
         coarse = self._result(run, answer)
         if run.on_better is not None and isinstance(coarse.answer.outcome, Localization):
             run.on_better(coarse)
-        if not run.query.allow_coarse:
-            return self._next(run, step)
         done = Done(coarse, Ending.DEGRADED)
         return Next((step,), Fallback(lambda: done, run.deadline_s - ANSWER_MARGIN_S))
 
@@ -347,6 +345,9 @@ class QueryStages:
 
     def _further(self, run: QueryRun, query: Query, tier: int, best: Result) -> QueryRun:
         """Another search; if it finds nothing better in time, the best result so far is returned."""
+        known, found = run.best.answer.outcome if run.best else None, best.answer.outcome
+        if run.on_better is not None and isinstance(found, Localization) and found is not known:
+            run.on_better(best)
         limits = time.monotonic(), self._give_up_s(run)
         return QueryRun(query, run.source, run.views, run.deadline_s, run.on_better, tier, best, *limits)
 

@@ -184,9 +184,9 @@ class Metrics(Observer, BackgroundObserver):
         """An attempt at an answered query's pose ended."""
         self._attempts(rung, outcome).inc()
 
-    def answered_coarsely(self, seconds: float) -> None:
-        """A call got a coarse answer, to be refined, this long after it arrived."""
-        self._coarse_answer.observe(seconds)
+    def answered_early(self, seconds: float) -> None:
+        """A call got its first answer, which a better one may follow, this long after it arrived."""
+        self._early_answer.observe(seconds)
 
     def answered(
         self,
@@ -320,9 +320,8 @@ class Metrics(Observer, BackgroundObserver):
         text = "Queries with a pose prior that may say which references are near: tracked, or searched in full."
         tracking = self._counter("mapless_tracking", text, ["outcome"])
         self._tracking = Children(tracking, [("tracked",), ("searched",)])
-        self._coarse_answer = histogram(
-            "mapless_coarse_answer_seconds", "Time from arrival to a coarse answer that is to be refined.", CALL_BUCKETS
-        )
+        text = "Time from arrival to a first answer that a better one may follow."
+        self._early_answer = histogram("mapless_early_answer_seconds", text, CALL_BUCKETS)
         self._inliers = histogram("mapless_inliers", "2D-3D matches that agree with a pose.", INLIER_BUCKETS)
         self._inlier_ratio = histogram("mapless_inlier_ratio", "Inliers of all 2D-3D matches.", RATIO_BUCKETS)
         self._reprojection_error = histogram(

@@ -42,8 +42,8 @@ if TYPE_CHECKING:  # services do not load what computes
 
 Joint = TypeVar("Joint")
 
-FutureCoarseAnswer = asyncio.Future[pb.LocalizeResponse]
-"""Is set to the coarse answer, on the event loop, if there is one."""
+GiveBetter = Callable[[pb.LocalizeResponse], None]
+"""Receives an answer that is better than those before, while the final one is computed."""
 
 
 class LocalizationService(rpcs.LocalizationServiceServicer):
@@ -78,7 +78,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
     ) -> AsyncGenerator[pb.LocalizeProgressivelyResponse, None]:
         """Implements LocalizationService.LocalizeProgressively."""
         query, frames = await self._query(request, call)
-        return coarse_then_final(partial(self._answer, request, query, frames, call))
+        return better_then_final(partial(self._answer, request, query, frames, call))
 
     async def _query(self, request: pb.LocalizeRequest, call: Call) -> tuple[Query, AnswerFrames]:
         """Converts a request to a query; FieldError or RequestError names the wrong field."""
@@ -94,10 +94,10 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         query: Query,
         frames: AnswerFrames,
         call: Call,
-        coarse: asyncio.Future[pb.LocalizeResponse] | None = None,
+        give: GiveBetter | None = None,
     ) -> pb.LocalizeResponse:
-        """Computes the final answer; before, sets `coarse` to the coarse pose, if there is one."""
-        engine = self._engine()
+        """Computes the final answer; before, gives what there is so far."""
+        engine, given_count = self._engine(), 0
 
         def to_message(result: Result) -> pb.LocalizeResponse:
             response = outcome_to_message(result, query.options, frames)
@@ -112,18 +112,23 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
             response.diagnostics.processor_duration.FromNanoseconds(round(1e9 * processor_s))
             return response
 
-        def give_coarse(result: Result) -> None:
-            if coarse is not None and not coarse.done():
+        def give_better(result: Result) -> None:
+            nonlocal given_count
+            if give is None:
+                return
+            if not given_count:
                 seconds = time.monotonic() - call.arrived_s
-                call.note(coarse_ms=round(1000 * seconds, 1))
-                self._metrics.answered_coarsely(seconds)
-                coarse.set_result(to_message(result))
+                call.note(first_ms=round(1000 * seconds, 1))
+                self._metrics.answered_early(seconds)
+            given_count += 1
+            give(to_message(result))
 
-        job = engine.query_job(query, call.caller, on_better=None if coarse is None else give_coarse)
+        job = engine.query_job(query, call.caller, on_better=None if give is None else give_better)
         records = job.records  # what the functions above use, not the job: it holds the photograph, and them
         try:
             result = await engine.run(job)
         finally:
+            give = None  # a thread that has not noticed the end may still have a better one
             call.record(records)
         response, answer = to_message(result), result.answer
         parts_ms = {stage: round(1000 * seconds, 1) for stage, seconds in result.stage_seconds.items()}
@@ -307,23 +312,22 @@ async def localize_photographs(
             call.record(records)
 
 
-async def coarse_then_final(
-    answer: Callable[[FutureCoarseAnswer], Coroutine[Any, Any, pb.LocalizeResponse]],
+async def better_then_final(
+    answer: Callable[[GiveBetter], Coroutine[Any, Any, pb.LocalizeResponse]],
 ) -> AsyncGenerator[pb.LocalizeProgressivelyResponse, None]:
-    """Yields the coarse answer as soon as it is known, if there is one, and then the final answer.
+    """Yields each answer as soon as it is known, and then the final one.
 
-    `answer` returns the final one; before, it may set its argument to the coarse one. It is computed whether the
-    messages are read or not, so a slow reader delays only its own messages. Closing the generator cancels the answer,
-    and frees its place in the queue. Any exception of `answer` is raised, after the coarse message if there was one.
+    `answer` returns the final one; before, it may give others to its argument, on the event loop. It is computed
+    whether the messages are read or not, so a slow reader delays only its own messages. Closing the generator cancels
+    the answer, and frees its place in the queue. Any exception of `answer` is raised after what was given before.
     """
-    coarse: FutureCoarseAnswer = asyncio.get_running_loop().create_future()
-    answering = asyncio.ensure_future(answer(coarse))
-    either: set[asyncio.Future[Any]] = {answering, coarse}
+    given: asyncio.Queue[pb.LocalizeResponse | None] = asyncio.Queue()
+    answering = asyncio.ensure_future(answer(given.put_nowait))
+    answering.add_done_callback(lambda _: given.put_nowait(None))
     try:
-        await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
-        if coarse.done():
-            yield pb.LocalizeProgressivelyResponse(answer=coarse.result())
-        yield pb.LocalizeProgressivelyResponse(answer=await answering, is_final=True)
+        while (better := await given.get()) is not None:
+            yield pb.LocalizeProgressivelyResponse(answer=better)
+        yield pb.LocalizeProgressivelyResponse(answer=answering.result(), is_final=True)
     finally:
         answering.cancel()
         await asyncio.gather(answering, return_exceptions=True)

@@ -110,9 +110,10 @@ class Client {
   bool IsServing(Timeout timeout = {}) const;
 
   v1::LocalizeResponse Localize(const v1::LocalizeRequest& request, Timeout timeout = {}) const;
-  // The final answer; `on_coarse` gets a coarse pose before it, if there is one, in the caller's thread.
+  // The final answer; `on_better` gets each better answer before it, in the caller's thread, none or one mostly: localizations
+  // in which the server has little trust, and first, where options.allow_coarse is set, a coarse pose that nothing has checked.
   v1::LocalizeResponse LocalizeProgressively(const v1::LocalizeRequest& request,
-                                             const std::function<void(const v1::LocalizeResponse&)>& on_coarse,
+                                             const std::function<void(const v1::LocalizeResponse&)>& on_better,
                                              Timeout timeout = {}) const;
   v1::LocalizeRigResponse LocalizeRig(const v1::LocalizeRigRequest& request, Timeout timeout = {}) const;
   v1::LocalizeSequenceResponse LocalizeSequence(const v1::LocalizeSequenceRequest& request, Timeout timeout = {}) const;
