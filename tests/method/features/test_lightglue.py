@@ -69,7 +69,8 @@ def views() -> tuple[View, list[View]]:
 
 
 def tensors(query: View, references: Sequence[View]) -> list[Tensor]:
-    arrays = (*Padded.of([query], 2048).arrays[:2], *Padded.of(references, 2048).arrays)
+    ours, theirs = Padded.of([query], 2048), Padded.of(references, 2048)
+    arrays = ours.positions, ours.descriptors, theirs.positions, theirs.descriptors, theirs.mask
     return [torch.from_numpy(a) for a in arrays]
 
 

@@ -197,7 +197,8 @@ class NetworkReconstructor:
         )
 
     def _outcome(self, scene: _Scene, output: NetworkOutput, index: int) -> Outcome:
-        points, logits, poses = (tensor[index].float() for tensor in vars(output).values())
+        tensors = output.local_points, output.confidence_logits, output.camera_poses
+        points, logits, poses = (tensor[index].float() for tensor in tensors)
         *layouts, of_query = (view.layout for view in scene.views)
         parts = points, _without_filling(logits.sigmoid(), scene.views[:-1]), poses
         flat = torch.cat([part.reshape(-1) for part in parts]).cpu().numpy()  # in one transfer
@@ -211,11 +212,10 @@ class NetworkReconstructor:
         local_from_camera = [RigidTransform(pose[:3, :3], pose[:3, 3]) for pose in matrices.astype(np.float64)]
         size = of_query.grid.height_px, of_query.grid.width_px
         unknown = np.full((*size, 3), np.nan, np.float32), np.zeros(size, np.float32)  # the query's maps
-        cameras = (layout.camera for layout in layouts)
-        views = zip(cameras, point_maps, confidence, local_from_camera[:-1], strict=True)
+        views = zip(layouts, point_maps, confidence, local_from_camera[:-1], strict=True)
         return Reconstruction(
             ReconstructedView(of_query.camera, *unknown, local_from_camera[-1]),
-            tuple(ReconstructedView(*view) for view in views),
+            tuple(ReconstructedView(layout.camera, points, trust, pose) for layout, points, trust, pose in views),
             self._runner.metre_sigma if scene.is_metric else None,
         )
 

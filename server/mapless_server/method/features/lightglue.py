@@ -114,11 +114,13 @@ class LightGlueMatching:
         if self.options.pairs_at_once == 1:
             return [self.match_one(query, reference) for reference in references]
         limit, device = self.options.max_keypoints, self._device
-        padded = Padded.of(references, limit)
-        arrays = (*Padded.of([query], limit).arrays[:2], *padded.arrays)
-        tensors = [torch.from_numpy(array).to(device, non_blocking=True) for array in arrays]
+        ours, theirs = Padded.of([query], limit), Padded.of(references, limit)
+        arrays = ours.positions, ours.descriptors, theirs.positions, theirs.descriptors, theirs.mask
+        position, descriptor, positions, descriptors, mask = (
+            torch.from_numpy(array).to(device, non_blocking=True) for array in arrays
+        )
         with torch.autocast(device.type, torch.float16, enabled=self.options.half):
-            index, score = self._network(*tensors)
+            index, score = self._network(position, descriptor, positions, descriptors, mask)
         # One transfer for both: indices are whole numbers below 2^24.
         column, probability = torch.stack([index.float(), score.float()]).cpu().numpy()
         return [self._probable(*row) for row in zip(column, probability, strict=True)]
@@ -141,11 +143,6 @@ class Padded:
     positions: NDArray[np.float32]
     descriptors: NDArray[np.float32]
     mask: NDArray[np.bool_]
-
-    @property
-    def arrays(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-        """The arrays in the order of the network's arguments."""
-        return self.positions, self.descriptors, self.mask
 
     @classmethod
     def of(cls, views: Sequence[View], max_keypoints: int) -> "Padded":

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array, csc_array, csr_array
 from scipy.sparse.csgraph import connected_components
 
 from mapless.geometry import Array
@@ -57,7 +56,7 @@ class Tracks:
         return self._sums @ values if values.ndim == 1 else summed(self._sums, values)
 
     @cached_property
-    def _sums(self) -> Any:
+    def _sums(self) -> csr_array:
         """Matrix (P, O) whose product sums over each point's observations, five times as fast as `reduceat`."""
         count, ends = len(self.point), np.append(self.starts, len(self.point))
         return csr_array((np.ones(count), np.arange(count), ends), shape=(self.point_count, count))
@@ -77,7 +76,7 @@ class Tracks:
         return Tracks(renumbered[self.point[rows]], self.view[rows], self.keypoint[rows]), rows, points
 
 
-def summed(sums: Any, values: Array) -> Array:
+def summed(sums: csr_array | csc_array, values: Array) -> Array:
     """Product of a sparse matrix (P, O) with columns (N, O), (N, P): in one call, a third of the time of N."""
     return np.ascontiguousarray((sums @ np.ascontiguousarray(values.T)).T)
 
@@ -101,7 +100,7 @@ def build_tracks(
         return Tracks(nothing, nothing, nothing)
     edges = np.concatenate(used)
     total = int(offsets[-1])
-    graph: Any = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(total, total))
+    graph = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(total, total))
     _, component = connected_components(graph, directed=False)
     degree = np.bincount(edges.ravel(), minlength=total)
     node = np.flatnonzero(degree)

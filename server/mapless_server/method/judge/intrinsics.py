@@ -25,19 +25,19 @@ def intrinsics_checks(evidence: IntrinsicsEvidence, options: ContradictionOption
     unit = np.array([sent.focal_x_px, scale, scale, 1.0])
     change = unit * evidence.value
     change[0] = sent.focal_x_px * np.expm1(evidence.value[0])
-    conflict = evidence.contradicted(options, evidence.prior_sigma)
+    estimated, sigma, given_sigma = given + change, unit * evidence.sigma, unit * evidence.prior_sigma
+    conflict, used = evidence.contradicted(options, evidence.prior_sigma), evidence.removed != 0
     return tuple(
-        IntrinsicsCheck(*row)
-        for row in zip(
-            IntrinsicsParameter,
-            given.tolist(),
-            (given + change).tolist(),
-            (unit * evidence.sigma).tolist(),
-            (unit * evidence.prior_sigma).tolist(),
-            conflict.tolist(),
-            (evidence.removed != 0).tolist(),
-            strict=True,
+        IntrinsicsCheck(
+            parameter,
+            given=float(given[i]),
+            estimated=float(estimated[i]),
+            estimated_sigma=float(sigma[i]),
+            given_sigma=float(given_sigma[i]),
+            conflict=bool(conflict[i]),
+            used=bool(used[i]),
         )
+        for i, parameter in enumerate(IntrinsicsParameter)
     )
 
 

@@ -9,7 +9,6 @@ agree with one another and pass it. `judge` computes the trust of poses that pas
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import poselib
@@ -131,9 +130,8 @@ def ransac(seen: PixelPoints, world_from_camera: RigidTransform | None, options:
     pose = None
     if len(seen) >= 2 * SAMPLE:
         sample = np.arange(SAMPLE) * len(seen) // SAMPLE
-        pose, found = _ransac(seen[sample], initial, options, SAMPLE_ITERATIONS, 0)
-        enough = found.get("num_inliers", 0) >= SAMPLE_INLIERS
-        pose = _refined(seen, pose, options) if enough else None
+        pose, count = _ransac(seen[sample], initial, options, SAMPLE_ITERATIONS, 0)
+        pose = _refined(seen, pose, options) if count >= SAMPLE_INLIERS else None
     if pose is None:
         pose, _ = _ransac(seen, initial, options, options.max_iterations)
     rotation, translation = np.asarray(pose.R), np.asarray(pose.t)
@@ -148,8 +146,8 @@ def _ransac(
     options: PnpOptions,
     max_iterations: int,
     refinement_steps: int = 100,
-) -> tuple[poselib.CameraPose, dict[str, Any]]:
-    """PoseLib's RANSAC: the pose, and what was found. PoseLib silently ignores options that it does not know."""
+) -> tuple[poselib.CameraPose, int]:
+    """PoseLib's RANSAC: the pose, and its number of inliers. PoseLib silently ignores options that it does not know."""
     ransac_options = {
         "max_reproj_error": options.inlier_px,
         "min_iterations": min(options.min_iterations, max_iterations),
@@ -157,7 +155,10 @@ def _ransac(
         "seed": 0,
     }
     camera, refinement = poselib_camera(seen.camera), _refinement(options, refinement_steps)
-    return poselib.estimate_absolute_pose(seen.pixels, seen.x_in_world, camera, ransac_options, refinement, initial)
+    pose, found = poselib.estimate_absolute_pose(
+        seen.pixels, seen.x_in_world, camera, ransac_options, refinement, initial
+    )
+    return pose, int(found.get("num_inliers", 0))
 
 
 def _refined(seen: PixelPoints, pose: poselib.CameraPose, options: PnpOptions) -> poselib.CameraPose:
